@@ -1,0 +1,1 @@
+"""The stages in order, readable from top to bottom; run from the clone."""

@@ -1,0 +1,1 @@
+"""``taccorl <verb>``: one file per verb, loaded only when asked for."""

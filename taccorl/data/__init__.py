@@ -1,0 +1,1 @@
+"""From recording to dataset: spec, readers, timing, checks, LeRobot format."""

@@ -1,0 +1,29 @@
+"""Errors that a user meets. Each message names the thing, the value, the place and the way out."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class TaccorlError(Exception):
+    """Anything that is the input's fault, not the program's: shown as one line, never as a traceback."""
+
+
+class SpecError(TaccorlError):
+    """A data spec that cannot be obeyed: unknown key, missing field, wrong type."""
+
+
+class RecordingError(TaccorlError):
+    """A recording that cannot be read or does not hold what its spec promises."""
+
+
+class DatasetError(TaccorlError):
+    """A dataset that is incomplete, of another kind, or in the way."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """`` did you mean 'x'? `` for the closest known name, else the list of all; ends without a full stop."""
+    names = sorted(str(k) for k in known)
+    close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean {close[0]!r}?"
+    return f"known: {', '.join(names) if names else 'none'}"

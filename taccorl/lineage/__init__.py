@@ -1,0 +1,1 @@
+"""What was made from what: a content-addressed store, explained, on any engine."""

@@ -1,0 +1,1 @@
+"""Rerun and pictures: what an episode looks and feels like."""
