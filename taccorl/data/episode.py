@@ -1,0 +1,97 @@
+"""One attempt on one clock: numbers as arrays, pictures as a stream; what the writer writes, checks check and views show.
+
+Letters in shapes: T rows (time), K taxels, L history.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from taccorl.data.spec import DatasetSpec
+
+Pictures = dict[str, np.ndarray]
+"""Feature key → (rows, columns, 3) uint8 RGB."""
+
+
+@dataclass(frozen=True)
+class Video:
+    """An episode's part of a video file of a LeRobot dataset."""
+
+    path: Path
+    from_s: float
+    """Time of the episode's first frame inside the file."""
+    num_frames: int
+
+
+@dataclass(frozen=True)
+class ChannelTiming:
+    """How a channel's samples met the rows of this episode (all in seconds)."""
+
+    channel: str
+    feature: str
+    align: str
+    rate_hz: float
+    """Median rate of the channel within the episode."""
+    gaps: int
+    """Intervals longer than 1.5 median intervals."""
+    longest_gap_s: float
+    age_median_s: float
+    age_max_s: float
+    """Age of the sample that a row shows: row time − sample time; negative only for interpolate's look-ahead."""
+    duplicates: int = 0
+    out_of_order: int = 0
+    zero_stamps: int = 0
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode, cut and aligned. T rows at ``spec.fps``."""
+
+    name: str
+    """For people: recording and episode."""
+    spec: DatasetSpec
+    start_ns: int
+    """Recording's clock at row 0."""
+    arrays: dict[str, np.ndarray]
+    """Feature key → (T, size): every feature of the episode that is not a video."""
+    pictures: Callable[[], Iterator[Pictures]]
+    """Calling it streams the T rows' pictures from the start, for the video features of ``picture_keys``."""
+    picture_keys: tuple[str, ...]
+    instruction: str
+    success: bool | None = None
+    """What the operator's marker said; None if nobody said."""
+    origin: str = ""
+    """Where it is from, e.g. "surrogate stand-in, not a robot"; empty for a recording that does not say."""
+    timing: tuple[ChannelTiming, ...] = ()
+    picture_rows: dict[str, np.ndarray] = field(default_factory=dict)
+    """Video key → (T,) number of the source picture a row shows, for freezes and repeats; empty in a dataset."""
+    baselines: dict[str, np.ndarray] = field(default_factory=dict)
+    """Tactile key → (K,) counts that were subtracted."""
+    videos: dict[str, Video] = field(default_factory=dict)
+    """Video key → file, where the episode comes from a dataset."""
+    stages: tuple[tuple[int, str], ...] = ()
+    """(first row, name) of the task's stages, where known."""
+    provenance: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def num_rows(self) -> int:
+        return len(next(iter(self.arrays.values())))
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """(T,) seconds since row 0."""
+        return np.arange(self.num_rows) / self.spec.fps
+
+    def joints(self, key: str, unit: str) -> np.ndarray:
+        """(size,) bool: which elements of ``key`` have that unit."""
+        units = self.spec.features[key].unit
+        names = (units,) * self.spec.features[key].size if isinstance(units, str) else units
+        return np.array([u == unit for u in names])
+
+    def pads(self, key: str) -> dict[str, np.ndarray]:
+        """Pad name → (T, rows, columns) newest counts above baseline of tactile feature ``key``."""
+        feature, sensor = self.spec.features[key], self.spec.sensors[key]
+        counts = self.arrays[key].reshape(-1, feature.history, len(feature.pads), sensor.rows, sensor.columns)
+        return {pad: counts[:, -1, p] for p, pad in enumerate(feature.pads)}

@@ -1,0 +1,1 @@
+"""Recording formats, one file each: register a ``Reader`` with ``@readers.register("name")`` and it takes part."""

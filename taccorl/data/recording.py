@@ -1,0 +1,328 @@
+"""A recording as the robot wrote it: channels with their own time stamps, read by a plug-in, kept as plain arrays.
+
+A ``Reader`` (one per format, in ``readers/``) turns files into ``Message``s. ``load_recording`` reads a whole recording
+once: numbers are decoded and spooled to disk, pictures leave only their stamps and are decoded later, when wanted, so
+that memory does not grow with the recording.
+"""
+
+import contextlib
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from taccorl.data import decode
+from taccorl.data.spec import ChannelSpec, RecordingSpec
+from taccorl.errors import RecordingError, nearest
+from taccorl.plugins import Registry
+
+
+class Message(NamedTuple):
+    """One message of one topic."""
+
+    topic: str
+    log_ns: int
+    """When the recorder received it (ns)."""
+    stamp_ns: int | None
+    """Its header stamp (ns); None where messages of that type have none."""
+    value: Any
+    """Decoded; None where only stamps were asked for."""
+
+
+@dataclass(frozen=True)
+class TopicType:
+    """What a file says a topic is."""
+
+    name: str
+    """Schema name, e.g. ``sensor_msgs/msg/JointState``."""
+    encoding: str
+    """How it is encoded: cdr, json, protobuf, array …"""
+    undecodable: str | None = None
+    """Why its values cannot be decoded; None where they can."""
+    shape: tuple[int, ...] | None = None
+    """Shape of one value, where the format says so (HDF5, LeRobot)."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A part of a file that is lost, and why."""
+
+    file: str
+    byte_start: int
+    byte_end: int
+    reason: str
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def __str__(self) -> str:
+        return f"{Path(self.file).name} bytes {self.byte_start:,} to {self.byte_end:,}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class Source:
+    """One recording among the user's inputs: its files, and the part of them where a file holds several recordings."""
+
+    path: Path
+    files: tuple[Path, ...]
+    part: str | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.path}#{self.part}" if self.part else str(self.path)
+
+
+class Reader(ABC):
+    """A recording format. Subclasses read; they never write, decode nothing that was not asked for, and lose nothing silently."""
+
+    suffixes: ClassVar[tuple[str, ...]] = ()
+    """File endings that this reader opens, for finding recordings in a folder."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.damage: list[Damage] = []
+        """Filled while reading."""
+        self.metadata: dict[str, dict[str, str]] = {}
+        """Named records beside the messages; filled while reading."""
+
+    @classmethod
+    def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
+        """The recordings that ``path`` (a file or folder) holds, or None if this reader does not know such a path.
+
+        The default: a file with one of ``suffixes`` is one recording.
+        """
+        del split_bag
+        return [Source(path, (path,))] if path.is_file() and path.suffix in cls.suffixes else None
+
+    @abstractmethod
+    def topics(self) -> dict[str, TopicType]:
+        """Every topic in the recording. May be incomplete until ``messages`` has run over a damaged file."""
+
+    @abstractmethod
+    def messages(
+        self,
+        topics: Collection[str] | None,
+        *,
+        stamps_only: Collection[str] = (),
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[Message]:
+        """Messages of ``topics`` (None: of all, stamps only) in file order; may skip those logged outside [start, end].
+
+        Raises:
+            RecordingError: the file is not of this format, or an asked-for topic cannot be decoded.
+        """
+
+
+readers: Registry[type[Reader]] = Registry("reader", "taccorl.data.readers")
+
+
+def find_sources(path: Path, *, reader: str | None = None, split_bag: bool = False) -> list[tuple[str, Source]]:
+    """(reader name, source) of every recording that ``path`` holds: a file, a bag folder, a dataset, or a folder of those.
+
+    Raises:
+        RecordingError: nothing there, or nothing that a reader opens.
+    """
+    path = Path(path)
+    if not path.exists():
+        siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+        raise RecordingError(f"{path}: no such file or folder; {nearest(path.name, siblings)}")
+    names = [reader] if reader else list(readers)
+    found = _sources_at(path, names, split_bag)
+    if found is None and path.is_dir():
+        children = sorted(path.iterdir(), key=lambda p: decode.natural_key(p.name))
+        nested = [_sources_at(child, names, split_bag) or [] for child in children]
+        found = [item for items in nested for item in items]
+    if found is None and path.is_file() and reader is not None:
+        found = [(reader, Source(path, (path,)))]  # an odd ending: the named reader will say what is wrong with it
+    if not found:
+        endings = sorted({s for name in names for s in readers.get(name).suffixes})
+        raise RecordingError(
+            f"{path}: no recording here; readers {names} open {', '.join(endings)} and LeRobot datasets"
+        )
+    return found
+
+
+def _sources_at(path: Path, names: list[str], split_bag: bool) -> list[tuple[str, Source]] | None:
+    for name in names:
+        sources = readers.get(name).sources(path, split_bag=split_bag)
+        if sources is not None:
+            return [(name, source) for source in sources]
+    return None
+
+
+@dataclass
+class Channel:
+    """One stream of a recording. N messages, in the order of the file."""
+
+    name: str
+    spec: ChannelSpec
+    log_ns: np.ndarray
+    """(N,) int64."""
+    stamp_ns: np.ndarray | None
+    """(N,) int64; None where the messages have no header."""
+    values: np.ndarray | None
+    """(N, size) numbers; None for pictures."""
+
+
+@dataclass
+class Recording:
+    """One recording, read once. Pictures are read again when ``pictures`` is asked for them."""
+
+    source: Source
+    spec: RecordingSpec
+    reader: Reader
+    channels: dict[str, Channel]
+    texts: dict[str, list[tuple[int, str]]]
+    """(log_ns, text) of marker and instruction topics."""
+    counts: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def damage(self) -> list[Damage]:
+        return self.reader.damage
+
+    def pictures(
+        self, wanted: dict[str, list[tuple[int, int | None]]]
+    ) -> Iterator[tuple[str, tuple[int, int | None], Any]]:
+        """Encoded pictures by (log_ns, stamp_ns), as they come in the file: (channel, identity, payload)."""
+        by_topic = {self.spec.channels[name].topic: name for name in wanted}
+        sets = {name: set(ids) for name, ids in wanted.items()}
+        logs = [log for ids in wanted.values() for log, _ in ids]
+        if not logs:
+            return
+        for m in self.reader.messages(set(by_topic), start_ns=min(logs), end_ns=max(logs)):
+            name = by_topic[m.topic]
+            if (m.log_ns, m.stamp_ns) in sets[name]:
+                sets[name].discard((m.log_ns, m.stamp_ns))
+                yield name, (m.log_ns, m.stamp_ns), m.value
+
+
+class Spool:
+    """Rows appended to a file on disk and read back as one memory-mapped array: memory stays flat however long it gets."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self._path = folder / f"{name}.spool"
+        self._file = self._path.open("wb")
+        self._dtype: np.dtype | None = None
+        self._size = 0
+        self._rows = 0
+
+    def append(self, row: np.ndarray) -> None:
+        """``row``: 1-D; every row of a channel has the same size and dtype."""
+        if self._dtype is None:
+            self._dtype, self._size = row.dtype, row.size
+        elif row.size != self._size:
+            raise RecordingError(f"{row.size} values after messages with {self._size}")
+        self._file.write(row.astype(self._dtype, copy=False).tobytes())
+        self._rows += 1
+
+    def finish(self) -> np.ndarray:
+        """(rows, size)"""
+        self._file.close()
+        if self._rows == 0 or self._dtype is None:
+            return np.empty((0, 0))
+        return np.memmap(self._path, dtype=self._dtype, mode="r", shape=(self._rows, self._size))
+
+
+def load_recording(
+    source: Source, spec: RecordingSpec, scratch: Path, progress: Callable[[int], None] | None = None
+) -> Recording:
+    """Read a recording once, decoding the spec's topics only.
+
+    Args:
+        scratch: folder for spooled numbers; must live as long as the recording is used.
+        progress: called with the number of messages read so far, now and then.
+
+    Raises:
+        RecordingError: not readable, topics missing, of another type, or a message that does not fit the spec.
+    """
+    reader = readers.get(spec.reader)(source)
+    loader = _Loader(reader, spec, scratch)
+    for k, message in enumerate(reader.messages(loader.topics, stamps_only=loader.picture_topics)):
+        loader.take(message)
+        if progress is not None and k % 2000 == 0:
+            progress(k)
+    return loader.finish()
+
+
+class _Loader:
+    def __init__(self, reader: Reader, spec: RecordingSpec, scratch: Path) -> None:
+        self.reader, self.spec = reader, spec
+        pictures = {c for key in spec.target.keys("video") if key in spec.features for c in spec.features[key].channels}
+        pads = {
+            c: s for key, s in spec.target.sensors.items() if key in spec.features for c in spec.features[key].channels
+        }
+        self.by_topic: dict[str, list[str]] = {}
+        for name, channel in spec.channels.items():
+            self.by_topic.setdefault(channel.topic, []).append(name)
+        self.picture_topics = {spec.channels[c].topic for c in pictures}
+        both = self.picture_topics & {spec.channels[c].topic for c in spec.channels if c not in pictures}
+        if both:
+            raise RecordingError(f"{', '.join(sorted(both))}: read both as pictures and as numbers")
+        self.text_topics = {t for t in (spec.episodes.topic, spec.instruction.topic) if t}
+        self.topics = set(self.by_topic) | self.text_topics
+        self.log: dict[str, list[int]] = {t: [] for t in self.topics}
+        self.stamp: dict[str, list[int | None]] = {t: [] for t in self.topics}
+        self.texts: dict[str, list[tuple[int, str]]] = {t: [] for t in self.text_topics}
+        self.spools = {c: Spool(scratch, c) for c in spec.channels if c not in pictures}
+        self.extract = {
+            c: decode.pad_extractor(spec.channels[c], pads[c])
+            if c in pads
+            else decode.vector_extractor(spec.channels[c])
+            for c in self.spools
+        }
+
+    def take(self, m: Message) -> None:
+        self.log[m.topic].append(m.log_ns)
+        self.stamp[m.topic].append(m.stamp_ns)
+        if m.topic in self.text_topics:
+            self.texts[m.topic].append((m.log_ns, decode.text(m.value, m.topic)))
+        for name in self.by_topic.get(m.topic, ()):
+            if name in self.spools:
+                try:
+                    self.spools[name].append(self.extract[name](m.value))
+                except RecordingError as error:
+                    raise RecordingError(f"{m.topic}, message {len(self.log[m.topic]) - 1}: {error}") from error
+
+    def finish(self) -> Recording:
+        present = self.reader.topics()
+        missing = [t for t in sorted(self.by_topic) if not self.log[t]]
+        marker = self.spec.episodes.topic
+        if marker and not self.log[marker]:
+            missing.append(marker)
+        if missing:
+            hint = (
+                "; ".join(f"{t}: {nearest(t, present)}" for t in missing[:3]) if present else "the file names no topics"
+            )
+            raise RecordingError(
+                f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint})"
+            )
+        for name, channel in self.spec.channels.items():
+            found = present[channel.topic].name
+            if channel.type is not None and decode.type_key(found) != decode.type_key(channel.type):
+                raise RecordingError(f"{channel.topic} is {found}, the spec's channel {name!r} says {channel.type}")
+        channels = {name: self._channel(name) for name in self.spec.channels}
+        counts = {t: len(log) for t, log in self.log.items()}
+        return Recording(self.reader.source, self.spec, self.reader, channels, self.texts, counts)
+
+    def _channel(self, name: str) -> Channel:
+        spec = self.spec.channels[name]
+        stamps = self.stamp[spec.topic]
+        if any(s is None for s in stamps):
+            if self.spec.clock_of(name) == "header":
+                raise RecordingError(f"{spec.topic} has no header stamp: write `clock: log` on channel {name!r}")
+            stamp_ns = None
+        else:
+            stamp_ns = np.array(stamps, dtype=np.int64)
+        values = self.spools[name].finish() if name in self.spools else None
+        return Channel(name, spec, np.array(self.log[spec.topic], dtype=np.int64), stamp_ns, values)
+
+
+@contextlib.contextmanager
+def opened(source: Source, spec: RecordingSpec, progress: Callable[[int], None] | None = None) -> Iterator[Recording]:
+    """``load_recording`` with a scratch folder that is removed afterwards."""
+    with tempfile.TemporaryDirectory(prefix="taccorl_") as scratch:
+        yield load_recording(source, spec, Path(scratch), progress)

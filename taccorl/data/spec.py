@@ -1,0 +1,416 @@
+"""The data contract: what a dataset holds, how a sensor speaks, how recordings fill the dataset.
+
+Every feature states dtype, shape, unit, frame, rate and valid range. The files live in ``data_specs/``.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import SpecError, nearest
+
+Align = Literal["hold", "asof", "interpolate", "window"]
+SPEC_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class WireSpec:
+    """How one pad frame arrives: ``rows × columns`` values of ``dtype``, row after row."""
+
+    rows: int
+    columns: int
+    dtype: Literal["uint8", "uint16"]
+    transpose: bool
+    """True: wire rows are pad columns, so the frame is transposed to the pad's rows × columns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineSpec:
+    """Which counts mean "no touch": per taxel, the median of the recording's first ``frames`` frames."""
+
+    rule: Literal["median_of_first"]
+    frames: int
+    max_spread_count: float
+    """A pad whose frames spread more than this about their median (0.99 quantile) is not at rest: no baseline."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorSpec:
+    """One kind of tactile pad."""
+
+    spec_version: int
+    name: str
+    rows: int
+    columns: int
+    wire: WireSpec
+    adc_bits: int
+    wire_shift_bits: int
+    """The firmware drops this many low bits of the ADC before sending (10-bit ADC as a byte: 2)."""
+    rate_hz: float
+    scan_time_s: float
+    """Time to scan the whole pad; the stamp is its end."""
+    unit: str
+    baseline: BaselineSpec
+    noise_count: float
+    """Counts above baseline that an untouched taxel may show."""
+    scheme: Literal["fixed_scale"]
+    gain_per_count: float
+    """Normalised reading = counts above baseline × gain; the policy's processor applies it, never the dataset."""
+
+    @property
+    def max_count(self) -> int:
+        """Largest count on the wire: (2^bits − 1) >> shift."""
+        return (2**self.adc_bits - 1) >> self.wire_shift_bits
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureSpec:
+    """One feature of the dataset."""
+
+    dtype: Literal["float32", "int16", "video"]
+    shape: tuple[int, ...]
+    unit: str | tuple[str, ...]
+    frame: str
+    rate_hz: float
+    """Rate at which the robot measures it; the dataset holds it at the dataset's fps."""
+    range: tuple[float, float] | dict[str, tuple[float, float]]
+    names: tuple[str, ...] = ()
+    sensor: str | None = None
+    """Tactile: sensor file, relative to this one."""
+    pads: tuple[str, ...] = ()
+    """Tactile: pad order; the feature is these pads' taxels, row after row, pad after pad."""
+    history: int = 1
+    """L: readings per row, oldest first (align: window)."""
+    optional: bool = False
+    """A recording spec may leave it out."""
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    @functools.cached_property
+    def limits(self) -> np.ndarray:
+        """(size, 2) lowest and highest valid value per element."""
+        if isinstance(self.range, dict):
+            return np.array([self.range[n] for n in self.names], dtype=float)
+        return np.tile(np.array(self.range, dtype=float), (self.size, 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetSpec:
+    """What the dataset holds and the policy sees."""
+
+    spec_version: int
+    name: str
+    robot_type: str
+    fps: int
+    features: dict[str, FeatureSpec]
+    video_codec: Literal["h264", "libsvtav1"] = "libsvtav1"
+    sensors: dict[str, SensorSpec] = dataclasses.field(default_factory=dict)
+    """Filled on loading: feature key → its sensor. Not a key of the file."""
+
+    def keys(self, kind: Literal["video", "tactile", "vector"]) -> list[str]:
+        """Feature keys of one kind."""
+
+        def kind_of(key: str) -> str:
+            f = self.features[key]
+            return "video" if f.dtype == "video" else "tactile" if key in self.sensors else "vector"
+
+        return [key for key in self.features if kind_of(key) == kind]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelSpec:
+    """One recorded stream: where it is, what part of it counts, on which clock, when it is late."""
+
+    topic: str
+    """Topic (MCAP, bag), path inside the file (HDF5) or feature key (LeRobot)."""
+    rate_hz: float
+    max_age_s: float | None = None
+    """A row whose newest sample is older than this is stale: the episode splits there. Needed unless align is hold."""
+    type: str | None = None
+    """Schema name; another one in the file is refused."""
+    field: str | None = None
+    """Field of the message (dotted)."""
+    pick: tuple[str, ...] = ()
+    """Elements by the message's own ``name`` list, never by position."""
+    scale: tuple[float, ...] = ()
+    """Multiplied in after picking, per element: unit conversion or a driver's known factor."""
+    clock: Literal["header", "log"] | None = None
+    """Default: the recording spec's clock."""
+    latency_s: float = 0.0
+    """Time from the event to its stamp; subtracted."""
+    drop_zero_stamp: bool = False
+    """Messages stamped 0 (PiPER's joint_ctrl before a first command) are dropped and counted."""
+    lead_frames: int = 0
+    """Index-aligned files only: sample k belongs to row k + lead_frames (cobot_magic's action: 1)."""
+    channel_order: Literal["rgb", "bgr"] = "rgb"
+    """Raw HDF5 pictures only."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MappingSpec:
+    """How one feature is filled: these channels, one after the other, brought to the grid by ``align``."""
+
+    channels: tuple[str, ...]
+    align: Align
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodesSpec:
+    """Where episodes begin and end."""
+
+    by: Literal["whole_file", "markers", "metadata"]
+    topic: str | None = None
+    """markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard"."""
+    min_s: float = 1.0
+    """Shorter pieces are not worth an episode: reported, not written."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstructionSpec:
+    """The sentence the policy reads (LeRobot's task)."""
+
+    from_: Literal["spec", "metadata", "markers", "topic"]
+    text: str | None = None
+    """from: spec."""
+    key: str | None = None
+    """from: metadata: key of the MCAP metadata record."""
+    topic: str | None = None
+    """from: topic."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingSpec:
+    """How recordings of one robot's drivers fill a dataset spec."""
+
+    spec_version: int
+    dataset: str
+    """Dataset spec, relative to this file."""
+    reader: str
+    clock: Literal["header", "log"]
+    episodes: EpisodesSpec
+    instruction: InstructionSpec
+    channels: dict[str, ChannelSpec]
+    features: dict[str, MappingSpec]
+    split_bag: bool = False
+    """Files x_0, x_1, … of a folder without metadata.yaml are one recording."""
+    max_clock_spread_s: float = 0.25
+    """Channels whose clocks (log time − stamp) differ by more are on different clocks: refused."""
+    contract: DatasetSpec | None = None
+    """Filled on loading from ``dataset``. Not a key of the file."""
+
+    @property
+    def target(self) -> DatasetSpec:
+        assert self.contract is not None, "load a RecordingSpec with load_recording_spec"
+        return self.contract
+
+    @property
+    def mapped(self) -> dict[str, FeatureSpec]:
+        """The dataset's features that this spec fills, in the dataset's order."""
+        return {key: f for key, f in self.target.features.items() if key in self.features}
+
+    def clock_of(self, channel: str) -> Literal["header", "log"]:
+        return self.channels[channel].clock or self.clock
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of everything that decides the output; comments and layout of the files do not."""
+        return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
+
+
+def data_specs_folder() -> Path:
+    """The shipped specs: the clone's ``data_specs``, or the copy inside an installed package."""
+    package = Path(__file__).resolve().parents[1]
+    clone = package.parent / "data_specs"
+    return clone if clone.is_dir() else package / "_data_specs"
+
+
+def find_spec(name: str | Path) -> Path:
+    """A spec's path: as given, else by its bare name among the shipped ones.
+
+    Raises:
+        SpecError: neither exists; names the nearest shipped spec.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    shipped = {p.stem: p for p in sorted(data_specs_folder().rglob("*.yaml"))}
+    if str(name) in shipped:
+        return shipped[str(name)]
+    raise SpecError(f"no spec {str(name)!r}: neither a file nor a shipped spec; {nearest(path.stem, shipped)}")
+
+
+def load_sensor_spec(path: Path) -> SensorSpec:
+    """A sensor file of ``data_specs/sensors``."""
+    document = Document(SensorSpec, path)
+    spec = document.value
+    _check_version(document, spec.spec_version)
+    pad, wire = (spec.rows, spec.columns), (spec.wire.rows, spec.wire.columns)
+    if (wire[::-1] if spec.wire.transpose else wire) != pad:
+        raise document.error(
+            "wire", f"{wire[0]}×{wire[1]} with transpose: {spec.wire.transpose} is not the pad's {pad[0]}×{pad[1]}"
+        )
+    if spec.max_count > np.iinfo(np.int16).max:
+        raise document.error("adc_bits", f"{spec.max_count} counts do not fit the dataset's int16")
+    return spec
+
+
+def load_dataset_spec(path: Path) -> DatasetSpec:
+    """A dataset file of ``data_specs``.
+
+    Raises:
+        SpecError: with file, line, key, value and the way out.
+    """
+    path = Path(path)
+    document = Document(DatasetSpec, path)
+    spec = document.value
+    _check_version(document, spec.spec_version)
+    if spec.sensors:
+        raise document.error("sensors", "is not a key of this file; give `sensor:` on the tactile feature")
+    if spec.fps <= 0:
+        raise document.error("fps", f"{spec.fps} is not a rate")
+    sensors: dict[str, SensorSpec] = {}
+    for key, feature in spec.features.items():
+        where = f"features/{key}"
+        if not (key == "action" or key.startswith("observation.")):
+            raise document.error(where, "LeRobot's policies read `action` and `observation.*` only")
+        if feature.sensor is not None:
+            sensors[key] = load_sensor_spec(path.parent / feature.sensor)
+        _check_feature(document, where, feature, sensors.get(key))
+    return dataclasses.replace(spec, sensors=sensors)
+
+
+def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, sensor: SensorSpec | None) -> None:
+    if any(n <= 0 for n in feature.shape) or not feature.shape:
+        raise document.error(f"{where}/shape", f"{list(feature.shape)} holds nothing")
+    if feature.dtype == "video":
+        if len(feature.shape) != 3 or feature.shape[2] != 3 or feature.shape[0] % 2 or feature.shape[1] % 2:
+            raise document.error(
+                f"{where}/shape", f"{list(feature.shape)} is not [rows, columns, 3] with even rows and columns"
+            )
+        return
+    if len(feature.shape) != 1:
+        raise document.error(
+            f"{where}/shape",
+            f"{list(feature.shape)}: LeRobot merges and edits flat features only; write [{feature.size}]",
+        )
+    if feature.names and len(feature.names) != feature.size:
+        raise document.error(f"{where}/names", f"{len(feature.names)} names for {feature.size} values")
+    if len(set(feature.names)) != len(feature.names):
+        raise document.error(f"{where}/names", "a name stands twice")
+    if isinstance(feature.unit, tuple) and len(feature.unit) != feature.size:
+        raise document.error(f"{where}/unit", f"{len(feature.unit)} units for {feature.size} values")
+    if isinstance(feature.range, dict):
+        for name in feature.range:
+            if name not in feature.names:
+                raise document.error(f"{where}/range/{name}", f"no such name; {nearest(name, feature.names)}")
+        missing = [n for n in feature.names if n not in feature.range]
+        if missing or not feature.names:
+            raise document.error(f"{where}/range", f"no range for {', '.join(missing) or 'unnamed values'}")
+    if (feature.limits[:, 0] >= feature.limits[:, 1]).any():
+        raise document.error(f"{where}/range", "a lower bound is not below its upper bound")
+    if sensor is None:
+        if feature.pads or feature.history != 1:
+            raise document.error(where, "`pads` and `history` need `sensor`")
+        return
+    expected = feature.history * len(feature.pads) * sensor.rows * sensor.columns
+    if feature.dtype != "int16" or feature.size != expected:
+        raise document.error(
+            f"{where}/shape",
+            f"{feature.dtype} [{feature.size}], but {feature.history} × {len(feature.pads)} pads × "
+            f"{sensor.rows}×{sensor.columns} taxels ({sensor.name}) are int16 [{expected}]",
+        )
+
+
+def load_recording_spec(name: str | Path) -> RecordingSpec:
+    """A recording spec by path or by the bare name of a shipped one, checked against its dataset spec.
+
+    Raises:
+        SpecError: with file, line, key, value and the way out.
+    """
+    path = find_spec(name)
+    document = Document(RecordingSpec, path)
+    spec = document.value
+    _check_version(document, spec.spec_version)
+    if spec.contract is not None:
+        raise document.error("contract", "is not a key of this file; give `dataset:`")
+    contract = load_dataset_spec(path.parent / spec.dataset)
+    spec = dataclasses.replace(spec, contract=contract)
+    for key in spec.features:
+        if key not in contract.features:
+            raise document.error(f"features/{key}", f"not in {spec.dataset}; {nearest(key, contract.features)}")
+    missing = [k for k, f in contract.features.items() if k not in spec.features and not f.optional]
+    if missing:
+        raise document.error("features", f"nothing fills {', '.join(missing)} of {spec.dataset}")
+    for key, mapping in spec.features.items():
+        _check_mapping(document, spec, key, mapping)
+    used = {c for m in spec.features.values() for c in m.channels}
+    for name_, channel in spec.channels.items():
+        where = f"channels/{name_}"
+        if name_ not in used:
+            raise document.error(where, "no feature uses it; remove it or map it")
+        if channel.max_age_s is not None and channel.max_age_s <= 0:
+            raise document.error(f"{where}/max_age_s", f"{channel.max_age_s} s: every row would be stale")
+        if channel.rate_hz <= 0:
+            raise document.error(f"{where}/rate_hz", f"{channel.rate_hz} is not a rate")
+        if channel.scale and channel.pick and len(channel.scale) != len(channel.pick):
+            raise document.error(
+                f"{where}/scale", f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
+            )
+    _check_sources(document, spec)
+    return spec
+
+
+def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mapping: MappingSpec) -> None:
+    where, feature = f"features/{key}", spec.target.features[key]
+    for name in mapping.channels:
+        if name not in spec.channels:
+            raise document.error(f"{where}/channels", f"no channel {name!r}; {nearest(name, spec.channels)}")
+        has_age = spec.channels[name].max_age_s is not None
+        if has_age and mapping.align == "hold":
+            raise document.error(
+                f"channels/{name}/max_age_s", f"has no effect: {key} holds the last value; use align: asof"
+            )
+        if not has_age and mapping.align != "hold":
+            raise document.error(f"channels/{name}", f"key 'max_age_s' is missing: {key} is aligned by {mapping.align}")
+    if feature.dtype == "video" and (len(mapping.channels) != 1 or mapping.align not in ("hold", "asof")):
+        raise document.error(where, "a picture comes from one channel, aligned by hold or asof")
+    if (mapping.align == "window") != (feature.history > 1):
+        raise document.error(
+            f"{where}/align", f"{mapping.align} with history: {feature.history}; a window needs history > 1"
+        )
+    if mapping.align == "interpolate" and feature.dtype != "float32":
+        raise document.error(f"{where}/align", f"{feature.dtype} values are not interpolated")
+    if key in spec.target.sensors and len(mapping.channels) != len(feature.pads):
+        raise document.error(f"{where}/channels", f"{len(mapping.channels)} channels for pads {list(feature.pads)}")
+    picked = [len(spec.channels[c].pick) for c in mapping.channels]
+    if feature.dtype == "float32" and all(picked) and sum(picked) != feature.size:
+        raise document.error(f"{where}/channels", f"pick {sum(picked)} values together; {key} has {feature.size}")
+
+
+def _check_sources(document: Document[Any], spec: RecordingSpec) -> None:
+    episodes, instruction = spec.episodes, spec.instruction
+    if (episodes.by == "markers") != (episodes.topic is not None):
+        raise document.error("episodes", "`topic` goes with `by: markers`, and only with it")
+    needs = {"spec": "text", "metadata": "key", "topic": "topic", "markers": None}[instruction.from_]
+    for field in ("text", "key", "topic"):
+        given = getattr(instruction, field) is not None
+        if given != (field == needs):
+            verb = "is missing" if not given else "has no effect"
+            raise document.error("instruction", f"`{field}` {verb} with `from: {instruction.from_}`")
+    if instruction.from_ == "markers" and episodes.by != "markers":
+        raise document.error("instruction/from", "markers name the instruction only with `episodes: by: markers`")
+
+
+def _check_version(document: Document[Any], version: int) -> None:
+    if version != SPEC_VERSION:
+        raise document.error("spec_version", f"{version}; this taccorl reads version {SPEC_VERSION}")

@@ -1,0 +1,150 @@
+"""YAML into frozen dataclasses, strictly: a wrong key or value is an error with file, line and the nearest name.
+
+Keys that start with ``x-`` are shared anchors and ignored. Nothing is guessed: ``no`` is not the text "no".
+"""
+
+import dataclasses
+import types
+import typing
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import yaml
+
+from taccorl.errors import SpecError, nearest
+
+
+class Document[T]:
+    """One YAML file as a dataclass, with the line of every key.
+
+    Raises:
+        SpecError: the file is missing, is not YAML, or does not fit ``cls``.
+    """
+
+    def __init__(self, cls: type[T], path: Path) -> None:
+        self.path = Path(path)
+        self._lines: dict[str, int] = {}
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise SpecError(f"{self.path}: cannot be read as a spec: {error}") from error
+        try:
+            root = yaml.compose(text, Loader=yaml.SafeLoader)
+        except yaml.YAMLError as error:
+            raise SpecError(f"{self.path}: is not YAML: {' '.join(str(error).split())}") from error
+        if root is None:
+            raise SpecError(f"{self.path}: is empty; a complete example is any file in data_specs/")
+        self.value: T = self._build(cls, root, "")
+
+    def error(self, key: str, text: str) -> SpecError:
+        """A SpecError that points at ``key`` (dotted path), or at its closest parent that stands in the file."""
+        parts = key.split("/")
+        while parts and "/".join(parts) not in self._lines:
+            parts.pop()
+        line = self._lines.get("/".join(parts), 1)
+        return SpecError(f"{self.path}:{line}: {key.replace('/', ' → ')}: {text}")
+
+    def _build(self, kind: Any, node: yaml.Node, key: str) -> Any:
+        self._lines.setdefault(key, node.start_mark.line + 1)
+        if dataclasses.is_dataclass(kind):
+            return self._dataclass(kind, node, key)
+        origin, args = get_origin(kind), get_args(kind)
+        if origin in (typing.Union, types.UnionType):
+            return self._union(args, node, key)
+        if origin is Literal:
+            text = self._scalar(str, node, key)
+            if text not in args:
+                raise self.error(key, f"{text!r} is none of {', '.join(map(repr, args))}; {nearest(text, args)}")
+            return text
+        if origin is dict:
+            return {name: self._build(args[1], child, f"{key}/{name}") for name, child in self._items(node, key)}
+        if origin is tuple:
+            return self._tuple(args, node, key)
+        return self._scalar(kind, node, key)
+
+    def _items(self, node: yaml.Node, key: str) -> list[tuple[str, yaml.Node]]:
+        if not isinstance(node, yaml.MappingNode):
+            raise self.error(key, f"expected keys and values, found {_describe(node)}")
+        items: dict[str, yaml.Node] = {}
+        for name_node, child in node.value:
+            name = str(name_node.value)
+            self._lines[f"{key}/{name}" if key else name] = name_node.start_mark.line + 1
+            if name in items:
+                raise self.error(f"{key}/{name}" if key else name, "stands here twice; keep one")
+            if not name.startswith("x-"):
+                items[name] = child
+        return list(items.items())
+
+    def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
+        hints = typing.get_type_hints(cls)
+        fields = {f.name: f for f in dataclasses.fields(cls)}
+        # A trailing underscore keeps a YAML key free of Python's own words (`from` is `from_` in the dataclass).
+        known = {name.rstrip("_"): name for name in fields}
+        values: dict[str, Any] = {}
+        for name, child in self._items(node, key):
+            path = f"{key}/{name}" if key else name
+            if name not in known:
+                raise self.error(path, f"unknown key {name!r}; {nearest(name, known)}")
+            values[known[name]] = self._build(hints[known[name]], child, path)
+        for name, field in fields.items():
+            required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+            if required and name not in values:
+                raise self.error(key, f"key {name.rstrip('_')!r} is missing")
+        return cls(**values)
+
+    def _tuple(self, args: tuple[Any, ...], node: yaml.Node, key: str) -> tuple[Any, ...]:
+        if not isinstance(node, yaml.SequenceNode):
+            raise self.error(key, f"expected a list, found {_describe(node)}")
+        if len(args) == 2 and args[1] is Ellipsis:
+            return tuple(self._build(args[0], child, f"{key}/{i}") for i, child in enumerate(node.value))
+        if len(args) != len(node.value):
+            raise self.error(key, f"expected {len(args)} values, found {len(node.value)}")
+        return tuple(self._build(a, c, f"{key}/{i}") for i, (a, c) in enumerate(zip(args, node.value, strict=True)))
+
+    def _union(self, kinds: tuple[Any, ...], node: yaml.Node, key: str) -> Any:
+        if type(None) in kinds and isinstance(node, yaml.ScalarNode) and node.tag.endswith(":null"):
+            return None
+        kinds = tuple(k for k in kinds if k is not type(None))
+        shape = {yaml.MappingNode: (dict,), yaml.SequenceNode: (tuple,), yaml.ScalarNode: (str, int, float, bool)}[
+            type(node)
+        ]
+        fitting = [
+            k
+            for k in kinds
+            if (get_origin(k) or k) in shape
+            or (get_origin(k) is Literal and isinstance(node, yaml.ScalarNode))
+            or (dataclasses.is_dataclass(k) and isinstance(node, yaml.MappingNode))
+        ]
+        if not fitting:
+            raise self.error(key, f"does not fit: found {_describe(node)}")
+        errors: list[SpecError] = []
+        for kind in fitting:
+            try:
+                return self._build(kind, node, key)
+            except SpecError as error:
+                errors.append(error)
+        raise errors[-1]
+
+    def _scalar(self, kind: Any, node: yaml.Node, key: str) -> Any:
+        if not isinstance(node, yaml.ScalarNode):
+            raise self.error(key, f"expected one {kind.__name__}, found {_describe(node)}")
+        tag = node.tag.rsplit(":", 1)[-1]
+        if kind is bool and tag == "bool":
+            return str(node.value).lower() in ("true", "yes", "on")
+        if kind is int and tag == "int":
+            return int(yaml.safe_load(node.value))
+        if kind is float and tag in ("float", "int", "str"):
+            try:
+                return float(node.value)  # YAML 1.1 reads 1e-3 as text; it is a number here
+            except ValueError:
+                pass
+        if kind is str and tag == "str":
+            return str(node.value)
+        hint = "; put it in quotes" if kind is str else ""
+        raise self.error(key, f"expected {kind.__name__}, found {_describe(node)}{hint}")
+
+
+def _describe(node: yaml.Node) -> str:
+    if isinstance(node, yaml.ScalarNode):
+        return f"{node.value!r}"
+    return "a list" if isinstance(node, yaml.SequenceNode) else "keys and values"

@@ -1,0 +1,175 @@
+"""From many clocks to one: which clock a channel keeps, and which of its samples each row of the grid shows.
+
+Pure functions on int64 nanoseconds. No row ever shows the future: ``hold``, ``asof`` and ``window`` use nothing after the
+row's time, and ``interpolate`` (for offline study) looks ahead to one next sample, within the channel's max_age_s, and says so.
+A row without a fresh sample is stale; stale rows are never filled or deleted: the episode is split there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.data.spec import Align
+from taccorl.errors import RecordingError
+
+NS_PER_S = 1_000_000_000
+SIM_TIME_S = 1e6
+"""Clocks further apart than this are not two clocks set differently: one counts from a simulation's start."""
+
+
+@dataclass(frozen=True)
+class ClockReading:
+    """One channel's times on the clock that its spec chose. N samples kept, in time order."""
+
+    time_ns: np.ndarray
+    """(N,) int64, strictly increasing; latency subtracted."""
+    order: np.ndarray
+    """(N,) index of each kept sample among the channel's messages."""
+    skew_s: float
+    """Median of log time − stamp; 0 on the log clock."""
+    duplicates: int
+    out_of_order: int
+    zero_stamps: int
+
+
+def read_clock(
+    log_ns: np.ndarray,
+    stamp_ns: np.ndarray | None,
+    *,
+    clock: str,
+    latency_s: float = 0.0,
+    drop_zero_stamp: bool = False,
+) -> ClockReading:
+    """A channel's own times: chosen clock, minus latency, sorted; repeated times keep their first sample.
+
+    Args:
+        log_ns: (M,) when each message was recorded.
+        stamp_ns: (M,) header stamps, or None where messages have none.
+    """
+    time_ns = log_ns if clock == "log" or stamp_ns is None else stamp_ns
+    keep = np.ones(len(time_ns), dtype=bool)
+    if drop_zero_stamp and stamp_ns is not None:
+        keep = stamp_ns != 0
+    zero_stamps = int((~keep).sum())
+    index = np.flatnonzero(keep)
+    kept = time_ns[index]
+    skew_s = 0.0
+    if clock == "header" and stamp_ns is not None and len(index):
+        skew_s = float(np.median(log_ns[index] - stamp_ns[index])) / NS_PER_S
+    out_of_order = int((np.diff(kept) < 0).sum())
+    by_time = np.argsort(kept, kind="stable")
+    kept, index = kept[by_time], index[by_time]
+    first = np.ones(len(kept), dtype=bool)
+    first[1:] = np.diff(kept) > 0
+    return ClockReading(
+        time_ns=kept[first] - round(latency_s * NS_PER_S),
+        order=index[first],
+        skew_s=skew_s,
+        duplicates=int((~first).sum()),
+        out_of_order=out_of_order,
+        zero_stamps=zero_stamps,
+    )
+
+
+def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
+    """Are all channels on one clock?
+
+    Args:
+        skew_s: topic → median of log time − stamp; 0 for channels on the log clock.
+
+    Raises:
+        RecordingError: two channels' clocks differ by more than ``max_spread_s``.
+    """
+    if not skew_s:
+        return
+    center = float(np.median(list(skew_s.values())))
+    topic, skew = max(skew_s.items(), key=lambda item: abs(item[1] - center))
+    low, high = min(skew_s.values()), max(skew_s.values())
+    if high - low <= max_spread_s:
+        return
+    if abs(high - low) > SIM_TIME_S:
+        topic, skew = max(skew_s.items(), key=lambda item: abs(item[1]))
+        raise RecordingError(
+            f"stamps of {topic} are {skew:.6g} s behind its log time (simulation time?) while other channels are on the "
+            f"log clock: set `clock: log` for the recording, or give every channel a header clock"
+        )
+    raise RecordingError(
+        f"stamps of {topic} are {skew - center:+.3f} s off the other channels' clock "
+        f"(log time − stamp: {skew:.3f} s against {center:.3f} s): set `latency_s: {center - skew:.3f}` on that channel if "
+        f"this is constant, else `clock: log`, and mend the recorder's clock"
+    )
+
+
+def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
+    """(T,) row times from ``start_ns`` at ``fps``, the last one at or before ``end_ns``. No drift: each is rounded alone."""
+    if end_ns < start_ns:
+        return np.empty(0, dtype=np.int64)
+    num_rows = (end_ns - start_ns) * fps // NS_PER_S + 1
+    return start_ns + (np.arange(num_rows, dtype=np.int64) * NS_PER_S + fps // 2) // fps
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Which samples of one channel each row shows. T rows, L history."""
+
+    index: np.ndarray
+    """(T, L) sample index, oldest first; −1 where the row has none."""
+    weight: np.ndarray | None
+    """(T,) share of the following sample (interpolate), else None."""
+    age_s: np.ndarray
+    """(T,) row time − time of the newest sample used; negative for a look-ahead; inf where there is none."""
+    fresh: np.ndarray
+    """(T,) bool: the row has what it needs."""
+
+
+def match(
+    grid_ns: np.ndarray,
+    time_ns: np.ndarray,
+    align: Align,
+    *,
+    max_age_s: float | None = None,
+    history: int = 1,
+    rate_hz: float = 0.0,
+) -> Matched:
+    """Samples for every row.
+
+    Args:
+        grid_ns: (T,) row times.
+        time_ns: (N,) strictly increasing sample times.
+        align: ``hold`` the last sample, however old (a command stays in force); ``asof`` the last sample, stale beyond
+            ``max_age_s``; ``interpolate`` between the last and the next, each within ``max_age_s``; ``window`` the last
+            ``history`` samples at the channel's own rate, stale unless the newest is within ``max_age_s`` and the oldest
+            within max_age_s + (history − 1) / ``rate_hz``.
+    """
+    last = np.searchsorted(time_ns, grid_ns, side="right") - 1
+    has = last >= 0
+    safe = np.maximum(last, 0)
+    if len(time_ns) == 0:
+        nothing = np.full((len(grid_ns), history), -1)
+        return Matched(nothing, None, np.full(len(grid_ns), np.inf), np.zeros(len(grid_ns), dtype=bool))
+    age_s = np.where(has, (grid_ns - time_ns[safe]) / NS_PER_S, np.inf)
+    if align == "hold":
+        return Matched(np.where(has, last, -1)[:, None], None, age_s, has)
+    assert max_age_s is not None, "the spec demands max_age_s for every align but hold"
+    fresh = has & (age_s <= max_age_s)
+    if align == "asof":
+        return Matched(np.where(has, last, -1)[:, None], None, age_s, fresh)
+    if align == "interpolate":
+        following = np.minimum(safe + 1, len(time_ns) - 1)
+        exact = has & (time_ns[safe] == grid_ns)
+        ahead_s = (time_ns[following] - grid_ns) / NS_PER_S
+        fresh &= exact | ((following > safe) & (ahead_s <= max_age_s))
+        step = np.maximum(time_ns[following] - time_ns[safe], 1)
+        weight = np.where(exact, 0.0, (grid_ns - time_ns[safe]) / step)
+        return Matched(np.where(has, last, -1)[:, None], weight, np.where(exact, 0.0, -ahead_s), fresh)
+    oldest = last - history + 1
+    span_s = np.where(oldest >= 0, (grid_ns - time_ns[np.maximum(oldest, 0)]) / NS_PER_S, np.inf)
+    fresh &= (oldest >= 0) & (span_s <= max_age_s + (history - 1) / rate_hz)
+    index = last[:, None] + np.arange(1 - history, 1)
+    return Matched(np.where(oldest[:, None] >= 0, index, -1), None, age_s, fresh)
+
+
+def runs(fresh: np.ndarray) -> list[tuple[int, int]]:
+    """[first, last + 1) of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], fresh, [False])).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
