@@ -81,8 +81,10 @@ class Reader(ABC):
     suffixes: ClassVar[tuple[str, ...]] = ()
     """File endings that this reader opens, for finding recordings in a folder."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, spec: RecordingSpec | None = None) -> None:
         self.source = source
+        self.spec = spec
+        """None while somebody only looks into a file."""
         self.damage: list[Damage] = []
         """Filled while reading."""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -239,7 +241,7 @@ def load_recording(
     Raises:
         RecordingError: not readable, topics missing, of another type, or a message that does not fit the spec.
     """
-    reader = readers.get(spec.reader)(source)
+    reader = readers.get(spec.reader)(source, spec)
     loader = _Loader(reader, spec, scratch)
     for k, message in enumerate(reader.messages(loader.topics, stamps_only=loader.picture_topics)):
         loader.take(message)

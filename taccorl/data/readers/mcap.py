@@ -23,6 +23,7 @@ from mcap.stream_reader import breakup_chunk
 
 from taccorl.data import decode
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
+from taccorl.data.spec import RecordingSpec
 from taccorl.errors import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -42,8 +43,8 @@ class McapReader(Reader):
 
     suffixes = (".mcap",)
 
-    def __init__(self, source: Source) -> None:
-        super().__init__(source)
+    def __init__(self, source: Source, spec: RecordingSpec | None = None) -> None:
+        super().__init__(source, spec)
         self._topics: dict[str, TopicType] = {}
         self._chunk_times: dict[tuple[Path, int], tuple[int, int]] = {}
         self._whole = False

@@ -1,0 +1,47 @@
+"""``make demo``: a recording as the robot's drivers would write it → dataset → checks → Rerun and a contact sheet.
+
+There is no robot here: the recording is a stand-in, and everything made from it says so.
+"""
+
+import shutil
+from pathlib import Path
+
+from taccorl.cli import main as cli
+from taccorl.demos.stand_in import StandInConfig, write_mcap
+
+OUT = Path("outputs/demo")
+SPEC = "piper_flexitac_mcap"
+
+
+def taccorl(*words: str) -> None:
+    """One command, shown as a user would type it."""
+    print(f"\n$ taccorl {' '.join(words)}", flush=True)
+    code = cli.main(list(words))
+    if code != 0:
+        raise SystemExit(f"taccorl {words[0]} ended with {code}")
+
+
+def main() -> None:
+    """Everything lands in outputs/demo, which is made anew."""
+    shutil.rmtree(OUT, ignore_errors=True)
+    recordings, dataset = OUT / "recordings", OUT / "dataset"
+    recordings.mkdir(parents=True)
+    for k in range(2):
+        path = recordings / f"stand_in_{k}.mcap"
+        write_mcap(path, StandInConfig(duration_s=8.0, seed=k))
+        print(f"wrote {path} ({path.stat().st_size / 1e6:.0f} MB): surrogate, not a robot")
+    first = str(recordings / "stand_in_0.mcap")
+    taccorl("ingest", "inspect", first)
+    taccorl("ingest", str(recordings), f"--spec={SPEC}", f"--out={dataset}", f"--store={OUT / 'store'}")
+    taccorl("check", str(dataset))
+    taccorl("view", str(dataset), "--episode=0", f"--save={OUT / 'episode.rrd'}", f"--sheet={OUT / 'contact_sheet.png'}")
+    taccorl("lineage", "explain", str(dataset), f"--store={OUT / 'store'}")
+    print(f"\nrecordings     {recordings}")
+    print(f"dataset        {dataset}   (LeRobotDataset('local/demo', root={str(dataset)!r}))")
+    print(f"report         {OUT / 'dataset.ingest_report.json'}")
+    print(f"Rerun          {OUT / 'episode.rrd'}   (.venv/bin/rerun {OUT / 'episode.rrd'})")
+    print(f"contact sheet  {OUT / 'contact_sheet.png'}")
+
+
+if __name__ == "__main__":
+    main()

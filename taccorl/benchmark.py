@@ -1,0 +1,192 @@
+"""Benchmarks: figures with goal, rival, n and spread, measured in one run. ``make bench``, ``make bench ONLY=ingest``.
+
+A package registers its benchmarks in a module ``benchmarks`` with ``@benchmark("name")``: a function that yields ``Row``s.
+Timings are CPU-seconds or ratios within one run, because machines are shared and noisy. All rows go to ``bench.json``;
+``docs/benchmarks.md`` is rendered from it.
+"""
+
+import dataclasses
+import datetime
+import importlib
+import importlib.util
+import json
+import os
+import pkgutil
+import platform
+import resource
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import taccorl
+from taccorl.errors import TaccorlError, nearest
+
+ROOT = Path(taccorl.__file__).resolve().parents[1]
+JSON_PATH = ROOT / "bench.json"
+PAGE_PATH = ROOT / "docs" / "benchmarks.md"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One figure."""
+
+    name: str
+    value: float
+    unit: str
+    goal: str = ""
+    """"≥ 4" or "< 1.5"; empty: no goal, for information."""
+    rival: str = ""
+    """What it is compared with, in the same run."""
+    rival_value: float | None = None
+    n: int
+    """How often it was measured."""
+    spread: float
+    """(largest − smallest) / 2 of the n measurements, in the row's unit."""
+    met: bool | None = None
+    command: str = ""
+    machine: str = ""
+    date: str = ""
+
+
+BENCHMARKS: dict[str, Callable[[], Iterator[Row]]] = {}
+
+
+def benchmark(name: str) -> Callable[[Callable[[], Iterator[Row]]], Callable[[], Iterator[Row]]]:
+    """Register a function that yields rows under ``name``."""
+
+    def add(fn: Callable[[], Iterator[Row]]) -> Callable[[], Iterator[Row]]:
+        BENCHMARKS[name] = fn
+        return fn
+
+    return add
+
+
+def spread(values: list[float]) -> float:
+    """Half the range of the measurements."""
+    return (max(values) - min(values)) / 2
+
+
+def cpu_s(*, children: bool = False) -> float:
+    """CPU-seconds (user + system) of this process and, with ``children``, of those that ended."""
+    usages = [resource.getrusage(resource.RUSAGE_SELF)]
+    if children:
+        usages.append(resource.getrusage(resource.RUSAGE_CHILDREN))
+    return sum(u.ru_utime + u.ru_stime for u in usages)
+
+
+def meets(value: float, goal: str) -> bool | None:
+    """``meets(4.2, "≥ 4")`` is True; no goal is None."""
+    if not goal:
+        return None
+    sign, _, bound = goal.partition(" ")
+    limit = float(bound.split()[0].replace(",", ""))
+    return {"≥": value >= limit, "≤": value <= limit, "<": value < limit, ">": value > limit, "=": value == limit}[sign]
+
+
+def machine() -> str:
+    """Cores and processor, without anything that names the host."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    return f"{os.cpu_count()} cores, {model}, shared"
+
+
+def run(only: str | None = None) -> list[Row]:
+    """Run all benchmarks, or the one named ``only``, and store their rows."""
+    for package in pkgutil.iter_modules(taccorl.__path__):
+        name = f"taccorl.{package.name}.benchmarks"
+        if package.ispkg and importlib.util.find_spec(name):
+            importlib.import_module(name)
+    if only is not None and only not in BENCHMARKS:
+        raise TaccorlError(f"no benchmark {only!r}; {nearest(only, BENCHMARKS)}")
+    rows = []
+    for name in [only] if only else list(BENCHMARKS):
+        print(f"bench {name} …", flush=True)
+        for row in BENCHMARKS[name]():
+            full = dataclasses.replace(
+                row,
+                name=f"{name}: {row.name}",
+                met=meets(row.value, row.goal),
+                command=f"make bench ONLY={name}",
+                machine=machine(),
+                date=datetime.date.today().isoformat(),
+            )
+            print(f"  {_line(full)}", flush=True)
+            rows.append(full)
+    _store(rows)
+    return rows
+
+
+def _line(row: Row) -> str:
+    met = {True: "met", False: "NOT MET", None: ""}[row.met]
+    rival = f"; {row.rival}: {row.rival_value:.4g}" if row.rival_value is not None else ""
+    return f"{row.name}: {row.value:.4g} ± {row.spread:.2g} {row.unit} (n={row.n}{rival}) {row.goal} {met}".rstrip()
+
+
+def _store(rows: list[Row]) -> None:
+    kept: dict[str, dict[str, Any]] = {}
+    if JSON_PATH.exists():
+        kept = {r["name"]: r for r in json.loads(JSON_PATH.read_text())}
+    replaced = {r.name.split(":")[0] for r in rows}
+    kept = {name: r for name, r in kept.items() if name.split(":")[0] not in replaced}
+    merged = list(kept.values()) + [dataclasses.asdict(r) for r in rows]
+    merged.sort(key=lambda r: r["name"].split(":")[0])
+    JSON_PATH.write_text(json.dumps(merged, indent=1, ensure_ascii=False) + "\n")
+    PAGE_PATH.parent.mkdir(exist_ok=True)
+    PAGE_PATH.write_text(render(merged))
+    print(f"{JSON_PATH.name} and {PAGE_PATH.relative_to(ROOT)} written")
+
+
+def render(rows: list[dict[str, Any]]) -> str:
+    """The page of all rows."""
+    lines = [
+        "# Benchmarks",
+        "",
+        "Written by `make bench` from `bench.json`; do not edit. Value ± half the range of n measurements. Timings are",
+        "CPU-seconds or ratios within one run: the machine is shared. Recordings here are stand-ins, never a robot's.",
+        "",
+        "| what | value | unit | goal | met | rival in the same run | n | command | machine | date |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        met = {True: "yes", False: "**no**", None: ""}[r["met"]]
+        rival = f"{r['rival']}: {r['rival_value']:.4g}" if r["rival_value"] is not None else r["rival"]
+        value = f"{r['value']:.4g} ± {r['spread']:.2g}"
+        cells = [
+            r["name"],
+            value,
+            r["unit"],
+            r["goal"],
+            met,
+            rival,
+            str(r["n"]),
+            f"`{r['command']}`",
+            r["machine"],
+            r["date"],
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """``python -m taccorl.benchmark [--only=name]``"""
+    only = [a.removeprefix("--only=") for a in sys.argv[1:] if a.startswith("--only=")]
+    try:
+        # The module run as __main__ is another one than taccorl.benchmark, where the packages register.
+        rows = importlib.import_module("taccorl.benchmark").run(only[0] if only else None)
+    except TaccorlError as error:
+        print(error, file=sys.stderr)
+        return 2
+    missed = [r.name for r in rows if r.met is False]
+    print(f"{len(rows)} figures, {len(missed)} short of their goal" + (f": {'; '.join(missed)}" if missed else ""))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

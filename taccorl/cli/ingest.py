@@ -1,0 +1,144 @@
+"""``taccorl ingest recordings/ --spec=piper_flexitac_mcap --out=outputs/my_dataset``
+
+Recordings (MCAP, ROS 2 bags, HDF5, LeRobot datasets) into one LeRobot v3 dataset with touch.
+``taccorl ingest inspect FILE`` prints what a recording holds and a draft spec.
+"""
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from taccorl.cli.parse import parse
+from taccorl.errors import DatasetError, TaccorlError
+from taccorl.lineage.engines import Engine, LocalEngine
+
+
+@dataclass(kw_only=True)
+class IngestConfig:
+    """Recordings into one LeRobot dataset."""
+
+    paths: list[Path]
+    """Files, bag folders, datasets, or folders of those."""
+    spec: str
+    """Recording spec: a file, or the bare name of one in data_specs/recordings/."""
+    out: Path = Path("outputs/dataset")
+    """The dataset's folder. It must not hold anything else."""
+    store: Path = Path("outputs/store")
+    """Finished recordings are kept here, so that a second run goes on where the first ended."""
+    dry_run: bool = False
+    """Read, align and check, but write nothing."""
+    replace: bool = False
+    """If `out` holds another dataset, move that aside (out.old-1, …) and publish this one."""
+    engine: Engine = field(default_factory=LocalEngine)
+    """Where to work: --engine.type=local --engine.workers=2, slurm, ray."""
+
+
+@dataclass(kw_only=True)
+class InspectConfig:
+    """What a recording holds, and a draft spec."""
+
+    paths: list[Path]
+    """Files, bag folders, datasets, or folders of those."""
+    reader: str | None = None
+    """mcap, db3, hdf5, lerobot or a plug-in's; by the file's kind if not given."""
+    split_bag: bool = False
+    """Files x_0, x_1, … of a folder are one recording."""
+    draft: Path | None = None
+    """Write the draft spec here instead of printing it; an existing file is left alone."""
+
+
+def main(argv: list[str]) -> int:
+    """0: all written or split; 1: something was quarantined or refused."""
+    if argv and argv[0] == "inspect":
+        return _inspect(parse(InspectConfig, argv[1:], positional="paths"))
+    return _ingest(parse(IngestConfig, argv, positional="paths"))
+
+
+def _ingest(config: IngestConfig) -> int:
+    from taccorl.cli.tables import Bars, ingest_table
+    from taccorl.data.ingest import find_jobs, ingest
+    from taccorl.data.spec import load_recording_spec
+    from taccorl.lineage.store import Store
+
+    spec = load_recording_spec(config.spec)
+    jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run)
+    _check_out(config)
+    store = Store(config.store)
+    with Bars(len(jobs)) as bars:
+        try:
+            report = ingest(jobs, config.out, store, engine=config.engine, progress=bars.update)
+        except DatasetError as error:
+            if not config.replace or not config.out.exists():
+                raise
+            aside = _aside(config.out)
+            config.out.rename(aside)
+            print(f"moved what was at {config.out} to {aside} ({str(error).split(':')[0]})")
+            report = ingest(jobs, config.out, store, engine=config.engine, progress=bars.update)
+    ingest_table(report)
+    _write_report(report, config)
+    wrong = report["outcomes"]["quarantined"] + report["outcomes"]["refused"]
+    return 1 if wrong else 0
+
+
+def _check_out(config: IngestConfig) -> None:
+    """What is certain to be in the way is told before an hour of work, not after it."""
+    out = config.out
+    if config.dry_run or config.replace or not out.exists():
+        return
+    if not (out / "meta/taccorl/manifest.json").is_file():
+        raise DatasetError(
+            f"{out} exists and is no dataset of taccorl: give another --out, or --replace=true to move it aside"
+        )
+
+
+def _aside(out: Path) -> Path:
+    number = 1
+    while (aside := out.with_name(f"{out.name}.old-{number}")).exists():
+        number += 1
+    return aside
+
+
+def _write_report(report: dict[str, Any], config: IngestConfig) -> None:
+    path = config.out.with_name(f"{config.out.name}.ingest_report.json")
+    if config.dry_run:
+        print("dry run: nothing was written")
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temp = path.with_name(f".{path.name}.{os.getpid()}")
+    temp.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    temp.replace(path)
+    print(f"report: {path}")
+    if report["episodes"]:
+        print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows)")
+        print(f"look:    taccorl view {config.out} --episode=0")
+
+
+def _inspect(config: InspectConfig) -> int:
+    from taccorl.cli.tables import inventory_table
+    from taccorl.data.inspection import draft_spec, inspect_source
+    from taccorl.data.recording import find_sources
+
+    if config.draft is not None and config.draft.exists():
+        raise TaccorlError(f"{config.draft} exists; give another --draft, it would be overwritten")
+    failed = 0
+    for path in config.paths:
+        for name, source in find_sources(path, reader=config.reader, split_bag=config.split_bag):
+            try:
+                inventory = inspect_source(name, source)
+            except TaccorlError as error:
+                print(f"{source.name}: {error}")
+                failed += 1
+                continue
+            inventory_table(inventory)
+            text = draft_spec(inventory)
+            if config.draft is not None:
+                config.draft.write_text(text, encoding="utf-8")
+                print(f"draft spec: {config.draft}")
+                config.draft = None
+            elif inventory.fits:
+                print(f"fits the shipped spec: taccorl ingest {path} --spec={inventory.fits[0]}\n")
+            else:
+                print("draft spec (--draft=FILE writes it):\n\n" + text)
+    return 1 if failed else 0

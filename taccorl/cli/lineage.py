@@ -1,0 +1,100 @@
+"""taccorl lineage explain PATH [--store=outputs/store]
+taccorl lineage prune [--store=outputs/store] [--keep=DATASET ...] [--yes=true]
+
+explain  what a dataset or artefact was made from, down to the raw recordings, and what changed since (then it exits 1)
+prune    what the kept datasets were not made from; deletes it only with --yes=true
+"""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from taccorl.errors import TaccorlError, nearest
+
+DEFAULT_STORE = Path("outputs/store")
+
+
+@dataclass(kw_only=True)
+class ExplainConfig:
+    """taccorl lineage explain PATH"""
+
+    path: Path
+    """A dataset, an artefact, a file in one, or a raw recording."""
+    store: Path = DEFAULT_STORE
+    """Where to look for inputs that were moved; may be absent."""
+
+
+@dataclass(kw_only=True)
+class PruneConfig:
+    """taccorl lineage prune"""
+
+    store: Path = DEFAULT_STORE
+    """The store to free."""
+    keep: list[Path] = field(default_factory=list)
+    """Datasets whose whole lineage stays. Repeat --keep=DATASET for each; with none, every artefact may go."""
+    yes: bool = False
+    """Delete. Without it, only list what would be freed."""
+
+
+def main(argv: list[str]) -> int:
+    """Run ``taccorl lineage`` with the words after it; returns the exit status."""
+    verbs = {"explain": _explain, "prune": _prune}
+    if not argv or argv[0] in ("-h", "--help"):
+        print(__doc__)
+        return 0
+    if argv[0] not in verbs:
+        raise TaccorlError(f"taccorl lineage has no verb {argv[0]!r}; {nearest(argv[0], verbs)}")
+    return verbs[argv[0]](argv[1:])
+
+
+def _explain(argv: list[str]) -> int:
+    from taccorl.cli.parse import parse
+    from taccorl.lineage.explain import render, trace
+    from taccorl.lineage.prune import open_store
+
+    config = parse(ExplainConfig, argv, positional="path")
+    if config.store.exists() or config.store != DEFAULT_STORE:
+        store = open_store(config.store)
+    else:
+        store = None
+    origin = trace(config.path, store)
+    print(render(origin))
+    return 1 if origin.num_problems() else 0
+
+
+def _prune(argv: list[str]) -> int:
+    from taccorl.cli.parse import parse
+    from taccorl.lineage.prune import delete, open_store, unneeded
+
+    config = parse(PruneConfig, join_repeated(argv, "keep"))
+    store = open_store(config.store)
+    folders = unneeded(store, config.keep)
+    for folder in folders:
+        note = "  (left by a run that died)" if folder.is_leftover else ""
+        print(f"{_megabytes(folder.size_bytes)}  {folder.path}{note}")
+    total = _megabytes(sum(folder.size_bytes for folder in folders)).strip()
+    kept = f"needed for {len(config.keep)} kept datasets" if config.keep else "kept, as no --keep=DATASET was given"
+    print(f"{len(folders)} of {len(store.folders())} folders in {store.root} are not {kept}: {total}")
+    if not folders or not config.yes:
+        if folders:
+            print("Nothing was deleted; add --yes=true to delete them.")
+        return 0
+    busy = delete(store, folders)
+    print(f"Deleted {len(folders) - len(busy)} folders.")
+    for folder in busy:
+        print(f"Left alone, as a run is using it now: {folder.path}", file=sys.stderr)
+    return 0
+
+
+def join_repeated(argv: list[str], name: str) -> list[str]:
+    """``--keep=a --keep=b`` as the one list that draccus reads, ``--keep=["a", "b"]``."""
+    prefix = f"--{name}="
+    values = [word.removeprefix(prefix) for word in argv if word.startswith(prefix)]
+    if not values or values[0].startswith("["):
+        return argv
+    return [word for word in argv if not word.startswith(prefix)] + [prefix + json.dumps(values)]
+
+
+def _megabytes(size_bytes: int) -> str:
+    return f"{size_bytes / 1e6:10.1f} MB"

@@ -1,0 +1,52 @@
+"""``taccorl <verb> …``: one file per verb, imported only when it is asked for, so that the list appears at once."""
+
+import importlib
+import os
+import sys
+
+from taccorl.errors import TaccorlError, nearest
+
+VERBS = {
+    "data": {
+        "ingest": "recordings → LeRobot dataset with touch; `ingest inspect FILE` looks into one",
+        "check": "what is wrong with a recording or a dataset",
+        "view": "an episode in Rerun: pictures, touch, joints, arms",
+    },
+    "store": {"lineage": "what was made from what: `lineage explain PATH`, `lineage prune`"},
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one verb. 0: done; 1: done, but something was quarantined, refused or found wrong; 2: could not."""
+    words = sys.argv[1:] if argv is None else argv
+    known = [verb for group in VERBS.values() for verb in group]
+    if not words or words[0] in ("-h", "--help"):
+        print("usage: taccorl <verb> [what] [--option=value …]      taccorl <verb> --help\n")
+        for group, verbs in VERBS.items():
+            print(group)
+            for verb, line in verbs.items():
+                print(f"  {verb:9s}{line}")
+        print("\ntraining and scoring are LeRobot's own commands: lerobot-train, lerobot-eval")
+        return 0
+    if words[0] not in known:
+        print(f"taccorl: no verb {words[0]!r}; {nearest(words[0], known)}", file=sys.stderr)
+        return 2
+    try:
+        return importlib.import_module(f"taccorl.cli.{words[0]}").main(words[1:])
+    except TaccorlError as error:
+        print(f"taccorl {words[0]}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\ntaccorl {words[0]}: stopped; what was finished is kept, run again to go on", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `taccorl … | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except OSError as error:
+        place = f" ({error.filename})" if error.filename else ""
+        print(f"taccorl {words[0]}: {error.strerror or error}{place}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""What the verbs print: tables and progress bars, readable in a narrow terminal and in a log file."""
+
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from taccorl.data.inspection import Inventory
+
+COLORS = {"written": "green", "split": "yellow", "quarantined": "red", "refused": "red"}
+SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
+
+
+class Bars:
+    """Progress over recordings: rows of the one at work, or recordings done when several are at work."""
+
+    def __init__(self, num_recordings: int) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self._progress = Progress(*columns, transient=True, console=Console(stderr=True))
+        self._num = num_recordings
+        self._task: Any = None
+        self._name = ""
+
+    def __enter__(self) -> "Bars":
+        self._progress.start()
+        self._task = self._progress.add_task(f"reading ({self._num} recordings)", total=None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def update(self, name: str, done: int, total: int) -> None:
+        """``done`` of ``total`` of the recording ``name``."""
+        self._progress.update(self._task, description=_shorten(name), completed=done, total=total)
+
+
+def ingest_table(report: dict[str, Any]) -> None:
+    """One line a recording, what was wrong below it."""
+    table = Table("recording", "outcome", "episodes", "rows", "why", box=None, pad_edge=False)
+    for r in report["recordings"]:
+        written = [e for e in r["episodes"] if e["outcome"] == "written"]
+        name = r["recording"] + (f"#{r['part']}" if r["part"] else "")
+        rows = str(sum(e["rows"] for e in written))
+        table.add_row(_shorten(name), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows, r["reason"])
+    console = Console()
+    console.print(table)
+    for r in report["recordings"]:
+        if r["outcome"] != "written":
+            console.print(f"  look: [bold]{r['command']}[/bold]", highlight=False, soft_wrap=True)
+        for e in r["episodes"]:
+            for f in e["findings"]:
+                if f["severity"] != "note":
+                    label = Text(f"  {f['severity']}: ", SEVERITY[f["severity"]])
+                    console.print(label + Text(f"{_shorten(r['recording'])} {e['name']}: {f['text']}"), soft_wrap=True)
+    counts = ", ".join(f"{n} {o}" for o, n in report["outcomes"].items())
+    console.print(f"{len(report['recordings'])} recordings: {counts}", highlight=False)
+
+
+def findings_table(name: str, findings: list[Any]) -> None:
+    """What ``taccorl check`` found in one episode or dataset."""
+    console = Console()
+    worst = "error" if any(f.severity == "error" for f in findings) else "warning"
+    if not any(f.severity in ("error", "warning") for f in findings):
+        console.print(Text("ok       ", "green") + Text(name))
+    else:
+        console.print(Text(f"{worst:9s}", SEVERITY[worst]) + Text(name))
+    for f in findings:
+        console.print(Text(f"  {f.severity:8s}", SEVERITY[f.severity]) + Text(f"{f.check}: {f.text}"), soft_wrap=True)
+
+
+def inventory_table(inventory: Inventory) -> None:
+    """Channels, rates, gaps, clock skew and damage of one recording."""
+    console = Console()
+    files = f" ({len(inventory.source.files)} files)" if len(inventory.source.files) > 1 else ""
+    console.print(
+        f"[bold]{inventory.source.name}[/bold]{files}  {inventory.reader}, {inventory.duration_s:.2f} s",
+        highlight=False,
+    )
+    table = Table(box=None, pad_edge=False)
+    for column in ("topic", "type", "messages", "rate [Hz]", "gaps", "longest gap [s]", "clock"):
+        table.add_column(column, justify="left" if column in ("topic", "type", "clock") else "right", overflow="fold")
+    for t in inventory.topics:
+        rate, gap = (f"{t.rate_hz:.1f}", f"{t.longest_gap_s:.3f}") if t.rate_hz else ("–", "–")
+        table.add_row(t.topic, t.type.name, str(t.num_messages), rate, str(t.num_gaps), gap, _clock(t))
+    console.print(table)
+    for t in inventory.topics:
+        if t.type.undecodable:
+            console.print(f"  [yellow]not decodable[/yellow] {t.type.undecodable}", highlight=False, soft_wrap=True)
+    for name, record in inventory.metadata.items():
+        console.print(f"  metadata {name}: {record}", highlight=False, soft_wrap=True, markup=False)
+    for d in inventory.damage:
+        console.print(Text("  damage ", "red") + Text(str(d)), soft_wrap=True)
+
+
+def _clock(t: Any) -> str:
+    if not t.num_messages:
+        return "–"
+    if not t.stamped:
+        return "log (no header)"
+    if t.sim_time:
+        return f"header is {t.skew_s:.6g} s behind log: simulation time?"
+    return f"log − header {1e3 * t.skew_s:.1f} ms ± {1e3 * t.skew_p99_s:.1f}" + (
+        f", {t.repeated} repeated" if t.repeated else ""
+    )
+
+
+def _shorten(name: str, width: int = 48) -> str:
+    return name if len(name) <= width else "…" + name[1 - width :]

@@ -1,0 +1,455 @@
+"""A recording cut into episodes: clocks read, channels brought to the grid, split where a channel was silent.
+
+Nothing is invented and no middle row is deleted: what cannot become rows is listed as a ``Loss`` with its time and reason.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taccorl.data import decode, timing
+from taccorl.data.episode import ChannelTiming, Episode, Pictures
+from taccorl.data.recording import Recording, find_sources, opened
+from taccorl.data.spec import FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
+from taccorl.data.timing import NS_PER_S
+from taccorl.errors import RecordingError
+
+START_UP_S = 1.0
+"""Channels need not start and stop together: this much at either end is no loss worth a word."""
+MAX_WAITING_PICTURES = 1000
+"""Cameras of one recording come interleaved; more waiting than this means that they do not."""
+
+
+class Unfit(RecordingError):
+    """Readable, but not fit for a dataset: the recording is quarantined, not refused."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A stretch of a recording that became no rows. Seconds since the recording's first sample."""
+
+    start_s: float
+    end_s: float
+    reason: str
+    wanted: bool = True
+    """False: left out on purpose (the operator discarded it)."""
+
+
+@dataclass
+class Cut:
+    """What a recording gave."""
+
+    episodes: list[Episode] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Interval:
+    start_ns: int
+    end_ns: int
+    instruction: str
+    success: bool | None
+    marked: bool
+    """Its ends were marked, rather than being those of the file."""
+
+
+class BrokenPicture(RecordingError):
+    """A recorded picture that does not decode."""
+
+    def __init__(self, channel: str, log_ns: int, reason: str) -> None:
+        super().__init__(f"{channel}: the picture logged at {log_ns} ns is broken: {reason}")
+
+
+class Cutter:
+    """Cuts one recording. ``cut`` may be called again after broken pictures were dropped."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording, self.spec = recording, recording.spec
+        self.dropped: dict[str, set[tuple[int, int | None]]] = {}
+        self.clocks = self._read_clocks()
+        self.baselines = {
+            key: self._baseline(key, sensor)
+            for key, sensor in self.spec.target.sensors.items()
+            if key in self.spec.features
+        }
+        self.origin_ns = min(int(c.time_ns[0]) for c in self.clocks.values())
+
+    def _read_clocks(self) -> dict[str, timing.ClockReading]:
+        readings = {}
+        for name, channel in self.recording.channels.items():
+            bad = self.dropped.get(name, set())
+            stamps = channel.stamp_ns
+            keep = np.array([i for i in range(len(channel.log_ns)) if self._identity(name, i) not in bad], dtype=int)
+            reading = timing.read_clock(
+                channel.log_ns[keep],
+                None if stamps is None else stamps[keep],
+                clock=self.spec.clock_of(name),
+                latency_s=channel.spec.latency_s,
+                drop_zero_stamp=channel.spec.drop_zero_stamp,
+            )
+            if len(reading.time_ns) == 0:
+                raise RecordingError(
+                    f"{channel.spec.topic}: all {len(channel.log_ns)} messages are stamped 0 or broken"
+                )
+            readings[name] = timing.ClockReading(**{**vars(reading), "order": keep[reading.order]})
+        timing.check_clocks(
+            {self.spec.channels[name].topic: r.skew_s for name, r in readings.items()}, self.spec.max_clock_spread_s
+        )
+        return readings
+
+    def _identity(self, name: str, index: int) -> tuple[int, int | None]:
+        channel = self.recording.channels[name]
+        stamp = None if channel.stamp_ns is None else int(channel.stamp_ns[index])
+        return int(channel.log_ns[index]), stamp
+
+    def _baseline(self, key: str, sensor: SensorSpec) -> np.ndarray:
+        """(pads · rows · columns,) median of the first frames of every pad."""
+        rule, parts = sensor.baseline, []
+        for name in self.spec.features[key].channels:
+            channel = self.recording.channels[name]
+            assert channel.values is not None
+            first = np.asarray(channel.values[self.clocks[name].order[: rule.frames]], dtype=np.int64)
+            if len(first) < rule.frames:
+                raise Unfit(f"{channel.spec.topic}: {len(first)} frames, the baseline needs {rule.frames}")
+            baseline = np.round(np.median(first, axis=0)).astype(np.int64)
+            spread = float(np.quantile(np.abs(first - baseline), 0.99))
+            if spread > rule.max_spread_count:
+                raise Unfit(
+                    f"{channel.spec.topic}: counts spread {spread:.0f} about their median in the first {rule.frames} frames, "
+                    f"at rest at most {rule.max_spread_count:g}: touched while the baseline was taken?"
+                )
+            parts.append(baseline)
+        return np.concatenate(parts)
+
+    def seconds(self, time_ns: int) -> float:
+        """Seconds since the recording's first sample."""
+        return round((int(time_ns) - self.origin_ns) / NS_PER_S, 3)
+
+    def cut(self) -> Cut:
+        """All episodes, with what was lost between them."""
+        result = Cut()
+        intervals = self._intervals(result)
+        for number, interval in enumerate(intervals):
+            self._cut_interval(interval, f"episode {number}" if len(intervals) > 1 else "", result)
+        return result
+
+    def _intervals(self, result: Cut) -> list[_Interval]:
+        by = self.spec.episodes.by
+        if by == "markers":
+            return self._marked(result)
+        if by == "metadata":
+            return self._from_metadata()
+        last = max(int(c.time_ns[-1]) for c in self.clocks.values())
+        return [_Interval(self.origin_ns, last, self._instruction(), self._success(), marked=False)]
+
+    def _common_ns(self, log_ns: int) -> int:
+        """A log time on the channels' clock."""
+        skews = [c.skew_s for n, c in self.clocks.items() if self.spec.clock_of(n) == "header"]
+        return log_ns - round(float(np.median(skews)) * NS_PER_S) if skews else log_ns
+
+    def _marked(self, result: Cut) -> list[_Interval]:
+        topic = self.spec.episodes.topic
+        assert topic is not None
+        intervals, start, instruction = [], None, ""
+        last = max(int(c.time_ns[-1]) for c in self.clocks.values())
+
+        def unfinished(end_ns: int, why: str) -> None:
+            assert start is not None
+            intervals.append(_Interval(start, end_ns, instruction, None, marked=True))
+            result.losses.append(Loss(self.seconds(end_ns), self.seconds(end_ns), f"no end marker on {topic}: {why}"))
+
+        for log_ns, text in sorted(self.recording.texts[topic]):
+            time_ns = self._common_ns(log_ns)
+            word, _, rest = text.partition(":")
+            if word == "start":
+                if start is not None:
+                    unfinished(time_ns, "the next episode starts")
+                start = time_ns
+                instruction = self._instruction() if self.spec.instruction.from_ != "markers" else rest.strip()
+                if not instruction:
+                    raise RecordingError(f"{topic}: marker {text!r} names no instruction (`start:<instruction>`)")
+            elif word in ("success", "failure", "discard"):
+                if start is None:
+                    raise RecordingError(
+                        f"{topic}: marker {text!r} at {self.seconds(time_ns)} s without a start before it"
+                    )
+                if word == "discard":
+                    result.losses.append(
+                        Loss(self.seconds(start), self.seconds(time_ns), "discarded by the operator", False)
+                    )
+                else:
+                    intervals.append(_Interval(start, time_ns, instruction, word == "success", marked=True))
+                start = None
+            else:
+                raise RecordingError(
+                    f"{topic}: unknown marker {text!r}; start:<instruction>, success, failure, discard are known"
+                )
+        if start is not None:
+            unfinished(last, "the recording ends within the episode")
+        return intervals
+
+    def _from_metadata(self) -> list[_Interval]:
+        """MCAP metadata records ``episode_<id>`` with ``start`` and ``end`` (log time, ns), ``instruction``, ``success``."""
+        found = []
+        for name, record in sorted(self.recording.reader.metadata.items(), key=lambda item: item[1].get("start", "")):
+            if not name.startswith("episode_"):
+                continue
+            try:
+                start, end = (self._common_ns(int(record[k])) for k in ("start", "end"))
+            except (KeyError, ValueError) as error:
+                raise RecordingError(f"metadata record {name!r}: {record} has no start and end in ns") from error
+            told = record.get("success", "").lower()
+            success = {"true": True, "false": False}.get(told)
+            found.append(_Interval(start, end, record.get("instruction") or self._instruction(), success, marked=True))
+        if not found:
+            raise RecordingError(
+                "no metadata record episode_<id> in the recording; has "
+                + (", ".join(self.recording.reader.metadata) or "none")
+            )
+        return sorted(found, key=lambda i: i.start_ns)
+
+    def _instruction(self) -> str:
+        rule = self.spec.instruction
+        if rule.from_ == "spec":
+            return rule.text or ""
+        if rule.from_ == "topic":
+            assert rule.topic is not None
+            texts = {text for _, text in self.recording.texts[rule.topic]}
+            if len(texts) != 1:
+                raise RecordingError(
+                    f"{rule.topic} holds {len(texts)} different instructions {sorted(texts)[:3]}; one is needed"
+                )
+            return texts.pop()
+        for record in self.recording.reader.metadata.values():
+            if rule.key in record:
+                return record[rule.key]
+        known = sorted({k for r in self.recording.reader.metadata.values() for k in r})
+        raise RecordingError(f"no metadata key {rule.key!r} for the instruction; the recording has {known or 'none'}")
+
+    def _success(self) -> bool | None:
+        told = {r["success"].lower() for r in self.recording.reader.metadata.values() if "success" in r}
+        return {"true": True, "false": False}.get(told.pop()) if len(told) == 1 else None
+
+    def _cut_interval(self, interval: _Interval, label: str, result: Cut) -> None:
+        start_ns = max([interval.start_ns, *(self._first_usable_ns(key) for key in self.spec.mapped)])
+        ends = [
+            int(self.clocks[c].time_ns[-1])
+            for key in self.spec.mapped
+            for c in self.spec.features[key].channels
+            if self.spec.features[key].align != "hold"
+        ]
+        end_ns = min([interval.end_ns, *ends])
+        self._report_ends(interval, start_ns, end_ns, result)
+        grid_ns = timing.make_grid(start_ns, end_ns, self.spec.target.fps)
+        matches = {key: self._match(key, grid_ns) for key in self.spec.mapped}
+        stale = {c: ~m.fresh for by_channel in matches.values() for c, m in by_channel.items()}
+        fresh = ~np.any(list(stale.values()), axis=0) if len(grid_ns) else np.zeros(0, dtype=bool)
+        for a, b in timing.runs(~fresh):
+            silent = sorted({c for c, s in stale.items() if s[a:b].any()})
+            reason = f"no fresh sample of {', '.join(silent)} for {b - a} rows"
+            result.losses.append(Loss(self.seconds(grid_ns[a]), self.seconds(grid_ns[b - 1]), reason))
+        pieces = timing.runs(fresh)
+        for number, (a, b) in enumerate(pieces):
+            if (b - a) / self.spec.target.fps < self.spec.episodes.min_s:
+                reason = f"{b - a} rows are shorter than the spec's min_s {self.spec.episodes.min_s:g}"
+                result.losses.append(Loss(self.seconds(grid_ns[a]), self.seconds(grid_ns[b - 1]), reason))
+                continue
+            part = f"part {number}" if len(pieces) > 1 else ""
+            name = " ".join(w for w in (self.recording.source.name, label, part) if w)
+            result.episodes.append(self._episode(name, interval, grid_ns[a:b], matches, slice(a, b)))
+
+    def _first_usable_ns(self, key: str) -> int:
+        mapping, history = self.spec.features[key], self.spec.target.features[key].history
+        firsts = []
+        for name in mapping.channels:
+            time_ns = self.clocks[name].time_ns
+            if len(time_ns) < history:
+                raise Unfit(f"{self.spec.channels[name].topic}: {len(time_ns)} samples, a window needs {history}")
+            firsts.append(int(time_ns[history - 1]))
+        return max(firsts)
+
+    def _report_ends(self, interval: _Interval, start_ns: int, end_ns: int, result: Cut) -> None:
+        slack_ns = round((0.0 if interval.marked else START_UP_S) * NS_PER_S) + NS_PER_S // 4
+        if start_ns - interval.start_ns > slack_ns:
+            late = max(self.clocks, key=lambda c: int(self.clocks[c].time_ns[0]))
+            begin, end = self.seconds(interval.start_ns), self.seconds(min(start_ns, interval.end_ns))
+            result.losses.append(Loss(begin, end, f"{late} begins late"))
+        if interval.end_ns - end_ns > slack_ns and end_ns >= start_ns:
+            early = min(self.clocks, key=lambda c: int(self.clocks[c].time_ns[-1]))
+            result.losses.append(Loss(self.seconds(end_ns), self.seconds(interval.end_ns), f"{early} ends early"))
+
+    def _match(self, key: str, grid_ns: np.ndarray) -> dict[str, timing.Matched]:
+        mapping, feature = self.spec.features[key], self.spec.target.features[key]
+        return {
+            name: timing.match(
+                grid_ns,
+                self.clocks[name].time_ns,
+                mapping.align,
+                max_age_s=self.spec.channels[name].max_age_s,
+                history=feature.history,
+                rate_hz=self.spec.channels[name].rate_hz,
+            )
+            for name in mapping.channels
+        }
+
+    def _episode(
+        self,
+        name: str,
+        interval: _Interval,
+        grid_ns: np.ndarray,
+        matches: dict[str, dict[str, timing.Matched]],
+        rows: slice,
+    ) -> Episode:
+        arrays, sources, timings = {}, {}, []
+        for key, feature in self.spec.mapped.items():
+            mapping = self.spec.features[key]
+            timings += [self._timing(c, key, mapping, m, rows, grid_ns) for c, m in matches[key].items()]
+            if feature.dtype == "video":
+                channel = mapping.channels[0]
+                sources[key] = (channel, self.clocks[channel].order[matches[key][channel].index[rows, 0]])
+            else:
+                arrays[key] = self._array(key, feature, matches[key], rows)
+        return Episode(
+            name=name,
+            spec=self.spec.target,
+            start_ns=int(grid_ns[0]),
+            arrays=arrays,
+            pictures=lambda: self._pictures(sources, len(grid_ns)),
+            picture_keys=tuple(sources),
+            instruction=interval.instruction,
+            success=interval.success,
+            origin=next((r["origin"] for r in self.recording.reader.metadata.values() if "origin" in r), ""),
+            timing=tuple(timings),
+            picture_rows={key: index for key, (_, index) in sources.items()},
+            baselines=dict(self.baselines),
+        )
+
+    def _timing(
+        self, channel: str, key: str, mapping: MappingSpec, m: timing.Matched, rows: slice, grid_ns: np.ndarray
+    ) -> ChannelTiming:
+        clock = self.clocks[channel]
+        inside = clock.time_ns[(clock.time_ns >= grid_ns[0]) & (clock.time_ns <= grid_ns[-1])]
+        steps = np.diff(inside) / NS_PER_S
+        median = float(np.median(steps)) if len(steps) else float("inf")
+        age = m.age_s[rows]
+        return ChannelTiming(
+            channel=channel,
+            feature=key,
+            align=mapping.align,
+            rate_hz=round(1.0 / median, 3) if len(steps) else 0.0,
+            gaps=int((steps > 1.5 * median).sum()),
+            longest_gap_s=round(float(steps.max()), 6) if len(steps) else 0.0,
+            age_median_s=round(float(np.median(age)), 6),
+            age_max_s=round(float(age.max()), 6),
+            duplicates=clock.duplicates,
+            out_of_order=clock.out_of_order,
+            zero_stamps=clock.zero_stamps,
+        )
+
+    def _array(self, key: str, feature: FeatureSpec, matches: dict[str, timing.Matched], rows: slice) -> np.ndarray:
+        """(T, size) of one feature, in its dtype."""
+        parts = []
+        for name, m in matches.items():
+            values = self.recording.channels[name].values
+            assert values is not None
+            order, index = self.clocks[name].order, m.index[rows]
+            part = np.asarray(values[order[index]])  # (T, L, size of the channel)
+            if m.weight is not None:
+                following = np.asarray(values[order[np.minimum(index + 1, len(order) - 1)]])
+                part = part + m.weight[rows, None, None] * (following - part)
+            parts.append(part)
+        joined = np.concatenate(parts, axis=2)
+        if key in self.baselines:
+            joined = joined.astype(np.int64) - self.baselines[key]
+        out = joined.reshape(len(joined), -1)
+        if out.shape[1] != feature.size:
+            raise RecordingError(
+                f"{key}: channels {', '.join(matches)} give {out.shape[1]} values, the dataset spec says {feature.size}"
+            )
+        return out.astype(feature.dtype)
+
+    def _pictures(self, sources: dict[str, tuple[str, np.ndarray]], num_rows: int) -> Iterator[Pictures]:
+        """Rows' pictures, decoded once each, in one pass over the file."""
+        if not sources:
+            return
+        identities = {key: [self._identity(c, int(i)) for i in index] for key, (c, index) in sources.items()}
+        key_of = {channel: key for key, (channel, _) in sources.items()}
+        waiting: dict[str, dict[tuple[int, int | None], Any]] = {key: {} for key in sources}
+        shown: dict[str, tuple[tuple[int, int | None], np.ndarray]] = {}
+        row = 0
+        wanted = {channel: identities[key] for channel, key in key_of.items()}
+        for channel, identity, payload in self.recording.pictures(wanted):
+            waiting[key_of[channel]][identity] = payload
+            if sum(map(len, waiting.values())) > MAX_WAITING_PICTURES:
+                raise RecordingError(
+                    f"{MAX_WAITING_PICTURES} pictures wait for other cameras': cameras are not interleaved in the file"
+                )
+            while row < num_rows and all(
+                identities[k][row] in waiting[k] or (k in shown and shown[k][0] == identities[k][row]) for k in sources
+            ):
+                for key in sources:
+                    if key not in shown or shown[key][0] != identities[key][row]:
+                        identity = identities[key][row]
+                        shown[key] = (
+                            identity,
+                            self._decode(key, sources[key][0], identity, waiting[key].pop(identity)),
+                        )
+                yield {key: picture for key, (_, picture) in shown.items()}
+                row += 1
+        if row < num_rows:
+            raise RecordingError(
+                f"{self.recording.source.name}: its pictures ended at row {row} of {num_rows}: did the file change?"
+            )
+
+    def _decode(self, key: str, channel: str, identity: tuple[int, int | None], payload: Any) -> np.ndarray:
+        rows, columns, _ = self.spec.target.features[key].shape
+        try:
+            return decode.letterbox(decode.picture(payload, self.spec.channels[channel]), rows, columns)
+        except RecordingError as error:
+            raise BrokenPicture(channel, identity[0], str(error)) from error
+
+    def drop_broken_pictures(self) -> int:
+        """Decode every picture once and forget those that do not: their rows take an older one or split the episode."""
+        channels = {
+            c: key
+            for key in self.spec.target.keys("video")
+            if key in self.spec.features
+            for c in self.spec.features[key].channels
+        }
+        everything = {
+            c: [self._identity(c, i) for i in range(len(self.recording.channels[c].log_ns))] for c in channels
+        }
+        broken = 0
+        for channel, identity, payload in self.recording.pictures(everything):
+            try:
+                decode.picture(payload, self.spec.channels[channel])
+            except RecordingError:
+                self.dropped.setdefault(channel, set()).add(identity)
+                broken += 1
+        self.clocks = self._read_clocks()
+        return broken
+
+
+@contextlib.contextmanager
+def open_episodes(path: Path, spec: str | Path | RecordingSpec) -> Iterator[list[Episode]]:
+    """The episodes of one recording, for looking at; usable inside the ``with`` only (numbers live in a scratch folder).
+
+    Raises:
+        RecordingError: not readable, more than one recording, or nothing in it fits the spec.
+    """
+    loaded = spec if isinstance(spec, RecordingSpec) else load_recording_spec(spec)
+    sources = find_sources(path, reader=loaded.reader, split_bag=loaded.split_bag)
+    with contextlib.ExitStack() as stack:
+        episodes: list[Episode] = []
+        for _, source in sources:
+            cut = Cutter(stack.enter_context(opened(source, loaded))).cut()
+            episodes += cut.episodes
+            if not cut.episodes and len(sources) == 1:
+                raise RecordingError(
+                    f"{path}: no episode: {'; '.join(loss.reason for loss in cut.losses) or 'no rows'}"
+                )
+        yield episodes

@@ -1,0 +1,291 @@
+"""Recordings into one LeRobot dataset: each recording a stage of its own in the store, then merged and published whole.
+
+Every input ends as exactly one of: ``written``; ``split`` (written in part: something was silent, damaged or cut off, and
+what was lost is listed); ``quarantined`` (readable, but its data is wrong); ``refused`` (cannot be read or does not fit the
+spec). Originals are only ever read.
+"""
+
+import dataclasses
+import errno
+import json
+import shlex
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from taccorl.data.checks import Finding, check_episode, check_recording_episodes
+from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Loss, Unfit
+from taccorl.data.dataset import dataset_spec_to_json, episode_record
+from taccorl.data.episode import Episode
+from taccorl.data.recording import Damage, Recording, Source, find_sources, opened
+from taccorl.data.spec import RecordingSpec
+from taccorl.errors import RecordingError, TaccorlError
+from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.lineage.stage import Artefact, Stage
+from taccorl.lineage.store import Store
+
+Outcome = Literal["written", "split", "quarantined", "refused"]
+Progress = Callable[[str, int, int], None]
+"""(recording, rows done, rows in all)"""
+
+PROVENANCE = "meta/taccorl"
+DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
+RECORDING_STAGE_VERSION = 1
+DATASET_STAGE_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording to ingest; plain data, so that it can go to another process or machine."""
+
+    source: Source
+    spec: RecordingSpec
+    spec_name: str
+    store: Path
+    dry_run: bool = False
+
+
+class NothingToWrite(RecordingError):
+    """The recording gave no episode that a dataset may have; carries its report entry."""
+
+    def __init__(self, entry: dict[str, Any]) -> None:
+        super().__init__(entry["reason"])
+        self.entry = entry
+
+
+def find_jobs(paths: Sequence[Path], spec: RecordingSpec, spec_name: str, store: Path, dry_run: bool) -> list[Job]:
+    """One job per recording under ``paths``, in the order given, folders in natural order; a path twice is one input.
+
+    Raises:
+        RecordingError: a path holds no recording.
+    """
+    jobs: dict[str, Job] = {}
+    for path in paths:
+        for _, source in find_sources(path, reader=spec.reader, split_bag=spec.split_bag):
+            jobs.setdefault(source.name, Job(source, spec, spec_name, store, dry_run))
+    return list(jobs.values())
+
+
+def ingest(
+    jobs: Sequence[Job], out: Path, store: Store, *, engine: Engine | None = None, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Ingest all jobs and publish the dataset at ``out``; returns the report.
+
+    Raises:
+        DatasetError: ``out`` holds something else; checked before any work is done as far as possible.
+        TaccorlError: the machine failed (disk full); what was finished is kept and not done again.
+    """
+    if engine is None or (isinstance(engine, LocalEngine) and engine.workers <= 1):
+        entries = [ingest_one(job, progress) for job in jobs]
+    else:
+        done = iter(range(1, len(jobs) + 1))
+        entries = engine.map(
+            ingest_one,
+            jobs,
+            name=lambda job: job.source.name,
+            on_done=lambda job, _: progress(job.source.name, next(done), len(jobs)) if progress else None,
+        )
+    report = _report(jobs, entries)
+    shards = [(entry, Path(entry["artefact"])) for entry in entries if entry.get("artefact")]
+    for entry in entries:
+        entry.pop("artefact", None)
+    if not shards or any(job.dry_run for job in jobs):
+        return report
+    spec = jobs[0].spec
+    stage = Stage(
+        "dataset",
+        lambda config, inputs, folder: _assemble(spec, report, entries, inputs, folder),
+        version=DATASET_STAGE_VERSION,
+        manifest=DATASET_MANIFEST,
+    )
+    # Names without folders: the same files reached by another path are the same dataset.
+    named = [[Path(e["recording"]).name, e["part"], e["outcome"]] for e in entries]
+    config = {"spec": spec.digest, "recordings": named}
+    inputs = [Artefact(path, json.loads((path / "manifest.json").read_text())["digest"]) for _, path in shards]
+    store.run(stage, config, inputs, destination=out)
+    return report
+
+
+def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
+    """One recording to a shard in the store. Never raises for a fault of the recording: the entry says what happened."""
+    try:
+        entry = _dry(job) if job.dry_run else _stored(job, progress)
+    except NothingToWrite as nothing:
+        entry = nothing.entry
+    except Unfit as error:
+        entry = _entry("quarantined", str(error))
+    except TaccorlError as error:
+        entry = _entry("refused", str(error))
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise TaccorlError(
+                f"no space left on the disk of {job.store}; what was finished is kept: free space, run again"
+            ) from error
+        entry = _entry("refused", f"{error.strerror or error} ({error.filename or job.source.name})")
+    except MemoryError:
+        raise
+    except (
+        Exception
+    ) as error:  # our fault, not the user's: no traceback on the screen, but the whole of it in the report
+        entry = _entry("refused", f"a fault in taccorl, please report it: {type(error).__name__}: {error}")
+        entry["traceback"] = traceback.format_exc()
+    return _named(entry, job)
+
+
+def _stored(job: Job, progress: Progress | None) -> dict[str, Any]:
+    store = Store(job.store)
+    stage = Stage("recording", lambda config, inputs, folder: _build(job, folder, progress), RECORDING_STAGE_VERSION)
+    inputs = [store.source(path) for path in job.source.files]
+    artefact = store.run(stage, {"spec": job.spec.digest, "part": job.source.part}, inputs)
+    entry = json.loads((artefact.path / "entry.json").read_text())
+    return {**entry, "artefact": str(artefact.path), "source_digests": [a.digest for a in inputs]}
+
+
+def _dry(job: Job) -> dict[str, Any]:
+    with opened(job.source, job.spec) as recording:
+        cut = Cutter(recording).cut()
+        _, entry = _judge(recording, cut)
+    return entry
+
+
+def _build(job: Job, folder: Path, progress: Progress | None) -> None:
+    """Stage ``recording``: dataset/, entry.json and episodes.json of one recording."""
+    from taccorl.data.lerobot_format import write_episodes
+
+    with opened(job.source, job.spec) as recording:
+        cutter, broken = Cutter(recording), 0
+        while True:
+            good, entry = _judge(recording, cutter.cut())
+            if broken:
+                entry["broken_pictures"] = broken
+            if not good:
+                raise NothingToWrite(entry)
+            rows = sum(e.num_rows for e in good)
+            report = None if progress is None else lambda done, rows=rows: progress(job.source.name, done, rows)
+            try:
+                write_episodes(good, folder / "dataset", progress=report)
+                break
+            except BrokenPicture:
+                if broken:
+                    raise
+                broken = cutter.drop_broken_pictures()
+        records = [episode_record(e, "") for e in good]
+    _dump(folder / "entry.json", entry)
+    _dump(folder / "episodes.json", records)
+
+
+def _judge(recording: Recording, cut: Cut) -> tuple[list[Episode], dict[str, Any]]:
+    """Which episodes are fit for the dataset, and the recording's report entry."""
+    findings = [check_episode(e, pictures=False) for e in cut.episodes]
+    good = [e for e, found in zip(cut.episodes, findings, strict=True) if not any(f.severity == "error" for f in found)]
+    across = check_recording_episodes(good) if len(good) > 1 else []
+    origin_ns = min((e.start_ns for e in cut.episodes), default=0)
+    episodes = []
+    for e, found in zip(cut.episodes, findings, strict=True):
+        start_s = (e.start_ns - origin_ns) / 1e9
+        episodes.append(
+            {
+                "name": e.name.removeprefix(recording.source.name).strip(),
+                "outcome": "written" if e in good else "quarantined",
+                "start_s": round(start_s, 3),
+                "end_s": round(start_s + (e.num_rows - 1) / e.spec.fps, 3),
+                "rows": e.num_rows,
+                "instruction": e.instruction,
+                "success": e.success,
+                "origin": e.origin,
+                "findings": [dataclasses.asdict(f) for f in found],
+                "timing": [dataclasses.asdict(t) for t in e.timing],
+            }
+        )
+    outcome, reason = _outcome(cut, findings, recording.damage)
+    entry = _entry(outcome, reason)
+    entry["episodes"] = episodes
+    entry["findings"] = [dataclasses.asdict(f) for f in across]
+    entry["losses"] = [dataclasses.asdict(loss) for loss in cut.losses]
+    entry["damage"] = [{**dataclasses.asdict(d), "file": Path(d.file).name} for d in recording.damage]
+    entry["messages"] = dict(sorted(recording.counts.items()))
+    return good, entry
+
+
+def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damage]) -> tuple[Outcome, str]:
+    errors = [f for found in findings for f in found if f.severity == "error"]
+    lost = [loss for loss in cut.losses if loss.wanted]
+    if errors:
+        wrong = sum(any(f.severity == "error" for f in found) for found in findings)
+        return "quarantined", f"{wrong} of {len(findings)} episodes: {errors[0].text}"
+    if not cut.episodes:
+        return "quarantined", "; ".join(_describe(loss) for loss in cut.losses[:3]) or "no rows"
+    if lost or damage:
+        reasons = [str(d) for d in damage[:1]] + [_describe(loss) for loss in lost[:1]]
+        more = len(lost) + len(damage) - len(reasons)
+        return "split", "; ".join(reasons) + (f"; {more} more in the report" if more > 0 else "")
+    return "written", ""
+
+
+def _describe(loss: Loss) -> str:
+    if loss.start_s == loss.end_s:
+        return f"{loss.start_s:.2f} s: {loss.reason}"
+    return f"{loss.start_s:.2f} to {loss.end_s:.2f} s: {loss.reason}"
+
+
+def _entry(outcome: Outcome, reason: str) -> dict[str, Any]:
+    return {"outcome": outcome, "reason": reason, "episodes": [], "findings": [], "losses": [], "damage": []}
+
+
+def _named(entry: dict[str, Any], job: Job) -> dict[str, Any]:
+    """The entry with what depends on where the recording lies: kept out of the store, which knows contents only."""
+    path, spec = shlex.quote(str(job.source.path)), shlex.quote(job.spec_name)
+    readable = entry["outcome"] != "refused"
+    command = f"taccorl view {path} --spec={spec}" if readable else f"taccorl ingest inspect {path}"
+    head = {
+        "recording": str(job.source.path),
+        "part": job.source.part,
+        "spec": job.spec_name,
+        "spec_digest": job.spec.digest,
+        "outcome": entry["outcome"],
+        "reason": entry["reason"],
+        "command": command,
+    }
+    return {**head, **{k: v for k, v in entry.items() if k not in head}}
+
+
+def _report(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> dict[str, Any]:
+    outcomes = {o: sum(e["outcome"] == o for e in entries) for o in ("written", "split", "quarantined", "refused")}
+    written = [e for entry in entries for e in entry["episodes"] if e["outcome"] == "written"]
+    for index, episode in enumerate(written):
+        episode["index_in_dataset"] = index
+    return {
+        "report_version": 1,
+        "dry_run": any(job.dry_run for job in jobs),
+        "dataset_spec": jobs[0].spec.target.name,
+        "outcomes": outcomes,
+        "episodes": len(written),
+        "rows": sum(e["rows"] for e in written),
+        "recordings": entries,
+    }
+
+
+def _assemble(
+    spec: RecordingSpec, report: dict[str, Any], entries: list[dict[str, Any]], shards: list[Path], folder: Path
+) -> None:
+    """Stage ``dataset``: the shards merged, with their provenance in meta/taccorl/."""
+    from taccorl.data.lerobot_format import merge
+
+    merge([shard / "dataset" for shard in shards], folder)
+    meta = folder / PROVENANCE
+    meta.mkdir(parents=True)
+    records = []
+    with_rows = [e for e in entries if any(x["outcome"] == "written" for x in e["episodes"])]
+    for entry, shard in zip(with_rows, shards, strict=True):
+        named = {"recording": entry["recording"], "part": entry["part"], "source_digest": entry["source_digests"][0]}
+        records += [{**record, **named} for record in json.loads((shard / "episodes.json").read_text())]
+    _dump(meta / "episodes.json", records)
+    _dump(meta / "ingest_report.json", report)
+    _dump(meta / "dataset_spec.json", dataset_spec_to_json(spec.target))
+    _dump(meta / "recording_spec.json", dataclasses.asdict(dataclasses.replace(spec, contract=None)))
+
+
+def _dump(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,0 +1,174 @@
+"""What a recording holds: channels, rates, gaps, clock skew, damage; and a draft spec to start from."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taccorl.data import decode
+from taccorl.data.recording import Damage, Source, TopicType, readers
+from taccorl.data.spec import data_specs_folder, load_recording_spec
+from taccorl.data.timing import NS_PER_S, SIM_TIME_S
+from taccorl.errors import SpecError
+
+PICTURES = ("CompressedImage", "Image")
+VECTORS = ("JointState", "MultiArray", "Imu", "Pose", "Twist", "Wrench")
+TEXTS = ("String",)
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """One topic, measured over the whole recording."""
+
+    topic: str
+    type: TopicType
+    num_messages: int
+    first_ns: int
+    last_ns: int
+    rate_hz: float
+    """1 / median interval of its own stamps (log times where it has none); 0 with fewer than two messages."""
+    longest_gap_s: float
+    num_gaps: int
+    """Intervals longer than 1.5 median intervals."""
+    stamped: bool
+    skew_s: float
+    """Median of log time − header stamp; 0 without a header."""
+    skew_p99_s: float
+    repeated: int
+    """Messages with the stamp of an earlier one."""
+
+    @property
+    def sim_time(self) -> bool:
+        """The header counts from a simulation's start (or from boot), not from 1970."""
+        return self.stamped and abs(self.skew_s) > SIM_TIME_S
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """One recording, looked at."""
+
+    source: Source
+    reader: str
+    topics: tuple[TopicSummary, ...]
+    metadata: dict[str, dict[str, str]]
+    damage: tuple[Damage, ...]
+    fits: tuple[str, ...] = field(default=())
+    """Shipped recording specs whose topics are all here."""
+
+    @property
+    def duration_s(self) -> float:
+        spans = [(t.first_ns, t.last_ns) for t in self.topics if t.num_messages]
+        return (max(b for _, b in spans) - min(a for a, _ in spans)) / NS_PER_S if spans else 0.0
+
+
+def inspect_source(reader_name: str, source: Source) -> Inventory:
+    """Read every message's times, decode nothing.
+
+    Raises:
+        RecordingError: not of that format, or empty.
+    """
+    reader = readers.get(reader_name)(source)
+    times: dict[str, tuple[list[int], list[int | None]]] = {}
+    for m in reader.messages(None):
+        log, stamp = times.setdefault(m.topic, ([], []))
+        log.append(m.log_ns)
+        stamp.append(m.stamp_ns)
+    types = reader.topics()
+    summaries = [_summary(topic, types[topic], *times.get(topic, ([], []))) for topic in sorted(types)]
+    with_messages = {t.topic for t in summaries if t.num_messages}
+    return Inventory(
+        source,
+        reader_name,
+        tuple(summaries),
+        dict(reader.metadata),
+        tuple(reader.damage),
+        _fitting(reader_name, with_messages),
+    )
+
+
+def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | None]) -> TopicSummary:
+    log_ns = np.array(log, dtype=np.int64)
+    stamped = bool(stamps) and all(s is not None and s != 0 for s in stamps[len(stamps) // 2 :])
+    stamp_ns = np.array([s or 0 for s in stamps], dtype=np.int64)
+    good = stamp_ns != 0
+    own = np.sort(stamp_ns[good]) if stamped else np.sort(log_ns)
+    steps = np.diff(own)[np.diff(own) > 0] / NS_PER_S
+    median = float(np.median(steps)) if len(steps) else 0.0
+    skew = (log_ns[good] - stamp_ns[good]) / NS_PER_S if stamped else np.zeros(1)
+    return TopicSummary(
+        topic=topic,
+        type=kind,
+        num_messages=len(log),
+        first_ns=int(log_ns[0]) if len(log) else 0,
+        last_ns=int(log_ns[-1]) if len(log) else 0,
+        rate_hz=1.0 / median if median else 0.0,
+        longest_gap_s=float(steps.max()) if len(steps) else 0.0,
+        num_gaps=int((steps > 1.5 * median).sum()),
+        stamped=stamped,
+        skew_s=float(np.median(skew)),
+        skew_p99_s=float(np.quantile(np.abs(skew - np.median(skew)), 0.99)),
+        repeated=int((np.diff(own) == 0).sum()),
+    )
+
+
+def _fitting(reader_name: str, topics: set[str]) -> tuple[str, ...]:
+    names = []
+    for path in sorted((data_specs_folder() / "recordings").glob("*.yaml")):
+        try:
+            spec = load_recording_spec(path)
+        except SpecError:
+            continue
+        if spec.reader == reader_name and {c.topic for c in spec.channels.values()} <= topics:
+            names.append(path.stem)
+    return tuple(names)
+
+
+def draft_spec(inventory: Inventory) -> str:
+    """A recording spec to start from, as YAML text: the channels as measured, the features left to fill in."""
+    useful = [t for t in inventory.topics if t.num_messages and t.type.undecodable is None]
+    vectors = [t for t in useful if _is(t, VECTORS) or (t.type.shape is not None and len(t.type.shape) <= 1)]
+    pictures = [t for t in useful if _is(t, PICTURES) or (t.type.shape is not None and len(t.type.shape) == 3)]
+    texts = [t for t in useful if _is(t, TEXTS)]
+    clock = "header" if vectors + pictures and all(t.stamped and not t.sim_time for t in vectors + pictures) else "log"
+    lines = [
+        f"# Draft from {inventory.source.name}: check every line; `taccorl ingest … --dry_run=true` tells what is still wrong.",
+        "spec_version: 1",
+        "dataset: ../taccorl_bimanual.yaml   # what the dataset shall hold; relative to this file",
+        f"reader: {inventory.reader}",
+        f"clock: {clock}",
+        "episodes: {by: whole_file, min_s: 1.0}" + (f"   # or by: markers, topic: {texts[0].topic}" if texts else ""),
+        "instruction: {from: spec, text: TODO}",
+        "channels:   # keep what a feature below uses, remove the rest",
+    ]
+    names = {t.topic: _short(t.topic) for t in vectors + pictures}
+    lines += [f"  {names[t.topic]}: {_channel(t, clock)}" for t in vectors + pictures]
+    skipped = [t for t in inventory.topics if t not in vectors and t not in pictures and t not in texts]
+    lines += [f"  # {t.topic}: {t.type.undecodable or t.type.name}" for t in skipped]
+    lines.append("features:   # fill the lists; several channels are joined in this order")
+    lines += ["  observation.state: {channels: [TODO], align: asof}", "  action: {channels: [TODO], align: asof}"]
+    lines += [f"  observation.images.{names[t.topic]}: {{channels: [{names[t.topic]}], align: asof}}" for t in pictures]
+    lines.append("  observation.tactile: {channels: [TODO, TODO, TODO, TODO], align: asof}")
+    return "\n".join(lines) + "\n"
+
+
+def _is(t: TopicSummary, words: tuple[str, ...]) -> bool:
+    return any(word in decode.type_key(t.type.name).rsplit("/", 1)[-1] for word in words)
+
+
+def _short(topic: str) -> str:
+    words = [w for w in topic.strip("/").replace("-", "_").split("/") if w not in ("image_raw", "compressed", "color")]
+    return "_".join(words).replace(".", "_") or "channel"
+
+
+def _channel(t: TopicSummary, clock: str) -> str:
+    rate = float(f"{t.rate_hz:.3g}") if t.rate_hz else 1.0
+    parts = [f"topic: {t.topic}"]
+    if t.type.name and t.type.name != "no schema" and t.type.shape is None:
+        parts.append(f"type: {t.type.name}")
+    if _is(t, ("JointState",)):
+        parts += ["field: position", "pick: [TODO]"]
+    elif _is(t, ("MultiArray",)):
+        parts.append("field: data")
+    if clock == "header" and not t.stamped:
+        parts.append("clock: log")
+    parts += [f"rate_hz: {rate:g}", f"max_age_s: {max(0.03, round(2.4 / rate, 3)):g}"]
+    return "{" + ", ".join(parts) + "}"

@@ -1,0 +1,184 @@
+"""Episodes into a LeRobot v3 dataset, by LeRobot's own writer, with proof that every row has its own picture.
+
+LeRobot 0.6.1's streaming encoder drops frames without an error when it lags behind (video_utils.py, feed_frame), and rows
+then show later pictures. So frames are fed under back-pressure, and afterwards every video file is proved to hold exactly
+one frame a row at its time; a dataset that fails is written again the slow way, through PNG files.
+"""
+
+import contextlib
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taccorl.data.dataset import Dataset
+from taccorl.data.episode import Episode
+from taccorl.data.spec import DatasetSpec
+from taccorl.errors import DatasetError
+
+QUEUE_FRAMES = 16
+"""Frames that may wait per camera; 3 cameras × 16 × 0.9 MB at 480×640."""
+ENCODERS: dict[str, dict[str, Any]] = {
+    # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
+    "libsvtav1": {"vcodec": "libsvtav1", "g": 2, "crf": 30, "preset": 12},
+    "h264": {"vcodec": "h264", "g": 2, "crf": 23, "preset": "veryfast"},
+}
+
+
+def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """LeRobot's features dict. Unit, frame, range and, for touch, the sensor's layout travel in the feature itself."""
+    features: dict[str, dict[str, Any]] = {}
+    for key in keys:
+        f = spec.features[key]
+        entry: dict[str, Any] = {"dtype": f.dtype, "shape": f.shape}
+        entry["names"] = ["height", "width", "channels"] if f.dtype == "video" else list(f.names) or None
+        if f.dtype != "video":
+            entry |= {"unit": list(f.unit) if isinstance(f.unit, tuple) else f.unit, "frame": f.frame}
+            if not isinstance(f.range, dict):
+                entry["range"] = list(f.range)
+        if key in spec.sensors:
+            sensor = spec.sensors[key]
+            entry["tactile"] = {
+                "sensor": sensor.name,
+                "layout": [f.history, len(f.pads), sensor.rows, sensor.columns],
+                "layout_names": ["history", "pad", "row", "column"],
+                "pads": list(f.pads),
+                "signal": "counts above baseline",
+                "scheme": sensor.scheme,
+                "gain_per_count": sensor.gain_per_count,
+            }
+        features[key] = entry
+    return features
+
+
+def write_episodes(
+    episodes: Sequence[Episode], root: Path, *, progress: Callable[[int], None] | None = None, streaming: bool = True
+) -> None:
+    """A new dataset at ``root`` with these episodes; proved, else written again through PNG files.
+
+    Args:
+        progress: called with the number of rows written so far.
+        streaming: False goes the slow way at once.
+
+    Raises:
+        DatasetError: even the slow way's videos do not hold one frame a row.
+        RecordingError: a picture is broken; nothing is left at ``root``.
+    """
+    if root.exists():
+        raise DatasetError(f"{root} exists already; nothing was touched: give another folder")
+    try:
+        _write(episodes, root, progress, streaming)
+        problems = Dataset(root).video_problems()
+        if problems and streaming:
+            logging.getLogger(__name__).warning("%s: %s; writing again without streaming", root, problems[0])
+            shutil.rmtree(root)
+            _write(episodes, root, progress, streaming=False)
+            problems = Dataset(root).video_problems()
+    except BaseException:
+        shutil.rmtree(root, ignore_errors=True)
+        raise
+    if problems:
+        raise DatasetError(f"{root}: {len(problems)} problems, first: {problems[0]}")
+
+
+def _write(episodes: Sequence[Episode], root: Path, progress: Callable[[int], None] | None, streaming: bool) -> None:
+    with quiet_lerobot():
+        from lerobot.configs import RGBEncoderConfig
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        first = episodes[0]
+        keys = [k for k in first.spec.features if k in first.arrays or k in first.picture_keys]
+        dataset = LeRobotDataset.create(
+            repo_id=f"local/{root.name}",
+            fps=first.spec.fps,
+            features=lerobot_features(first.spec, keys),
+            root=root,
+            robot_type=first.spec.robot_type,
+            use_videos=True,
+            streaming_encoding=streaming and bool(first.picture_keys),
+            encoder_queue_maxsize=QUEUE_FRAMES,
+            rgb_encoder=RGBEncoderConfig(**ENCODERS[first.spec.video_codec]),
+            encoder_threads=1,  # one a camera: cheaper than many, and the same bytes on any machine
+        )
+        done = 0
+        try:
+            for episode in episodes:
+                for row in _rows(episode):
+                    _wait_for_room(dataset)
+                    dataset.add_frame(row)
+                    done += 1
+                    if progress is not None:
+                        progress(done)
+                dataset.save_episode()
+            dataset.finalize()
+        except BaseException:
+            with contextlib.suppress(Exception):  # stop encoder threads; the error that brought us here matters
+                dataset.clear_episode_buffer()
+                dataset.finalize()
+            raise
+
+
+def _rows(episode: Episode) -> Iterator[dict[str, Any]]:
+    pictures = episode.pictures() if episode.picture_keys else iter([{}] * episode.num_rows)
+    for k, shown in enumerate(pictures):
+        numbers = {key: values[k] for key, values in episode.arrays.items()}
+        yield {**numbers, **shown, "task": episode.instruction}
+
+
+def _wait_for_room(dataset: Any) -> None:
+    """Back-pressure: LeRobot drops a frame whose queue stays full for 0.1 s. We are the only feeder, so room stays room."""
+    encoder = dataset.writer._streaming_encoder
+    while encoder is not None and any(q.full() for q in encoder._frame_queues.values()):
+        if not all(t.is_alive() for t in encoder._threads.values()):
+            return  # feed_frame tells what killed it
+        time.sleep(0.002)
+
+
+def merge(roots: Sequence[Path], destination: Path) -> None:
+    """Datasets into one, by LeRobot's ``aggregate_datasets``; a single one is copied. Proved like a written one.
+
+    Raises:
+        DatasetError: they differ in features, fps or robot, or the merged videos do not hold one frame a row.
+    """
+    if len(roots) == 1:
+        shutil.copytree(roots[0], destination, dirs_exist_ok=True)
+    else:
+        with quiet_lerobot():
+            from lerobot.datasets.aggregate import aggregate_datasets
+
+            if destination.exists():
+                destination.rmdir()  # LeRobot wants to make it; not empty is an error here
+            try:
+                aggregate_datasets(
+                    repo_ids=[f"local/{r.name}" for r in roots],
+                    aggr_repo_id=f"local/{destination.name}",
+                    roots=list(roots),
+                    aggr_root=destination,
+                )
+            except ValueError as error:
+                raise DatasetError(f"these datasets do not merge: {error}") from error
+    problems = Dataset(destination).video_problems()
+    if problems:
+        raise DatasetError(f"{destination}: {len(problems)} problems after merging, first: {problems[0]}")
+
+
+@contextlib.contextmanager
+def quiet_lerobot() -> Iterator[None]:
+    """LeRobot offline and without its progress bars, encoder banners and download attempts; errors still show."""
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")
+    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
+    os.environ.setdefault("SVT_LOG", "1")
+    os.environ.setdefault("TQDM_DISABLE", "1")
+    root = logging.getLogger()
+    level = root.level
+    root.setLevel(logging.ERROR)
+    with np.errstate(all="ignore"):
+        try:
+            yield
+        finally:
+            root.setLevel(level)

@@ -1,0 +1,138 @@
+"""SHA-256 digests of bytes, files and folders, with a cache so that an unchanged recording is read once.
+
+A folder's digest is the digest of its sorted relative paths and their contents: no times, no permissions, no empty
+folders. Files and folders whose name starts with a dot are left out of a *source* folder: tools and desktops drop them
+there (``.DS_Store``, ``.cache``), and they are no data. What a stage wrote is digested whole, dot or not.
+A link to a file counts as the file; a link to a folder is refused.
+"""
+
+import hashlib
+import json
+import os
+import stat
+import time
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+from taccorl.lineage.errors import LineageError
+
+FRESH_S = 2.0  # a file touched less than this ago may change again without its times showing it: not cached
+
+
+def digest_bytes(*parts: bytes) -> str:
+    """SHA-256 of the parts, each with its length, so that ("ab", "c") and ("a", "bc") differ."""
+    sha = hashlib.sha256()
+    for part in parts:
+        sha.update(len(part).to_bytes(8, "little"))
+        sha.update(part)
+    return sha.hexdigest()
+
+
+def digest_files(files: Mapping[str, str]) -> str:
+    """The digest of a folder, given ``{relative path: digest of the file}``."""
+    return digest_bytes(json.dumps(dict(sorted(files.items()))).encode())
+
+
+class DigestCache:
+    """Digests of files by path, valid while size, times and inode stand still.
+
+    One small file per entry, renamed into place: processes need no lock and lose no entry of one another.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get(self, path: Path, stamp: list[int]) -> str | None:
+        """The digest of ``path`` if it was recorded under the same ``stamp``."""
+        try:
+            entry = json.loads(self._entry(path).read_text())
+            return entry["digest"] if entry["stamp"] == stamp else None
+        except (OSError, ValueError, KeyError, TypeError):  # absent, or torn by a power cut: read the file again
+            return None
+
+    def put(self, path: Path, stamp: list[int], digest: str) -> None:
+        """Remember ``digest``."""
+        entry = self._entry(path)
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        temp = entry.with_name(f"{entry.name}.{os.getpid()}-{os.urandom(4).hex()}")
+        temp.write_text(json.dumps({"path": os.fsdecode(path), "stamp": stamp, "digest": digest}))
+        temp.replace(entry)
+
+    def _entry(self, path: Path) -> Path:
+        name = digest_bytes(os.fsencode(path))[:32]
+        return self.folder / name[:2] / f"{name}.json"
+
+
+def digest_file(path: Path, cache: DigestCache | None = None) -> str:
+    """SHA-256 of a file's content; with a ``cache`` the file is read only if it changed.
+
+    Raises:
+        LineageError: ``path`` is no regular file, or changes while it is read.
+    """
+    path = Path(path).absolute()
+    stamp = _stamp(path)
+    if cache is not None and (known := cache.get(path, stamp)) is not None:
+        return known
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if _stamp(path) != stamp:
+        raise LineageError(
+            f"{path} changed while it was read. Is it still being recorded? Run again when it is complete."
+        )
+    ctime_s = stamp[2] / 1e9
+    if cache is not None and abs(time.time() - ctime_s) > FRESH_S:
+        cache.put(path, stamp, digest)
+    return digest
+
+
+def _stamp(path: Path) -> list[int]:
+    """Size, modification time, change time (which ``touch -d`` cannot set back) and inode."""
+    try:
+        info = path.stat()
+    except FileNotFoundError:
+        raise LineageError(f"{path} does not exist" + (" (a broken link)" if path.is_symlink() else "")) from None
+    if not stat.S_ISREG(info.st_mode):
+        raise LineageError(
+            f"{path} is no regular file: it has no content to digest. Give a file, or a folder of files."
+        )
+    return [info.st_size, info.st_mtime_ns, info.st_ctime_ns, info.st_ino]
+
+
+def list_files(folder: Path, *, hidden: bool = False, also: Collection[str] = ()) -> dict[str, Path]:
+    """Every file below ``folder`` by its relative posix path, sorted; of the hidden ones all, or those in ``also``."""
+    found: dict[str, Path] = {}
+    shown = {prefix for name in also for prefix in _prefixes(name)}
+    for where, folders, names in os.walk(folder, onerror=_cannot_read):
+        base = Path(where).relative_to(folder)
+        wanted = {n: (base / n).as_posix() for n in (*folders, *names)}
+        wanted = {n: rel for n, rel in wanted.items() if hidden or not n.startswith(".") or rel in shown}
+        folders[:] = [n for n in folders if n in wanted]
+        for name in folders:
+            if Path(where, name).is_symlink():
+                raise LineageError(
+                    f"{Path(where, name)} links to a folder: what it holds could change unseen. "
+                    f"Give the folder itself ({Path(where, name).resolve()}), or copy it."
+                )
+        found |= {wanted[n]: Path(where, n) for n in names if n in wanted}
+    return dict(sorted(found.items()))
+
+
+def _prefixes(name: str) -> list[str]:
+    parts = name.split("/")
+    return ["/".join(parts[: i + 1]) for i in range(len(parts))]
+
+
+def _cannot_read(error: OSError) -> None:
+    raise LineageError(f"{error.filename}: {error.strerror}") from error
+
+
+def digest_each(
+    folder: Path, cache: DigestCache | None = None, *, hidden: bool = False, also: Collection[str] = ()
+) -> dict[str, str]:
+    """``{relative path: digest}`` of the files below ``folder``, chosen as by `list_files`."""
+    return {name: digest_file(path, cache) for name, path in list_files(folder, hidden=hidden, also=also).items()}
+
+
+def digest_folder(folder: Path, cache: DigestCache | None = None) -> str:
+    """Digest of a folder's visible files: equal content gives an equal digest, whatever the times and the place."""
+    return digest_files(digest_each(folder, cache))

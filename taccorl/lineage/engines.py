@@ -1,0 +1,192 @@
+"""Engines: run one function over many items, in this process, in several, or on a cluster.
+
+``--engine.type=local --engine.workers=8``, ``--engine.type=slurm --engine.partition=cpu``, ``--engine.type=ray``
+
+Results come in the order of the items. An item that fails does not stop the others; at the end one `EngineError` names
+every item that failed. What was done lies in the store, so the next run does only the rest.
+"""
+
+import abc
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import draccus
+
+from taccorl.lineage import cluster
+from taccorl.lineage.errors import EngineError
+from taccorl.lineage.processes import Done, Failed, attempt, run_in_processes
+from taccorl.lineage.store import Artefact, Stage, Store
+
+NAMED_FAILURES = 20  # in one message; the rest is counted
+NAME_LENGTH = 160
+
+
+@dataclass(frozen=True, kw_only=True)
+class Engine(draccus.ChoiceRegistry, abc.ABC):
+    """Where items are worked on."""
+
+    def map(
+        self,
+        fn: Callable[[Any], Any],
+        items: Sequence[Any],
+        *,
+        on_done: Callable[[Any, Any], None] | None = None,
+        name: Callable[[Any], str] = str,
+    ) -> list[Any]:
+        """``[fn(item) for item in items]``.
+
+        Args:
+            fn: a function at the top level of a module; with more than one process it and the items are pickled.
+            items: plain data such as paths.
+            on_done: called here with (item, result) as each item is done, whatever the order.
+            name: how an item is called in messages.
+
+        Raises:
+            EngineError: names each item that failed and why; all other items were done.
+        """
+        items = list(items)
+        outcomes: dict[int, Done | Failed] = {}
+
+        def take(index: int, outcome: Done | Failed) -> None:
+            outcomes[index] = outcome
+            if on_done is not None and isinstance(outcome, Done):
+                on_done(items[index], outcome.result)
+
+        def short_name(item: Any) -> str:
+            return name(item)[:NAME_LENGTH]
+
+        if items:
+            self._run(fn, items, short_name, take)
+        failures = [(short_name(items[i]), o) for i, o in sorted(outcomes.items()) if isinstance(o, Failed)]
+        if failures:
+            raise EngineError(_failure_text(failures, len(items)))
+        return [outcome.result for _, outcome in sorted(outcomes.items()) if isinstance(outcome, Done)]
+
+    @abc.abstractmethod
+    def _run(
+        self,
+        fn: Callable[[Any], Any],
+        items: list[Any],
+        name: Callable[[Any], str],
+        take: Callable[[int, Done | Failed], None],
+    ) -> None:
+        """Hand every item's index and outcome to ``take``."""
+
+
+@Engine.register_subclass("local")
+@dataclass(frozen=True, kw_only=True)
+class LocalEngine(Engine):
+    """This machine."""
+
+    workers: int = 1
+    """Processes; 1 works in this process, one item after another, which is best for a debugger."""
+
+    def _run(self, fn, items, name, take) -> None:
+        workers = min(self.workers, len(items))
+        if workers > 1:
+            run_in_processes(fn, items, workers, name, take)
+            return
+        for index, item in enumerate(items):
+            take(index, attempt(fn, item))
+
+
+@Engine.register_subclass("slurm")
+@dataclass(frozen=True, kw_only=True)
+class SlurmEngine(Engine):
+    """A Slurm cluster, through datatrove (extra ``cluster``). Waits until the job has ended."""
+
+    partition: str
+    """Slurm partition."""
+    work_dir: Path = Path("outputs/slurm")
+    """Items, results and logs pass through here: a folder that all nodes see. So must the store be."""
+    tasks: int = 100
+    """Elements of the job array at most; each takes every tasks-th item. Below your cluster's MaxArraySize."""
+    time: str = "24:00:00"
+    """Time limit of one task."""
+    cpus_per_task: int = 1
+    mem_per_cpu_gb: int = 4
+
+    def _run(self, fn, items, name, take) -> None:
+        job = cluster.Job.create(self.work_dir, fn, items, name)
+        cluster.run_on_slurm(
+            job,
+            take,
+            tasks=min(self.tasks, len(items)),
+            partition=self.partition,
+            time=self.time,
+            cpus_per_task=self.cpus_per_task,
+            mem_per_cpu_gb=self.mem_per_cpu_gb,
+        )
+
+
+@Engine.register_subclass("ray")
+@dataclass(frozen=True, kw_only=True)
+class RayEngine(Engine):
+    """A running Ray cluster, through datatrove (extra ``cluster``). ``on_done`` is called at the end."""
+
+    work_dir: Path = Path("outputs/ray")
+    """Items, results and logs pass through here: a folder that all nodes see. So must the store be."""
+    tasks: int = 100
+    """Ray tasks at most; each takes every tasks-th item."""
+    cpus_per_task: int = 1
+    mem_per_cpu_gb: int = 4
+
+    def _run(self, fn, items, name, take) -> None:
+        job = cluster.Job.create(self.work_dir, fn, items, name)
+        cluster.run_on_ray(
+            job,
+            take,
+            tasks=min(self.tasks, len(items)),
+            cpus_per_task=self.cpus_per_task,
+            mem_per_cpu_gb=self.mem_per_cpu_gb,
+        )
+
+
+def map_stage(
+    store: Store,
+    stage: Stage,
+    config: Any,
+    inputs: Sequence[Artefact],
+    *,
+    engine: Engine | None = None,
+    on_done: Callable[[Artefact, Artefact], None] | None = None,
+) -> list[Artefact]:
+    """One stage over many inputs, one artefact each, in order: the resume of a pipeline per recording or shard.
+
+    Args:
+        store: where the artefacts go; what it has already is not made again.
+        stage: gets one input at a time.
+        config: the same for all.
+        inputs: what to run the stage on.
+        engine: where to run; in this process by default.
+        on_done: called with (input, artefact), first for those that were there.
+
+    Raises:
+        EngineError: names each input that failed; the artefacts of all others are in the store.
+    """
+    found = {i: artefact for i, item in enumerate(inputs) if (artefact := store.find(stage, config, [item]))}
+    for i, artefact in found.items():
+        if on_done is not None:
+            on_done(inputs[i], artefact)
+    missing = [i for i in range(len(inputs)) if i not in found]
+    fn = functools.partial(_run_one, store, stage, config)
+    made = (engine or LocalEngine()).map(fn, [inputs[i] for i in missing], on_done=on_done)
+    every = found | dict(zip(missing, made, strict=True))
+    return [every[i] for i in range(len(inputs))]
+
+
+def _run_one(store: Store, stage: Stage, config: Any, item: Artefact) -> Artefact:
+    return store.run(stage, config, [item])
+
+
+def _failure_text(failures: list[tuple[str, Failed]], num_items: int) -> str:
+    lines = [f"{len(failures)} of {num_items} items failed; the others are done:"]
+    lines += [f"  {name}: {failed.reason}" for name, failed in failures[:NAMED_FAILURES]]
+    if len(failures) > NAMED_FAILURES:
+        lines.append(f"  and {len(failures) - NAMED_FAILURES} more")
+    if trace := next((failed.trace for _, failed in failures if failed.trace), None):
+        lines.append(f"The first traceback:\n{trace}")
+    return "\n".join(lines)

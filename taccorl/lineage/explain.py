@@ -1,0 +1,162 @@
+"""What an artefact was made from, down to the raw recordings, and whether anything changed since: a tree as text.
+
+``✗`` marks what no longer matches its record: a changed, missing or added file, or an input that is gone.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from taccorl.lineage.canonical import flatten, show
+from taccorl.lineage.digest import DigestCache, digest_file, digest_files
+from taccorl.lineage.errors import LineageError
+from taccorl.lineage.manifest import digests_now, read_manifest
+from taccorl.lineage.store import Store
+
+SHOWN = 12  # hex digits of a digest; settings in one line; changed files by name
+
+
+@dataclass
+class Origin:
+    """One artefact or raw source, what is wrong with it, and what it was made from."""
+
+    title: str
+    lines: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    inputs: list["Origin"] = field(default_factory=list)
+
+    def num_problems(self) -> int:
+        """How many things no longer match, here and in everything below."""
+        return len(self.problems) + sum(origin.num_problems() for origin in self.inputs)
+
+
+def explain(path: Path, store: Store | None) -> str:
+    """The tree of what ``path`` was made from, as text.
+
+    Args:
+        path: an artefact, a dataset, a file in one, or a raw source.
+        store: where to look for inputs that were moved, and for digests that are already known; or None.
+    """
+    return render(trace(path, store))
+
+
+def trace(path: Path, store: Store | None) -> Origin:
+    """The tree of what ``path`` was made from.
+
+    Raises:
+        LineageError: there is nothing at ``path``.
+    """
+    path = Path(path).absolute()
+    if not path.exists():
+        raise LineageError(f"{path} does not exist: nothing to explain.")
+    folder = _artefact_around(path)
+    tracer = _Tracer(store)
+    return tracer.raw(path, recorded=None) if folder is None else tracer.artefact(folder)
+
+
+def _artefact_around(path: Path) -> Path | None:
+    """``path`` or the nearest folder above it whose manifest knows it."""
+    for folder in (path, *path.parents):
+        if manifest := read_manifest(folder):
+            inside = path.relative_to(folder).as_posix()
+            if inside == "." or any(name == inside or name.startswith(f"{inside}/") for name in manifest["files"]):
+                return folder
+    return None
+
+
+class _Tracer:
+    """Walks the manifests; says each thing once."""
+
+    def __init__(self, store: Store | None) -> None:
+        self.store = store
+        self.cache: DigestCache | None = store.digests if store else None
+        self.said: set[Path] = set()
+
+    def artefact(self, folder: Path, recorded: str | None = None) -> Origin:
+        manifest = read_manifest(folder)
+        title = (
+            f"{manifest['stage']} v{manifest['stage_version']}  key {manifest['key']}  {_digest(manifest['digest'])}"
+        )
+        if folder in self.said:
+            return Origin(f"{title}  (see above)")
+        self.said.add(folder)
+        now = digests_now(folder, self.cache)
+        origin = Origin(title, _lines(folder, manifest), _changes(manifest["files"], now))
+        if recorded not in (None, manifest["digest"], digest_files(now)):
+            origin.problems.append(f"holds something else now: {_digest(str(recorded))} went into the step above")
+        origin.inputs = [self.input(entry) for entry in manifest["inputs"]]
+        return origin
+
+    def input(self, entry: dict[str, Any]) -> Origin:
+        path, recorded = Path(entry["path"]), entry["digest"]
+        if not path.exists() and entry["key"] and self.store and (moved := self.store.find_key(entry["key"])):
+            path = moved
+        if not path.exists():
+            kind = f"artefact of key {entry['key']}" if entry["key"] else "source"
+            return Origin(
+                f"{kind}  {path}  {_digest(recorded)}", problems=["missing: there is nothing at this path now"]
+            )
+        return self.artefact(path, recorded) if read_manifest(path) else self.raw(path, recorded)
+
+    def raw(self, path: Path, recorded: str | None) -> Origin:
+        now = _content(path, self.cache)
+        origin = Origin(f"source  {path}  {_digest(recorded or now)}")
+        if recorded not in (None, now):
+            origin.problems.append(f"changed since: {_digest(now)} now")
+        return origin
+
+
+def _content(path: Path, cache: DigestCache | None) -> str:
+    return digest_files(digests_now(path, cache)) if path.is_dir() else digest_file(path, cache)
+
+
+def _lines(folder: Path, manifest: dict[str, Any]) -> list[str]:
+    versions = ", ".join(f"{name} {version}" for name, version in manifest["software"].items())
+    return [
+        f"at {folder}: {len(manifest['files'])} files",
+        f"made {manifest['created']} in {manifest['seconds']} s by {versions}",
+        f"config: {_config(manifest)}",
+    ]
+
+
+def _config(manifest: dict[str, Any]) -> str:
+    changed = manifest["config_not_default"]
+    settings = flatten(manifest["config"]) if changed is None else changed
+    text = ", ".join(f"{name or 'value'}={show(value)}" for name, value in settings.items())
+    if changed is None:
+        return text
+    return f"{text} (all else at its default)" if text else "all at its default"
+
+
+def _changes(then: dict[str, str], now: dict[str, str]) -> list[str]:
+    """Files that differ from the manifest, the first few by name."""
+    found = [
+        f"changed since: {name}, {_digest(then[name])} then, {_digest(now[name])} now"
+        for name in then
+        if name in now and now[name] != then[name]
+    ]
+    found += [f"missing: {name}, {_digest(then[name])} then" for name in then if name not in now]
+    found += [f"added since: {name}" for name in now if name not in then]
+    return found if len(found) <= SHOWN else [*found[:SHOWN], f"and {len(found) - SHOWN} more files like these"]
+
+
+def _digest(digest: str) -> str:
+    return f"digest {digest[:SHOWN]}"
+
+
+def render(origin: Origin) -> str:
+    """The tree as text, one line per fact, and a last line that says whether all is as it was made."""
+    wrong = origin.num_problems()
+    verdict = f"✗ {wrong} differ from the record" if wrong else "✓ everything is as it was recorded"
+    return "\n".join([*_tree(origin), verdict])
+
+
+def _tree(origin: Origin) -> list[str]:
+    inner = "│  " if origin.inputs else "   "
+    lines = [origin.title, *(f"{inner}{line}" for line in origin.lines), *(f"{inner}✗ {p}" for p in origin.problems)]
+    for i, child in enumerate(origin.inputs):
+        last = i == len(origin.inputs) - 1
+        first, *rest = _tree(child)
+        lines.append(f"{'└─ ' if last else '├─ '}{first}")
+        lines += [f"{'   ' if last else '│  '}{line}" for line in rest]
+    return lines

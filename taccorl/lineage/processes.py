@@ -1,0 +1,208 @@
+"""A pool of worker processes that names the item a worker died on, and whose workers die with their parent.
+
+The standard pool cannot say which item broke it, and gives up all others. Here each worker has its own pipe, so the
+parent knows what each one holds: a worker that is killed or crashes costs that one item, and is replaced.
+"""
+
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import traceback
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from taccorl.errors import TaccorlError
+from taccorl.lineage.errors import EngineError
+
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+LOOK_S = 1.0  # how often to look for workers that died without closing their pipe
+GRACE_S = 5.0  # how long a worker may tidy up before it is killed
+
+
+@dataclass(frozen=True)
+class Done:
+    """What the function returned for one item."""
+
+    result: Any
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Why there is no result for one item."""
+
+    reason: str
+    trace: str | None = None
+    """The traceback, when it is the program's fault rather than the input's."""
+
+
+def attempt(fn: Callable[[Any], Any], item: Any) -> Done | Failed:
+    """``fn(item)``, with an exception turned into a `Failed`."""
+    try:
+        return Done(fn(item))
+    except Exception as error:
+        trace = None if isinstance(error, TaccorlError) else traceback.format_exc()
+        return Failed(f"{type(error).__name__}: {error}", trace)
+
+
+def pickled(thing: Any, what: str) -> bytes:
+    """``thing`` as bytes for another process.
+
+    Raises:
+        EngineError: it cannot be sent.
+    """
+    try:
+        return pickle.dumps(thing)
+    except Exception as error:
+        raise EngineError(
+            f"{what} cannot be sent to another process: {error}. A function must be defined at the top level of a "
+            f"module (no lambda, no function in a function); items must be plain data, such as paths."
+        ) from error
+
+
+def run_in_processes(
+    fn: Callable[[Any], Any],
+    items: Sequence[Any],
+    workers: int,
+    name: Callable[[Any], str],
+    on_outcome: Callable[[int, Done | Failed], None],
+) -> None:
+    """Run ``fn`` on every item in ``workers`` processes; ``on_outcome(index, outcome)`` is called as each one ends.
+
+    Raises:
+        EngineError: ``fn`` or an item cannot be sent, or workers cannot start.
+    """
+    fn_bytes = pickled(fn, f"function {getattr(fn, '__qualname__', fn)}")
+    todo = deque((i, pickled(item, f"item {name(item)}")) for i, item in enumerate(items))
+    pool: list[_Worker] = []
+    try:
+        while todo or any(worker.index is not None for worker in pool):
+            while len(pool) < workers and sum(not worker.ready for worker in pool) < len(todo):
+                pool.append(_Worker(fn_bytes))
+            wait([worker.pipe for worker in pool], timeout=LOOK_S)
+            for worker in list(pool):
+                for outcome in worker.news():
+                    on_outcome(outcome[0], outcome[1])
+                if worker.is_dead:
+                    pool.remove(worker)
+                elif worker.ready and worker.index is None and todo:
+                    worker.give(*todo.popleft())
+    except BaseException:
+        for worker in pool:
+            worker.process.terminate()
+        raise
+    finally:
+        for worker in pool:
+            worker.pipe.close()  # an idle worker ends when its pipe does
+        for worker in pool:
+            worker.process.join(GRACE_S)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+
+
+class _Worker:
+    """One process as its parent sees it."""
+
+    def __init__(self, fn_bytes: bytes) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, far_end = context.Pipe()
+        # Not a daemon: a stage may have processes of its own. That it dies with us is seen to in the worker.
+        self.process: BaseProcess = context.Process(target=_work, args=(far_end, fn_bytes, os.getpid()))
+        self.process.start()
+        far_end.close()
+        self.ready, self.index, self.is_dead = False, None, False
+
+    def give(self, index: int, item_bytes: bytes) -> None:
+        self.index = index
+        with contextlib.suppress(OSError):  # it died just now: news() will tell
+            self.pipe.send_bytes(item_bytes)
+
+    def news(self) -> list[tuple[int, Done | Failed]]:
+        """What became of the item, if anything did."""
+        ended = self.process.exitcode is not None  # asked first: what it sent before it ended is still in the pipe
+        try:
+            message = pickle.loads(self.pipe.recv_bytes()) if self.pipe.poll() else None
+        except (EOFError, OSError):
+            message, ended = None, True
+        if message is None:
+            return self._died() if ended else []
+        if not self.ready:
+            if isinstance(message, Failed):
+                raise EngineError(
+                    f"the function cannot be loaded in a worker process: {message.reason}\n{message.trace}"
+                )
+            self.ready = True
+            return []
+        index, self.index = self.index, None
+        return [] if index is None else [(index, message)]
+
+    def _died(self) -> list[tuple[int, Done | Failed]]:
+        self.is_dead = True
+        self.process.join(GRACE_S)
+        if self.process.is_alive():  # it closed its pipe but goes on: no use to us
+            self.process.kill()
+            self.process.join()
+        how = _exit_in_words(self.process.exitcode)
+        if not self.ready:
+            raise EngineError(
+                f"a worker process {how} before it could start; what it printed above says why. "
+                f"A script that uses workers needs its start under `if __name__ == '__main__':`."
+            )
+        return [] if self.index is None else [(self.index, Failed(f"the worker process {how} while it had this item"))]
+
+
+def _exit_in_words(exitcode: int | None) -> str:
+    if exitcode is None or exitcode >= 0:
+        return f"ended with exit code {exitcode}"
+    try:
+        return f"was killed by {signal.Signals(-exitcode).name}"
+    except ValueError:
+        return f"was killed by signal {-exitcode}"
+
+
+def _work(pipe: Connection, fn_bytes: bytes, parent_pid: int) -> None:
+    """The worker's life: load the function, then one item after another until the pipe closes."""
+    die_with_parent(parent_pid)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which then ends us in order
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that a stage can tidy up
+    loaded = attempt(pickle.loads, fn_bytes)
+    pipe.send_bytes(pickle.dumps(loaded if isinstance(loaded, Failed) else Done(None)))
+    while isinstance(loaded, Done):
+        try:
+            item_bytes = pipe.recv_bytes()
+        except EOFError:
+            return
+        pipe.send_bytes(_outcome_bytes(loaded.result, item_bytes))
+
+
+def _outcome_bytes(fn: Callable[[Any], Any], item_bytes: bytes) -> bytes:
+    outcome = attempt(lambda data: fn(pickle.loads(data)), item_bytes)
+    try:
+        return pickle.dumps(outcome)
+    except Exception as error:
+        return pickle.dumps(Failed(f"its result cannot be sent back to the parent process: {error}"))
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """End this process as soon as its parent is gone, however the parent ended."""
+    threading.Thread(target=_end_after_parent, daemon=True).start()  # works everywhere, between two bytecodes
+    if sys.platform == "linux":  # the kernel does it at once, whatever this process is doing
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent_pid:  # it was gone before the lines above took effect
+        os._exit(1)
+
+
+def _end_after_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)

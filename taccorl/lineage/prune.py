@@ -1,0 +1,110 @@
+"""Free the store of artefacts that no kept dataset was made from, and of what dead runs left behind.
+
+Only folders that the store itself made are ever considered: ``<stage>/<key>`` and their temporary forms. Do not prune
+while a pipeline runs: it may be about to read an artefact that no dataset refers to yet.
+"""
+
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from filelock import Timeout
+
+from taccorl.errors import DatasetError
+from taccorl.lineage.errors import LineageError
+from taccorl.lineage.manifest import read_manifest
+from taccorl.lineage.store import KEY, MARKER, Store, is_store
+
+LEFTOVER = re.compile(rf"\.({KEY.pattern})\..+")
+
+
+@dataclass(frozen=True)
+class Unneeded:
+    """A folder in the store that may go."""
+
+    path: Path
+    key: str
+    size_bytes: int
+    is_leftover: bool
+    """A dead run's temporary folder, rather than an artefact."""
+
+
+def open_store(root: Path) -> Store:
+    """The store at ``root``, which must be one already.
+
+    Raises:
+        LineageError: ``root`` is anything else.
+    """
+    if not is_store(root):
+        raise LineageError(f"{root} is not a taccorl store: it has no {MARKER}. Name the store with --store=FOLDER.")
+    return Store(root)
+
+
+def unneeded(store: Store, keep: Sequence[Path]) -> list[Unneeded]:
+    """Artefacts that none of the ``keep`` datasets was made from, and leftovers of dead runs; deletes nothing.
+
+    Raises:
+        DatasetError: a dataset to keep does not exist or has no manifest, so what it needs is unknown.
+    """
+    needed = _needed_keys(store, keep)
+    found = [_describe(path, path.name) for path in store.artefacts() if path.name not in needed]
+    return found + [_describe(path, key) for path, key in _leftovers(store) if not _is_alive(store, key)]
+
+
+def delete(store: Store, folders: Sequence[Unneeded]) -> list[Unneeded]:
+    """Delete the ``folders`` from the store; returns those that another run is using right now, which stay."""
+    busy = []
+    for folder in folders:
+        if not folder.path.resolve().is_relative_to(store.root):
+            raise LineageError(f"{folder.path} lies outside the store {store.root}: not deleted.")
+        try:
+            with store.lock(folder.key, wait=False):
+                doomed = folder.path
+                if not folder.is_leftover:  # first out of sight in one step: a killed prune leaves no half artefact
+                    doomed = folder.path.with_name(f".{folder.key}.pruned-{os.getpid()}")
+                    folder.path.rename(doomed)
+                shutil.rmtree(doomed)
+        except Timeout:
+            busy.append(folder)
+    return busy
+
+
+def _needed_keys(store: Store, keep: Sequence[Path]) -> set[str]:
+    """The keys of the ``keep`` datasets and of everything they were made from."""
+    in_store = {path.name: path for path in store.artefacts()}
+    todo = []
+    for path in keep:
+        if not (manifest := read_manifest(path)):
+            problem = "has no taccorl manifest" if Path(path).exists() else "does not exist"
+            raise DatasetError(f"--keep={path} {problem}: what it was made from is unknown. Nothing was deleted.")
+        todo.append(manifest)
+    needed: set[str] = set()
+    while todo:
+        manifest = todo.pop()
+        if manifest["key"] in needed:
+            continue
+        needed.add(manifest["key"])
+        for entry in manifest["inputs"]:  # an input outside the store, itself a dataset, has inputs in it all the same
+            todo.append(read_manifest(in_store.get(entry["key"], Path(entry["path"]))))
+        todo = [manifest for manifest in todo if manifest]
+    return needed
+
+
+def _leftovers(store: Store) -> list[tuple[Path, str]]:
+    return [(path, match[1]) for path in store.folders() if (match := LEFTOVER.fullmatch(path.name))]
+
+
+def _is_alive(store: Store, key: str) -> bool:
+    try:
+        with store.lock(key, wait=False):
+            return False
+    except Timeout:
+        return True
+
+
+def _describe(path: Path, key: str) -> Unneeded:
+    size_bytes = sum(file.lstat().st_size for file in path.rglob("*") if not file.is_dir())
+    return Unneeded(path, key, size_bytes, is_leftover=path.name.startswith("."))

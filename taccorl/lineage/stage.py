@@ -1,0 +1,46 @@
+"""A stage is a named step of a pipeline; an artefact is what it made, or a raw source."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from taccorl.lineage.errors import LineageError
+from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A named step. Raise ``version`` when the meaning of its code changes: old artefacts then no longer count."""
+
+    name: str
+    fn: Callable[[Any, list[Path], Path], None]
+    """Reads the config and the inputs, writes files into the folder given last. It may remove and remake the folder."""
+    version: int = 1
+    manifest: str = MANIFEST_PLACES[0]
+    """Where in the artefact the manifest lies: one of MANIFEST_PLACES."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", self.name):
+            raise LineageError(f"stage name {self.name!r}: letters, digits, '_' and '-' only; it names a folder.")
+        if self.manifest not in MANIFEST_PLACES:
+            raise LineageError(
+                f"stage {self.name}: manifest at {self.manifest!r}, but it is only found again at one of {MANIFEST_PLACES}."
+            )
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A file or folder and the digest of its content."""
+
+    path: Path
+    digest: str
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """What made it; empty for a raw source."""
+        return read_manifest(self.path)
+
+    def __str__(self) -> str:
+        return str(self.path)

@@ -1,0 +1,296 @@
+"""Content-addressed store: a stage runs once for the same config and inputs, and survives ``kill -9`` at any point.
+
+A stage is a plain function ``fn(config, inputs, out_dir)``. Its artefact is the folder ``root/<stage>/<key>`` with
+
+    key = sha256(stage name, stage version, canonical config, digests of the inputs in order), first 16 hex digits.
+
+The folder is built under a temporary name beside its final place, its manifest is written last, then one rename makes
+it exist. So an artefact is either complete or not there. A lock per key (the kernel frees it when its holder dies)
+lets a second run wait and find the artefact instead of making it again; under that lock, whatever a dead run left is
+removed.
+
+The key knows contents, not names: a stage must not read meaning from an input's path. Put it into the config.
+"""
+
+import contextlib
+import logging
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from taccorl.errors import DatasetError
+from taccorl.lineage.canonical import canonical, canonical_text, differences, not_default
+from taccorl.lineage.digest import (
+    DigestCache,
+    digest_bytes,
+    digest_each,
+    digest_file,
+    digest_files,
+    digest_folder,
+    list_files,
+)
+from taccorl.lineage.errors import LineageError
+from taccorl.lineage.manifest import digests_now, manifest_place, read_manifest, software, write_manifest
+from taccorl.lineage.stage import Artefact, Stage
+
+MARKER = "taccorl-store.txt"
+MARKER_TEXT = "A taccorl store: every folder here can be made again. `taccorl lineage prune` frees space.\n"
+KEY_DIGITS = 16
+KEY = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}")
+
+logger = logging.getLogger(__name__)
+
+
+class Store:
+    """A folder of artefacts. It can be sent to other processes; all of them may use it at once."""
+
+    def __init__(self, root: Path) -> None:
+        """Open the store in folder ``root``; a folder that is absent or empty becomes one."""
+        self.root = Path(root).resolve()
+        _mark(self.root)
+        self.digests = DigestCache(self.root / ".digests")
+
+    def source(self, path: Path) -> Artefact:
+        """A raw file or folder (or an earlier artefact, wherever it lies), addressed by its content as it is now."""
+        path = Path(path).absolute()
+        if not path.is_dir():
+            return Artefact(path, digest_file(path, self.digests))
+        if not list_files(path):
+            raise LineageError(f"{path} holds no files (names that start with a dot do not count): nothing to read.")
+        digest = (
+            digest_files(digests_now(path, self.digests)) if read_manifest(path) else digest_folder(path, self.digests)
+        )
+        return Artefact(path, digest)
+
+    def key(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> str:
+        """The address of what ``stage`` makes of ``config`` and ``inputs``."""
+        parts = [stage.name, str(stage.version), canonical_text(config), *(artefact.digest for artefact in inputs)]
+        return digest_bytes(*(part.encode() for part in parts))[:KEY_DIGITS]
+
+    def find(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> Artefact | None:
+        """The artefact if the store has it; never makes anything."""
+        key = self.key(stage, config, inputs)
+        return _with_key(self._place(stage, key), key)
+
+    def find_key(self, key: str) -> Path | None:
+        """The folder of the artefact with this key, whatever its stage."""
+        return next((path for path in self.artefacts() if path.name == key), None)
+
+    def artefacts(self) -> list[Path]:
+        """The folders of all artefacts."""
+        return [path for path in self.folders() if KEY.fullmatch(path.name)]
+
+    def folders(self) -> list[Path]:
+        """Every folder below a stage's folder: artefacts, and what runs are building or left."""
+        stages = [path for path in sorted(self.root.iterdir()) if _is_own(path) and not path.name.startswith(".")]
+        return [path for stage in stages for path in sorted(stage.iterdir()) if _is_own(path)]
+
+    def run(
+        self, stage: Stage, config: Any, inputs: Sequence[Artefact], *, destination: Path | None = None
+    ) -> Artefact:
+        """The artefact of ``stage``; made now if it is not there yet.
+
+        Args:
+            stage: what to run.
+            config: a dataclass or plain JSON data; handed to the stage as it is.
+            inputs: handed to the stage as paths, in this order.
+            destination: publish the artefact there, outside the store, instead of under its key.
+
+        Raises:
+            DatasetError: ``destination`` holds anything else; nothing of it is touched.
+        """
+        job = self._job(stage, config, list(inputs), destination)
+        if (found := self._existing(job)) is not None:
+            return found
+        with self.lock(job.lock_name):
+            for leftover in job.leftovers():
+                shutil.rmtree(leftover)
+            found = self._existing(job)
+            return found if found is not None else self._make(job)
+
+    def _job(self, stage: Stage, config: Any, inputs: list[Artefact], destination: Path | None) -> "_Job":
+        key = self.key(stage, config, inputs)
+        if destination is None:
+            return _Job(stage, config, inputs, key, self._place(stage, key), lock_name=key, temp_prefix=f".{key}.")
+        final = Path(destination).absolute()
+        final = final.parent.resolve() / final.name
+        if final.is_relative_to(self.root) or self.root.is_relative_to(final):
+            raise DatasetError(f"destination {final} and the store {self.root} lie in one another; choose another.")
+        lock_name = f"destination-{digest_bytes(str(final).encode())[:KEY_DIGITS]}"
+        # Beside the user's folder: named after this store, whose lock alone tells if a temporary folder's maker lives.
+        temp_prefix = f".{final.name}.taccorl-{digest_bytes(str(self.root).encode())[:8]}-"
+        return _Job(stage, config, inputs, key, final, lock_name, temp_prefix)
+
+    def _make(self, job: "_Job") -> Artefact:
+        for artefact in job.inputs:
+            if not artefact.path.exists():
+                raise LineageError(
+                    f"stage {job.stage.name}: its input {artefact.path} is gone. Make or restore it first."
+                )
+        temp = job.final.with_name(f"{job.temp_prefix}{os.getpid()}-{os.urandom(2).hex()}")
+        temp.mkdir(parents=True)
+        try:
+            start_s = time.perf_counter()
+            job.stage.fn(job.config, [artefact.path for artefact in job.inputs], temp)
+            digest = _seal(temp, job, seconds=time.perf_counter() - start_s)
+            try:
+                temp.rename(job.final)
+            except OSError:  # something came to lie there meanwhile: the same artefact is as good as ours
+                if (found := self._existing(job)) is None:
+                    raise
+                shutil.rmtree(temp, ignore_errors=True)
+                return found
+            _flush(job.final.parent)
+            return Artefact(job.final, digest)
+        except BaseException:
+            shutil.rmtree(temp, ignore_errors=True)
+            raise
+
+    def _existing(self, job: "_Job") -> Artefact | None:
+        found = _with_key(job.final, job.key)
+        if found is None and os.path.lexists(job.final):
+            raise DatasetError(_in_the_way(job))
+        return found
+
+    def _place(self, stage: Stage, key: str) -> Path:
+        return self.root / stage.name / key
+
+    @contextlib.contextmanager
+    def lock(self, name: str, *, wait: bool = True) -> Iterator[None]:
+        """Hold the lock ``name`` of this store: the kernel frees it when its holder dies.
+
+        Raises:
+            filelock.Timeout: somebody else holds it and ``wait`` is False.
+        """
+        folder = self.root / ".locks"
+        folder.mkdir(exist_ok=True)
+        # The lock file stays: removing it would let a waiter and a newcomer hold "the same" lock on two files.
+        lock = FileLock(folder / f"{name}.lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            if not wait:
+                raise
+            logger.info("waiting: another run is making %s", name)
+            lock.acquire()
+        try:
+            yield
+        finally:
+            lock.release()
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One call of `Store.run`, with its key and places."""
+
+    stage: Stage
+    config: Any
+    inputs: list[Artefact]
+    key: str
+    final: Path
+    lock_name: str
+    temp_prefix: str
+
+    def leftovers(self) -> list[Path]:
+        """Temporary folders of runs that died, if the lock is ours."""
+        if not self.final.parent.is_dir():
+            return []
+        beside = self.final.parent.iterdir()
+        return [path for path in beside if path.name.startswith(self.temp_prefix) and path.is_dir()]
+
+
+def is_store(root: Path) -> bool:
+    """True if ``root`` was made by `Store`."""
+    return (Path(root) / MARKER).is_file()
+
+
+def _mark(root: Path) -> None:
+    if is_store(root):
+        return
+    if root.exists() and not root.is_dir():
+        raise LineageError(f"store {root} is a file; give a folder.")
+    if root.is_dir() and any(root.iterdir()) and not is_store(root):
+        raise LineageError(f"{root} is not a taccorl store (it has no {MARKER}) and not empty. Give a new folder.")
+    root.mkdir(parents=True, exist_ok=True)
+    (root / MARKER).write_text(MARKER_TEXT)  # its existence is the mark, so a second writer does no harm
+
+
+def _is_own(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()  # a link leads out of the store
+
+
+def _with_key(folder: Path, key: str) -> Artefact | None:
+    manifest = read_manifest(folder)
+    return Artefact(folder, manifest["digest"]) if manifest and manifest["key"] == key else None
+
+
+def _seal(temp: Path, job: _Job, seconds: float) -> str:
+    """Digest what the stage wrote, bring it to the disk, write the manifest; returns the artefact's digest."""
+    stage = job.stage
+    files = digest_each(temp, hidden=True) if temp.is_dir() else {}
+    if not files:
+        raise LineageError(f"stage {stage.name} wrote no file into its folder: an artefact needs one. Mend the stage.")
+    if (place := stage.manifest if stage.manifest in files else manifest_place(temp)) is not None:
+        raise LineageError(f"stage {stage.name} wrote {place} itself: that place is the store's. Leave it out.")
+    for name in files:
+        _flush(temp / name)
+    digest = digest_files(files)
+    manifest = {
+        "stage": stage.name,
+        "stage_version": stage.version,
+        "key": job.key,
+        "digest": digest,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": round(seconds, 3),
+        "config": canonical(job.config),
+        "config_not_default": not_default(job.config),
+        "inputs": [
+            {"path": str(artefact.path), "digest": artefact.digest, "key": _key_of(artefact)} for artefact in job.inputs
+        ],
+        "software": software(),
+        "files": files,
+    }
+    write_manifest(temp, stage.manifest, manifest)
+    for folder in {temp, *(path.parent for path in (temp / stage.manifest, *(temp / name for name in files)))}:
+        _flush(folder)
+    return digest
+
+
+def _key_of(artefact: Artefact) -> str | None:
+    """The key of an input, unless it is raw or was changed since it was made."""
+    manifest = artefact.manifest
+    return manifest["key"] if manifest and manifest["digest"] == artefact.digest else None
+
+
+def _in_the_way(job: _Job) -> str:
+    wanted = f"{job.stage.name} v{job.stage.version}, key {job.key}"
+    way_out = "Nothing was touched: give another destination, or move that one away yourself."
+    manifest = read_manifest(job.final)
+    if not manifest:
+        kind = f"a folder of {sum(1 for _ in job.final.rglob('*'))} entries" if job.final.is_dir() else "a file"
+        return f"{job.final} is in the way: it is {kind} without a taccorl manifest; this run makes {wanted}. {way_out}"
+    present = f"{manifest['stage']} v{manifest['stage_version']}, key {manifest['key']}, made {manifest['created']}"
+    changes = differences(manifest["config"], canonical(job.config))
+    if [entry["digest"] for entry in manifest["inputs"]] != [artefact.digest for artefact in job.inputs]:
+        changes.append(f"inputs: {len(manifest['inputs'])} then, {len(job.inputs)} now, not the same content")
+    return (
+        f"{job.final} is in the way: it holds {present}; this run makes {wanted} "
+        f"({'; '.join(changes) or 'same config and inputs'}). {way_out}"
+    )
+
+
+def _flush(path: Path) -> None:
+    """Bring a file or a folder (POSIX: the same call) to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

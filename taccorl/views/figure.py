@@ -1,0 +1,151 @@
+"""The two PiPER arms as a figure of capsules: joint frames as built, thicknesses and stands schematic. No physics, no meshes.
+
+Frames: ``base`` is an arm's mounting plate (z up, x forward), ``link_i`` turns with joint i about its own z axis; in link 6,
+z points out of the gripper and y is the way the fingers slide. Letters in shapes: T rows (time).
+"""
+
+import re
+
+import cv2
+import numpy as np
+import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from taccorl.data.episode import Episode
+from taccorl.views.touch import Pad
+
+# Parent-to-link origin: position (m), then fixed-axis roll, pitch, yaw (rad). agilexrobotics/Piper_ros,
+# piper_description.urdf at 116596c.
+LINK_ORIGINS = (
+    ((0.0, 0.0, 0.123), (0.0, 0.0, 0.0)),
+    ((0.0, 0.0, 0.0), (1.5708, -0.1359, -3.1416)),
+    ((0.28503, 0.0, 0.0), (0.0, 0.0, -1.7939)),
+    ((-0.021984, -0.25075, 0.0), (1.5708, 0.0, 0.0)),
+    ((0.0, 0.0, 0.0), (-1.5708, 0.0, 0.0)),
+    ((8.8259e-5, -0.091, 0.0), (1.5708, 0.0, 0.0)),
+)
+FINGER_Z_M = 0.1358  # where the fingers begin on link 6's z axis; same file
+FINGER_LENGTH_M = 0.064  # 32 taxels, 2 mm apart
+PAD_WIDTH_M = 0.024  # 12 taxels, 2 mm apart
+
+# Schematic from here on.
+BASE_POS_WORLD = {"left": (0.0, 0.3, 0.0), "right": (0.0, -0.3, 0.0)}
+BONE_RADIUS_M = (0.045, 0.0, 0.036, 0.032, 0.0, 0.028, 0.024)  # base, link 1 to 6; 0: no bone, its child sits on it
+JOINT_RADIUS_M = (0.052, 0.048, 0.044, 0.036, 0.036, 0.034)
+PAD_THICKNESS_M = 0.003
+FINGER_THICKNESS_M = 0.010
+BONE_COLOR = {"left": (96, 165, 250), "right": (251, 146, 60)}
+JOINT_COLOR = (71, 85, 105)
+FINGER_COLOR = (51, 65, 85)
+
+
+def arms_of(episode: Episode) -> dict[str, np.ndarray]:
+    """Side → (T, 7) joints 1 to 6 (rad) and gripper opening (m), for the PiPER arms that the episode's state names."""
+    feature = episode.spec.features.get("observation.state")
+    if feature is None or "piper" not in episode.spec.robot_type.lower():
+        return {}
+    index = {re.sub(r"\.pos$", "", name): i for i, name in enumerate(feature.names)}
+    found = {}
+    for side in BASE_POS_WORLD:
+        names = [f"{side}_joint_{i}" for i in range(1, 7)] + [f"{side}_gripper"]
+        if all(name in index for name in names):
+            found[side] = episode.arrays["observation.state"][:, [index[name] for name in names]].astype(float)
+    return found
+
+
+def link_poses(joints_rad: np.ndarray) -> np.ndarray:
+    """(T, 7, 4, 4) base_from_link of the base and links 1 to 6, for (T, 6) joint angles."""
+    poses = np.tile(np.eye(4), (len(joints_rad), 7, 1, 1))
+    for i, (xyz, rpy) in enumerate(LINK_ORIGINS):
+        origin = np.eye(4)
+        origin[:3, :3], origin[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz
+        turn = np.tile(np.eye(4), (len(joints_rad), 1, 1))
+        turn[:, :3, :3] = Rotation.from_euler("z", joints_rad[:, i : i + 1]).as_matrix()
+        poses[:, i + 1] = poses[:, i] @ origin @ turn
+    return poses
+
+
+def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
+    """(T, 2, 4, 4) base_from_pad of the pads' faces; finger a slides along +y of link 6, finger b along −y."""
+    poses = np.repeat(link6_poses[:, None], 2, axis=1)
+    for finger, sign in enumerate((1.0, -1.0)):
+        offset = np.zeros((len(opening_m), 3))
+        offset[:, 1], offset[:, 2] = sign * opening_m / 2, FINGER_Z_M + FINGER_LENGTH_M / 2
+        poses[:, finger, :3, 3] += np.einsum("tij,tj->ti", link6_poses[:, :3, :3], offset)
+    return poses
+
+
+def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], indexes: list[rr.TimeColumn]) -> None:
+    """The arms under ``/figure``; a pad's colour is its sum on the pad's fixed scale."""
+    rec.log("figure", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    by_name = {pad.name: pad for pad in pads}
+    for side, joints in arms_of(episode).items():
+        root = f"figure/{side}"
+        poses = link_poses(joints[:, :6])
+        _log_still_parts(rec, root, side)
+        for i in range(1, 7):
+            _send_poses(rec, f"{root}/link_{i}", poses[:, i], indexes)
+        faces = pad_poses(poses[:, 6], joints[:, 6])
+        for finger, name in enumerate("ab"):
+            _send_poses(rec, f"{root}/finger_{name}", faces[:, finger], indexes)
+            pad = by_name.get(f"{side}_{name}")
+            if pad is not None:
+                colors = pad_colors(pad)
+                columns = rr.Boxes3D.columns(colors=colors)
+                rr.send_columns(f"{root}/finger_{name}/pad", indexes, columns, recording=rec)
+        path = faces[:, :, :3, 3].mean(axis=1)
+        rec.log(f"{root}/tool_path", rr.LineStrips3D([path], colors=[(*BONE_COLOR[side], 120)], radii=0.0015), static=True)
+
+
+def pad_colors(pad: Pad) -> np.ndarray:
+    """(T,) RGBA as uint32: the heatmaps' colours, 0 at no active taxel, full where every taxel is at the contact threshold."""
+    share = np.clip(pad.sum_count / pad.full_sum_count, 0.0, 1.0)
+    bgr = cv2.applyColorMap((255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_INFERNO)[:, 0].astype(np.uint32)
+    return (bgr[:, 2] << 24) | (bgr[:, 1] << 16) | (bgr[:, 0] << 8) | 255
+
+
+def _send_poses(rec: rr.RecordingStream, path: str, poses: np.ndarray, indexes: list[rr.TimeColumn]) -> None:
+    quat_xyzw = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quat_xyzw)
+    rr.send_columns(path, indexes, columns, recording=rec)
+
+
+def _log_still_parts(rec: rr.RecordingStream, root: str, side: str) -> None:
+    """Everything that does not change its shape, each in the frame of the link that carries it."""
+    rec.log(root, rr.Transform3D(translation=BASE_POS_WORLD[side]), static=True)
+    plate = rr.Cylinders3D(lengths=[0.03], radii=[0.07], centers=[(0, 0, 0.015)], colors=[JOINT_COLOR], fill_mode="solid")
+    rec.log(f"{root}/plate", plate, static=True)
+    label = rr.Points3D([(0, 0, -0.02)], labels=[f"{side} arm"], radii=0.001, colors=[BONE_COLOR[side]], show_labels=True)
+    rec.log(f"{root}/label", label, static=True)
+    ends = [xyz for xyz, _ in LINK_ORIGINS] + [(0.0, 0.0, 0.1)]
+    for i, (radius, end) in enumerate(zip(BONE_RADIUS_M, ends, strict=True)):
+        link = f"{root}/link_{i}" if i else root
+        if radius:
+            rec.log(f"{link}/bone", _capsule(np.array(end), radius, BONE_COLOR[side]), static=True)
+        if i:
+            r = JOINT_RADIUS_M[i - 1]
+            drum = rr.Cylinders3D(lengths=[2.2 * r], radii=[r], colors=[JOINT_COLOR], fill_mode="solid")
+            rec.log(f"{link}/joint", drum, static=True)
+    rail = rr.Boxes3D(half_sizes=[(0.018, 0.055, 0.016)], centers=[(0, 0, 0.116)], colors=[FINGER_COLOR], fill_mode="solid")
+    rec.log(f"{root}/link_6/rail", rail, static=True)
+    for name, sign in (("a", 1.0), ("b", -1.0)):
+        behind = sign * (PAD_THICKNESS_M + FINGER_THICKNESS_M / 2)
+        for part, thickness, y, color in (
+            ("body", FINGER_THICKNESS_M, behind, FINGER_COLOR),
+            ("pad", PAD_THICKNESS_M, sign * PAD_THICKNESS_M / 2, (0, 0, 0)),
+        ):
+            half = (PAD_WIDTH_M / 2, thickness / 2, FINGER_LENGTH_M / 2)
+            box = rr.Boxes3D(half_sizes=[half], centers=[(0, y, 0)], colors=[color], fill_mode="solid")
+            rec.log(f"{root}/finger_{name}/{part}", box, static=True)
+
+
+def _capsule(end: np.ndarray, radius_m: float, color: tuple[int, int, int]) -> rr.Capsules3D:
+    """From the link's origin to ``end``."""
+    turn, _ = Rotation.align_vectors([end], [(0.0, 0.0, 1.0)])
+    return rr.Capsules3D(
+        lengths=[np.linalg.norm(end)],
+        radii=[radius_m],
+        quaternions=[rr.Quaternion(xyzw=turn.as_quat())],
+        colors=[color],
+        fill_mode="solid",
+    )

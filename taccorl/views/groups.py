@@ -1,0 +1,45 @@
+"""Which numbers of a vector belong into one plot: same unit, same arm, short names."""
+
+import re
+from dataclasses import dataclass
+
+from taccorl.data.spec import FeatureSpec
+
+MOST_LINES = 8
+"""More lines than this are hard to tell apart: split by the first word of their names (left, right)."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Lines of one plot."""
+
+    name: str
+    """Also an entity path's last part."""
+    unit: str
+    columns: tuple[int, ...]
+    labels: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+def groups_of(feature: FeatureSpec) -> list[Group]:
+    """Every element of ``feature``, once, in plots of one unit."""
+    units = (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
+    names = feature.names or tuple(str(i) for i in range(feature.size))
+    names = tuple(re.sub(r"\.(pos|position)$", "", name) for name in names)
+    groups = []
+    for unit in dict.fromkeys(units):
+        columns = [i for i, u in enumerate(units) if u == unit]
+        sides = dict.fromkeys(names[i].split("_")[0] for i in columns)
+        if len(columns) > MOST_LINES and 1 < len(sides) < len(columns):
+            for side in sides:
+                of_side = tuple(i for i in columns if names[i].split("_")[0] == side)
+                labels = tuple(names[i].removeprefix(f"{side}_") for i in of_side)
+                groups.append(Group(f"{side} arm", unit, of_side, labels))
+        else:
+            kind = "grippers" if all("gripper" in names[i] for i in columns) else "joints"
+            labels = tuple(names[i].removesuffix("_gripper") for i in columns)
+            groups.append(Group(kind, unit, tuple(columns), labels))
+    return groups

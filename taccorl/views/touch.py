@@ -1,0 +1,78 @@
+"""What the pads say in every row: active taxels, their sum, the peak, and the contact gate.
+
+Letters in shapes: T rows (time).
+"""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.data.episode import Episode
+from taccorl.data.spec import SensorSpec
+
+CONTACT_THRESHOLD = 0.4
+"""λ_f: a normalised reading beyond this is contact (paper Table 3)."""
+MIN_ACTIVE_TAXELS = 1
+"""m: so many taxels must be beyond λ_f (paper Table 3)."""
+
+
+@dataclass(frozen=True)
+class Pad:
+    """One pad over an episode."""
+
+    name: str
+    sensor: SensorSpec
+    counts: np.ndarray
+    """(T, rows, columns) counts above baseline."""
+
+    @functools.cached_property
+    def active(self) -> np.ndarray:
+        """(T, rows, columns) bool: above the sensor's noise."""
+        return self.counts > self.sensor.noise_count
+
+    @property
+    def num_active(self) -> np.ndarray:
+        """(T,) active taxels."""
+        return self.active.sum(axis=(1, 2))
+
+    @property
+    def sum_count(self) -> np.ndarray:
+        """(T,) counts of the active taxels, added up: 0 as long as nothing touches."""
+        return np.where(self.active, self.counts, 0).sum(axis=(1, 2), dtype=np.int64)
+
+    @property
+    def peak_count(self) -> np.ndarray:
+        """(T,) counts of the highest taxel."""
+        return self.counts.max(axis=(1, 2))
+
+    @property
+    def gate_count(self) -> float:
+        """λ_f in counts."""
+        return CONTACT_THRESHOLD / self.sensor.gain_per_count
+
+    @property
+    def full_sum_count(self) -> float:
+        """Fixed scale of the sum where it is a colour: every taxel of the pad at λ_f."""
+        return self.gate_count * self.sensor.rows * self.sensor.columns
+
+
+def pads_of(episode: Episode) -> list[Pad]:
+    """The episode's pads in the data spec's order. A feature with history shows its newest reading, and only pads not shown yet."""
+    keys = [key for key in episode.spec.keys("tactile") if key in episode.arrays]
+    found: dict[str, Pad] = {}
+    for key in sorted(keys, key=lambda k: episode.spec.features[k].history):
+        for name, counts in episode.pads(key).items():
+            found.setdefault(name, Pad(name, episode.spec.sensors[key], counts))
+    return list(found.values())
+
+
+def contact_gate(pads: list[Pad]) -> np.ndarray:
+    """(T,) bool, paper's c_t at history L = 1: I[Σ_k I(|f_k| > λ_f) ≥ m] over all pads; f = counts × gain."""
+    over = sum((np.abs(p.counts) * p.sensor.gain_per_count > CONTACT_THRESHOLD).sum(axis=(1, 2)) for p in pads)
+    return np.asarray(over) >= MIN_ACTIVE_TAXELS
+
+
+def peak_row(pads: list[Pad]) -> int:
+    """The row with the highest sum over all pads; 0 without touch."""
+    return int(np.argmax(sum(p.sum_count for p in pads))) if pads else 0

@@ -1,0 +1,254 @@
+"""Engines: results in order, failures named, crashes survived, and no process outlives its parent."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import draccus
+import pytest
+
+from taccorl.errors import TaccorlError
+from taccorl.lineage import cluster
+from taccorl.lineage.engines import Engine, LocalEngine, RayEngine, SlurmEngine, map_stage
+from taccorl.lineage.errors import EngineError
+from taccorl.lineage.store import Store
+
+from . import toys
+from .toys import INGEST, IngestConfig, make_raw
+
+ONE_AND_TWO_WORKERS = pytest.mark.parametrize("workers", [1, 2])
+TESTS_FOLDER = str(Path(__file__).parents[1])
+
+
+@ONE_AND_TWO_WORKERS
+def test_results_come_in_the_order_of_the_items_and_on_done_as_they_are_done(workers):
+    done = []
+    results = LocalEngine(workers=workers).map(
+        toys.double_slowly_first, range(6), on_done=lambda *pair: done.append(pair)
+    )
+    assert results == [0, 2, 4, 6, 8, 10]
+    assert sorted(done) == [(0, 0), (1, 2), (2, 4), (3, 6), (4, 8), (5, 10)]
+    assert done[0] == ((0, 0) if workers == 1 else (1, 2))
+
+
+@ONE_AND_TWO_WORKERS
+def test_item_that_fails_is_named_and_the_others_are_done(workers):
+    done = []
+    with pytest.raises(EngineError) as caught:
+        LocalEngine(workers=workers).map(toys.refuse_odd, range(5), on_done=lambda item, _: done.append(item))
+    assert str(caught.value).splitlines() == [
+        "2 of 5 items failed; the others are done:",
+        "  1: RecordingError: recording 1 is odd",
+        "  3: RecordingError: recording 3 is odd",
+    ]
+    assert sorted(done) == [0, 2, 4]
+
+
+@ONE_AND_TWO_WORKERS
+def test_fault_of_the_program_shows_its_traceback(workers):
+    with pytest.raises(EngineError, match=r"(?s)0: ZeroDivisionError.*return 1 / x"):
+        LocalEngine(workers=workers).map(toys.divide_by, [1, 0])
+
+
+def test_worker_that_crashes_is_named_with_its_item_and_the_others_are_done():
+    done = []
+    with pytest.raises(EngineError) as caught:
+        LocalEngine(workers=2).map(
+            toys.crash_on_seven, range(12), on_done=lambda item, _: done.append(item), name="demo_{}".format
+        )
+    assert str(caught.value).splitlines() == [
+        "2 of 12 items failed; the others are done:",
+        "  demo_7: the worker process ended with exit code 3 while it had this item",
+        "  demo_8: the worker process was killed by SIGSEGV while it had this item",
+    ]
+    assert sorted(done) == [0, 1, 2, 3, 4, 5, 6, 9, 10, 11]
+
+
+def test_function_or_item_that_cannot_be_sent_is_said_before_anything_starts():
+    with pytest.raises(EngineError, match=r"function .*lambda.* cannot be sent"):
+        LocalEngine(workers=2).map(lambda x: x, [1, 2])
+    with pytest.raises(EngineError, match="item <generator"):
+        LocalEngine(workers=2).map(toys.double, [1, (x for x in "ab")])
+    assert LocalEngine().map(lambda x: x, [1, 2]) == [1, 2]  # nothing is sent within one process
+
+
+def test_result_that_cannot_be_sent_back_is_named():
+    with pytest.raises(EngineError, match="1: its result cannot be sent back"):
+        LocalEngine(workers=2).map(make_generator, [1, 2])
+
+
+def make_generator(x):
+    return (i for i in range(x))
+
+
+def test_no_items_give_no_results():
+    assert LocalEngine(workers=4).map(toys.double, []) == []
+
+
+def test_script_without_a_main_guard_is_told_so_instead_of_hanging(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from lineage.toys import double\nfrom taccorl.lineage.engines import LocalEngine\n"
+        "LocalEngine(workers=2).map(double, [1, 2])\n"
+    )
+    done = run_script([str(script)])
+    assert done.returncode == 1
+    assert "if __name__ == '__main__':" in done.stderr.splitlines()[-1]
+
+
+def run_script(words: list[str]) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": TESTS_FOLDER}
+    return subprocess.run(
+        [sys.executable, *words], capture_output=True, text=True, timeout=60, env=environment, check=False
+    )
+
+
+# Processes that outlive nobody.
+
+PARENT = """
+import sys
+from pathlib import Path
+from lineage.toys import sleep_and_leave_pid
+from taccorl.lineage.engines import LocalEngine
+if __name__ == "__main__":
+    LocalEngine(workers=2).map(sleep_and_leave_pid, [Path(sys.argv[1]) / "a", Path(sys.argv[1]) / "b"])
+"""
+
+PARENT_WITHOUT_KERNEL_HELP = """
+import multiprocessing, sys, threading
+from pathlib import Path
+from lineage.toys import sleep_and_leave_pid
+from taccorl.lineage.processes import _end_after_parent
+def child(path):
+    threading.Thread(target=_end_after_parent, daemon=True).start()
+    sleep_and_leave_pid(path)
+if __name__ == "__main__":
+    spawn = multiprocessing.get_context("spawn")
+    for name in "ab":
+        spawn.Process(target=child, args=(Path(sys.argv[1]) / name,)).start()
+"""
+
+
+@pytest.mark.parametrize("source", [PARENT, PARENT_WITHOUT_KERNEL_HELP], ids=["engine", "portable fallback"])
+def test_workers_die_with_a_sigkilled_parent(tmp_path, source):
+    (tmp_path / "parent.py").write_text(source)
+    environment = os.environ | {"PYTHONPATH": TESTS_FOLDER}
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py"), str(tmp_path)], env=environment)
+    notes = [tmp_path / "a", tmp_path / "b"]
+    assert within_10_s(lambda: all(note.exists() and note.read_text() for note in notes))
+    pids = [int(note.read_text()) for note in notes]
+    assert all(is_running(pid) for pid in pids)
+    parent.kill()
+    parent.wait()
+    assert within_10_s(lambda: not any(is_running(pid) for pid in pids))
+
+
+def test_interrupted_engine_ends_its_workers(tmp_path):
+    (tmp_path / "parent.py").write_text(PARENT)
+    environment = os.environ | {"PYTHONPATH": TESTS_FOLDER}
+    words = [sys.executable, str(tmp_path / "parent.py"), str(tmp_path)]
+    parent = subprocess.Popen(words, env=environment, stderr=subprocess.PIPE)
+    notes = [tmp_path / "a", tmp_path / "b"]
+    assert within_10_s(lambda: all(note.exists() and note.read_text() for note in notes))
+    parent.send_signal(signal.SIGINT)
+    parent.communicate(timeout=20)
+    assert not any(is_running(int(note.read_text())) for note in notes)
+
+
+def within_10_s(condition) -> bool:
+    end_s = time.monotonic() + 10
+    while time.monotonic() < end_s:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def is_running(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state not in ("Z", "X")  # a zombie has ended; only its entry waits for whoever adopted it
+
+
+# One stage over many inputs.
+
+
+@ONE_AND_TWO_WORKERS
+def test_map_stage_makes_one_artefact_per_input_and_only_what_is_missing(tmp_path, workers):
+    store, raw, log = Store(tmp_path / "store"), make_raw(tmp_path / "raw", num=3), tmp_path / "log"
+    sources = [store.source(path) for path in sorted(raw.iterdir())]
+    config = IngestConfig(log=log)
+    middle = store.run(INGEST, config, [sources[1]])
+    done = []
+    made = map_stage(
+        store, INGEST, config, sources, engine=LocalEngine(workers=workers), on_done=lambda *pair: done.append(pair)
+    )
+    assert [artefact.manifest["inputs"][0]["digest"] for artefact in made] == [source.digest for source in sources]
+    assert made[1] == middle
+    assert done[0] == (sources[1], middle)
+    assert sorted(done, key=str) == sorted(zip(sources, made, strict=True), key=str)
+    assert sorted(log.read_text().splitlines()) == ["ingest demo_0.raw", "ingest demo_1.raw", "ingest demo_2.raw"]
+    assert map_stage(store, INGEST, config, sources) == made
+
+
+def test_map_stage_names_the_input_that_failed_and_keeps_the_rest(tmp_path):
+    store, raw = Store(tmp_path / "store"), make_raw(tmp_path / "raw")
+    sources = [store.source(path) for path in sorted(raw.iterdir())]
+    (raw / "demo_0.raw").unlink()
+    with pytest.raises(EngineError, match=rf"{raw}/demo_0\.raw: LineageError: .* is gone"):
+        map_stage(store, INGEST, IngestConfig(), sources)
+    assert store.find(INGEST, IngestConfig(), [sources[1]]) is not None
+
+
+# Clusters. datatrove is not installed with the tests: what is ours is tested, its executors are not.
+
+
+@dataclass
+class AnyConfig:
+    engine: Engine = field(default_factory=LocalEngine)
+
+
+def test_engine_is_chosen_on_the_command_line():
+    assert draccus.parse(AnyConfig, args=[]).engine == LocalEngine(workers=1)
+    assert draccus.parse(AnyConfig, args=["--engine.type=local", "--engine.workers=3"]).engine == LocalEngine(workers=3)
+    slurm = draccus.parse(AnyConfig, args=["--engine.type=slurm", "--engine.partition=cpu"]).engine
+    assert slurm == SlurmEngine(partition="cpu")
+
+
+@pytest.mark.parametrize("engine", [SlurmEngine(partition="cpu"), RayEngine()])
+def test_cluster_without_datatrove_says_what_to_install(engine, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "datatrove", None)  # as if not installed, wherever this runs
+    monkeypatch.setitem(sys.modules, "datatrove.executor", None)
+    with pytest.raises(TaccorlError, match=r"pip install lerobot_policy_taccorl\[cluster\]"):
+        engine.map(toys.double, [1, 2])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_job_folder_carries_items_to_tasks_and_results_back_and_names_what_was_lost(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "require_datatrove", lambda: None)
+    job = cluster.Job.create(tmp_path, toys.refuse_odd, [0, 1, 2, 4, 6], str)
+    for rank in (0, 2):  # of three tasks, the one with items 1 and 4 was killed
+        cluster.RankTask(job.folder)(None, rank=rank, world_size=3)
+    outcomes, taken = {}, set()
+    job.collect(taken, outcomes.__setitem__)
+    assert outcomes == {0: cluster.Done(0), 2: cluster.Done(2), 3: cluster.Done(4)}
+    cluster.RankTask(job.folder)(None, rank=1, world_size=5)
+    job.collect(taken, outcomes.__setitem__)
+    assert outcomes[1] == cluster.Failed("RecordingError: recording 1 is odd")
+    job.name_the_lost(taken, outcomes.__setitem__)
+    assert outcomes[4].reason == f"its task ended without a result; logs: {job.folder / 'logs'}"
+    assert len(outcomes) == 5
+
+
+def test_function_of_the_started_script_cannot_go_to_a_cluster(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "require_datatrove", lambda: None)
+    monkeypatch.setattr(make_generator, "__module__", "__main__")
+    with pytest.raises(EngineError, match="Move it into a module"):
+        cluster.Job.create(tmp_path, make_generator, [1], str)

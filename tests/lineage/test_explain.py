@@ -1,0 +1,121 @@
+"""Explain: the tree down to the raw files, and every kind of change since is reported."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from taccorl.lineage.errors import LineageError
+from taccorl.lineage.explain import explain, trace
+from taccorl.lineage.stage import Artefact, Stage
+from taccorl.lineage.store import Store
+
+from .toys import INGEST, MERGE_DATASET, IngestConfig, make_raw
+
+GOOD = "✓ everything is as it was recorded"
+
+
+class World:
+    """Two raw files, an episode of each in the store, and a dataset merged from both."""
+
+    def __init__(self, folder: Path) -> None:
+        self.raw, self.store, self.dataset = make_raw(folder / "raw"), Store(folder / "store"), folder / "dataset"
+        config = IngestConfig(rate_hz=20.0)
+        self.sources = [self.store.source(path) for path in sorted(self.raw.iterdir())]
+        self.episodes: list[Artefact] = [self.store.run(INGEST, config, [source]) for source in self.sources]
+        self.made = self.store.run(MERGE_DATASET, IngestConfig(), self.episodes, destination=self.dataset)
+
+
+@pytest.fixture
+def world(tmp_path):
+    return World(tmp_path)
+
+
+def problems(path: Path, store: Store | None = None) -> list[str]:
+    def all_of(origin):
+        return origin.problems + [p for child in origin.inputs for p in all_of(child)]
+
+    return all_of(trace(path, store))
+
+
+def test_tree_names_stage_version_key_digest_config_date_and_raw_sources(world):
+    text = explain(world.dataset, world.store)
+    lines = text.splitlines()
+    made, episode = world.made.manifest, world.episodes[0].manifest
+    assert lines[0] == f"merge v1  key {made['key']}  digest {made['digest'][:12]}"
+    assert lines[1] == f"│  at {world.dataset}: 5 files"
+    assert lines[2].startswith(f"│  made {made['created']} in {made['seconds']} s by python 3.12")
+    assert lines[3] == "│  config: all at its default"
+    assert lines[4] == f"├─ ingest v1  key {episode['key']}  digest {episode['digest'][:12]}"
+    assert "config: rate_hz=20.0 (all else at its default)" in lines[7]
+    assert lines[8] == f"│  └─ source  {world.raw}/demo_0.raw  digest {world.sources[0].digest[:12]}"
+    assert lines[9].startswith("└─ ingest v1")
+    assert lines[-1] == GOOD
+
+
+def test_any_file_of_a_dataset_explains_the_dataset_and_a_raw_file_is_its_own_source(world):
+    whole = explain(world.dataset, None)
+    assert explain(world.dataset / "0.bin", None) == whole
+    assert explain(world.dataset / "meta" / "taccorl", None) == whole
+    raw = explain(world.raw / "demo_0.raw", None)
+    assert raw.splitlines() == [f"source  {world.raw}/demo_0.raw  digest {world.sources[0].digest[:12]}", GOOD]
+    with pytest.raises(LineageError, match="does not exist"):
+        explain(world.raw / "demo_9.raw", None)
+
+
+def test_changed_missing_and_added_files_are_reported_by_name(world):
+    (world.dataset / "0.bin").write_text("edited")
+    (world.dataset / "1.bin").unlink()
+    (world.dataset / "extra.txt").write_text("new")
+    (world.dataset / ".DS_Store").write_text("no data")
+    changed, missing, added = problems(world.dataset)
+    assert changed.startswith("changed since: 0.bin, digest ")
+    assert missing.startswith("missing: 1.bin, digest ")
+    assert added == "added since: extra.txt"
+    assert explain(world.dataset, None).endswith("✗ 3 differ from the record")
+
+
+def test_changed_and_missing_raw_files_are_reported(world):
+    (world.raw / "demo_0.raw").write_text("edited")
+    (world.raw / "demo_1.raw").unlink()
+    assert [problem.split(":")[0] for problem in problems(world.dataset, world.store)] == ["changed since", "missing"]
+    text = explain(world.dataset, world.store)
+    assert f"source  {world.raw}/demo_1.raw  digest {world.sources[1].digest[:12]}" in text
+
+
+def test_tampering_deep_in_the_store_is_reported(world):
+    (world.episodes[1].path / "data" / "3.bin").write_text("edited")
+    [problem] = problems(world.dataset, world.store)
+    assert problem.startswith("changed since: data/3.bin")
+
+
+def test_input_replaced_by_another_artefact_is_reported(world, tmp_path):
+    made = world.store.run(INGEST, IngestConfig(rate_hz=1.0), [world.store.source(world.raw / "demo_0.raw")])
+    later = world.store.run(MERGE_DATASET, IngestConfig(), [made], destination=tmp_path / "later")
+    shutil.rmtree(made.path)
+    shutil.copytree(world.episodes[0].path, made.path)
+    [problem] = problems(later.path)
+    assert problem == f"holds something else now: digest {made.digest[:12]} went into the step above"
+
+
+def test_store_that_was_moved_is_found_by_key(world, tmp_path):
+    (tmp_path / "store").rename(tmp_path / "elsewhere")
+    assert [problem.split(":")[0] for problem in problems(world.dataset, None)] == ["missing", "missing"]
+    assert problems(world.dataset, Store(tmp_path / "elsewhere")) == []
+
+
+def test_input_used_twice_is_explained_once(world, tmp_path):
+    twice = world.store.run(MERGE_DATASET, IngestConfig(), [world.episodes[0]] * 2, destination=tmp_path / "twice")
+    text = explain(twice.path, world.store)
+    assert text.count("demo_0.raw") == 1
+    assert text.count("(see above)") == 1
+
+
+def test_plain_config_is_shown_whole_as_it_declares_no_defaults(tmp_path):
+    store = Store(tmp_path / "store")
+    artefact = store.run(Stage("one", _write), {"noise": {"std_m": 0.01}, "name": "cup"}, [])
+    assert "config: name=cup, noise.std_m=0.01" in explain(artefact.path, store)
+
+
+def _write(config, inputs, out_dir):
+    (out_dir / "one").write_text("x")

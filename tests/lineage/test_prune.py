@@ -1,0 +1,169 @@
+"""Prune: keeps what kept datasets were made from, frees the rest and the leftovers, and touches nothing else."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from taccorl.cli.lineage import join_repeated, main
+from taccorl.errors import DatasetError, TaccorlError
+from taccorl.lineage.explain import trace
+from taccorl.lineage.prune import delete, open_store, unneeded
+from taccorl.lineage.stage import Stage
+from taccorl.lineage.store import Store
+
+from .toys import INGEST, MERGE, IngestConfig, make_raw
+
+
+@pytest.fixture
+def world(tmp_path):
+    """A dataset of two merged episodes, and two artefacts that it does not need."""
+    store, raw = Store(tmp_path / "store"), make_raw(tmp_path / "raw", num=3)
+    sources = [store.source(path) for path in sorted(raw.iterdir())]
+    episodes = [store.run(INGEST, IngestConfig(), [source]) for source in sources[:2]]
+    merged = store.run(MERGE, IngestConfig(), episodes)
+    store.run(Stage("finish", _finish), None, [merged], destination=tmp_path / "dataset")
+    store.run(INGEST, IngestConfig(rate_hz=20.0), [sources[0]])
+    store.run(INGEST, IngestConfig(), [sources[2]])
+    return tmp_path
+
+
+def _finish(config, inputs, out_dir):
+    (out_dir / "all.bin").write_bytes((inputs[0] / "0.bin").read_bytes())
+
+
+def _die(config, inputs, out_dir):
+    (out_dir / "half").write_text("x" * 1000)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def leave_leftover(store: Store) -> None:
+    if (pid := os.fork()) == 0:
+        store.run(Stage("ingest", _die), None, [])
+    os.waitpid(pid, 0)
+
+
+def test_keeps_what_the_dataset_was_made_from_however_deep_and_frees_the_rest(world):
+    store = Store(world / "store")
+    leave_leftover(store)
+    folders = unneeded(store, [world / "dataset"])
+    assert [(folder.path.parent.name, folder.is_leftover) for folder in folders] == [
+        ("ingest", False),
+        ("ingest", False),
+        ("ingest", True),
+    ]
+    # Five files each: 200 bytes less 0…4, and the text "20.0" or "30.0" at the end of each; and the manifest.
+    manifest_bytes = (folders[0].path / "manifest.json").stat().st_size
+    assert folders[0].size_bytes == 5 * 200 - 10 + 5 * 4 + manifest_bytes
+    assert folders[2].size_bytes == 1000
+    assert delete(store, folders) == []
+    assert len(store.folders()) == 3  # two episodes and what they were merged into
+    assert trace(world / "dataset", store).num_problems() == 0
+    assert unneeded(store, [world / "dataset"]) == []
+
+
+def test_lineage_through_another_dataset_outside_the_store_is_followed(world):
+    store = Store(world / "store")
+    derived = store.run(Stage("copy", _copy), None, [store.source(world / "dataset")], destination=world / "derived")
+    assert len(unneeded(store, [derived.path])) == 2
+
+
+def _copy(config, inputs, out_dir):
+    (out_dir / "all.bin").write_bytes((inputs[0] / "all.bin").read_bytes())
+
+
+def test_folders_that_the_store_did_not_make_are_left_alone(world):
+    store = Store(world / "store")
+    mine, outside = store.root / "ingest" / "my_notes", world / "outside"
+    for folder in (mine, outside):
+        folder.mkdir()
+        (folder / "thesis.txt").write_text("mine")
+    (store.root / "ingest" / "0123456789abcdef").symlink_to(outside)
+    delete(store, unneeded(store, []))
+    assert (mine / "thesis.txt").exists()
+    assert (outside / "thesis.txt").exists()
+    assert store.artefacts() == []
+    assert (world / "dataset" / "all.bin").exists()
+    assert len(list((world / "raw").iterdir())) == 3
+
+
+def test_dataset_of_unknown_origin_cannot_be_kept(world):
+    with pytest.raises(DatasetError, match="no taccorl manifest"):
+        unneeded(Store(world / "store"), [world / "raw"])
+    with pytest.raises(DatasetError, match="does not exist"):
+        unneeded(Store(world / "store"), [world / "datset"])
+
+
+def test_folder_that_is_no_store_is_refused(world):
+    for folder in (world / "raw", world / "absent", Path("/")):
+        with pytest.raises(TaccorlError, match="not a taccorl store"):
+            open_store(folder)
+    assert not (world / "absent").exists()
+
+
+def test_what_a_run_is_building_now_is_neither_listed_nor_deleted(world):
+    store = Store(world / "store")
+    script = (
+        "import sys; from pathlib import Path; from taccorl.lineage.stage import Stage; from taccorl.lineage.store import Store\n"
+        "def wait(config, inputs, out_dir):\n"
+        "    (out_dir / 'half').write_text('x'); print('building', flush=True); sys.stdin.readline()\n"
+        "print(Store(Path(sys.argv[1])).run(Stage('wait', wait), None, []).path)"
+    )
+    words = [sys.executable, "-c", script, str(store.root)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "building\n"
+        listed = unneeded(store, [])
+        assert len(listed) == 5
+        assert not any("wait" in str(folder.path) for folder in listed)
+        assert delete(store, listed) == []
+        made, _ = process.communicate("\n", timeout=20)
+    assert (Path(made.strip()) / "half").exists()
+
+
+# The command.
+
+
+def test_command_lists_first_and_deletes_only_with_yes(world, capsys):
+    words = ["prune", f"--store={world / 'store'}", f"--keep={world / 'dataset'}"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "2 of 5 folders" in out
+    assert "Nothing was deleted" in out
+    assert len(Store(world / "store").artefacts()) == 5
+    assert main([*words, "--yes=true"]) == 0
+    assert "Deleted 2 folders" in capsys.readouterr().out
+    assert len(Store(world / "store").artefacts()) == 3
+
+
+def test_command_explains_and_its_status_tells_if_anything_changed(world, capsys):
+    words = ["explain", str(world / "dataset"), f"--store={world / 'store'}"]
+    assert main(words) == 0
+    assert "demo_1.raw" in capsys.readouterr().out
+    (world / "raw" / "demo_1.raw").write_text("edited")
+    assert main(words) == 1
+    assert "✗ changed since" in capsys.readouterr().out
+
+
+def test_explain_needs_no_store(world, capsys, monkeypatch):
+    monkeypatch.chdir(world)
+    assert main(["explain", "dataset"]) == 0
+    assert not (world / "outputs").exists()
+    with pytest.raises(TaccorlError, match="not a taccorl store"):
+        main(["explain", "dataset", "--store=raw"])
+
+
+def test_unknown_verb_names_the_nearest(capsys):
+    with pytest.raises(TaccorlError, match="did you mean 'explain'"):
+        main(["explian"])
+    assert main([]) == 0
+    assert capsys.readouterr().out.startswith("taccorl lineage explain PATH")
+
+
+def test_repeated_keep_becomes_one_list():
+    assert join_repeated(["--keep=a", "--yes=true", "--keep=b c"], "keep") == ["--yes=true", '--keep=["a", "b c"]']
+    assert join_repeated(["--keep=[a, b]"], "keep") == ["--keep=[a, b]"]
+    assert join_repeated(["--yes=true"], "keep") == ["--yes=true"]

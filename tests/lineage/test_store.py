@@ -1,0 +1,275 @@
+"""The store: keys, manifests, destinations, and stages that fail."""
+
+import hashlib
+import json
+import os
+import pickle
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from taccorl.errors import DatasetError
+from taccorl.lineage.canonical import canonical_text
+from taccorl.lineage.errors import LineageError
+from taccorl.lineage.stage import Stage
+from taccorl.lineage.store import Store, is_store
+
+from .toys import INGEST, MERGE_DATASET, IngestConfig, make_raw, run_pipeline
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture
+def raw(tmp_path):
+    return make_raw(tmp_path / "raw")
+
+
+def write_one(config, inputs, out_dir):
+    (out_dir / "one").write_text(str(config))
+
+
+ONE = Stage("one", write_one)
+
+
+def hidden_folders(folder):
+    """Temporary folders anywhere below, but for the store's own .locks and .digests."""
+    return [p for p in folder.rglob(".*") if p.is_dir() and p.name not in (".locks", ".digests")]
+
+
+def test_key_is_the_first_16_hex_of_the_sha256_of_stage_version_config_and_inputs(store, raw):
+    source = store.source(raw / "demo_0.raw")
+    by_hand = hashlib.sha256()
+    for part in ["ingest", "1", '{"rate_hz":30.0,"type":"IngestConfig"}', hashlib.sha256(bytes(200)).hexdigest()]:
+        by_hand.update(len(part).to_bytes(8, "little") + part.encode())
+    assert canonical_text(IngestConfig()) == '{"rate_hz":30.0,"type":"IngestConfig"}'
+    assert store.key(INGEST, IngestConfig(), [source]) == by_hand.hexdigest()[:16]
+
+
+def test_key_changes_with_stage_version_config_and_inputs_and_with_nothing_else(store, raw):
+    a, b = (store.source(path) for path in sorted(raw.iterdir()))
+    key = store.key(INGEST, IngestConfig(), [a, b])
+    others = [
+        store.key(replace(INGEST, version=2), IngestConfig(), [a, b]),
+        store.key(replace(INGEST, name="other"), IngestConfig(), [a, b]),
+        store.key(INGEST, IngestConfig(rate_hz=20.0), [a, b]),
+        store.key(INGEST, IngestConfig(), [b, a]),
+        store.key(INGEST, IngestConfig(), [a]),
+    ]
+    assert len({key, *others}) == 6
+    copy = shutil.copy(raw / "demo_0.raw", raw / "elsewhere")
+    assert store.key(INGEST, IngestConfig(log=Path("any")), [store.source(Path(copy)), b]) == key
+
+
+def test_artefact_lies_under_its_key_and_is_made_once(store, raw, tmp_path):
+    log = tmp_path / "log"
+    first = run_pipeline(store, raw, log=log)
+    again = run_pipeline(Store(store.root), raw, log=log)
+    assert again == first
+    assert first.path == store.root / "merge" / first.manifest["key"]
+    assert log.read_text().splitlines() == ["ingest demo_0.raw", "ingest demo_1.raw", "merge"]
+    assert store.find(INGEST, IngestConfig(rate_hz=1.0), [store.source(raw / "demo_0.raw")]) is None
+
+
+def test_manifest_says_what_was_made_from_what(store, raw):
+    source = store.source(raw / "demo_1.raw")
+    config = IngestConfig(rate_hz=20.0)
+    artefact = store.run(INGEST, config, [source])
+    manifest = json.loads((artefact.path / "manifest.json").read_text())
+    assert (manifest["stage"], manifest["stage_version"]) == ("ingest", 1)
+    assert manifest["config"] == {"rate_hz": 20.0, "type": "IngestConfig"}
+    assert manifest["config_not_default"] == {"rate_hz": 20.0}
+    assert manifest["inputs"] == [{"path": str(raw / "demo_1.raw"), "digest": source.digest, "key": None}]
+    assert manifest["files"]["data/4.bin"] == hashlib.sha256(b"\1" * 196 + b"20.0").hexdigest()
+    assert set(manifest["files"]) == {f"data/{i}.bin" for i in range(5)}
+    assert manifest["created"].endswith("+00:00")
+    assert 0.02 <= manifest["seconds"] < 10
+    assert manifest["software"]["python"].startswith("3.12")
+    assert "taccorl" in manifest["software"]
+    assert artefact.manifest == manifest
+    assert source.manifest == {}
+
+
+def test_equal_content_has_an_equal_digest_whatever_made_it_and_when(store):
+    other = Stage("other", write_one, version=7)
+    assert store.run(ONE, "x", []).digest == store.run(other, "x", []).digest != store.run(ONE, "y", []).digest
+
+
+def test_dataset_used_as_a_source_is_the_artefact_it_is(store, raw, tmp_path):
+    made = run_pipeline(store, raw, tmp_path / "dataset")
+    (tmp_path / "dataset" / ".cache").mkdir()
+    (tmp_path / "dataset" / ".cache" / "junk").write_text("dropped there by a tool")
+    source = store.source(tmp_path / "dataset")
+    assert source.digest == made.digest
+    assert store.run(ONE, "x", [source]).manifest["inputs"][0]["key"] == made.manifest["key"]
+    (tmp_path / "dataset" / "0.bin").write_text("edited")
+    edited = store.source(tmp_path / "dataset")
+    assert edited.digest != made.digest
+    assert store.run(ONE, "x", [edited]).manifest["inputs"][0]["key"] is None
+
+
+def test_hidden_file_that_a_stage_wrote_is_part_of_the_artefact(store):
+    def write_hidden(config, inputs, out_dir):
+        (out_dir / ".info").mkdir()
+        (out_dir / ".info" / "notes").write_text("x")
+
+    artefact = store.run(Stage("hidden", write_hidden), None, [])
+    assert list(artefact.manifest["files"]) == [".info/notes"]
+    assert store.source(artefact.path).digest == artefact.digest
+
+
+def test_stage_may_remake_its_folder_as_lerobot_does(store):
+    def remake(config, inputs, out_dir):
+        out_dir.rmdir()
+        out_dir.mkdir(exist_ok=False)
+        (out_dir / "one").write_text("x")
+
+    assert (store.run(Stage("remake", remake), None, []).path / "one").read_text() == "x"
+
+
+def test_stage_that_raises_leaves_nothing_and_frees_its_lock(store):
+    def fail(config, inputs, out_dir):
+        (out_dir / "half").write_text("x")
+        raise ValueError("the gripper slipped")
+
+    for _ in range(2):
+        with pytest.raises(ValueError, match="slipped"):
+            store.run(Stage("failing", fail), None, [])
+    assert list((store.root / "failing").iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["nothing", "the manifest", "a copied manifest", "no folder"])
+def test_stage_that_wrote_no_artefact_is_named(store, what):
+    inner = store.run(ONE, "x", [])
+
+    def bad(config, inputs, out_dir):
+        if what == "the manifest":
+            (out_dir / "manifest.json").write_text("{}")
+        elif what == "a copied manifest":
+            (out_dir / "meta" / "taccorl").mkdir(parents=True)
+            shutil.copy(inner.path / "manifest.json", out_dir / "meta" / "taccorl" / "manifest.json")
+        elif what == "no folder":
+            out_dir.rmdir()
+
+    with pytest.raises(LineageError, match="stage bad wrote"):
+        store.run(Stage("bad", bad), None, [])
+    assert list((store.root / "bad").iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["", ".hidden", "a/b", "a b", "../up"])
+def test_stage_name_that_is_no_folder_name_is_refused(name):
+    with pytest.raises(LineageError, match="stage name"):
+        Stage(name, write_one)
+
+
+def test_manifest_where_it_would_not_be_found_is_refused():
+    with pytest.raises(LineageError, match="meta/taccorl"):
+        Stage("one", write_one, manifest="somewhere.json")
+
+
+def test_input_that_is_gone_is_named(store, raw):
+    source = store.source(raw / "demo_0.raw")
+    (raw / "demo_0.raw").unlink()
+    with pytest.raises(LineageError, match=r"demo_0\.raw is gone"):
+        store.run(INGEST, IngestConfig(), [source])
+    with pytest.raises(LineageError, match="does not exist"):
+        store.source(raw / "demo_0.raw")
+
+
+# Destination: the user's own folder.
+
+
+def test_destination_holds_the_dataset_and_a_second_run_leaves_it_untouched(store, raw, tmp_path):
+    destination, log = tmp_path / "datasets" / "insert", tmp_path / "log"
+    made = run_pipeline(store, raw, destination, log=log)
+    assert made.path == destination
+    assert made.manifest["key"] == json.loads((destination / "meta" / "taccorl" / "manifest.json").read_text())["key"]
+    assert not (store.root / "merge").exists()
+    (destination / "my_notes.txt").write_text("mine")
+    assert run_pipeline(store, raw, destination, log=log) == made
+    assert (destination / "my_notes.txt").read_text() == "mine"
+    assert log.read_text().count("merge") == 1
+    assert hidden_folders(tmp_path / "datasets") == []
+
+
+def test_destination_with_another_config_is_refused_with_both_named(store, raw, tmp_path):
+    source = store.source(raw / "demo_0.raw")
+    made = store.run(
+        MERGE_DATASET, IngestConfig(), [store.run(INGEST, IngestConfig(), [source])], destination=tmp_path / "d"
+    )
+    other = IngestConfig(rate_hz=20.0)
+    with pytest.raises(DatasetError) as caught:
+        store.run(MERGE_DATASET, other, [store.run(INGEST, other, [source])], destination=tmp_path / "d")
+    message = str(caught.value)
+    for part in [str(tmp_path / "d"), made.manifest["key"], "rate_hz: 30.0 → 20.0", "inputs", "another destination"]:
+        assert part in message
+    assert store.source(tmp_path / "d").digest == made.digest
+
+
+@pytest.mark.parametrize("what", ["folder", "empty folder", "file", "broken link", "foreign manifest"])
+def test_destination_that_is_the_users_is_never_touched(store, tmp_path, what):
+    destination = tmp_path / "d"
+    if what == "file":
+        destination.write_text("mine")
+    elif what == "broken link":
+        destination.symlink_to("nowhere")
+    else:
+        destination.mkdir()
+    if what == "folder":
+        (destination / "thesis.txt").write_text("mine")
+    elif what == "foreign manifest":
+        (destination / "manifest.json").write_text('{"name": "a web app", "key": "x"}')
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(DatasetError, match="is in the way"):
+        store.run(ONE, "x", [], destination=destination)
+    new = set(tmp_path.rglob("*")) - set(before)
+    assert all(path.is_relative_to(store.root) for path in new)
+    assert set(before) <= set(tmp_path.rglob("*"))
+
+
+def test_destination_in_the_store_is_refused(store):
+    with pytest.raises(DatasetError, match="in one another"):
+        store.run(ONE, "x", [], destination=store.root / "mine")
+
+
+def test_leftovers_beside_a_destination_go_only_if_they_are_this_stores(store, tmp_path):
+    def die(config, inputs, out_dir):
+        (out_dir / "half").write_text("x")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    others = Store(tmp_path / "other_store")
+    for owner in (store, others):
+        if (pid := os.fork()) == 0:
+            owner.run(Stage("one", die), "x", [], destination=tmp_path / "d")
+        os.waitpid(pid, 0)
+    assert len(hidden_folders(tmp_path)) == 2
+    store.run(ONE, "x", [], destination=tmp_path / "d")
+    assert len(hidden_folders(tmp_path)) == 1  # that one's maker may be alive: only the other store's lock can tell
+
+
+# The store's own folder.
+
+
+def test_store_marks_its_folder_and_refuses_a_folder_that_holds_other_things(tmp_path):
+    assert is_store(Store(tmp_path / "new").root)
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.txt").write_text("mine")
+    with pytest.raises(LineageError, match="not a taccorl store"):
+        Store(tmp_path / "home")
+    assert [path.name for path in (tmp_path / "home").iterdir()] == ["thesis.txt"]
+
+
+def test_store_can_be_sent_to_another_process(store):
+    assert pickle.loads(pickle.dumps(store)).run(ONE, "x", []).path.parent.parent == store.root
+
+
+def test_artefact_whose_manifest_was_deleted_is_in_the_way(store):
+    (store.run(ONE, "x", []).path / "manifest.json").unlink()
+    assert store.find(ONE, "x", []) is None
+    with pytest.raises(DatasetError, match="without a taccorl manifest"):
+        store.run(ONE, "x", [])

@@ -1,0 +1,106 @@
+"""Cheap stages and functions for the tests of lineage, and a script that runs them: ``toys.py STORE RAW LOG [DEST]``.
+
+The pipeline: two raw files → ``ingest`` each → ``merge``. Every run of a stage appends one line to the log.
+"""
+
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from taccorl.errors import RecordingError
+from taccorl.lineage.stage import Artefact, Stage
+from taccorl.lineage.store import Store
+
+PAUSE_S = 0.004
+NUM_PARTS = 5
+PIPELINE_MIN_S = 3 * NUM_PARTS * PAUSE_S  # three stages; the pauses alone last this long
+
+
+@dataclass(frozen=True, kw_only=True)
+class IngestConfig:
+    rate_hz: float = 30.0
+    log: Path | None = field(default=None, compare=False)
+
+
+def ingest(config: Any, inputs: list[Path], out_dir: Path) -> None:
+    _log(config.log, f"ingest {inputs[0].name}")
+    content = inputs[0].read_bytes()
+    (out_dir / "data").mkdir()
+    for i in range(NUM_PARTS):
+        time.sleep(PAUSE_S)
+        (out_dir / "data" / f"{i}.bin").write_bytes(content[i:] + str(config.rate_hz).encode())
+
+
+def merge(config: Any, inputs: list[Path], out_dir: Path) -> None:
+    _log(config.log, "merge")
+    for i in range(NUM_PARTS):
+        time.sleep(PAUSE_S)
+        (out_dir / f"{i}.bin").write_bytes(b"".join((path / "data" / f"{i}.bin").read_bytes() for path in inputs))
+
+
+def _log(path: Path | None, line: str) -> None:
+    if path is not None:
+        with path.open("a") as file:
+            file.write(f"{line}\n")
+
+
+INGEST = Stage("ingest", ingest)
+MERGE = Stage("merge", merge)
+MERGE_DATASET = Stage("merge", merge, manifest="meta/taccorl/manifest.json")
+
+
+def make_raw(folder: Path, num: int = 2) -> Path:
+    folder.mkdir(parents=True)
+    for i in range(num):
+        (folder / f"demo_{i}.raw").write_bytes(bytes([i]) * 200)
+    return folder
+
+
+def run_pipeline(store: Store, raw: Path, destination: Path | None = None, *, log: Path | None = None) -> Artefact:
+    config = IngestConfig(log=log)
+    episodes = [store.run(INGEST, config, [store.source(path)]) for path in sorted(raw.iterdir())]
+    stage = MERGE if destination is None else MERGE_DATASET
+    return store.run(stage, config, episodes, destination=destination)
+
+
+def double(x: int) -> int:
+    return 2 * x
+
+
+def double_slowly_first(x: int) -> int:
+    time.sleep(0.3 if x == 0 else 0)
+    return 2 * x
+
+
+def refuse_odd(x: int) -> int:
+    if x % 2:
+        raise RecordingError(f"recording {x} is odd")
+    return x
+
+
+def divide_by(x: int) -> float:
+    return 1 / x
+
+
+def crash_on_seven(x: int) -> int:
+    if x == 7:
+        os._exit(3)
+    if x == 8:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return x
+
+
+def sleep_and_leave_pid(path: Path) -> None:
+    path.write_text(str(os.getpid()))
+    time.sleep(60)
+
+
+if __name__ == "__main__":
+    store_root, raw_folder, log_file, *dest = [Path(word) for word in sys.argv[1:]]
+    print("ready", flush=True)
+    sys.stdin.readline()
+    print(run_pipeline(Store(store_root), raw_folder, *dest, log=log_file).digest)
