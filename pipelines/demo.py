@@ -34,7 +34,9 @@ def main() -> None:
     taccorl("ingest", "inspect", first)
     taccorl("ingest", str(recordings), f"--spec={SPEC}", f"--out={dataset}", f"--store={OUT / 'store'}")
     taccorl("check", str(dataset))
-    taccorl("view", str(dataset), "--episode=0", f"--save={OUT / 'episode.rrd'}", f"--sheet={OUT / 'contact_sheet.png'}")
+    taccorl(
+        "view", str(dataset), "--episode=0", f"--save={OUT / 'episode.rrd'}", f"--sheet={OUT / 'contact_sheet.png'}"
+    )
     taccorl("lineage", "explain", str(dataset), f"--store={OUT / 'store'}")
     print(f"\nrecordings     {recordings}")
     print(f"dataset        {dataset}   (LeRobotDataset('local/demo', root={str(dataset)!r}))")

@@ -9,8 +9,16 @@ from rich.text import Text
 
 from taccorl.data.inspection import Inventory
 
+WIDE = 150
+"""Columns of a log file or pipe, which has no width of its own."""
 COLORS = {"written": "green", "split": "yellow", "quarantined": "red", "refused": "red"}
 SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
+
+
+def console() -> Console:
+    """The terminal at its own width; anything else wide enough not to fold a topic's name."""
+    found = Console()
+    return found if found.is_terminal else Console(width=WIDE)
 
 
 class Bars:
@@ -44,37 +52,37 @@ def ingest_table(report: dict[str, Any]) -> None:
         name = r["recording"] + (f"#{r['part']}" if r["part"] else "")
         rows = str(sum(e["rows"] for e in written))
         table.add_row(_shorten(name), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows, r["reason"])
-    console = Console()
-    console.print(table)
+    out = console()
+    out.print(table)
     for r in report["recordings"]:
         if r["outcome"] != "written":
-            console.print(f"  look: [bold]{r['command']}[/bold]", highlight=False, soft_wrap=True)
+            out.print(f"  look: [bold]{r['command']}[/bold]", highlight=False, soft_wrap=True)
         for e in r["episodes"]:
             for f in e["findings"]:
                 if f["severity"] != "note":
                     label = Text(f"  {f['severity']}: ", SEVERITY[f["severity"]])
-                    console.print(label + Text(f"{_shorten(r['recording'])} {e['name']}: {f['text']}"), soft_wrap=True)
+                    out.print(label + Text(f"{_shorten(r['recording'])} {e['name']}: {f['text']}"), soft_wrap=True)
     counts = ", ".join(f"{n} {o}" for o, n in report["outcomes"].items())
-    console.print(f"{len(report['recordings'])} recordings: {counts}", highlight=False)
+    out.print(f"{len(report['recordings'])} recordings: {counts}", highlight=False)
 
 
 def findings_table(name: str, findings: list[Any]) -> None:
     """What ``taccorl check`` found in one episode or dataset."""
-    console = Console()
+    out = console()
     worst = "error" if any(f.severity == "error" for f in findings) else "warning"
     if not any(f.severity in ("error", "warning") for f in findings):
-        console.print(Text("ok       ", "green") + Text(name))
+        out.print(Text("ok       ", "green") + Text(name))
     else:
-        console.print(Text(f"{worst:9s}", SEVERITY[worst]) + Text(name))
+        out.print(Text(f"{worst:9s}", SEVERITY[worst]) + Text(name))
     for f in findings:
-        console.print(Text(f"  {f.severity:8s}", SEVERITY[f.severity]) + Text(f"{f.check}: {f.text}"), soft_wrap=True)
+        out.print(Text(f"  {f.severity:8s}", SEVERITY[f.severity]) + Text(f"{f.check}: {f.text}"), soft_wrap=True)
 
 
 def inventory_table(inventory: Inventory) -> None:
     """Channels, rates, gaps, clock skew and damage of one recording."""
-    console = Console()
+    out = console()
     files = f" ({len(inventory.source.files)} files)" if len(inventory.source.files) > 1 else ""
-    console.print(
+    out.print(
         f"[bold]{inventory.source.name}[/bold]{files}  {inventory.reader}, {inventory.duration_s:.2f} s",
         highlight=False,
     )
@@ -84,14 +92,14 @@ def inventory_table(inventory: Inventory) -> None:
     for t in inventory.topics:
         rate, gap = (f"{t.rate_hz:.1f}", f"{t.longest_gap_s:.3f}") if t.rate_hz else ("–", "–")
         table.add_row(t.topic, t.type.name, str(t.num_messages), rate, str(t.num_gaps), gap, _clock(t))
-    console.print(table)
+    out.print(table)
     for t in inventory.topics:
         if t.type.undecodable:
-            console.print(f"  [yellow]not decodable[/yellow] {t.type.undecodable}", highlight=False, soft_wrap=True)
+            out.print(f"  [yellow]not decodable[/yellow] {t.type.undecodable}", highlight=False, soft_wrap=True)
     for name, record in inventory.metadata.items():
-        console.print(f"  metadata {name}: {record}", highlight=False, soft_wrap=True, markup=False)
+        out.print(f"  metadata {name}: {record}", highlight=False, soft_wrap=True, markup=False)
     for d in inventory.damage:
-        console.print(Text("  damage ", "red") + Text(str(d)), soft_wrap=True)
+        out.print(Text("  damage ", "red") + Text(str(d)), soft_wrap=True)
 
 
 def _clock(t: Any) -> str:

@@ -1,7 +1,6 @@
 """What a decoded message means: numbers by name, pad frames, pictures, texts. The same for ROS 2, protobuf, JSON and arrays."""
 
 import base64
-import binascii
 import re
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +14,7 @@ from taccorl.errors import RecordingError, nearest
 
 def natural_key(name: str) -> tuple[Any, ...]:
     """Sort key that puts episode_2 before episode_10."""
-    return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name))
+    return tuple(int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", name)))
 
 
 def type_key(name: str) -> str:
@@ -56,9 +55,10 @@ def stamp_ns(value: Any) -> int | None:
             continue
         for sec, nsec in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs")):
             try:
-                return int(get(stamp, sec)) * 1_000_000_000 + int(get(stamp, nsec))
-            except (RecordingError, TypeError, ValueError):
+                found = int(get(stamp, sec)) * 1_000_000_000 + int(get(stamp, nsec))
+            except (RecordingError, TypeError, ValueError, OverflowError):
                 continue
+            return found if abs(found) < 2**63 else None
     return None
 
 
@@ -66,9 +66,9 @@ def text(value: Any, topic: str) -> str:
     """A std_msgs/String, a JSON string or ``{"data": …}``."""
     if isinstance(value, str):
         return value
-    found = get(value, "data")
+    found = _maybe(value, "data")
     if not isinstance(found, str):
-        raise RecordingError(f"{topic}: expected a text, found {type(found).__name__}")
+        raise RecordingError(f"{topic}: expected a text (std_msgs/String), found {type(found or value).__name__}")
     return found
 
 
@@ -78,22 +78,31 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
     indices: dict[tuple[str, ...], list[int]] = {}
 
     def pick(value: Any, numbers: np.ndarray) -> np.ndarray:
-        names = tuple(get(value, "name"))
+        found = get(value, "name")
+        if isinstance(found, str | bytes) or not hasattr(found, "__iter__"):
+            raise RecordingError(f"`name` is {found!r}, not a list of names")
+        names = tuple(str(n) for n in found)
         if names not in indices:
-            absent = [n for n in channel.pick if n not in names]
-            if absent:
-                raise RecordingError(f"no {absent[0]!r} among its names; {nearest(absent[0], names)}")
+            for name in channel.pick:
+                if names.count(name) != 1:
+                    how = "stands twice" if name in names else "is not"
+                    raise RecordingError(f"{name!r} {how} among its names; {nearest(name, names)}")
             indices[names] = [names.index(n) for n in channel.pick]
-        if numbers.size < len(names):
+        if numbers.size != len(names):
             raise RecordingError(f"{numbers.size} values for {len(names)} names in {channel.field!r}")
         return numbers[indices[names]]
 
     def extract(value: Any) -> np.ndarray:
         found = get(value, channel.field) if channel.field else value
         try:
-            numbers = np.asarray(found, dtype=np.float64).reshape(-1)
-        except (TypeError, ValueError) as error:
+            plain = np.asarray(found)
+            if plain.dtype.kind not in "biuf":  # NumPy would read the text "1.5" as 1.5, and None as not-a-number
+                raise TypeError(f"it is {type(found).__name__} of {plain.dtype}")
+            numbers = plain.astype(np.float64).reshape(-1)
+        except (TypeError, ValueError, OverflowError) as error:
             raise RecordingError(f"{channel.field or 'its value'} is no list of numbers: {error}") from error
+        if numbers.size == 0:
+            raise RecordingError(f"{channel.field or 'its value'} is empty")
         if channel.pick:
             numbers = pick(value, numbers)
         if scale is not None:
@@ -115,21 +124,45 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
         if isinstance(found, str):
             found = _from_base64(found)
         if isinstance(found, bytes | bytearray | memoryview):
+            if len(found) % dtype.itemsize:
+                raise RecordingError(f"{len(found)} bytes are no whole number of {wire.dtype} counts")
             counts = np.frombuffer(found, dtype)
         else:
-            exact = np.asarray(found).reshape(-1)
-            counts = exact.astype(dtype)
-            if not np.array_equal(counts, exact):
-                raise RecordingError(f"counts that are not {wire.dtype} (normalised by the driver?): record raw counts")
+            counts = _exact_counts(found, dtype)
         if counts.size != wire.rows * wire.columns:
             raise RecordingError(
                 f"{counts.size} taxels, sensor {sensor.name} has {wire.rows}×{wire.columns}; "
                 f"other layouts: a file in data_specs/sensors/"
             )
+        if counts.ndim == 2 and counts.shape != (wire.rows, wire.columns):
+            raise RecordingError(
+                f"a frame of {counts.shape[0]}×{counts.shape[1]} taxels, the wire of {sensor.name} is "
+                f"{wire.rows}×{wire.columns}: transposed already?"
+            )
+        if counts.max() > sensor.max_count:
+            raise RecordingError(
+                f"a count of {counts.max()}, {sensor.name} sends at most {sensor.max_count} ({sensor.adc_bits} bits without "
+                f"the lowest {sensor.wire_shift_bits}): another byte order, or another sensor?"
+            )
         frame = counts.reshape(wire.rows, wire.columns)
         return (frame.T if wire.transpose else frame).reshape(-1)
 
     return extract
+
+
+def _exact_counts(found: Any, dtype: np.dtype) -> np.ndarray:
+    """A list or array of whole numbers, in its own shape, as ``dtype``."""
+    try:
+        exact = np.asarray(found)
+        if exact.dtype.kind not in "biuf":
+            raise TypeError(f"{type(found).__name__} of {exact.dtype}")
+        bounds = np.iinfo(dtype)
+        whole = bool(((exact >= bounds.min) & (exact <= bounds.max) & (exact == np.floor(exact))).all())
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"no list of counts: {error}") from error
+    if not whole:
+        raise RecordingError(f"counts that are not {dtype.name} (normalised by the driver?): record raw counts")
+    return exact.astype(dtype)
 
 
 def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
@@ -139,15 +172,25 @@ def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
         RecordingError: damaged, or an encoding we do not decode.
     """
     if isinstance(value, np.ndarray) and value.ndim == 3:
+        if value.dtype != np.uint8 or value.shape[2] != 3:
+            raise RecordingError(f"a picture of {value.dtype} {value.shape}; (rows, columns, 3) of uint8 is read")
         return value if channel.channel_order == "rgb" else np.ascontiguousarray(value[..., ::-1])
     data = value if isinstance(value, bytes | np.ndarray) else get(value, channel.field or "data")
     if isinstance(data, str):
         data = _from_base64(data)
+    elif isinstance(data, bytes | bytearray | memoryview) or (isinstance(data, np.ndarray) and data.dtype == np.uint8):
+        data = bytes(data)
+    else:
+        raise RecordingError(f"a picture as {type(data).__name__}; bytes, or base64 text in JSON, are read")
     encoding = _maybe(value, "encoding")
     if encoding is not None:
-        return _raw_picture(value, bytes(data), str(encoding))
+        return _raw_picture(value, data, str(encoding))
     # A picture is never turned by its EXIF note: the camera's frame is the pixel grid.
-    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # no bytes, or a header that claims an absurd size
+        decoded = None
     if decoded is None:
         raise RecordingError(
             f"a picture of format {_maybe(value, 'format')!r} that OpenCV cannot decode (jpeg and png are read)"
@@ -159,8 +202,14 @@ def _raw_picture(value: Any, data: bytes, encoding: str) -> np.ndarray:
     channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
     if encoding not in channels:
         raise RecordingError(f"raw pictures in {encoding!r} are not read; {nearest(encoding, channels)}")
-    rows, columns, depth = int(get(value, "height")), int(get(value, "width")), channels[encoding]
-    step = int(_maybe(value, "step") or columns * depth)
+    depth = channels[encoding]
+    try:
+        rows, columns = int(get(value, "height")), int(get(value, "width"))
+        step = int(_maybe(value, "step") or columns * depth)
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"a raw picture without whole numbers for its size: {error}") from error
+    if min(rows, columns) <= 0 or step < columns * depth:
+        raise RecordingError(f"a raw picture of {rows}×{columns} {encoding} pixels, {step} bytes a row")
     if len(data) < rows * step:
         raise RecordingError(f"{len(data)} bytes for a picture of {rows}×{step} bytes")
     pixels = (
@@ -198,5 +247,5 @@ def _maybe(value: Any, field: str) -> Any:
 def _from_base64(data: str) -> bytes:
     try:
         return base64.b64decode(data, validate=True)
-    except binascii.Error as error:
+    except ValueError as error:  # not its alphabet (binascii.Error), or not even ASCII
         raise RecordingError(f"text that is not base64: {error}") from error

@@ -254,11 +254,19 @@ def load_sensor_spec(path: Path) -> SensorSpec:
     document = Document(SensorSpec, path)
     spec = document.value
     _check_version(document, spec.spec_version)
+    for key in ("rows", "columns", "adc_bits", "rate_hz", "scan_time_s", "gain_per_count", "baseline/frames"):
+        value = getattr(spec.baseline if "/" in key else spec, key.rpartition("/")[2])
+        if value <= 0:
+            raise document.error(key, f"{value:g} is not above 0")
+    if not 0 <= spec.wire_shift_bits < spec.adc_bits <= 32:
+        raise document.error("wire_shift_bits", f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no count")
     pad, wire = (spec.rows, spec.columns), (spec.wire.rows, spec.wire.columns)
     if (wire[::-1] if spec.wire.transpose else wire) != pad:
         raise document.error(
             "wire", f"{wire[0]}×{wire[1]} with transpose: {spec.wire.transpose} is not the pad's {pad[0]}×{pad[1]}"
         )
+    if spec.max_count > np.iinfo(spec.wire.dtype).max:
+        raise document.error("wire/dtype", f"{spec.max_count} counts do not fit the wire's {spec.wire.dtype}")
     if spec.max_count > np.iinfo(np.int16).max:
         raise document.error("adc_bits", f"{spec.max_count} counts do not fit the dataset's int16")
     return spec
@@ -278,13 +286,15 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
         raise document.error("sensors", "is not a key of this file; give `sensor:` on the tactile feature")
     if spec.fps <= 0:
         raise document.error("fps", f"{spec.fps} is not a rate")
+    if not spec.features:
+        raise document.error("features", "holds nothing")
     sensors: dict[str, SensorSpec] = {}
     for key, feature in spec.features.items():
         where = f"features/{key}"
         if not (key == "action" or key.startswith("observation.")):
             raise document.error(where, "LeRobot's policies read `action` and `observation.*` only")
         if feature.sensor is not None:
-            sensors[key] = load_sensor_spec(path.parent / feature.sensor)
+            sensors[key] = load_sensor_spec(_beside(document, f"{where}/sensor", feature.sensor))
         _check_feature(document, where, feature, sensors.get(key))
     return dataclasses.replace(spec, sensors=sensors)
 
@@ -292,11 +302,20 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
 def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, sensor: SensorSpec | None) -> None:
     if any(n <= 0 for n in feature.shape) or not feature.shape:
         raise document.error(f"{where}/shape", f"{list(feature.shape)} holds nothing")
+    if feature.rate_hz <= 0:
+        raise document.error(f"{where}/rate_hz", f"{feature.rate_hz:g} is not a rate")
     if feature.dtype == "video":
         if len(feature.shape) != 3 or feature.shape[2] != 3 or feature.shape[0] % 2 or feature.shape[1] % 2:
             raise document.error(
                 f"{where}/shape", f"{list(feature.shape)} is not [rows, columns, 3] with even rows and columns"
             )
+        for option in ("names", "pads", "sensor"):
+            if getattr(feature, option):
+                raise document.error(f"{where}/{option}", "has no effect on pictures; remove it")
+        if isinstance(feature.unit, tuple) or isinstance(feature.range, dict) or feature.history != 1:
+            raise document.error(where, "pictures have one unit, one range and no history")
+        if feature.range[0] >= feature.range[1]:
+            raise document.error(f"{where}/range", "a lower bound is not below its upper bound")
         return
     if len(feature.shape) != 1:
         raise document.error(
@@ -322,6 +341,8 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
         if feature.pads or feature.history != 1:
             raise document.error(where, "`pads` and `history` need `sensor`")
         return
+    if len(set(feature.pads)) != len(feature.pads):
+        raise document.error(f"{where}/pads", "a pad stands twice")
     expected = feature.history * len(feature.pads) * sensor.rows * sensor.columns
     if feature.dtype != "int16" or feature.size != expected:
         raise document.error(
@@ -343,7 +364,7 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
     _check_version(document, spec.spec_version)
     if spec.contract is not None:
         raise document.error("contract", "is not a key of this file; give `dataset:`")
-    contract = load_dataset_spec(path.parent / spec.dataset)
+    contract = load_dataset_spec(_beside(document, "dataset", spec.dataset))
     spec = dataclasses.replace(spec, contract=contract)
     for key in spec.features:
         if key not in contract.features:
@@ -366,15 +387,25 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
             raise document.error(
                 f"{where}/scale", f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
             )
+        if channel.pick and channel.field is None:
+            raise document.error(f"{where}/pick", "names elements of a `field` (position, velocity …); none is given")
+    if spec.max_clock_spread_s <= 0:
+        raise document.error("max_clock_spread_s", f"{spec.max_clock_spread_s:g} s: no two clocks agree to that")
     _check_sources(document, spec)
     return spec
 
 
 def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mapping: MappingSpec) -> None:
     where, feature = f"features/{key}", spec.target.features[key]
+    if not mapping.channels or len(set(mapping.channels)) != len(mapping.channels):
+        raise document.error(f"{where}/channels", "names no channel, or one twice")
     for name in mapping.channels:
         if name not in spec.channels:
             raise document.error(f"{where}/channels", f"no channel {name!r}; {nearest(name, spec.channels)}")
+        if feature.dtype == "video" or key in spec.target.sensors:
+            for option in ("pick", "scale"):
+                if getattr(spec.channels[name], option):
+                    raise document.error(f"channels/{name}/{option}", f"has no effect: {key} holds no named numbers")
         has_age = spec.channels[name].max_age_s is not None
         if has_age and mapping.align == "hold":
             raise document.error(
@@ -407,8 +438,19 @@ def _check_sources(document: Document[Any], spec: RecordingSpec) -> None:
         if given != (field == needs):
             verb = "is missing" if not given else "has no effect"
             raise document.error("instruction", f"`{field}` {verb} with `from: {instruction.from_}`")
+    if instruction.text is not None and not instruction.text.strip():
+        raise document.error("instruction/text", "is empty; the policy reads it")
     if instruction.from_ == "markers" and episodes.by != "markers":
         raise document.error("instruction/from", "markers name the instruction only with `episodes: by: markers`")
+
+
+def _beside(document: Document[Any], key: str, name: str) -> Path:
+    """The file that ``key`` names, relative to the document's own folder."""
+    path = document.path.parent / name
+    if not path.is_file():
+        siblings = [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+        raise document.error(key, f"no file {name!r} beside it; {nearest(path.name, siblings)}")
+    return path
 
 
 def _check_version(document: Document[Any], version: int) -> None:

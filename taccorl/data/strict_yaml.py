@@ -1,9 +1,12 @@
 """YAML into frozen dataclasses, strictly: a wrong key or value is an error with file, line and the nearest name.
 
-Keys that start with ``x-`` are shared anchors and ignored. Nothing is guessed: ``no`` is not the text "no".
+Keys that start with ``x-`` are shared anchors and ignored. Nothing is guessed: ``no`` is not the text "no", ``"3"`` is not
+the number 3, and 010, 0x1F, 1:30 and .inf, which YAML 1.1 reads in ways of its own, are not numbers at all.
 """
 
 import dataclasses
+import math
+import re
 import types
 import typing
 from pathlib import Path
@@ -12,6 +15,9 @@ from typing import Any, Literal, get_args, get_origin
 import yaml
 
 from taccorl.errors import SpecError, nearest
+
+PLAIN_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
+PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
 
 class Document[T]:
@@ -30,8 +36,14 @@ class Document[T]:
             raise SpecError(f"{self.path}: cannot be read as a spec: {error}") from error
         try:
             root = yaml.compose(text, Loader=yaml.SafeLoader)
+        except yaml.MarkedYAMLError as error:
+            line = error.problem_mark.line + 1 if error.problem_mark else 1
+            hint = "; indent with spaces" if "'\\t'" in str(error.problem) else ""
+            raise SpecError(f"{self.path}:{line}: is not YAML: {error.problem}{hint}") from error
         except yaml.YAMLError as error:
             raise SpecError(f"{self.path}: is not YAML: {' '.join(str(error).split())}") from error
+        except RecursionError as error:
+            raise SpecError(f"{self.path}: is nested too deeply for a spec") from error
         if root is None:
             raise SpecError(f"{self.path}: is empty; a complete example is any file in data_specs/")
         self.value: T = self._build(cls, root, "")
@@ -42,7 +54,8 @@ class Document[T]:
         while parts and "/".join(parts) not in self._lines:
             parts.pop()
         line = self._lines.get("/".join(parts), 1)
-        return SpecError(f"{self.path}:{line}: {key.replace('/', ' → ')}: {text}")
+        place = f"{key.replace('/', ' → ')}: " if key else ""
+        return SpecError(f"{self.path}:{line}: {place}{text}")
 
     def _build(self, kind: Any, node: yaml.Node, key: str) -> Any:
         self._lines.setdefault(key, node.start_mark.line + 1)
@@ -57,7 +70,8 @@ class Document[T]:
                 raise self.error(key, f"{text!r} is none of {', '.join(map(repr, args))}; {nearest(text, args)}")
             return text
         if origin is dict:
-            return {name: self._build(args[1], child, f"{key}/{name}") for name, child in self._items(node, key)}
+            items = self._items(node, key)
+            return {name: self._build(args[1], child, f"{key}/{name}" if key else name) for name, child in items}
         if origin is tuple:
             return self._tuple(args, node, key)
         return self._scalar(kind, node, key)
@@ -67,13 +81,19 @@ class Document[T]:
             raise self.error(key, f"expected keys and values, found {_describe(node)}")
         items: dict[str, yaml.Node] = {}
         for name_node, child in node.value:
+            if not isinstance(name_node, yaml.ScalarNode):
+                raise self.error(key, f"a key must be a word, found {_describe(name_node)}")
             name = str(name_node.value)
-            self._lines[f"{key}/{name}" if key else name] = name_node.start_mark.line + 1
+            path = f"{key}/{name}" if key else name
+            self._lines[path] = name_node.start_mark.line + 1
             if name in items:
-                raise self.error(f"{key}/{name}" if key else name, "stands here twice; keep one")
-            if not name.startswith("x-"):
-                items[name] = child
-        return list(items.items())
+                raise self.error(path, "stands here twice; keep one")
+            if name == "<<":
+                raise self.error(
+                    path, "merge keys are not read; write the keys out, or share one whole value by an anchor"
+                )
+            items[name] = child
+        return [(name, child) for name, child in items.items() if not name.startswith("x-")]
 
     def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
         hints = typing.get_type_hints(cls)
@@ -131,16 +151,17 @@ class Document[T]:
         tag = node.tag.rsplit(":", 1)[-1]
         if kind is bool and tag == "bool":
             return str(node.value).lower() in ("true", "yes", "on")
-        if kind is int and tag == "int":
-            return int(yaml.safe_load(node.value))
-        if kind is float and tag in ("float", "int", "str"):
-            try:
-                return float(node.value)  # YAML 1.1 reads 1e-3 as text; it is a number here
-            except ValueError:
-                pass
+        plain = node.style is None  # quoted digits are a text
+        if kind is int and plain and PLAIN_INT.fullmatch(node.value):
+            return int(node.value)
+        # By its own rule, not by YAML 1.1's, which reads 1e-3 as a text
+        if kind is float and plain and PLAIN_FLOAT.fullmatch(node.value) and math.isfinite(float(node.value)):
+            return float(node.value)
         if kind is str and tag == "str":
             return str(node.value)
-        hint = "; put it in quotes" if kind is str else ""
+        hint = {str: "; put it in quotes", int: "; plain digits only", float: "; plain decimal digits only"}.get(
+            kind, ""
+        )
         raise self.error(key, f"expected {kind.__name__}, found {_describe(node)}{hint}")
 
 

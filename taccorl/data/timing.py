@@ -26,7 +26,7 @@ class ClockReading:
     order: np.ndarray
     """(N,) index of each kept sample among the channel's messages."""
     skew_s: float
-    """Median of log time − stamp; 0 on the log clock."""
+    """Median of log time − event time on the header clock, event time being stamp − latency; 0 on the log clock."""
     duplicates: int
     out_of_order: int
     zero_stamps: int
@@ -46,6 +46,7 @@ def read_clock(
         log_ns: (M,) when each message was recorded.
         stamp_ns: (M,) header stamps, or None where messages have none.
     """
+    assert clock == "log" or stamp_ns is not None, "load_recording refuses a header clock without headers"
     time_ns = log_ns if clock == "log" or stamp_ns is None else stamp_ns
     keep = np.ones(len(time_ns), dtype=bool)
     if drop_zero_stamp and stamp_ns is not None:
@@ -55,7 +56,7 @@ def read_clock(
     kept = time_ns[index]
     skew_s = 0.0
     if clock == "header" and stamp_ns is not None and len(index):
-        skew_s = float(np.median(log_ns[index] - stamp_ns[index])) / NS_PER_S
+        skew_s = float(np.median(log_ns[index] - stamp_ns[index])) / NS_PER_S + latency_s
     out_of_order = int((np.diff(kept) < 0).sum())
     by_time = np.argsort(kept, kind="stable")
     kept, index = kept[by_time], index[by_time]
@@ -75,28 +76,30 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
     """Are all channels on one clock?
 
     Args:
-        skew_s: topic → median of log time − stamp; 0 for channels on the log clock.
+        skew_s: topic → ``ClockReading.skew_s``.
 
     Raises:
         RecordingError: two channels' clocks differ by more than ``max_spread_s``.
     """
-    if not skew_s:
+    ranked = sorted(skew_s.items(), key=lambda item: item[1])
+    if not ranked or ranked[-1][1] - ranked[0][1] <= max_spread_s:
         return
-    center = float(np.median(list(skew_s.values())))
-    topic, skew = max(skew_s.items(), key=lambda item: abs(item[1] - center))
-    low, high = min(skew_s.values()), max(skew_s.values())
-    if high - low <= max_spread_s:
-        return
-    if abs(high - low) > SIM_TIME_S:
-        topic, skew = max(skew_s.items(), key=lambda item: abs(item[1]))
+    # Parted at the widest step, the smaller group is the odd one; of equal groups the one further from log time.
+    cut = int(np.argmax(np.diff([skew for _, skew in ranked]))) + 1
+    halves = [(group, float(np.median([skew for _, skew in group]))) for group in (ranked[:cut], ranked[cut:])]
+    (odd, off_s), (_, usual_s) = sorted(halves, key=lambda half: (len(half[0]), -abs(half[1])))
+    if abs(off_s - usual_s) > SIM_TIME_S:
+        sim, sim_s = max(halves, key=lambda half: abs(half[1]))
         raise RecordingError(
-            f"stamps of {topic} are {skew:.6g} s behind its log time (simulation time?) while other channels are on the "
-            f"log clock: set `clock: log` for the recording, or give every channel a header clock"
+            f"stamps of {', '.join(topic for topic, _ in sim)} are {sim_s:.6g} s behind their log time (simulation time?) "
+            f"while other channels are on the log clock: set `clock: log` for the recording, or give every channel a "
+            f"header clock"
         )
     raise RecordingError(
-        f"stamps of {topic} are {skew - center:+.3f} s off the other channels' clock "
-        f"(log time − stamp: {skew:.3f} s against {center:.3f} s): set `latency_s: {center - skew:.3f}` on that channel if "
-        f"this is constant, else `clock: log`, and mend the recorder's clock"
+        f"stamps of {', '.join(topic for topic, _ in odd)} are {abs(off_s - usual_s):.3f} s "
+        f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (log time − stamp: {off_s:.3f} s against "
+        f"{usual_s:.3f} s, `max_clock_spread_s` allows {max_spread_s:g} s): if this is constant, add "
+        f"{usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`, and mend the recorder's clock"
     )
 
 
@@ -145,8 +148,9 @@ def match(
     has = last >= 0
     safe = np.maximum(last, 0)
     if len(time_ns) == 0:
-        nothing = np.full((len(grid_ns), history), -1)
-        return Matched(nothing, None, np.full(len(grid_ns), np.inf), np.zeros(len(grid_ns), dtype=bool))
+        index = np.full((len(grid_ns), history if align == "window" else 1), -1)
+        weight = np.zeros(len(grid_ns)) if align == "interpolate" else None
+        return Matched(index, weight, np.full(len(grid_ns), np.inf), np.zeros(len(grid_ns), dtype=bool))
     age_s = np.where(has, (grid_ns - time_ns[safe]) / NS_PER_S, np.inf)
     if align == "hold":
         return Matched(np.where(has, last, -1)[:, None], None, age_s, has)
@@ -160,8 +164,9 @@ def match(
         ahead_s = (time_ns[following] - grid_ns) / NS_PER_S
         fresh &= exact | ((following > safe) & (ahead_s <= max_age_s))
         step = np.maximum(time_ns[following] - time_ns[safe], 1)
-        weight = np.where(exact, 0.0, (grid_ns - time_ns[safe]) / step)
-        return Matched(np.where(has, last, -1)[:, None], weight, np.where(exact, 0.0, -ahead_s), fresh)
+        weight = np.where(exact | ~has | (following == safe), 0.0, (grid_ns - time_ns[safe]) / step)
+        age_s = np.where(has, np.where(exact, 0.0, -ahead_s), np.inf)
+        return Matched(np.where(has, last, -1)[:, None], weight, age_s, fresh)
     oldest = last - history + 1
     span_s = np.where(oldest >= 0, (grid_ns - time_ns[np.maximum(oldest, 0)]) / NS_PER_S, np.inf)
     fresh &= (oldest >= 0) & (span_s <= max_age_s + (history - 1) / rate_hz)

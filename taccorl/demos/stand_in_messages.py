@@ -7,13 +7,14 @@ uses messages of the same fields, described at run time. Pictures in JSON and pr
 
 import base64
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
-from mcap_ros2._dynamic import serialize_dynamic
+from mcap_ros2._dynamic import serialize_dynamic  # its public Writer cannot mix encodings in one file
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -27,40 +28,40 @@ ENCODINGS = ("ros2", "json", "protobuf")
 Message = dict[str, Any]
 
 
-def _definition(fields: str, **parts: str) -> str:
-    """A .msg text followed by the texts it refers to, as rosbag2 stores them; commas stand for line ends."""
+def _definition(fields: str, used: Mapping[str, str] = MappingProxyType({})) -> str:
+    """A .msg text followed by the texts of the types it uses, as rosbag2 stores them; commas stand for line ends."""
     text = fields.replace(", ", "\n")
-    for name, part in parts.items():
-        text += f"\n{'=' * 80}\nMSG: {name.replace('__', '/')}\n" + part.replace(", ", "\n")
+    for name, part in used.items():
+        text += f"\n{'=' * 80}\nMSG: {name}\n" + part.replace(", ", "\n")
     return text
 
 
 _HEADER = {
-    "std_msgs__Header": "builtin_interfaces/Time stamp, string frame_id",
-    "builtin_interfaces__Time": "int32 sec, uint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp, string frame_id",
+    "builtin_interfaces/Time": "int32 sec, uint32 nanosec",
 }
 _LAYOUT = {
-    "std_msgs__MultiArrayLayout": "MultiArrayDimension[] dim, uint32 data_offset",
-    "std_msgs__MultiArrayDimension": "string label, uint32 size, uint32 stride",
+    "std_msgs/MultiArrayLayout": "MultiArrayDimension[] dim, uint32 data_offset",
+    "std_msgs/MultiArrayDimension": "string label, uint32 size, uint32 stride",
 }
 _TRANSFORM = {
-    "geometry_msgs__TransformStamped": "std_msgs/Header header, string child_frame_id, Transform transform",
-    "geometry_msgs__Transform": "Vector3 translation, Quaternion rotation",
-    "geometry_msgs__Vector3": "float64 x, float64 y, float64 z",
-    "geometry_msgs__Quaternion": "float64 x, float64 y, float64 z, float64 w",
+    "geometry_msgs/TransformStamped": "std_msgs/Header header, string child_frame_id, Transform transform",
+    "geometry_msgs/Transform": "Vector3 translation, Quaternion rotation",
+    "geometry_msgs/Vector3": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Quaternion": "float64 x, float64 y, float64 z, float64 w",
 }
 ROS2_DEFINITIONS = {
     JOINT_STATE: _definition(
-        "std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort", **_HEADER
+        "std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort", _HEADER
     ),
-    COMPRESSED_IMAGE: _definition("std_msgs/Header header, string format, uint8[] data", **_HEADER),
-    UINT8_ARRAY: _definition("std_msgs/MultiArrayLayout layout, uint8[] data", **_LAYOUT),
+    COMPRESSED_IMAGE: _definition("std_msgs/Header header, string format, uint8[] data", _HEADER),
+    UINT8_ARRAY: _definition("std_msgs/MultiArrayLayout layout, uint8[] data", _LAYOUT),
     STRING: "string data",
     ARM_STATUS: _definition(
         "uint8 ctrl_mode, uint8 arm_status, uint8 mode_feedback, uint8 teach_status, uint8 motion_status, "
         "uint8 trajectory_num, int64 err_code"
     ),
-    TF: _definition("geometry_msgs/TransformStamped[] transforms", **_TRANSFORM, **_HEADER),
+    TF: _definition("geometry_msgs/TransformStamped[] transforms", _TRANSFORM | _HEADER),
     # rosbag2 stores the three parts of a service type like this; no .msg parser accepts the separators
     SERVICE_EVENT: "bool enable_request\n---\nbool enable_response\n---\n",
 }
@@ -93,7 +94,9 @@ def _proto_files() -> descriptor_pb2.FileDescriptorSet:
     for full_name, fields in _PROTO_MESSAGES.items():
         package, name = full_name.split(".")
         if package not in files:
-            files[package] = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto3")
+            files[package] = descriptor_pb2.FileDescriptorProto(
+                name=f"{package}.proto", package=package, syntax="proto3"
+            )
         message = files[package].message_type.add(name=name)
         for number, field in enumerate(fields.split(), start=1):
             field_name, kind = field.split(":")
@@ -132,8 +135,10 @@ def _to_json(ros_type: str) -> Callable[[Message], bytes]:
 
 
 def _json_schema(ros_type: str) -> bytes:
-    names = ["timestamp", "frame_id", "data", "format"] if ros_type == COMPRESSED_IMAGE else []
-    names = names or [line.split()[-1] for line in ROS2_DEFINITIONS[ros_type].split("\n" + "=" * 80)[0].splitlines()]
+    if ros_type == COMPRESSED_IMAGE:
+        names = ["timestamp", "frame_id", "data", "format"]
+    else:
+        names = [line.split()[-1] for line in ROS2_DEFINITIONS[ros_type].split("\n=")[0].splitlines()]
     return json.dumps({"title": _OTHER_NAMES[ros_type][0], "type": "object", "required": names}).encode()
 
 

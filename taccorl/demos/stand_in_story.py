@@ -29,6 +29,7 @@ STAND_HEIGHT_M = 0.012  # the tube waits in a small stand
 MISSED_BY_M = 0.038  # a failed insertion stops this much too high
 
 _GRID_HZ = 500
+SHORTEST_EPISODE_S = 2.0  # else the pads would touch within half a second of the start marker
 _MARKER_MARGIN_S = 0.1  # between the edge of an episode's time slot and its marker
 _TREMOR_RAD = 0.002  # times three sines
 _UP = np.array([0.0, 0.0, 1.0])

@@ -59,7 +59,8 @@ def _artefact_around(path: Path) -> Path | None:
     for folder in (path, *path.parents):
         if manifest := read_manifest(folder):
             inside = path.relative_to(folder).as_posix()
-            if inside == "." or any(name == inside or name.startswith(f"{inside}/") for name in manifest["files"]):
+            known = [*manifest["files"], manifest["place"]]
+            if inside == "." or any(name == inside or name.startswith(f"{inside}/") for name in known):
                 return folder
     return None
 

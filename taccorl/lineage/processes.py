@@ -147,6 +147,7 @@ class _Worker:
 
     def _died(self) -> list[tuple[int, Done | Failed]]:
         self.is_dead = True
+        self.pipe.close()
         self.process.join(GRACE_S)
         if self.process.is_alive():  # it closed its pipe but goes on: no use to us
             self.process.kill()

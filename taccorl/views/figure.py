@@ -6,12 +6,12 @@ z points out of the gripper and y is the way the fingers slide. Letters in shape
 
 import re
 
-import cv2
 import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from taccorl.data.episode import Episode
+from taccorl.views.colors import ARM_COLORS, LINE_COLORS, heat
 from taccorl.views.touch import Pad
 
 # Parent-to-link origin: position (m), then fixed-axis roll, pitch, yaw (rad). agilexrobotics/Piper_ros,
@@ -31,11 +31,18 @@ PAD_WIDTH_M = 0.024  # 12 taxels, 2 mm apart
 # Schematic from here on.
 BASE_POS_WORLD = {"left": (0.0, 0.3, 0.0), "right": (0.0, -0.3, 0.0)}
 BONE_RADIUS_M = (0.045, 0.0, 0.036, 0.032, 0.0, 0.028, 0.024)  # base, link 1 to 6; 0: no bone, its child sits on it
-JOINT_RADIUS_M = (0.052, 0.048, 0.044, 0.036, 0.036, 0.034)
+# Radius, length, and place on the joint's own axis: frames 1 and 2, and 4 and 5, have one origin, their drums do not.
+JOINT_DRUMS_M = (
+    (0.056, 0.030, -0.070),
+    (0.046, 0.100, 0.0),
+    (0.042, 0.090, 0.0),
+    (0.040, 0.026, -0.075),
+    (0.034, 0.074, 0.0),
+    (0.034, 0.026, 0.010),
+)
 PAD_THICKNESS_M = 0.003
 FINGER_THICKNESS_M = 0.010
-BONE_COLOR = {"left": (96, 165, 250), "right": (251, 146, 60)}
-JOINT_COLOR = (71, 85, 105)
+PLATE_COLOR = (71, 85, 105)
 FINGER_COLOR = (51, 65, 85)
 
 
@@ -89,19 +96,21 @@ def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], index
         for finger, name in enumerate("ab"):
             _send_poses(rec, f"{root}/finger_{name}", faces[:, finger], indexes)
             pad = by_name.get(f"{side}_{name}")
-            if pad is not None:
-                colors = pad_colors(pad)
-                columns = rr.Boxes3D.columns(colors=colors)
+            if pad is None:
+                rec.log(f"{root}/finger_{name}/pad", rr.Boxes3D.from_fields(colors=[PLATE_COLOR]), static=True)
+            else:  # never static as well: what is static hides what changes
+                columns = rr.Boxes3D.columns(colors=pad_colors(pad))
                 rr.send_columns(f"{root}/finger_{name}/pad", indexes, columns, recording=rec)
         path = faces[:, :, :3, 3].mean(axis=1)
-        rec.log(f"{root}/tool_path", rr.LineStrips3D([path], colors=[(*BONE_COLOR[side], 120)], radii=0.0015), static=True)
+        rec.log(
+            f"{root}/tool_path", rr.LineStrips3D([path], colors=[(*ARM_COLORS[side], 120)], radii=0.0015), static=True
+        )
 
 
 def pad_colors(pad: Pad) -> np.ndarray:
     """(T,) RGBA as uint32: the heatmaps' colours, 0 at no active taxel, full where every taxel is at the contact threshold."""
-    share = np.clip(pad.sum_count / pad.full_sum_count, 0.0, 1.0)
-    bgr = cv2.applyColorMap((255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_INFERNO)[:, 0].astype(np.uint32)
-    return (bgr[:, 2] << 24) | (bgr[:, 1] << 16) | (bgr[:, 0] << 8) | 255
+    rgb = heat(pad.sum_count / pad.full_sum_count).astype(np.uint32)
+    return (rgb[:, 0] << 24) | (rgb[:, 1] << 16) | (rgb[:, 2] << 8) | 255
 
 
 def _send_poses(rec: rr.RecordingStream, path: str, poses: np.ndarray, indexes: list[rr.TimeColumn]) -> None:
@@ -113,35 +122,43 @@ def _send_poses(rec: rr.RecordingStream, path: str, poses: np.ndarray, indexes: 
 def _log_still_parts(rec: rr.RecordingStream, root: str, side: str) -> None:
     """Everything that does not change its shape, each in the frame of the link that carries it."""
     rec.log(root, rr.Transform3D(translation=BASE_POS_WORLD[side]), static=True)
-    plate = rr.Cylinders3D(lengths=[0.03], radii=[0.07], centers=[(0, 0, 0.015)], colors=[JOINT_COLOR], fill_mode="solid")
+    plate = rr.Cylinders3D(
+        lengths=[0.03], radii=[0.07], centers=[(0, 0, 0.015)], colors=[PLATE_COLOR], fill_mode="solid"
+    )
     rec.log(f"{root}/plate", plate, static=True)
-    label = rr.Points3D([(0, 0, -0.02)], labels=[f"{side} arm"], radii=0.001, colors=[BONE_COLOR[side]], show_labels=True)
+    label = rr.Points3D(
+        [(0, 0, -0.02)], labels=[f"{side} arm"], radii=0.001, colors=[ARM_COLORS[side]], show_labels=True
+    )
     rec.log(f"{root}/label", label, static=True)
     ends = [xyz for xyz, _ in LINK_ORIGINS] + [(0.0, 0.0, 0.1)]
     for i, (radius, end) in enumerate(zip(BONE_RADIUS_M, ends, strict=True)):
         link = f"{root}/link_{i}" if i else root
         if radius:
-            rec.log(f"{link}/bone", _capsule(np.array(end), radius, BONE_COLOR[side]), static=True)
+            rec.log(f"{link}/bone", _capsule(np.array(end), radius, ARM_COLORS[side]), static=True)
         if i:
-            r = JOINT_RADIUS_M[i - 1]
-            drum = rr.Cylinders3D(lengths=[2.2 * r], radii=[r], colors=[JOINT_COLOR], fill_mode="solid")
+            radius, length, z = JOINT_DRUMS_M[i - 1]
+            drum = rr.Cylinders3D(
+                lengths=[length], radii=[radius], centers=[(0, 0, z)], colors=[LINE_COLORS[i - 1]], fill_mode="solid"
+            )
             rec.log(f"{link}/joint", drum, static=True)
-    rail = rr.Boxes3D(half_sizes=[(0.018, 0.055, 0.016)], centers=[(0, 0, 0.116)], colors=[FINGER_COLOR], fill_mode="solid")
+    rail = rr.Boxes3D(
+        half_sizes=[(0.018, 0.055, 0.016)], centers=[(0, 0, 0.116)], colors=[FINGER_COLOR], fill_mode="solid"
+    )
     rec.log(f"{root}/link_6/rail", rail, static=True)
     for name, sign in (("a", 1.0), ("b", -1.0)):
         behind = sign * (PAD_THICKNESS_M + FINGER_THICKNESS_M / 2)
         for part, thickness, y, color in (
             ("body", FINGER_THICKNESS_M, behind, FINGER_COLOR),
-            ("pad", PAD_THICKNESS_M, sign * PAD_THICKNESS_M / 2, (0, 0, 0)),
+            ("pad", PAD_THICKNESS_M, sign * PAD_THICKNESS_M / 2, None),
         ):
             half = (PAD_WIDTH_M / 2, thickness / 2, FINGER_LENGTH_M / 2)
-            box = rr.Boxes3D(half_sizes=[half], centers=[(0, y, 0)], colors=[color], fill_mode="solid")
+            box = rr.Boxes3D(half_sizes=[half], centers=[(0, y, 0)], colors=color, fill_mode="solid")
             rec.log(f"{root}/finger_{name}/{part}", box, static=True)
 
 
 def _capsule(end: np.ndarray, radius_m: float, color: tuple[int, int, int]) -> rr.Capsules3D:
     """From the link's origin to ``end``."""
-    turn, _ = Rotation.align_vectors([end], [(0.0, 0.0, 1.0)])
+    turn = Rotation.align_vectors([end], [(0.0, 0.0, 1.0)])[0]
     return rr.Capsules3D(
         lengths=[np.linalg.norm(end)],
         radii=[radius_m],

@@ -14,7 +14,6 @@ class Group:
     """Lines of one plot."""
 
     name: str
-    """Also an entity path's last part."""
     unit: str
     columns: tuple[int, ...]
     labels: tuple[str, ...]
@@ -22,6 +21,11 @@ class Group:
     @property
     def title(self) -> str:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def path(self) -> str:
+        """The last part of its entity path, e.g. ``left_arm_rad``."""
+        return re.sub(r"\W+", "_", self.title).strip("_")
 
 
 def groups_of(feature: FeatureSpec) -> list[Group]:
@@ -37,7 +41,8 @@ def groups_of(feature: FeatureSpec) -> list[Group]:
             for side in sides:
                 of_side = tuple(i for i in columns if names[i].split("_")[0] == side)
                 labels = tuple(names[i].removeprefix(f"{side}_") for i in of_side)
-                groups.append(Group(f"{side} arm", unit, of_side, labels))
+                name = f"{side} arm" if side in ("left", "right") else side
+                groups.append(Group(name, unit, of_side, labels))
         else:
             kind = "grippers" if all("gripper" in names[i] for i in columns) else "joints"
             labels = tuple(names[i].removesuffix("_gripper") for i in columns)

@@ -58,7 +58,7 @@ class Pad:
 
 
 def pads_of(episode: Episode) -> list[Pad]:
-    """The episode's pads in the data spec's order. A feature with history shows its newest reading, and only pads not shown yet."""
+    """The episode's pads; of a feature with history the newest reading, and only where no other feature has the pad."""
     keys = [key for key in episode.spec.keys("tactile") if key in episode.arrays]
     found: dict[str, Pad] = {}
     for key in sorted(keys, key=lambda k: episode.spec.features[k].history):

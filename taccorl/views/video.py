@@ -1,15 +1,16 @@
 """An episode's part of a dataset's mp4 as a small mp4 of its own: packets are copied, never decoded or encoded again."""
 
+import contextlib
 import io
 from dataclasses import dataclass
 from fractions import Fraction
 
 import av
 from av.container import InputContainer
+from av.error import FFmpegError
 
 from taccorl.data.episode import Video
 from taccorl.errors import DatasetError
-
 
 MOST_REORDERED_FRAMES = 16
 """H.264's and AV1's limit: so far before a frame shown now may stand frames shown later."""
@@ -33,10 +34,12 @@ def cut(video: Video, fps: int) -> Clip:
         DatasetError: the file is not there, cannot be read, or holds fewer frames than the dataset says.
     """
     try:
-        with av.open(str(video.path)) as source:
+        with contextlib.closing(av.open(str(video.path))) as source:
             return _cut(source, video, fps)
-    except (av.FFmpegError, OSError, IndexError) as error:
-        raise DatasetError(f"{video.path}: cannot be read as a video ({error}): copy or write the dataset again") from error
+    except (FFmpegError, OSError, IndexError) as error:
+        raise DatasetError(
+            f"{video.path}: cannot be read as a video ({error}): copy or write the dataset again"
+        ) from error
 
 
 def _cut(source: InputContainer, video: Video, fps: int) -> Clip:

@@ -10,15 +10,14 @@ import time
 from pathlib import Path
 
 from taccorl.lineage.explain import trace
-from taccorl.lineage.manifest import read_manifest
-from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
 
-from . import toys
-from .toys import PIPELINE_MIN_S, make_raw, run_pipeline
+from . import kill_points, toys
+from .kill_points import TWO, temporary, wrong
+from .toys import make_raw, run_pipeline
 
-NUM_KILLS = 25
-FILE_EVENTS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.listdir", "os.scandir", "fcntl.flock"}
+NUM_KILLS = 20
+MAX_TRIES = 60
 
 
 def start(tmp_path: Path, destination: Path) -> subprocess.Popen:
@@ -38,115 +37,52 @@ def go(process: subprocess.Popen) -> None:
     process.stdin.flush()
 
 
-def temporary(folder: Path) -> list[Path]:
-    return [p for p in folder.rglob(".*") if p.is_dir() and p.name not in (".locks", ".digests")]
-
-
-def wrong(store: Store) -> list[Path]:
-    """Artefacts in the store that do not match their manifest."""
-    return [path for path in store.artefacts() if not read_manifest(path) or trace(path, None).problems]
-
-
-def test_sigkill_at_25_random_moments_never_leaves_a_half_artefact_and_a_rerun_gives_the_same_digest(tmp_path):
+def test_sigkill_at_20_random_moments_never_leaves_a_half_artefact_and_a_rerun_gives_the_same_digest(tmp_path):
     rng = random.Random(0)
-    expected = run_pipeline(Store(tmp_path / "reference"), make_raw(tmp_path / "raw"))
-    seen_temporary = seen_finished = 0
-    for i in range(NUM_KILLS):
+    raw, start_s = make_raw(tmp_path / "raw"), time.perf_counter()
+    expected = run_pipeline(Store(tmp_path / "reference"), raw)
+    duration_s = time.perf_counter() - start_s
+    num_killed = num_with_temporary = 0
+    for i in range(MAX_TRIES):
         here = tmp_path / f"kill_{i}"
         make_raw(here / "raw")
         process = start(here, here / "dataset")
         go(process)
-        time.sleep(rng.uniform(0, PIPELINE_MIN_S))  # the pauses alone last longer: it cannot have finished
+        time.sleep(rng.uniform(0, duration_s))
         process.kill()
         process.communicate()
-        assert process.returncode == -signal.SIGKILL
+        num_killed += process.returncode == -signal.SIGKILL
+        num_with_temporary += bool(temporary(here))
 
         store = Store(here / "store")
-        seen_temporary += bool(temporary(here))
-        seen_finished += bool(store.artefacts())
         assert wrong(store) == []
-        assert not (here / "dataset").exists()
+        assert not (here / "dataset").exists() or trace(here / "dataset", None).num_problems() == 0
 
         again = run_pipeline(store, here / "raw", here / "dataset")
         assert again.digest == expected.digest
-        assert temporary(here) == []
-        assert wrong(store) == []
         assert len(store.artefacts()) == 2
-    assert seen_temporary >= NUM_KILLS // 3  # else the kills came too early or too late to mean anything
-    assert seen_finished >= 1
+        assert wrong(store) == []
+        assert temporary(here) == []
+        if num_killed >= NUM_KILLS:
+            break
+    assert num_killed >= NUM_KILLS
+    assert num_with_temporary >= NUM_KILLS // 4  # else the kills came too early or too late to mean anything
 
 
-def run_until_event(kill_at: int, work) -> bool:
-    """``work()`` in a forked process that kills itself at its ``kill_at``-th file operation; True if it got through."""
-    pid = os.fork()
-    if pid == 0:
-        seen = 0
-
-        def count(event: str, _arguments: tuple) -> None:
-            nonlocal seen
-            if event in FILE_EVENTS:
-                seen += 1
-                if seen == kill_at:
-                    os.kill(os.getpid(), signal.SIGKILL)
-
-        try:
-            sys.addaudithook(count)
-            work()
-            os._exit(0)
-        except BaseException:
-            os._exit(1)
-    status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    assert status in (0, -signal.SIGKILL), status
-    return status == 0
-
-
-def write_two(config, inputs, out_dir):
-    (out_dir / "sub").mkdir()
-    (out_dir / "one").write_text("1")
-    (out_dir / "sub" / "two").write_text("2")
-
-
-TWO = Stage("two", write_two)
-
-
-def half_artefacts_over_all_kill_points(tmp_path: Path, store_class: type[Store]) -> tuple[int, int]:
-    """Kill before every single file operation of a run, in turn: number of kill points, and of wrong artefacts seen."""
-    num_wrong = 0
-    for kill_at in range(1, 500):
-        root = tmp_path / f"at_{kill_at}"
-        if run_until_event(kill_at, lambda root=root: store_class(root).run(TWO, None, [])):
-            return kill_at - 1, num_wrong
-        store = Store(root)
-        num_wrong += len(wrong(store))
-        if not wrong(store):
-            store.run(TWO, None, [])
-            assert wrong(store) == []
-            assert temporary(root) == []
-            assert len(store.artefacts()) == 1
-    raise AssertionError("the run never got through")
+def kill_at_every_point(tmp_path: Path, kind: str) -> list[int]:
+    words = [sys.executable, kill_points.__file__, str(tmp_path), kind]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
+    return [int(word) for word in done.stdout.split()]
 
 
 def test_killed_before_each_of_its_file_operations_a_run_never_leaves_a_wrong_artefact(tmp_path):
-    num_points, num_wrong = half_artefacts_over_all_kill_points(tmp_path, Store)
-    assert num_points >= 15  # mkdir, two files, their flushing, the manifest, the rename, the lock, …
+    num_points, num_wrong = kill_at_every_point(tmp_path, "sound")
+    assert num_points >= 15  # folders, two files, flushing them, the manifest, the rename, the lock, …
     assert num_wrong == 0
 
 
-class HastyStore(Store):
-    """The planted bug: builds in the final place, manifest first."""
-
-    def _make(self, job):
-        from taccorl.lineage.store import _seal
-
-        job.final.mkdir(parents=True)
-        (job.final / "one").write_text("early")
-        _seal(job.final, job, seconds=0.0)
-        job.stage.fn(job.config, [], job.final)
-        return super()._existing(job)
-
-
 def test_a_store_that_writes_the_manifest_first_is_caught_by_the_same_check(tmp_path):
-    _, num_wrong = half_artefacts_over_all_kill_points(tmp_path, HastyStore)
+    _, num_wrong = kill_at_every_point(tmp_path, "hasty")
     assert num_wrong > 0
 
 

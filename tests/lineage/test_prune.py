@@ -1,7 +1,5 @@
 """Prune: keeps what kept datasets were made from, frees the rest and the leftovers, and touches nothing else."""
 
-import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +13,7 @@ from taccorl.lineage.prune import delete, open_store, unneeded
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
 
-from .toys import INGEST, MERGE, IngestConfig, make_raw
+from .toys import INGEST, MERGE, IngestConfig, make_raw, run_and_die
 
 
 @pytest.fixture
@@ -35,25 +33,14 @@ def _finish(config, inputs, out_dir):
     (out_dir / "all.bin").write_bytes((inputs[0] / "0.bin").read_bytes())
 
 
-def _die(config, inputs, out_dir):
-    (out_dir / "half").write_text("x" * 1000)
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def leave_leftover(store: Store) -> None:
-    if (pid := os.fork()) == 0:
-        store.run(Stage("ingest", _die), None, [])
-    os.waitpid(pid, 0)
-
-
 def test_keeps_what_the_dataset_was_made_from_however_deep_and_frees_the_rest(world):
     store = Store(world / "store")
-    leave_leftover(store)
+    run_and_die(store.root)
     folders = unneeded(store, [world / "dataset"])
     assert [(folder.path.parent.name, folder.is_leftover) for folder in folders] == [
         ("ingest", False),
         ("ingest", False),
-        ("ingest", True),
+        ("one", True),
     ]
     # Five files each: 200 bytes less 0…4, and the text "20.0" or "30.0" at the end of each; and the manifest.
     manifest_bytes = (folders[0].path / "manifest.json").stat().st_size

@@ -2,10 +2,8 @@
 
 import hashlib
 import json
-import os
 import pickle
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +15,8 @@ from taccorl.lineage.errors import LineageError
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store, is_store
 
-from .toys import INGEST, MERGE_DATASET, IngestConfig, make_raw, run_pipeline
+from .kill_points import temporary
+from .toys import INGEST, MERGE_DATASET, IngestConfig, make_raw, run_and_die, run_pipeline
 
 
 @pytest.fixture
@@ -35,11 +34,6 @@ def write_one(config, inputs, out_dir):
 
 
 ONE = Stage("one", write_one)
-
-
-def hidden_folders(folder):
-    """Temporary folders anywhere below, but for the store's own .locks and .digests."""
-    return [p for p in folder.rglob(".*") if p.is_dir() and p.name not in (".locks", ".digests")]
 
 
 def test_key_is_the_first_16_hex_of_the_sha256_of_stage_version_config_and_inputs(store, raw):
@@ -143,6 +137,19 @@ def test_stage_that_raises_leaves_nothing_and_frees_its_lock(store):
     assert list((store.root / "failing").iterdir()) == []
 
 
+def test_stage_may_run_other_stages_but_not_wait_for_itself(store):
+    def outer(config, inputs, out_dir):
+        (out_dir / "one").write_text(store.run(ONE, "x", []).digest)
+
+    def itself(config, inputs, out_dir):
+        store.run(Stage("itself", itself), None, [])
+
+    made = store.run(Stage("outer", outer), None, [])
+    assert (made.path / "one").read_text() == store.run(ONE, "x", []).digest
+    with pytest.raises(RuntimeError, match="Deadlock"):
+        store.run(Stage("itself", itself), None, [])
+
+
 @pytest.mark.parametrize("what", ["nothing", "the manifest", "a copied manifest", "no folder"])
 def test_stage_that_wrote_no_artefact_is_named(store, what):
     inner = store.run(ONE, "x", [])
@@ -151,13 +158,13 @@ def test_stage_that_wrote_no_artefact_is_named(store, what):
         if what == "the manifest":
             (out_dir / "manifest.json").write_text("{}")
         elif what == "a copied manifest":
-            (out_dir / "meta" / "taccorl").mkdir(parents=True)
-            shutil.copy(inner.path / "manifest.json", out_dir / "meta" / "taccorl" / "manifest.json")
+            shutil.copy(inner.path / "manifest.json", out_dir / "manifest.json")
         elif what == "no folder":
             out_dir.rmdir()
 
+    place = "meta/taccorl/manifest.json" if what == "a copied manifest" else "manifest.json"
     with pytest.raises(LineageError, match="stage bad wrote"):
-        store.run(Stage("bad", bad), None, [])
+        store.run(Stage("bad", bad, manifest=place), None, [])
     assert list((store.root / "bad").iterdir()) == []
 
 
@@ -194,7 +201,7 @@ def test_destination_holds_the_dataset_and_a_second_run_leaves_it_untouched(stor
     assert run_pipeline(store, raw, destination, log=log) == made
     assert (destination / "my_notes.txt").read_text() == "mine"
     assert log.read_text().count("merge") == 1
-    assert hidden_folders(tmp_path / "datasets") == []
+    assert temporary(tmp_path / "datasets") == []
 
 
 def test_destination_with_another_config_is_refused_with_both_named(store, raw, tmp_path):
@@ -238,18 +245,11 @@ def test_destination_in_the_store_is_refused(store):
 
 
 def test_leftovers_beside_a_destination_go_only_if_they_are_this_stores(store, tmp_path):
-    def die(config, inputs, out_dir):
-        (out_dir / "half").write_text("x")
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    others = Store(tmp_path / "other_store")
-    for owner in (store, others):
-        if (pid := os.fork()) == 0:
-            owner.run(Stage("one", die), "x", [], destination=tmp_path / "d")
-        os.waitpid(pid, 0)
-    assert len(hidden_folders(tmp_path)) == 2
+    for root in (store.root, tmp_path / "other_store"):
+        run_and_die(root, tmp_path / "d")
+    assert len(temporary(tmp_path)) == 2
     store.run(ONE, "x", [], destination=tmp_path / "d")
-    assert len(hidden_folders(tmp_path)) == 1  # that one's maker may be alive: only the other store's lock can tell
+    assert len(temporary(tmp_path)) == 1  # that one's maker may be alive: only the other store's lock can tell
 
 
 # The store's own folder.

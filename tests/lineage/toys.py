@@ -5,6 +5,7 @@ The pipeline: two raw files → ``ingest`` each → ``merge``. Every run of a st
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
@@ -17,7 +18,6 @@ from taccorl.lineage.store import Store
 
 PAUSE_S = 0.004
 NUM_PARTS = 5
-PIPELINE_MIN_S = 3 * NUM_PARTS * PAUSE_S  # three stages; the pauses alone last this long
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,13 +67,34 @@ def run_pipeline(store: Store, raw: Path, destination: Path | None = None, *, lo
     return store.run(stage, config, episodes, destination=destination)
 
 
+def run_and_die(store_root: Path, destination: Path | None = None) -> None:
+    """A run in another process that is killed while its stage works: leaves a temporary folder with 1000 bytes."""
+    script = "import sys; from lineage.toys import start_dying; start_dying(*sys.argv[1:])"
+    words = [sys.executable, "-c", script, str(store_root), *([str(destination)] if destination else [])]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    assert subprocess.run(words, env=environment, check=False).returncode == -signal.SIGKILL
+
+
+def start_dying(store_root: str, destination: str | None = None) -> None:
+    Store(Path(store_root)).run(Stage("one", _die), "x", [], destination=Path(destination) if destination else None)
+
+
+def _die(config: Any, inputs: list[Path], out_dir: Path) -> None:
+    (out_dir / "half").write_text("x" * 1000)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def double(x: int) -> int:
     return 2 * x
 
 
-def double_slowly_first(x: int) -> int:
-    time.sleep(0.3 if x == 0 else 0)
-    return 2 * x
+def wait_for_the_second(note: Path) -> str:
+    """The item named ``0`` is done only after the item named ``1`` has been."""
+    end_s = time.monotonic() + 30
+    while note.name == "0" and not note.with_name("1").exists() and time.monotonic() < end_s:
+        time.sleep(0.01)
+    note.touch()
+    return note.name
 
 
 def refuse_odd(x: int) -> int:

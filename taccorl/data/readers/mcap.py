@@ -5,6 +5,7 @@ itself, and after a bad record the walk goes on at the next chunk. (mcap's own r
 nothing at all from a file without a footer.)
 """
 
+import contextlib
 import json
 import re
 import struct
@@ -47,6 +48,8 @@ class McapReader(Reader):
         super().__init__(source, spec)
         self._topics: dict[str, TopicType] = {}
         self._chunk_times: dict[tuple[Path, int], tuple[int, int]] = {}
+        self._definitions: dict[Path, tuple[dict[int, Schema], dict[int, Channel]]] = {}
+        """By file: kept between reads, because a partial read may skip the chunk that defines a channel."""
         self._whole = False
 
     @classmethod
@@ -110,8 +113,7 @@ class _File:
     ) -> None:
         self.path, self.reader = path, reader
         self.topics, self.stamps_only = topics, stamps_only
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
+        self.schemas, self.channels = reader._definitions.setdefault(path, ({}, {}))
         self.decoders: dict[int, Decoder] = {}
         self.stampers: dict[int, Callable[[bytes], int | None]] = {}
         self.orphans = 0
@@ -148,6 +150,7 @@ class _File:
 
     def _read_summary(self, file: BufferedReader) -> None:
         """Definitions from the summary at the end, so that a bad first chunk does not take its topics' meaning along."""
+        file.seek(0)
         try:
             summary = SeekingReader(file).get_summary()
         except Exception:  # mcap lets struct.error and others escape on damaged files; the walk reports the damage
@@ -258,10 +261,10 @@ class _File:
                 self.reader.metadata[r.name] = dict(r.metadata)
 
     def _message(self, channel: Channel, m: McapMessage) -> Message:
+        stamper = self.stampers.get(channel.id)
+        if stamper is None:
+            stamper = self.stampers[channel.id] = self._stamper(channel)
         if self.topics is None or channel.topic in self.stamps_only:
-            stamper = self.stampers.get(channel.id)
-            if stamper is None:
-                stamper = self.stampers[channel.id] = self._stamper(channel)
             return Message(channel.topic, m.log_time, stamper(m.data), None)
         decoder = self.decoders.get(channel.id)
         if decoder is None:
@@ -273,7 +276,8 @@ class _File:
                 f"{channel.topic}: a message at log time {m.log_time} ns does not fit its schema "
                 f"{self._type_name(channel)} ({type(error).__name__}: {error})"
             ) from error
-        return Message(channel.topic, m.log_time, decode.stamp_ns(value), value)
+        stamp = stamper(m.data) if channel.message_encoding == "cdr" else decode.stamp_ns(value)
+        return Message(channel.topic, m.log_time, stamp, value)
 
     def _define(self, channel: Channel) -> None:
         if self.channels.get(channel.id) == channel:
@@ -300,7 +304,8 @@ class _File:
             if encoding == "cdr":
                 from mcap_ros2.decoder import DecoderFactory as Ros2
 
-                found = Ros2().decoder_for(encoding, schema)
+                with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):  # it prints what it raises
+                    found = Ros2().decoder_for(encoding, schema)
             elif encoding == "protobuf":
                 from mcap_protobuf.decoder import DecoderFactory as Protobuf
 

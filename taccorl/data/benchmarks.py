@@ -1,0 +1,253 @@
+"""Figures of reading and writing recordings; ``make bench ONLY=ingest`` and the others."""
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from taccorl.benchmark import ROOT, Row, benchmark, cpu_s, spread
+from taccorl.data.spec import data_specs_folder, load_recording_spec
+
+RECORDING_S = 24.0
+LONG_RECORDING_S = 240.0
+RIVAL_ROWS = 150
+"""LeRobot's default writer takes 0.17 CPU-s a row: a part of the recording is enough to know its rate."""
+REPEATS = 3
+NATIVE = [480, 640, 3]
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one piece of work took."""
+
+    cpu_s: float
+    wall_s: float
+
+
+def _timed(work: Callable[[], Any]) -> Cost:
+    cpu, wall = cpu_s(children=True), time.perf_counter()
+    work()
+    return Cost(cpu_s(children=True) - cpu, time.perf_counter() - wall)
+
+
+def _native_spec(folder: Path) -> Path:
+    """The shipped spec with pictures kept at 480 × 640: nothing is scaled, so encoding costs most."""
+    specs = data_specs_folder()
+    for part in ("sensors", "recordings"):
+        (folder / part).mkdir(parents=True)
+    dataset = (specs / "taccorl_bimanual.yaml").read_text().replace("[224, 224, 3]", str(NATIVE))
+    (folder / "taccorl_bimanual.yaml").write_text(dataset)
+    (folder / "sensors/flexitac_v2.yaml").write_text((specs / "sensors/flexitac_v2.yaml").read_text())
+    recording = folder / "recordings/piper_flexitac_mcap.yaml"
+    recording.write_text((specs / "recordings/piper_flexitac_mcap.yaml").read_text())
+    return recording
+
+
+def _stand_in(path: Path, duration_s: float) -> Path:
+    from taccorl.demos.stand_in import StandInConfig, write_mcap
+
+    write_mcap(path, StandInConfig(duration_s=duration_s, seed=0))
+    return path
+
+
+@benchmark("ingest")
+def ingest_speed() -> Iterator[Row]:
+    """Rows a second against LeRobot's own default writer, real time, and the share of parsing."""
+    from taccorl.data.lerobot_format import quiet_lerobot
+
+    with quiet_lerobot():
+        import lerobot.datasets.lerobot_dataset  # noqa: F401  (its import, 11 CPU-s, is not what is measured)
+    with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
+        folder = Path(name)
+        recording = _stand_in(folder / "recording.mcap", RECORDING_S)
+        native = _native_spec(folder / "data_specs")
+        for label, spec_path in (("480×640 kept", native), ("224×224, as shipped", "piper_flexitac_mcap")):
+            yield from _ingest_rows(label, recording, load_recording_spec(spec_path), folder)
+
+
+def _ingest_rows(label: str, path: Path, spec: Any, folder: Path) -> Iterator[Row]:
+    ours, theirs, parsing = [], [], []
+    for k in range(REPEATS):
+        rows, cost = _our_ingest(path, spec, folder / f"ours_{label[:3]}_{k}")
+        ours.append((rows, cost))
+        theirs.append(_default_writer(path, spec, folder / f"theirs_{label[:3]}_{k}"))
+        parsing.append(_parse_only(path, spec).cpu_s / cost.cpu_s * 100)
+    per_cpu = [rows / cost.cpu_s for rows, cost in ours]
+    rival = [RIVAL_ROWS / cost.cpu_s for cost in theirs]
+    ratios = [a / b for a, b in zip(per_cpu, rival, strict=True)]
+    speed = [rows / 30 / cost.wall_s for rows, cost in ours]
+    mean = lambda values: sum(values) / len(values)  # noqa: E731
+    yield Row(
+        name=f"rows per CPU-second over LeRobot's default writer, {label}", value=mean(ratios), unit="×", goal="≥ 4",
+        rival="LeRobot default, rows/CPU-s, same frames, decoding not counted", rival_value=mean(rival), n=REPEATS, spread=spread(ratios),
+    )  # fmt: skip
+    wall = [(r / c.wall_s) / (RIVAL_ROWS / t.wall_s) for (r, c), t in zip(ours, theirs, strict=True)]
+    yield Row(
+        name=f"rows per second (wall) over LeRobot's default writer, {label}", value=mean(wall), unit="×", goal="≥ 4",
+        rival="LeRobot default, rows/s", rival_value=mean([RIVAL_ROWS / t.wall_s for t in theirs]), n=REPEATS, spread=spread(wall),
+    )  # fmt: skip
+    yield Row(
+        name=f"speed, {label}", value=mean(speed), unit="× real time", goal="≥ 1.5", n=REPEATS, spread=spread(speed)
+    )
+    yield Row(
+        name=f"rows per CPU-second, {label}", value=mean(per_cpu), unit="rows/CPU-s", n=REPEATS, spread=spread(per_cpu)
+    )
+    yield Row(
+        name=f"parsing, {label}",
+        value=mean(parsing),
+        unit="% of CPU time",
+        goal="< 5",
+        n=REPEATS,
+        spread=spread(parsing),
+    )
+
+
+def _our_ingest(path: Path, spec: Any, folder: Path) -> tuple[int, Cost]:
+    from taccorl.data.ingest import find_jobs, ingest
+    from taccorl.lineage.store import Store
+
+    store = Store(folder / "store")
+    jobs = find_jobs([path], spec, "bench", folder / "store", dry_run=False)
+    report: dict[str, Any] = {}
+    cost = _timed(lambda: report.update(ingest(jobs, folder / "dataset", store)))
+    assert report["outcomes"]["written"] + report["outcomes"]["split"] == 1, report["recordings"][0]["reason"]
+    return report["rows"], cost
+
+
+def _default_writer(path: Path, spec: Any, root: Path) -> Cost:
+    """LeRobotDataset.create with its defaults (PNG files, then AV1), fed the same decoded rows."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from taccorl.data.cutting import open_episodes
+    from taccorl.data.lerobot_format import _rows, lerobot_features, quiet_lerobot
+
+    with open_episodes(path, spec) as episodes, quiet_lerobot():
+        episode = episodes[0]
+        rows = [row for row, _ in zip(_rows(episode), range(RIVAL_ROWS), strict=False)]
+        features = lerobot_features(episode.spec, [k for k in episode.spec.features if k in rows[0]])
+
+        def write() -> None:
+            dataset = LeRobotDataset.create("local/rival", episode.spec.fps, features, root=root)
+            for row in rows:
+                dataset.add_frame(dict(row))
+            dataset.save_episode()
+            dataset.finalize()
+
+        return _timed(write)
+
+
+def _parse_only(path: Path, spec: Any) -> Cost:
+    """Both passes over the file, with messages decoded but no picture."""
+    from taccorl.data.recording import find_sources, opened
+
+    def parse() -> None:
+        with opened(find_sources(path)[0][1], spec) as recording:
+            cameras = [spec.features[key].channels[0] for key in spec.target.keys("video")]
+            ids = {}
+            for name in cameras:
+                channel = recording.channels[name]
+                ids[name] = list(zip(channel.log_ns.tolist(), channel.stamp_ns.tolist(), strict=True))  # pyright: ignore
+            for _ in recording.pictures(ids):
+                pass
+
+    return _timed(parse)
+
+
+@benchmark("memory")
+def ingest_memory() -> Iterator[Row]:
+    """Peak resident memory of the whole command, for a short and a long recording."""
+    peaks = {}
+    with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
+        folder = Path(name)
+        native = _native_spec(folder / "data_specs")
+        importing = _peak_mb(
+            [sys.executable, "-c", "import lerobot.datasets.lerobot_dataset, lerobot.datasets.aggregate"]
+        )
+        for duration_s in (RECORDING_S, LONG_RECORDING_S):
+            recording = _stand_in(folder / f"recording_{duration_s:g}.mcap", duration_s)
+            command = [sys.executable, "-m", "taccorl.cli.main", "ingest", str(recording), f"--spec={native}"]
+            command += [f"--out={folder / f'out_{duration_s:g}'}", f"--store={folder / 'store'}"]
+            peaks[duration_s] = _peak_mb(command)
+            recording.unlink()
+    for duration_s, peak in peaks.items():
+        yield Row(
+            name=f"peak memory, {duration_s:g} s at 3 × 480×640", value=peak, unit="MB", goal="< 1000",
+            rival="import of LeRobot alone", rival_value=importing, n=1, spread=0.0,
+        )  # fmt: skip
+
+
+def _peak_mb(command: list[str]) -> float:
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, "HF_HUB_OFFLINE": "1"})
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 0, command
+    return usage.ru_maxrss / 1000
+
+
+@benchmark("corruption")
+def corruption() -> Iterator[Row]:
+    """The corruption suite, case by case: tests/end_to_end/test_corruption.py."""
+    passed, total = _pytest("tests/end_to_end/test_corruption.py")
+    yield Row(
+        name="cases in their right outcome", value=100 * passed / total, unit="%", goal="≥ 100", n=total, spread=0.0
+    )
+
+
+@benchmark("kill")
+def kill() -> Iterator[Row]:
+    """kill -9 at 20 random moments, each followed by a second run: tests/end_to_end/test_interrupted_ingest.py."""
+    passed, total = _pytest("tests/end_to_end/test_interrupted_ingest.py", "-m", "slow")
+    yield Row(
+        name="20 of 20 byte-identical after kill -9 and rerun",
+        value=100 * passed / total,
+        unit="%",
+        goal="≥ 100",
+        n=20,
+        spread=0.0,
+    )
+
+
+def _pytest(*words: str) -> tuple[int, int]:
+    """(passed, run)"""
+    with tempfile.TemporaryDirectory() as name:
+        result = Path(name) / "result.xml"
+        command = [sys.executable, "-m", "pytest", "-q", *words, f"--junitxml={result}"]
+        subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False)
+        suite = ElementTree.parse(result).getroot()[0]
+        total = int(suite.get("tests", 0)) - int(suite.get("skipped", 0))
+        return total - int(suite.get("failures", 0)) - int(suite.get("errors", 0)), total
+
+
+@benchmark("start_up")
+def start_up() -> Iterator[Row]:
+    """CPU-seconds until the verbs are listed, and until ``taccorl check`` has looked at a recording (an empty one)."""
+    with tempfile.TemporaryDirectory() as name:
+        empty = Path(name) / "empty.mcap"
+        empty.touch()
+        for label, words, goal in (
+            ("list of verbs", [], "< 0.1"),
+            ("taccorl check on a recording", ["check", str(empty), "--spec=piper_flexitac_mcap"], "< 1.5"),
+        ):
+            values = [_children_cpu_s([str(Path(sys.executable).with_name("taccorl")), *words]) for _ in range(7)][2:]
+            yield Row(
+                name=label,
+                value=sum(values) / len(values),
+                unit="CPU-s",
+                goal=goal,
+                n=len(values),
+                spread=spread(values),
+            )
+
+
+def _children_cpu_s(command: list[str]) -> float:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

@@ -1,0 +1,238 @@
+"""Is an episode fit to train on? Timing, joints, pictures and touch, each judged by pure functions on its arrays.
+
+An **error** says that the data is wrong: ingest quarantines the episode. A **warning** says: look at it. A **note** is
+worth knowing; what could not be judged is a note too, never a pass in silence.
+
+    error    not_finite, joint_limit, out_of_range, swapped_arms, swapped_pads, noise_only,
+             action_lag (command after state), frozen_picture (half of the episode or more)
+    warning  low_rate, gaps, old_samples, jump, idle, frozen_state, frozen_picture, action_lag (too long, or unlike the
+             other arm or the other episodes), dead_taxel, stuck_taxel, saturated, noisy_pad, frozen_touch, silent_pad,
+             touch_lag, baseline_drift, baseline_offset
+    note     duplicates, out_of_order, zero_stamps, saturated (a few rows), contact_coverage, not_judged
+
+The parts are in ``joint_checks``, ``picture_checks``, ``touch_checks`` (a pad by itself) and ``grip_checks`` (pads
+against grippers). Thresholds stand there, with unit and reason.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from taccorl.data import joint_checks
+from taccorl.data.episode import ChannelTiming, Episode
+from taccorl.data.finding import Finding, Severity, not_judged
+from taccorl.data.grip_checks import (
+    DRIFT_SHARE,
+    TOUCH_LAG_S,
+    Grippers,
+    check_touch_and_grip,
+    read_grippers,
+    rest_level,
+    touch_lags,
+)
+from taccorl.data.joint_checks import ACTION, STATE
+from taccorl.data.picture_checks import check_pictures
+from taccorl.data.touch_checks import Pad, check_pads, read_pads, tactile_keys
+
+__all__ = ["Finding", "Severity", "check_episode", "check_recording_episodes"]
+
+RATE_SHARE = 0.8
+"""Of the rate that the spec states: a channel below it loses every fifth sample or was set up wrongly."""
+GAP_S = 0.1
+"""Three rows at 30 fps: so long a policy would look at the past."""
+GAPS_SHARE = 0.05
+"""Of a channel's samples: more dropped ones than leggedrobotics' recordings tolerate (5 %)."""
+OLD_SAMPLES_PERIODS = 1.5
+"""Median age of the sample in a row, in periods of the channel: half a period is usual, one the worst."""
+REPEAT_SHARE = 0.05
+"""PiPER's driver republishes values with one stamp; this many of them are worth a note."""
+EPISODE_LAG_S = 0.05
+"""Lag of one episode against the median of its recording: more than a row and a half at 30 fps."""
+COMPARED_EPISODES = 3
+"""It takes so many to say which one is odd."""
+
+
+def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
+    """All findings on one episode, worst first.
+
+    Args:
+        pictures: also decode the pictures, to find frozen ones.
+    """
+    findings = [f for timing in episode.timing for f in check_timing(timing, episode)]
+    if not episode.arrays or episode.num_rows < 2:
+        return [*findings, not_judged("", "episode", "it has less than two rows of numbers")]
+    values = joint_checks.check_values(episode)
+    wrong = {f.feature for f in values}
+    findings += values + _check_motion(episode, wrong)
+    joints_fit = not wrong & {STATE, ACTION} and not any(f.check == "swapped_arms" for f in findings)
+    for key in tactile_keys(episode):
+        findings += _check_touch(episode, key, joints_fit) if key not in wrong else []
+    findings += check_pictures(episode, decode=pictures)
+    return sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))
+
+
+def _check_motion(episode: Episode, wrong: set[str]) -> list[Finding]:
+    findings: list[Finding] = []
+    vectors = [key for key in (STATE, ACTION) if key in episode.arrays]
+    for key in vectors:
+        if key not in wrong:
+            findings += joint_checks.check_jumps(episode, key)
+    if vectors and not wrong & set(vectors):
+        pads = [pad for key in tactile_keys(episode) for pad in episode.pads(key).values()]
+        touch = np.stack([p.mean(axis=(1, 2)) for p in pads], axis=1) if pads else np.empty((episode.num_rows, 0))
+        findings += joint_checks.check_idle(episode, touch)
+    if not all(np.isfinite(episode.arrays[key]).all() for key in vectors):
+        return [*findings, not_judged(ACTION, "action lag, swapped arms", "values that are not finite")]
+    arms = joint_checks.episode_arms(episode)
+    if not any(len(arm.joints) for arm in arms):
+        return [*findings, not_judged(ACTION, "action lag, swapped arms", "no joints in rad named alike in both")]
+    swapped = joint_checks.check_swapped_arms(episode)
+    findings += swapped
+    if not any(f.severity == "error" for f in swapped):
+        findings += joint_checks.check_lag(episode)
+        findings += [f for arm in arms for f in joint_checks.check_frozen_state(episode, arm)]
+    return findings
+
+
+def _check_touch(episode: Episode, key: str, joints_fit: bool) -> list[Finding]:
+    pads = read_pads(episode, key)
+    findings = check_pads(episode, key, pads)
+    grippers = read_grippers(episode) if joints_fit else None
+    if grippers is None:
+        why = "no gripper in m in both state and action" if joints_fit else "joints or command are wrong"
+        return [*findings, not_judged(key, "touch against grippers", why)]
+    return findings + check_touch_and_grip(episode, key, pads, grippers)
+
+
+def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
+    """How one channel's samples met the rows."""
+    duration_s = episode.num_rows / episode.spec.fps
+    promised_hz = episode.spec.features[timing.feature].rate_hz
+    samples = max(timing.rate_hz * duration_s, 1.0)
+    findings: list[Finding] = []
+
+    def add(check: str, severity: Severity, text: str) -> None:
+        findings.append(Finding(check, severity, timing.channel, f"{timing.channel} ({timing.feature}): {text}"))
+
+    if timing.align != "hold":  # a command may come only when it changes
+        if timing.rate_hz < RATE_SHARE * promised_hz:
+            add(
+                "low_rate",
+                "warning",
+                f"{timing.rate_hz:.1f} Hz, the data spec says {promised_hz:g} Hz: a loaded host, a slower mode, or the spec",
+            )
+        if timing.longest_gap_s > GAP_S or timing.gaps > GAPS_SHARE * samples:
+            add(
+                "gaps",
+                "warning",
+                f"{timing.gaps} gaps in about {samples:.0f} samples, longest {timing.longest_gap_s * 1000:.0f} ms (limits: "
+                f"{GAPS_SHARE:.0%}, {GAP_S * 1000:.0f} ms): samples were dropped; look at the recorder's disk and USB load",
+            )
+        if timing.age_median_s > OLD_SAMPLES_PERIODS / promised_hz:
+            add(
+                "old_samples",
+                "warning",
+                f"rows show samples {timing.age_median_s * 1000:.0f} ms old (median), {timing.age_max_s * 1000:.0f} ms at "
+                f"worst; a period is {1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`",
+            )
+    if timing.duplicates > REPEAT_SHARE * samples:
+        add("duplicates", "note", f"{timing.duplicates} samples repeat a stamp; the first of each was kept")
+    if timing.out_of_order:
+        add("out_of_order", "note", f"{timing.out_of_order} samples were out of order; sorted by their stamps")
+    if timing.zero_stamps:
+        add("zero_stamps", "note", f"{timing.zero_stamps} samples were stamped 0 and dropped")
+    return findings
+
+
+# ---- across the episodes of a recording ----
+
+
+def check_recording_episodes(episodes: Sequence[Episode]) -> list[Finding]:
+    """What only shows when the episodes of one recording are laid side by side; names the odd one."""
+    if len(episodes) < 2:
+        return []
+    good = [e for e in episodes if e.arrays and e.num_rows >= 2 and not joint_checks.check_values(e)]
+    return [*_odd_lags(good), *_touch_lags(good), *_resting_levels(good)]
+
+
+def _odd_lags(episodes: list[Episode]) -> list[Finding]:
+    lags: dict[str, dict[str, float]] = {}
+    for episode in episodes:
+        for arm, lag in joint_checks.arm_lags(episode).items():
+            lags.setdefault(arm, {})[episode.name] = lag.lag_s
+    findings = []
+    for arm, by_episode in lags.items():
+        if len(by_episode) < COMPARED_EPISODES:
+            continue
+        for name, lag_s in by_episode.items():
+            others = float(np.median([x for n, x in by_episode.items() if n != name]))
+            if abs(lag_s - others) > EPISODE_LAG_S:
+                findings.append(
+                    Finding(
+                        "action_lag",
+                        "warning",
+                        ACTION,
+                        f"{name}: the {arm or 'only'} arm follows its command after {lag_s:.3f} s, in the other "
+                        f"{len(by_episode) - 1} episodes after {others:.3f} s: a clock stepped in this recording",
+                    )
+                )
+    return findings
+
+
+def _pads_and_grippers(episodes: list[Episode]) -> Iterator[tuple[Episode, str, list[Pad], Grippers]]:
+    """Per episode and tactile feature: the pads that belong to a gripper, and the grippers."""
+    for episode in episodes:
+        grippers = read_grippers(episode)
+        if grippers is not None:
+            for key in tactile_keys(episode):
+                yield episode, key, [pad for pad in read_pads(episode, key) if pad.arm in grippers.opening], grippers
+
+
+def _touch_lags(episodes: list[Episode]) -> list[Finding]:
+    """All holds together: one row's resolution no longer matters, so the window is the plain one."""
+    lags: dict[tuple[str, str], list[float]] = {}
+    for episode, key, pads, grippers in _pads_and_grippers(episodes):
+        for arm, found in touch_lags(pads, grippers, episode.spec.fps).items():
+            lags.setdefault((key, arm), []).extend(found)
+    findings = []
+    for (key, arm), found in lags.items():
+        lag = float(np.median(found))
+        if not TOUCH_LAG_S[0] <= lag <= TOUCH_LAG_S[1]:
+            findings.append(
+                Finding(
+                    "touch_lag",
+                    "warning",
+                    key,
+                    f"{arm} pads feel parts {abs(lag):.3f} s {'before' if lag < 0 else 'after'} the gripper stops on them "
+                    f"in all episodes (median of {len(found)}; plausible {TOUCH_LAG_S[0]:g} to {TOUCH_LAG_S[1]:g} s): set "
+                    f"`clock` or `latency_s` on the pads' channels",
+                )
+            )
+    return findings
+
+
+def _resting_levels(episodes: list[Episode]) -> list[Finding]:
+    """Pads that rest at another level in a later episode: one baseline for the whole recording no longer holds."""
+    levels: dict[tuple[str, str], dict[str, float]] = {}
+    limits: dict[str, float] = {}
+    for episode, key, pads, grippers in _pads_and_grippers(episodes):
+        limits[key] = DRIFT_SHARE * episode.spec.sensors[key].noise_count
+        for pad in pads:
+            level = rest_level(pad.counts, grippers.rest(pad.arm, episode.spec.fps), episode.spec.fps)
+            if level is not None:
+                levels.setdefault((key, pad.name), {})[episode.name] = level
+    findings = []
+    for (key, pad), by_episode in levels.items():
+        low, high = min(by_episode, key=by_episode.__getitem__), max(by_episode, key=by_episode.__getitem__)
+        change = by_episode[high] - by_episode[low]
+        if change > limits[key]:
+            findings.append(
+                Finding(
+                    "baseline_drift",
+                    "warning",
+                    key,
+                    f"{pad} rests at {by_episode[low]:+.1f} counts in {low} and at {by_episode[high]:+.1f} in {high} (limit "
+                    f"{limits[key]:g} counts apart, a third of noise_count): record shorter, or a new baseline in between",
+                )
+            )
+    return findings

@@ -1,0 +1,502 @@
+"""Any LeRobot v3 dataset read back as episodes, without LeRobot: parquet through pyarrow, videos through PyAV.
+
+Row k of an episode shows the video frame at from_timestamp + k / fps, found by its own time stamp, never by counting. What
+LeRobot's files cannot say (units, ranges, pads, baselines, success) is in ``meta/taccorl/``, where ingest wrote it; of other
+people's datasets it stays unknown.
+"""
+
+import contextlib
+import dataclasses
+import json
+import math
+from collections.abc import Collection, Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import av.error
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
+from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import DatasetError, nearest
+
+PROVENANCE = Path("meta/taccorl")
+BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+"""LeRobot's own columns: no features."""
+TOLERANCE_S = 1e-4
+"""A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``."""
+
+
+class Dataset:
+    """A LeRobot v3 dataset on disk. Opening it reads ``meta/`` only."""
+
+    def __init__(self, root: Path) -> None:
+        """
+        Raises:
+            DatasetError: no LeRobot v3 dataset, or not a whole one: says what is missing.
+        """
+        self.root = Path(root)
+        self.info = _read_info(self.root)
+        self._table = _read_episode_table(self.root, self.info)
+        self._tasks = _read_tasks(self.root)
+        self.spec, self.skipped = _read_spec(self.root, self.info)
+        """``skipped``: feature key → why episodes do not have it."""
+        self._records = _read_records(self.root, self._table)
+        manifest = self.root / PROVENANCE / "manifest.json"
+        self.provenance: dict[str, Any] | None = _read_json(manifest) if manifest.is_file() else None
+        absent = sorted({str(p) for i in range(self.num_episodes) if not (p := self.data_file(i)).is_file()})
+        if absent:
+            raise DatasetError(f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy it whole")
+
+    @property
+    def num_episodes(self) -> int:
+        return len(self._table)
+
+    def num_rows(self, index: int) -> int:
+        """Rows of one episode, as ``meta/episodes`` counts them."""
+        return int(self._entry(index)["length"])
+
+    def data_file(self, index: int) -> Path:
+        """The parquet file that holds the episode, perhaps among others."""
+        return self._file("data_path", "data/", index)
+
+    def video(self, index: int, key: str) -> Video:
+        """The episode's part of a video file."""
+        path = self._file("video_path", f"videos/{key}/", index, video_key=key)
+        return Video(path, float(self._entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
+
+    def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
+        """(T, *shape) of features that are no pictures, as stored; (T,) of texts. Reads only these rows and columns.
+
+        Raises:
+            DatasetError: rows are missing, or a value does not fit its feature's shape.
+        """
+        path, num_rows, features = self.data_file(index), self.num_rows(index), self.info["features"]
+        where = f"{path}, episode {index}"
+        columns = list(dict.fromkeys(["frame_index", *keys]))
+        with _plainly(path, "a whole parquet file"):
+            table = pq.read_table(path, columns=columns, filters=[("episode_index", "==", index)])
+        if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(range(num_rows)):
+            raise DatasetError(f"{where}: has {table.num_rows} rows, not rows 0 to {num_rows - 1} in order")
+        return {key: _column(table[key], tuple(features[key]["shape"]), f"{where}, {key}") for key in keys}
+
+    def frames(self, index: int, key: str, first: int = 0, end: int | None = None) -> Generator[np.ndarray, None, None]:
+        """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded), one at a time.
+
+        Raises:
+            DatasetError: a row has no frame at its time.
+        """
+        video, fps = self.video(index, key), self.spec.fps
+        end = video.num_frames if end is None else end
+        row = first
+        if row >= end:
+            return
+        for time_s, frame in _decode_from(video.path, video.from_s + first / fps):
+            due_s = video.from_s + row / fps
+            if time_s > due_s + TOLERANCE_S:
+                break
+            if time_s > due_s - TOLERANCE_S:
+                yield frame.to_ndarray(format="rgb24")
+                row += 1
+                if row == end:
+                    return
+        raise DatasetError(
+            f"{video.path}, episode {index}: no frame at {video.from_s + row / fps:.4f} s for row {row} of {end}"
+        )
+
+    def tasks(self, index: int) -> list[tuple[int, str]]:
+        """(first row, text) of every stretch of rows with one task; mostly there is one."""
+        numbers = self.values(index, ["task_index"])["task_index"].ravel()
+        starts = [0, *(np.flatnonzero(np.diff(numbers)) + 1)] if len(numbers) else []
+        unknown = sorted({int(numbers[row]) for row in starts} - set(self._tasks))
+        if unknown:
+            raise DatasetError(f"{self.root}/meta/tasks.parquet has no task {unknown[0]}, episode {index} shows it")
+        return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
+
+    def told(self, index: int) -> dict[str, Any]:
+        """Fields of ``Episode`` that ingest wrote down (success, origin, baselines, …); none for other people's datasets."""
+        return {} if self._records is None else dict(self._records[index])
+
+    def episode(self, index: int) -> Episode:
+        """One episode: its numbers now, its pictures when asked for."""
+        features = self.info["features"]
+        present = {key: f for key, f in self.spec.features.items() if key in features}
+        cameras = tuple(key for key, f in present.items() if f.dtype == "video")
+        stored = self.values(index, [key for key in present if key not in cameras])
+        tasks = self.tasks(index)
+        told = self.told(index)
+        if "stages" not in told and len(tasks) > 1:
+            told["stages"] = tuple(tasks)
+        return Episode(
+            name=f"{self.root.name} episode {index}",
+            spec=self.spec,
+            start_ns=told.pop("start_ns", 0),
+            arrays={key: rows.reshape(len(rows), -1).astype(present[key].dtype) for key, rows in stored.items()},
+            pictures=lambda: self._pictures(index, cameras),
+            picture_keys=cameras,
+            instruction=tasks[0][1] if tasks else "",
+            videos={key: self.video(index, key) for key in cameras},
+            **told,
+        )
+
+    def _pictures(self, index: int, cameras: tuple[str, ...]) -> Iterator[Pictures]:
+        with contextlib.ExitStack() as stack:
+            streams = [stack.enter_context(contextlib.closing(self.frames(index, key))) for key in cameras]
+            for shown in zip(*streams, strict=True):
+                for key, picture in zip(cameras, shown, strict=True):
+                    if picture.shape != self.spec.features[key].shape:
+                        path = self.video(index, key).path
+                        raise DatasetError(
+                            f"{path}: pictures are {picture.shape}, the spec says {self.spec.features[key].shape}"
+                        )
+                yield dict(zip(cameras, shown, strict=True))
+
+    def video_problems(self) -> list[str]:
+        """Proof, without decoding, that every row has its own frame: packets of each video file against the episodes' rows."""
+        cameras = [key for key, f in self.info["features"].items() if f["dtype"] == "video"]
+        problems = []
+        for key in cameras:
+            files: dict[Path, list[int]] = {}
+            for index in range(self.num_episodes):
+                files.setdefault(self.video(index, key).path, []).append(index)
+            for path, episodes in files.items():
+                problems += [f"{path.relative_to(self.root)}: {p}" for p in self._file_problems(path, key, episodes)]
+        return problems
+
+    def _file_problems(self, path: Path, key: str, episodes: list[int]) -> list[str]:
+        try:
+            times_s, corrupt = _packet_times(path)
+        except DatasetError as error:
+            return [str(error).removeprefix(f"{path}: ")]
+        problems = [f"{corrupt} of {len(times_s)} frames are cut off or corrupt"] if corrupt else []
+        owner: dict[int, int] = {}
+        for index in episodes:
+            video = self.video(index, key)
+            due_s = video.from_s + np.arange(video.num_frames) / self.spec.fps
+            nearby = _nearest(times_s, due_s)
+            found = np.abs(times_s[nearby] - due_s) < TOLERANCE_S if len(times_s) else np.zeros(len(due_s), dtype=bool)
+            if not found.all():
+                row = int(np.argmin(found))
+                problems.append(
+                    f"episode {index}: {int(found.sum())} frames for {len(due_s)} rows; row {row} has none "
+                    f"at {due_s[row]:.4f} s"
+                )
+            claimed = [int(f) for f in nearby[found]]
+            others = sorted({owner[f] for f in claimed if f in owner})
+            if others:
+                shared = sum(f in owner for f in claimed)
+                problems.append(f"episode {index}: {shared} of its frames are also those of episode {others[0]}")
+            owner.update(dict.fromkeys(claimed, index))
+        spare = [f for f in range(len(times_s)) if f not in owner]
+        if spare:
+            rows = sum(self.num_rows(i) for i in episodes)
+            problems.append(
+                f"{len(times_s)} frames for {rows} rows of episodes {episodes[0]} to {episodes[-1]}: {len(spare)} frames "
+                f"belong to no row, first at {times_s[spare[0]]:.4f} s"
+            )
+        return problems
+
+    def _entry(self, index: int) -> dict[str, Any]:
+        if not 0 <= index < len(self._table):
+            raise DatasetError(f"{self.root}: no episode {index}; it has {len(self._table)}, counted from 0")
+        return self._table[index]
+
+    def _file(self, template: str, prefix: str, index: int, **names: str) -> Path:
+        entry = self._entry(index)
+        try:
+            chunk, file = int(entry[f"{prefix}chunk_index"]), int(entry[f"{prefix}file_index"])
+            return self.root / str(self.info[template]).format(chunk_index=chunk, file_index=file, **names)
+        except (KeyError, TypeError) as error:
+            raise DatasetError(
+                f"{self.root}/meta: nothing says which file holds {prefix} of episode {index}"
+            ) from error
+
+
+def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
+    """A dataset spec with its sensors as plain JSON values; endless ranges as the texts "inf" and "-inf"."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(v) for key, v in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(v) for v in value]
+        return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+    return plain(dataclasses.asdict(spec))
+
+
+def dataset_spec_from_json(path: Path) -> DatasetSpec:
+    """The spec that was written to ``path`` with ``dataset_spec_to_json``, exactly; read as strictly as the YAML files.
+
+    Raises:
+        SpecError: with file, line, key and the way out.
+    """
+    document = Document(DatasetSpec, path)  # JSON is YAML
+    if document.value.spec_version != SPEC_VERSION:
+        raise document.error(
+            "spec_version", f"{document.value.spec_version}; this taccorl reads version {SPEC_VERSION}"
+        )
+    return document.value
+
+
+def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
+    """What ``meta/taccorl/episodes.json`` keeps of an episode: all that LeRobot's files cannot say."""
+    return {
+        "recording": str(episode.provenance.get("recording", episode.name)),
+        "part": episode.provenance.get("part"),
+        "source_digest": source_digest,
+        "start_ns": int(episode.start_ns),
+        "rows": episode.num_rows,
+        "instruction": episode.instruction,
+        "success": episode.success,
+        "origin": episode.origin,
+        "baselines": {key: np.asarray(counts).tolist() for key, counts in episode.baselines.items()},
+        "timing": [dataclasses.asdict(t) for t in episode.timing],
+        "stages": [[int(row), name] for row, name in episode.stages],
+    }
+
+
+def _from_record(record: dict[str, Any]) -> dict[str, Any]:
+    """Fields of ``Episode`` from its record; ``stages`` only where there are any."""
+    fields: dict[str, Any] = {
+        "start_ns": int(record["start_ns"]),
+        "success": record["success"],
+        "origin": record["origin"],
+        "baselines": {key: np.array(counts) for key, counts in record["baselines"].items()},
+        "timing": tuple(ChannelTiming(**t) for t in record["timing"]),
+        "provenance": {k: record[k] for k in ("recording", "part", "source_digest")},
+    }
+    if record["stages"]:
+        fields["stages"] = tuple((int(row), str(name)) for row, name in record["stages"])
+    return fields
+
+
+def _read_info(root: Path) -> dict[str, Any]:
+    if not root.is_dir():
+        siblings = [p.name for p in root.parent.iterdir() if p.is_dir()] if root.parent.is_dir() else []
+        raise DatasetError(f"{root}: no such folder; {nearest(root.name, siblings)}")
+    path = root / "meta" / "info.json"
+    if not path.is_file():
+        raise DatasetError(f"{root}: no LeRobot dataset: there is no meta/info.json")
+    info = _read_json(path)
+    version = str(info.get("codebase_version", "without a version"))
+    if version.startswith("v2.1"):
+        raise DatasetError(
+            f"{root}: is a LeRobot {version} dataset, v3 is read. Convert it (in place): python -m "
+            f"lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/{root.name} --root={root} --push-to-hub=false"
+        )
+    if not version.startswith("v3."):
+        raise DatasetError(
+            f"{root}: is a LeRobot dataset {version}, v3 is read; LeRobot converts v2.1 to v3.0, "
+            f"and older ones to v2.1 with the LeRobot release of their time"
+        )
+    needed = {"fps": int | float, "features": dict, "total_episodes": int, "data_path": str}
+    wrong = [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]
+    if wrong:
+        raise DatasetError(f"{path}: {wrong[0]} is missing or of another type: {info.get(wrong[0])!r}")
+    vague = [key for key, f in info["features"].items() if not {"dtype", "shape"} <= set(f)]
+    if vague:
+        raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
+    if int(info["fps"]) != info["fps"] or info["fps"] <= 0:
+        raise DatasetError(f"{path}: fps {info['fps']}; whole numbers of rows a second are read")
+    return info
+
+
+def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
+    """One dict per episode, in order, without the statistics."""
+    rows: list[dict[str, Any]] = []
+    for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
+        with _plainly(path, "a whole parquet file"):
+            names = [n for n in pq.read_schema(path).names if not n.startswith("stats/")]
+            rows += pq.read_table(path, columns=names).to_pylist()
+    rows.sort(key=lambda r: r["episode_index"])
+    listed, told = [r["episode_index"] for r in rows], info["total_episodes"]
+    if listed != list(range(told)):
+        missing = sorted(set(range(told)) - set(listed))
+        described = f"episode {missing[0]} is missing" if missing else "one stands twice or is too many"
+        raise DatasetError(
+            f"{root}: info.json counts {told} episodes, meta/episodes lists {len(listed)}, {described}: "
+            f"a writer that died before finalize(), or an incomplete copy"
+        )
+    return rows
+
+
+def _read_tasks(root: Path) -> dict[int, str]:
+    path = root / "meta" / "tasks.parquet"
+    if not path.is_file():
+        raise DatasetError(f"{root}: there is no meta/tasks.parquet: copy the whole dataset")
+    with _plainly(path, "a whole parquet file"):
+        table = pq.read_table(path)
+    # LeRobot up to 0.4 kept the text as pandas' index.
+    text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
+    if text is None or "task_index" not in table.column_names:
+        raise DatasetError(f"{path}: has columns {', '.join(table.column_names)}, not task_index and task")
+    return dict(zip(table["task_index"].to_pylist(), table[text].to_pylist(), strict=True))
+
+
+def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str, str]]:
+    """The spec that ingest wrote, checked against info.json; else what info.json says."""
+    derived, skipped = _derive_spec(root, info)
+    path = root / PROVENANCE / "dataset_spec.json"
+    if not path.is_file():
+        return derived, skipped
+    spec = dataset_spec_from_json(path)
+    if spec.fps != info["fps"]:
+        raise DatasetError(f"{path} says {spec.fps} fps, info.json {info['fps']}: not this dataset's spec")
+    for key, feature in spec.features.items():
+        found = derived.features.get(key)
+        if found is None and not feature.optional:
+            raise DatasetError(f"{path} has {key}, info.json has not: {skipped.get(key, 'was it removed?')}")
+        if found is not None and (found.dtype, found.shape) != (feature.dtype, feature.shape):
+            raise DatasetError(
+                f"{path}: {key} is {feature.dtype} {list(feature.shape)}, info.json says {found.dtype} {list(found.shape)}"
+            )
+    more = {key: "not in the dataset's own spec" for key in derived.features if key not in spec.features}
+    return spec, skipped | more
+
+
+def _derive_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str, str]]:
+    features, skipped = {}, {}
+    codec = "libsvtav1"
+    for key, f in info["features"].items():
+        if key in BOOKKEEPING:
+            continue
+        shape, names = tuple(f["shape"]), f.get("names")
+        unit, limits = "unknown", (-math.inf, math.inf)
+        if f["dtype"] == "video":
+            if isinstance(names, list) and names[:1] in (["channel"], ["channels"]):
+                shape = (*shape[1:], shape[0])
+            if len(shape) != 3 or shape[2] != 3 or (f.get("info") or {}).get("is_depth_map"):
+                skipped[key] = f"a video of shape {list(f['shape'])}: colour pictures are read"
+                continue
+            codec = "h264" if (f.get("info") or {}).get("video.codec") == "h264" else codec
+            unit, limits = "rgb8", (0.0, 255.0)
+        elif f["dtype"] == "image":
+            skipped[key] = "pictures inside the parquet files; lerobot-edit-dataset's convert_image_to_video helps"
+            continue
+        elif f["dtype"] not in ("float32", "int16") or len(shape) != 1:
+            skipped[key] = f"{f['dtype']} {list(shape)}: flat float32 and int16 are read"
+            continue
+        features[key] = FeatureSpec(
+            dtype=f["dtype"],
+            shape=shape,
+            unit=unit,
+            frame="unknown",
+            rate_hz=float(info["fps"]),
+            range=limits,
+            names=_names(names, shape) if f["dtype"] != "video" else (),
+        )
+    spec = DatasetSpec(
+        spec_version=SPEC_VERSION,
+        name=root.name,
+        robot_type=str(info.get("robot_type") or "unknown"),
+        fps=int(info["fps"]),
+        features=features,
+        video_codec=codec,
+    )
+    return spec, skipped
+
+
+def _names(names: Any, shape: tuple[int, ...]) -> tuple[str, ...]:
+    """One name per element, or none: datasets write lists, and dicts of one list ({"motors": […]})."""
+    if isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    if not isinstance(names, list) or len(names) != math.prod(shape) or len(set(map(str, names))) != len(names):
+        return ()
+    return tuple(map(str, names))
+
+
+def _read_records(root: Path, table: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
+    path = root / PROVENANCE / "episodes.json"
+    if not path.is_file():
+        return None
+    records = _read_json(path, list)
+    rows = [r.get("rows") for r in records]
+    if rows != [r["length"] for r in table]:
+        raise DatasetError(
+            f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, the dataset has {len(table)} episodes, "
+            f"{sum(r['length'] for r in table)} rows: edited by another tool? Remove this file to read it without"
+        )
+    try:
+        return [_from_record(r) for r in records]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{path}: not as taccorl writes it ({type(error).__name__}: {error})") from error
+
+
+def _read_json(path: Path, kind: type = dict) -> Any:
+    with _plainly(path, "JSON"):
+        value = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(value, kind):
+        raise DatasetError(f"{path}: holds a {type(value).__name__}, not a {kind.__name__}")
+    return value
+
+
+def _column(column: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """(T, *shape); texts (T,)."""
+    num_rows = len(column)
+    if isinstance(column.type, pa.BaseExtensionType):  # Hugging Face's Array2D, where `datasets` is imported
+        column = pa.chunked_array([c.storage for c in column.chunks], column.type.storage_type)
+    while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
+        column = pa.chunked_array([c.flatten() for c in column.chunks], column.type.value_type)
+    text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
+    if column.null_count or len(column) != num_rows * (1 if text else math.prod(shape)):
+        raise DatasetError(
+            f"{where}: {len(column)} values, {column.null_count} of them empty, for {num_rows} rows of shape {list(shape)}"
+        )
+    values = column.to_numpy()
+    return values if text else values.reshape(num_rows, *shape)
+
+
+def _nearest(times_s: np.ndarray, due_s: np.ndarray) -> np.ndarray:
+    """Index of the closest of the sorted ``times_s`` for each of ``due_s``."""
+    after = np.clip(np.searchsorted(times_s, due_s), 1, max(len(times_s) - 1, 1))
+    if len(times_s) < 2:
+        return np.zeros(len(due_s), dtype=int)
+    return np.where(due_s - times_s[after - 1] <= times_s[after] - due_s, after - 1, after)
+
+
+def _packet_times(path: Path) -> tuple[np.ndarray, int]:
+    """Sorted times (s) of a video's frames, and how many of them are corrupt, without decoding."""
+    times, corrupt = [], 0
+    with _plainly(path, "a video"), av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        for packet in container.demux(stream):
+            if packet.pts is not None and packet.size:
+                times.append(packet.pts * packet.time_base)
+                corrupt += packet.is_corrupt
+    return np.sort(np.array(times, dtype=float)), corrupt
+
+
+def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, av.VideoFrame]]:
+    """(time, frame) of a video from the keyframe before ``time_s`` on."""
+    with _plainly(path, "a video"), av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        assert stream.time_base is not None
+        base = float(stream.time_base)
+        container.seek(max(0, round(time_s / base) - 1), stream=stream)
+        frames = container.decode(stream)
+        first = next(frames, None)
+        if first is None or first.pts is None or first.pts * base > time_s + TOLERANCE_S:
+            container.seek(0, stream=stream)  # an index that points behind the wanted frame: from the start, then
+            frames = container.decode(stream)
+        else:
+            yield first.pts * base, first
+        for frame in frames:
+            if frame.pts is not None:
+                yield frame.pts * base, frame
+
+
+@contextlib.contextmanager
+def _plainly(path: Path, what: str) -> Iterator[None]:
+    """Libraries' errors about ``path`` as a DatasetError in plain words."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path}: is missing: copy the whole dataset") from error
+    except (pa.ArrowException, av.error.FFmpegError, OSError, ValueError, IndexError) as error:
+        raise DatasetError(f"{path}: is not {what} ({type(error).__name__}: {' '.join(str(error).split())})") from error

@@ -1,0 +1,38 @@
+"""What a check found in an episode: a stable name, how bad, where, and in words what to do."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Severity = Literal["error", "warning", "note"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check says about one episode, or about one episode among the others of its recording."""
+
+    check: str
+    """Short stable name, e.g. ``joint_limit``."""
+    severity: Severity
+    """error: the episode's data is wrong, ingest quarantines it; warning: look at it; note: worth knowing."""
+    feature: str
+    """Feature, or channel for timing."""
+    text: str
+    """Thing, value, place and way out."""
+    rows: tuple[int, int] | None = None
+    """[first, last + 1)"""
+
+
+def not_judged(feature: str, what: str, why: str) -> Finding:
+    """A check that could not be made says so, rather than pass in silence."""
+    return Finding("not_judged", "note", feature, f"{what} not judged: {why}")
+
+
+def place(rows: tuple[int, int], fps: int) -> str:
+    """``rows 30 to 44 (1.00 to 1.50 s)``"""
+    return f"rows {rows[0]} to {rows[1] - 1} ({rows[0] / fps:.2f} to {rows[1] / fps:.2f} s)"
+
+
+def listed(names: list[str], most: int = 4) -> str:
+    """The first few names, and how many more."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

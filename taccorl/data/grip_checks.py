@@ -1,0 +1,311 @@
+"""Touch against the grippers: does each pad feel what its own gripper holds, when it holds it, and nothing before?
+
+    hold     the gripper's command goes on closing, its state does not: a part is between the fingers
+    lag      first contact of the pad − moment at which the gripper came to its held opening
+
+Letters in shapes: T rows.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_dilation, uniform_filter1d
+
+from taccorl.data.episode import Episode
+from taccorl.data.finding import Finding, listed, not_judged
+from taccorl.data.joint_checks import ACTION, STATE, episode_arms
+from taccorl.data.timing import runs
+from taccorl.data.touch_checks import JUDGE_S, Pad
+
+HOLD_GAP_M = 0.003
+"""The command is this far past the state: more than calibration offset, less than any firm grip (8 mm is usual)."""
+HOLD_SPEED_M_PER_S = 0.010
+"""A closing gripper moves at 50 to 200 mm/s, a stalled one creeps as the pads give."""
+HOLD_MIN_S = 0.3
+HOLD_MERGE_S = 0.2
+STOP_BAND_M = 0.001
+"""Within this of its held opening the gripper has reached the part: a pad's rubber gives about so much."""
+HOLD_EDGE_S = 0.2
+"""Cut off both ends of a hold before asking a pad whether it feels it: clocks and creep blur them."""
+HOLD_SUM_S = 0.3
+"""It takes so much holding to judge a pad."""
+FEELS, SILENT = 0.8, 0.2
+"""A pad feels a hold if it is in contact in this share of its rows, and is silent below the other."""
+TOUCH_LAG_S = (-0.05, 0.15)
+"""Plausible first contact after the gripper's stop: soft parts are felt before it, 100 Hz scans and drivers come after."""
+TOUCH_LAG_SEARCH_S = 1.5
+OPEN_SHARE = 0.8
+"""Of the episode's widest opening: the gripper is open, nothing ought to touch the pads."""
+RELEASE_S = 0.3
+"""After a release the film creeps back: these rows do not count as rest."""
+REST_MIN_S = 0.3
+"""Rest needed at each end of an episode to speak of drift."""
+DRIFT_SHARE = 1 / 3
+"""Of the sensor's noise_count (15 counts): a drift of 5 counts in an episode eats a third of the contact threshold."""
+OFFSET_SHARE = 0.05
+"""Share of a pad's taxels (19 of 384) that may rest beyond the noise_count: residual touch, single bad taxels."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A gripper holds a part."""
+
+    first: int
+    """Row at which the gripper stands still."""
+    end: int
+    """Last row + 1."""
+    stop_s: float | None
+    """Episode time at which it came within STOP_BAND_M of its held opening; None if it held from row 0."""
+
+
+def find_holds(opening: np.ndarray, command: np.ndarray, fps: int) -> list[Hold]:
+    """Holds of one gripper from its opening (T,) and commanded opening (T,), both in m."""
+    opening, command = opening.astype(float), command.astype(float)
+    if len(opening) < 3:
+        return []
+    speed = np.abs(np.gradient(uniform_filter1d(opening, 3))) * fps
+    still = (opening - command > HOLD_GAP_M) & (speed < HOLD_SPEED_M_PER_S)
+    for first, end in runs(~still):
+        if first > 0 and end < len(still) and end - first <= HOLD_MERGE_S * fps:
+            still[first:end] = True
+    holds = []
+    for first, end in runs(still):
+        if end - first < HOLD_MIN_S * fps:
+            continue
+        held = float(np.median(opening[first:end])) + STOP_BAND_M
+        wider = np.flatnonzero(opening[:end] > held)
+        wider = wider[wider < (first + end) // 2]
+        stop_s = None
+        if len(wider) and wider[-1] + 1 < len(opening):
+            k = int(wider[-1])
+            stop_s = (k + (opening[k] - held) / max(opening[k] - opening[k + 1], 1e-9)) / fps
+        holds.append(Hold(first, end, stop_s))
+    return holds
+
+
+@dataclass(frozen=True)
+class Grippers:
+    """What the grippers did in an episode."""
+
+    opening: dict[str, np.ndarray]
+    """Arm → (T,) m."""
+    holds: dict[str, list[Hold]]
+    """Arm → its holds."""
+
+    def held(self, arm: str, *, cut: int = 0, grow: int = 0) -> np.ndarray:
+        """(T,) bool: the arm holds; holds cut by ``cut`` rows, or grown by ``grow`` rows, at both ends."""
+        rows = np.zeros(len(self.opening[arm]), dtype=bool)
+        for hold in self.holds[arm]:
+            rows[max(hold.first + cut - grow, 0) : max(hold.end - cut + grow, 0)] = True
+        return rows
+
+    def rest(self, arm: str, fps: int) -> np.ndarray:
+        """(T,) bool: gripper open, and not just after a release."""
+        opening = self.opening[arm]
+        closed = self.held(arm) | (opening < OPEN_SHARE * opening.max())
+        return ~binary_dilation(closed, np.ones(2 * round(RELEASE_S * fps) + 1, dtype=bool))
+
+
+def read_grippers(episode: Episode) -> Grippers | None:
+    """None where state or command have no gripper in m."""
+    arms = [arm for arm in episode_arms(episode) if arm.gripper is not None]
+    if not arms or not all(np.isfinite(episode.arrays[k]).all() for k in (STATE, ACTION)):
+        return None
+    opening = {a.name: episode.arrays[STATE][:, a.gripper] for a in arms}
+    command = {a.name: episode.arrays[ACTION][:, a.gripper] for a in arms}
+    return Grippers(opening, {a: find_holds(opening[a], command[a], episode.spec.fps) for a in opening})
+
+
+def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad], grippers: Grippers) -> list[Finding]:
+    """Everything that pads and grippers say together."""
+    fps = episode.spec.fps
+    if episode.num_rows < JUDGE_S * fps:
+        return [not_judged(key, "touch against grippers", f"{episode.num_rows / fps:.1f} s, it takes {JUDGE_S:g} s")]
+    own = [pad for pad in pads if pad.arm in grippers.opening]
+    if not own:
+        return [not_judged(key, "touch against grippers", f"pads {[p.name for p in pads]} name no arm with a gripper")]
+    if not any(grippers.holds.values()):
+        findings = [
+            not_judged(key, "touch against grippers", "no gripper holds anything (command past a stalled state)")
+        ]
+    else:
+        findings = _check_holds(key, own, grippers, fps)
+    return findings + [f for pad in own for f in _check_rest(key, pad, grippers.rest(pad.arm, fps))]
+
+
+# ---- holds ----
+
+
+def _share(contact: np.ndarray, rows: np.ndarray, fps: int) -> float | None:
+    """Share of ``rows`` in contact; None where they are too few to say."""
+    return float(contact[rows].mean()) if rows.sum() >= HOLD_SUM_S * fps else None
+
+
+def swapped_pads(pads: list[Pad], grippers: Grippers, fps: int) -> list[str] | None:
+    """Pads that feel the other arm's holds and not their own; None where the arms never hold one without the other.
+
+    While one arm holds alone, a pad of its own must be silent and one of the other arm's must feel it; and where the other
+    arm holds alone as well, it must be the other way round.
+    """
+    if len(grippers.opening) != 2:
+        return []
+    edge = round(HOLD_EDGE_S * fps)
+    arms = list(grippers.opening)
+    alone = [grippers.held(a, cut=edge) & ~grippers.held(b, grow=edge) for a, b in (arms, reversed(arms))]
+    shares = {p.name: [_share(p.contact, rows, fps) for rows in alone] for p in pads}
+    if all(share is None for both in shares.values() for share in both):
+        return None
+    found: set[str] = set()
+    for holding, resting in ((0, 1), (1, 0)):
+        own = [p for p in pads if p.arm == arms[holding]]
+        others = [p for p in pads if p.arm == arms[resting]]
+        if any(shares[p.name][holding] is None for p in pads):
+            continue
+        absent = [p for p in own if shares[p.name][holding] <= SILENT and shares[p.name][resting] in (None, *_feels)]
+        intruding = [p for p in others if shares[p.name][holding] >= FEELS]
+    return sorted(found)
+
+
+def _check_silence(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[Finding]:
+    held = {a: grippers.held(a, cut=round(HOLD_EDGE_S * fps)) for a in grippers.opening}
+    felt = {pad.name: _share(pad.contact, held[pad.arm], fps) for pad in pads}
+    judged = {name: share for name, share in felt.items() if share is not None}
+    silent = [name for name, share in judged.items() if share <= SILENT]
+    if not silent:
+        return []
+    loudest = max(float(np.abs(p.counts[held[p.arm]]).max()) for p in pads if p.name in silent)
+    if len(silent) == len(judged) and not any(pad.contact.any() for pad in pads):
+        seconds = sum(float(rows.sum()) for rows in held.values()) / fps
+        return [
+            Finding(
+                "noise_only",
+                "error",
+                key,
+                f"grippers hold parts for {seconds:.1f} s and no pad feels anything but noise (up to {loudest:.0f} counts, "
+                f"neighbouring taxels unlike each other, or below noise_count {pads[0].noise_count:g}): pads unplugged, "
+                f"wrong wire layout (rows, columns, transpose), or another recording's touch",
+            )
+        ]
+    return [
+        Finding(
+            "silent_pad",
+            "warning",
+            key,
+            f"{listed(silent)} never in contact while the gripper holds a part and other pads feel theirs: pad unplugged, "
+            f"or the part is held beside it",
+        )
+    ]
+
+
+def touch_lags(pads: list[Pad], grippers: Grippers, fps: int) -> dict[str, list[float]]:
+    """Arm → first contact after the gripper's stop (s), one per pad and hold that show both."""
+    lags: dict[str, list[float]] = {}
+    reach = round(TOUCH_LAG_SEARCH_S * fps)
+    for pad in pads:
+        for k, hold in enumerate(grippers.holds[pad.arm]):
+            if hold.stop_s is None:
+                continue
+            stop = round(hold.stop_s * fps)
+            before = grippers.holds[pad.arm][k - 1].end if k else 0
+            first, end = max(stop - reach, before), min(stop + reach, hold.end)
+            onset = _onset(pad, first, end)
+            if onset is not None:
+                lags.setdefault(pad.arm, []).append(onset / fps - hold.stop_s)
+    return lags
+
+
+def _onset(pad: Pad, first: int, end: int) -> float | None:
+    """Row, to a fraction, at which the pad begins to feel something that lasts; None if it does already or never does."""
+    lasting = [(a, b) for a, b in runs(pad.contact[first:end]) if b - a >= HOLD_SUM_S * pad.fps or b == end - first]
+    if not lasting or lasting[0][0] == 0:
+        return None
+    row = first + lasting[0][0]
+    level = pad.smooth[row - 1 : row + 1].max(axis=(1, 2))
+    return row - 1 + float(np.clip((pad.noise_count - level[0]) / max(level[1] - level[0], 1e-9), 0.0, 1.0))
+
+
+def _check_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[Finding]:
+    findings = []
+    low, high = TOUCH_LAG_S[0] - 1 / fps, TOUCH_LAG_S[1] + 1 / fps
+    for arm, lags in touch_lags(pads, grippers, fps).items():
+        lag = float(np.median(lags))
+        if low <= lag <= high:
+            continue
+        names = [pad.name for pad in pads if pad.arm == arm]
+        findings.append(
+            Finding(
+                "touch_lag",
+                "warning",
+                key,
+                f"{listed(names)} feel the part {abs(lag):.3f} s {'before' if lag < 0 else 'after'} the gripper stops on "
+                f"it (median of {len(lags)}; plausible {low:.2f} to {high:.2f} s): their clock is off by about "
+                f"{lag - sum(TOUCH_LAG_S) / 2:+.2f} s; set `clock` or `latency_s` on the pads' channels",
+            )
+        )
+    return findings
+
+
+# ---- rest ----
+
+
+def rest_change(counts: np.ndarray, rest: np.ndarray, fps: int) -> tuple[float, float] | None:
+    """(counts, seconds): change of the resting level of (T, R, C) between the first and the last rest, and the time between.
+
+    Median over the half of the pad that is touched least: the film under a contact creeps. None without rest at both ends.
+    """
+    found = [r for r in runs(rest) if r[1] - r[0] >= REST_MIN_S * fps]
+    if not found:
+        return None
+    first, last = found[0], found[-1]
+    if first == last:
+        third = (first[1] - first[0]) // 3
+        first, last = (first[0], first[0] + third), (last[1] - third, last[1])
+    seconds = (sum(last) - sum(first)) / 2 / fps
+    if min(first[1] - first[0], last[1] - last[0]) < REST_MIN_S * fps or seconds < 0.5 * len(counts) / fps:
+        return None
+    change = counts[slice(*last)].mean(axis=0) - counts[slice(*first)].mean(axis=0)
+    peak = counts.max(axis=0)
+    return float(np.median(change[peak <= np.median(peak)])), seconds
+
+
+def rest_level(counts: np.ndarray, rest: np.ndarray, fps: int) -> float | None:
+    """Counts: median resting level of (T, R, C) at the episode's first rest; None without one."""
+    found = [r for r in runs(rest) if r[1] - r[0] >= REST_MIN_S * fps]
+    return float(np.median(counts[slice(*found[0])].mean(axis=0))) if found else None
+
+
+def _check_rest(key: str, pad: Pad, rest: np.ndarray) -> list[Finding]:
+    findings = []
+    found = rest_change(pad.counts, rest, pad.fps)
+    limit = DRIFT_SHARE * pad.noise_count
+    if found is None:
+        findings.append(not_judged(key, f"baseline drift of {pad.name}", "its gripper does not rest open at both ends"))
+    elif abs(found[0]) > limit:
+        change, seconds = found
+        findings.append(
+            Finding(
+                "baseline_drift",
+                "warning",
+                key,
+                f"{pad.name}: untouched taxels drift by {change:+.1f} counts in {seconds:.1f} s ({change / seconds:+.2f} "
+                f"counts/s; limit {limit:g} counts an episode, a third of noise_count): warm up the pads, take a new "
+                f"baseline for each recording",
+            )
+        )
+    if rest.sum() >= REST_MIN_S * pad.fps:
+        level = np.median(pad.counts[rest], axis=0)
+        off = (np.abs(level) > pad.noise_count) & ~pad.stuck
+        if off.mean() > OFFSET_SHARE:
+            way_out = (
+                "touched while the baseline was taken" if np.median(level[off]) < 0 else "still touched, or drifted"
+            )
+            findings.append(
+                Finding(
+                    "baseline_offset",
+                    "warning",
+                    key,
+                    f"{pad.name}: {int(off.sum())} taxels rest at {np.median(level[off]):+.0f} counts (median) with the "
+                    f"gripper open: {way_out}; record with the pads free for the first second",
+                )
+            )
+    return findings

@@ -1,0 +1,293 @@
+"""The records of an MCAP file, none of them trusted: is this one whole, where is the next one, what does a chunk hold.
+
+A record is an opcode (1 byte), a length (8) and a body. CRCs protect what is inside a chunk and the summary at the file's
+end, nothing else; so a record counts as whole only if the lengths inside its body add up to its own.
+"""
+
+import io
+import struct
+import zlib
+from bisect import bisect_left
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO, NamedTuple
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, Message, MetadataIndex, Schema
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER_BYTES = 9
+MAX_CHUNK_BYTES = 1 << 28
+"""256 MiB. A larger chunk is not opened: a few damaged bytes must not take all the memory."""
+BLOCK_BYTES = 1 << 20
+
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
+MESSAGE_BYTES = 22  # channel (2), sequence (4), log time (8), publish time (8); the rest is the payload
+
+# Bodies: a number of fixed bytes; "short", "long": a part behind its own length in 4 or 8 bytes.
+_LAYOUTS: dict[int, tuple[int | str, ...]] = {
+    HEADER: ("short", "short"),
+    FOOTER: (20,),
+    SCHEMA: (2, "short", "short", "short"),
+    CHANNEL: (4, "short", "short", "short"),
+    CHUNK: (28, "short", "long"),
+    MESSAGE_INDEX: (2, "short"),
+    CHUNK_INDEX: (32, "short", 8, "short", 16),
+    ATTACHMENT: (16, "short", "short", "long", 4),
+    ATTACHMENT_INDEX: (40, "short", "short"),
+    STATISTICS: (42, "short"),
+    METADATA: ("short", "short"),
+    METADATA_INDEX: (16, "short"),
+    SUMMARY_OFFSET: (17,),
+    DATA_END: (4,),
+}
+KNOWN_OPCODES = frozenset({*_LAYOUTS, MESSAGE})
+_END_BYTES = HEADER_BYTES + 20 + len(MAGIC)
+
+
+class Record(NamedTuple):
+    """Where a record lies in its file."""
+
+    opcode: int
+    offset: int
+    length: int
+    """Bytes of its body."""
+
+    @property
+    def body(self) -> int:
+        return self.offset + HEADER_BYTES
+
+    @property
+    def end(self) -> int:
+        return self.body + self.length
+
+
+def whole_record(file: BinaryIO, offset: int, size: int) -> Record | None:
+    """The record at ``offset``, or None if what stands there cannot be one."""
+    record = _header(file, offset, size)
+    if record is None or record.end > size or record.opcode == 0:
+        return None
+    if record.opcode in _LAYOUTS:
+        return record if _fills(file, record) else None
+    if record.opcode == MESSAGE:
+        # Nothing inside a message says how long it is; and a damaged opcode must not make another record a message.
+        others = (HEADER, SCHEMA, CHANNEL, CHUNK, MESSAGE_INDEX, METADATA)
+        if record.length < MESSAGE_BYTES or any(_fills(file, record._replace(opcode=o)) for o in others):
+            return None
+    return record if _may_begin(file, record.end, size) else None
+
+
+def _header(file: BinaryIO, offset: int, size: int) -> Record | None:
+    if offset + HEADER_BYTES > size:
+        return None
+    file.seek(offset)
+    opcode, length = struct.unpack("<BQ", file.read(HEADER_BYTES))
+    return Record(opcode, offset, length)
+
+
+def _fills(file: BinaryIO, record: Record) -> bool:
+    """Do the lengths inside the body add up to the record's?"""
+    at = record.body
+    for part in _LAYOUTS[record.opcode]:
+        if isinstance(part, int):
+            at += part
+            continue
+        width = 4 if part == "short" else 8
+        if at + width > record.end:
+            return False
+        file.seek(at)
+        at += width + int.from_bytes(file.read(width), "little")
+    return at == record.end
+
+
+def _may_begin(file: BinaryIO, offset: int, size: int) -> bool:
+    """Could a record begin here? Yes at the end of the file, and where it was cut within a record."""
+    record = _header(file, offset, size)
+    if record is None:
+        return True
+    if record.opcode not in KNOWN_OPCODES and record.opcode < 0x80:
+        return False
+    if record.end > size or record.opcode not in _LAYOUTS:
+        return MESSAGE_BYTES <= record.length < 1 << 40
+    return _fills(file, record)
+
+
+def find_record(
+    file: BinaryIO, start: int, stop: int, size: int, opcodes: Collection[int], channels: Collection[int] = ()
+) -> int | None:
+    """Offset of the first whole record of one of ``opcodes`` in [start, stop); messages only of these channel ids."""
+    for offset in range(start, stop, BLOCK_BYTES):
+        file.seek(offset)
+        block = np.frombuffer(file.read(min(BLOCK_BYTES, stop - offset) + HEADER_BYTES - 1), np.uint8)
+        if len(block) < HEADER_BYTES:
+            return None
+        heads = block[: len(block) - HEADER_BYTES + 1]
+        small = (block[6 : len(heads) + 6] == 0) & (block[7 : len(heads) + 7] == 0) & (block[8:] == 0)  # below 2⁴⁰ bytes
+        for at in np.flatnonzero(np.isin(heads, list(opcodes)) & small):
+            record = whole_record(file, offset + int(at), size)
+            if record is not None and _is_sure(file, record, size, channels):
+                return record.offset
+    return None
+
+
+def _is_sure(file: BinaryIO, record: Record, size: int, channels: Collection[int]) -> bool:
+    if record.opcode == MESSAGE:
+        channel = int.from_bytes(read_body(file, record)[:2], "little")
+        return channel in channels and (record.end == size or whole_record(file, record.end, size) is not None)
+    return record.opcode != DATA_END or _may_begin(file, record.end, size)
+
+
+def read_body(file: BinaryIO, record: Record) -> bytes:
+    file.seek(record.body)
+    return file.read(record.length)
+
+
+def parse(opcode: int, body: bytes) -> Any:
+    """A message, or a record of mcap's own kinds."""
+    if opcode == MESSAGE:
+        channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
+        payload = body[MESSAGE_BYTES:]
+        return Message(channel, log_time, payload, publish_time, sequence)
+    return _PARSERS[opcode](ReadDataStream(io.BytesIO(body)))
+
+
+_PARSERS = {
+    SCHEMA: Schema.read,
+    CHANNEL: Channel.read,
+    CHUNK: Chunk.read,
+    CHUNK_INDEX: ChunkIndex.read,
+    ATTACHMENT_INDEX: AttachmentIndex.read,
+    METADATA_INDEX: MetadataIndex.read,
+}
+
+
+@dataclass
+class Summary:
+    """What the end of a file says about the rest."""
+
+    problem: str | None = None
+    """Why nothing in it is believed."""
+    proven: bool = False
+    """Its CRC is there and right."""
+    schemas: list[Schema] = field(default_factory=list)
+    channels: list[Channel] = field(default_factory=list)
+    has_chunks: bool = False
+    starts: list[int] = field(default_factory=list)
+    """Offsets of its chunks, attachments and metadata records, ascending."""
+    end: int | None = None
+    """Where the data section ends."""
+
+    def next_start(self, offset: int) -> int | None:
+        """The first indexed record at or after ``offset``."""
+        k = bisect_left(self.starts, offset)
+        return self.starts[k] if k < len(self.starts) else None
+
+
+def read_summary(file: BinaryIO, size: int) -> Summary:
+    """The summary, if the file has a footer and what it points to is sound."""
+    footer = whole_record(file, size - _END_BYTES, size) if size >= len(MAGIC) + _END_BYTES else None
+    file.seek(max(size - len(MAGIC), 0))
+    if footer is None or footer.opcode != FOOTER or file.read() != MAGIC:
+        return Summary(problem="there is no footer")
+    start, _, crc = struct.unpack("<QQI", read_body(file, footer))
+    if start == 0:
+        return Summary(end=footer.offset)
+    if not len(MAGIC) <= start <= footer.offset:
+        return Summary(problem="its footer points nowhere")
+    if crc and _crc(file, start, footer.end - 4) != crc:
+        return Summary(problem="its CRC does not match")
+    summary, offset = Summary(proven=crc != 0, end=start), start
+    while offset < footer.offset:
+        record = whole_record(file, offset, footer.offset)
+        if record is None or record.opcode in (MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END):
+            return Summary(problem=f"no index record at byte {offset:,}")
+        try:
+            _add(summary, record.opcode, read_body(file, record))
+        except (ValueError, struct.error, McapError) as error:
+            return Summary(problem=f"unreadable at byte {offset:,}: {error}")
+        offset = record.end
+    summary.starts.sort()
+    return summary
+
+
+def _add(summary: Summary, opcode: int, body: bytes) -> None:
+    if opcode == SCHEMA:
+        summary.schemas.append(parse(opcode, body))
+    elif opcode == CHANNEL:
+        summary.channels.append(parse(opcode, body))
+    elif opcode == CHUNK_INDEX:
+        summary.starts.append(parse(opcode, body).chunk_start_offset)
+        summary.has_chunks = True
+    elif opcode in (ATTACHMENT_INDEX, METADATA_INDEX):
+        summary.starts.append(parse(opcode, body).offset)
+
+
+def data_crc_matches(file: BinaryIO, data_end: Record) -> bool:
+    """Does the data section agree with the CRC in its last record? True where the writer left none."""
+    crc = int.from_bytes(read_body(file, data_end), "little")
+    return crc == 0 or _crc(file, 0, data_end.offset) == crc
+
+
+def _crc(file: BinaryIO, start: int, end: int) -> int:
+    file.seek(start)
+    crc = 0
+    while start < end and (block := file.read(min(BLOCK_BYTES, end - start))):
+        crc, start = zlib.crc32(block, crc), start + len(block)
+    return crc
+
+
+def chunk_records(chunk: Chunk) -> Iterator[Any]:
+    """Schemas, channels and messages of a chunk in order; its CRC is checked before the first one.
+
+    Raises:
+        ValueError: too large, does not decompress, wrong CRC, or not made of whole records.
+    """
+    data = _contents(chunk)
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ValueError("its CRC does not match")
+    if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
+        raise ValueError(f"{len(data):,} bytes uncompressed, it claims {chunk.uncompressed_size:,}")
+    offset = 0
+    while offset < len(data):
+        opcode, length = struct.unpack_from("<BQ", data, offset)
+        start, offset = offset + HEADER_BYTES, offset + HEADER_BYTES + length
+        if offset > len(data):
+            raise ValueError("a record reaches beyond its end")
+        if opcode in (SCHEMA, CHANNEL, MESSAGE):
+            yield parse(opcode, data[start:offset])
+
+
+def _contents(chunk: Chunk) -> bytes:
+    """Uncompressed, and never more than the chunk claims."""
+    claims = chunk.uncompressed_size
+    if claims > MAX_CHUNK_BYTES:
+        raise ValueError(f"it claims {claims:,} bytes uncompressed, at most {MAX_CHUNK_BYTES:,} are opened")
+    if chunk.compression == "":
+        return chunk.data
+    if chunk.compression not in ("zstd", "lz4"):
+        raise ValueError(f"compression {chunk.compression!r} is not read")
+    data = bytearray()
+    for block in _zstd_blocks(chunk.data) if chunk.compression == "zstd" else _lz4_blocks(chunk.data):
+        data += block
+        if len(data) > claims:
+            raise ValueError(f"it holds more than the {claims:,} bytes that it claims")
+    return bytes(data)
+
+
+def _zstd_blocks(data: bytes) -> Iterator[bytes]:
+    with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+        while block := reader.read(BLOCK_BYTES):
+            yield block
+
+
+def _lz4_blocks(data: bytes) -> Iterator[bytes]:
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    block = decompressor.decompress(data, BLOCK_BYTES)
+    while block:
+        yield block
+        block = b"" if decompressor.eof else decompressor.decompress(b"", BLOCK_BYTES)

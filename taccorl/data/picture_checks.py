@@ -1,0 +1,117 @@
+"""Do the cameras live? A camera that repeats one picture while joints move shows something that is not so.
+
+Two ways to see it: the same source picture on many rows (``Episode.picture_rows``), and decoded pictures that do not
+change. Each picture is compared as block means in grey levels, so that neither noise nor a video codec decides.
+"""
+
+import cv2
+import numpy as np
+
+from taccorl.data.episode import Episode
+from taccorl.data.finding import Finding, not_judged, place
+from taccorl.data.joint_checks import FROZEN_S, STATE, element_names, element_units, find_arms
+from taccorl.data.timing import runs
+
+THUMB_PX = 28
+"""Block means on a side: 8 × 8 pixels each at 224 × 224. Sensor noise of 3 levels leaves about 0.4 there."""
+SAME_LEVELS = 2.0
+"""Grey levels (of 255): pictures whose block means all differ less are the same picture."""
+SIGHT_RAD = 0.3
+"""An arm that turns a joint this far (12 cm at 0.4 m) is seen to move."""
+FROZEN_SHARE = 0.5
+"""Of the episode's rows: from here on the pictures are wrong rather than poor."""
+DARK_LEVEL = 4.0
+
+
+def thumbnail(picture: np.ndarray) -> np.ndarray:
+    """(THUMB_PX, THUMB_PX) float32 grey block means of a (rows, columns, 3) picture."""
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    return cv2.resize(grey.astype(np.float32), (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
+
+
+def same_picture_runs(thumbs: np.ndarray) -> list[tuple[int, int]]:
+    """[first, last + 1) of stretches whose pictures all look like their first; thumbs (T, h, w).
+
+    Compared with the first one, not the one before: a slow change adds up and ends the stretch.
+    """
+    found, first = [], 0
+    for row in range(1, len(thumbs) + 1):
+        if row == len(thumbs) or np.abs(thumbs[row] - thumbs[first]).max() >= SAME_LEVELS:
+            found.append((first, row))
+            first = row
+    return found
+
+
+def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
+    """Frozen cameras.
+
+    Args:
+        decode: also look at the pictures themselves, which takes their decoding.
+    """
+    findings = []
+    for key in episode.picture_keys:
+        numbers = episode.picture_rows.get(key)
+        if numbers is not None:
+            findings += _check_sources(episode, key, numbers)
+    open_keys = [key for key in episode.picture_keys if key not in {f.feature for f in findings}]
+    if not decode or not open_keys:
+        return findings
+    thumbs: dict[str, list[np.ndarray]] = {key: [] for key in open_keys}
+    for pictures in episode.pictures():
+        for key in open_keys:
+            thumbs[key].append(thumbnail(pictures[key]))
+    for key in open_keys:
+        findings += _check_thumbs(episode, key, np.array(thumbs[key]))
+    return findings
+
+
+def _frozen(episode: Episode, key: str, rows: tuple[int, int], what: str, num_frozen: int) -> Finding:
+    share = num_frozen / episode.num_rows
+    severity = "error" if share >= FROZEN_SHARE else "warning"
+    return Finding(
+        "frozen_picture",
+        severity,
+        key,
+        f"{what} for {(rows[1] - rows[0]) / episode.spec.fps:.2f} s, {place(rows, episode.spec.fps)}; {share:.0%} of the "
+        f"episode is frozen: the camera or its driver hung; cut these rows out, and look at the camera's USB port",
+        rows,
+    )
+
+
+def _check_sources(episode: Episode, key: str, numbers: np.ndarray) -> list[Finding]:
+    same = np.concatenate([[False], np.diff(numbers) == 0])
+    found = [(a - 1, b) for a, b in runs(same) if (b - a + 1) / episode.spec.fps >= FROZEN_S]
+    if not found:
+        return []
+    rows = max(found, key=lambda r: r[1] - r[0])
+    return [_frozen(episode, key, rows, "the same source picture", sum(b - a for a, b in found))]
+
+
+def _check_thumbs(episode: Episode, key: str, thumbs: np.ndarray) -> list[Finding]:
+    if len(thumbs) != episode.num_rows:
+        return [not_judged(key, "pictures", f"{len(thumbs)} pictures for {episode.num_rows} rows")]
+    joints = _joints_in_sight(episode, key)
+    if joints is None:
+        return [not_judged(key, "frozen pictures", "no joints in rad to compare with")]
+    found = []
+    for first, end in same_picture_runs(thumbs):
+        moved = np.ptp(joints[first:end], axis=0).max(initial=0.0)
+        if (end - first) / episode.spec.fps >= FROZEN_S and moved >= SIGHT_RAD:
+            found.append((first, end))
+    if not found:
+        return []
+    rows = max(found, key=lambda r: r[1] - r[0])
+    dark = thumbs[rows[0]].mean() < DARK_LEVEL
+    what = f"{'black' if dark else 'unchanged'} pictures while joints move by more than {SIGHT_RAD:g} rad"
+    return [_frozen(episode, key, rows, what, sum(b - a for a, b in found))]
+
+
+def _joints_in_sight(episode: Episode, key: str) -> np.ndarray | None:
+    """(T, n) joints that the camera ought to see move: a wrist camera's own arm, else all arms."""
+    if STATE not in episode.arrays or not np.isfinite(episode.arrays[STATE]).all():
+        return None
+    arms = find_arms(element_names(episode, STATE), element_units(episode, STATE))
+    camera = key.rsplit(".", 1)[-1]
+    own = [arm for arm in arms if arm.name and camera.startswith(f"{arm.name}_")] or arms
+    elements = np.concatenate([arm.joints for arm in own]) if own else np.empty(0, dtype=int)
+    return episode.arrays[STATE][:, elements] if len(elements) else None

@@ -1,0 +1,173 @@
+"""A LeRobot v3 dataset as recordings, one per episode: for datasets that others recorded, or to bring one to another spec.
+
+Topics are feature keys and ``task``. A taccorl dataset's touch also comes pad by pad, as ``<feature>/<pad>``: counts as the
+pad sent them (baseline added back, wire order), since a recording spec reads pads from the wire. Pictures are decoded
+videos: written again they are compressed twice.
+"""
+
+import contextlib
+import functools
+import re
+from collections.abc import Collection, Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taccorl.data.dataset import BOOKKEEPING, Dataset
+from taccorl.data.readers.hdf5 import RowClock
+from taccorl.data.recording import Message, Reader, Source, TopicType, readers
+from taccorl.data.timing import NS_PER_S
+from taccorl.errors import DatasetError, RecordingError
+
+TASK = "task"
+REGULAR_S = 1e-3
+"""Times stamps may be off k / fps by this (they are float32) and still mean row k."""
+
+
+@readers.register("lerobot")
+class LerobotReader(Reader):
+    """One episode of a LeRobot v3 dataset."""
+
+    @classmethod
+    def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
+        """One recording per episode of a dataset's folder."""
+        del split_bag
+        if not (path / "meta" / "info.json").is_file():
+            return None
+        with _as_recording_errors():
+            dataset = Dataset(path)
+            cameras = [k for k, f in dataset.info["features"].items() if f["dtype"] == "video"]
+            return [
+                Source(
+                    path,
+                    (dataset.data_file(i), *(dataset.video(i, camera).path for camera in cameras)),
+                    f"episode_{i:06d}",
+                )
+                for i in range(dataset.num_episodes)
+            ]
+
+    @functools.cached_property
+    def dataset(self) -> Dataset:
+        with _as_recording_errors():
+            return Dataset(self.source.path)
+
+    @functools.cached_property
+    def index(self) -> int:
+        """Which episode."""
+        found = re.fullmatch(r"episode_(\d+)", self.source.part or "")
+        if found is None:
+            raise RecordingError(f"{self.source.name}: names no episode; give the folder of a LeRobot dataset")
+        return int(found[1])
+
+    def topics(self) -> dict[str, TopicType]:
+        found = {TASK: TopicType("String", "lerobot")}
+        for key, f in self.dataset.info["features"].items():
+            shape = tuple(f["shape"])
+            if key in BOOKKEEPING:
+                continue
+            if f["dtype"] == "string":
+                found[key] = TopicType("String", "lerobot")
+            elif f["dtype"] in ("video", "image"):
+                colour = f["dtype"] == "video" and 3 in shape and not (f.get("info") or {}).get("is_depth_map")
+                found[key] = TopicType(f["dtype"], "lerobot", None if colour else self.dataset.skipped[key], shape)
+            else:
+                found[key] = TopicType(f["dtype"], "lerobot", None, shape)
+        for key, pad in self._pads():
+            sensor = self.dataset.spec.sensors[key]
+            found[f"{key}/{pad}"] = TopicType(sensor.wire.dtype, "lerobot", None, (sensor.rows * sensor.columns,))
+        return found
+
+    def messages(
+        self,
+        topics: Collection[str] | None,
+        *,
+        stamps_only: Collection[str] = (),
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[Message]:
+        known = self.topics()
+        asked = [topic for topic in known if topics is None or topic in topics]
+        read = [t for t in asked if topics is not None and t not in stamps_only]
+        for topic in read:
+            if known[topic].undecodable:
+                raise RecordingError(f"{self.source.name}: {topic}: {known[topic].undecodable}")
+        with _as_recording_errors(), contextlib.ExitStack() as stack:
+            log_ns = self._times_ns(asked)
+            tasks = dict(self.dataset.tasks(self.index))
+            self._describe(tasks)
+            inside = {t: _inside(times, start_ns, end_ns) for t, times in log_ns.items()}
+            if TASK in inside:
+                inside[TASK] &= np.isin(np.arange(self.dataset.num_rows(self.index)), list(tasks))
+            numbers = self._numbers([t for t in read if known[t].name != "video" and t != TASK])
+            films = {t: stack.enter_context(self._film(t, inside[t])) for t in read if known[t].name == "video"}
+            for k in range(self.dataset.num_rows(self.index)):
+                for topic in asked:
+                    if not inside[topic][k]:
+                        continue
+                    value: Any = None
+                    if topic in films:
+                        value = next(films[topic])
+                    elif topic in numbers:
+                        value = numbers[topic][k]
+                    elif topic in read:
+                        value = tasks[k]
+                    yield Message(topic, int(log_ns[topic][k]), None, value)
+
+    def _pads(self) -> list[tuple[str, str]]:
+        """(feature, pad) of every feature that is pads' newest readings."""
+        spec, present = self.dataset.spec, self.dataset.info["features"]
+        single = [k for k in spec.sensors if k in present and spec.features[k].history == 1]
+        return [(key, pad) for key in single for pad in spec.features[key].pads]
+
+    def _times_ns(self, topics: list[str]) -> dict[str, np.ndarray]:
+        """(T,) int64 per topic: row times by number where they are k / fps, else as stamped."""
+        stamped_s = self.dataset.values(self.index, ["timestamp"])["timestamp"].ravel().astype(float)
+        fps = self.dataset.spec.fps
+        clock, rows = RowClock.of(float(fps), self.spec), np.rint(stamped_s * fps).astype(np.int64)
+        if np.abs(stamped_s - rows / fps).max(initial=0.0) < REGULAR_S:
+            return {t: np.array([clock.time_ns(t, int(row)) for row in rows], dtype=np.int64) for t in topics}
+        stamped_ns = np.rint(stamped_s * NS_PER_S).astype(np.int64)
+        return {t: stamped_ns + clock.time_ns(t, 0) for t in topics}
+
+    def _describe(self, tasks: dict[int, str]) -> None:
+        told = self.dataset.told(self.index)
+        record = {"instruction": next(iter(tasks.values()), "")}
+        if told.get("success") is not None:
+            record["success"] = str(told["success"]).lower()
+        if told.get("origin"):
+            record["origin"] = told["origin"]
+        self.metadata["episode"] = record
+
+    def _numbers(self, topics: list[str]) -> dict[str, np.ndarray]:
+        """(T, …) values of features and single pads."""
+        pads = {f"{key}/{pad}": (key, pad) for key, pad in self._pads()}
+        features = {pads[t][0] if t in pads else t for t in topics}
+        stored = self.dataset.values(self.index, sorted(features))
+        return {t: self._wire_counts(*pads[t], stored[pads[t][0]]) if t in pads else stored[t] for t in topics}
+
+    def _wire_counts(self, key: str, pad: str, stored: np.ndarray) -> np.ndarray:
+        """(T, rows · columns) counts of one pad as its wire spec orders them."""
+        feature, sensor = self.dataset.spec.features[key], self.dataset.spec.sensors[key]
+        baseline = self.dataset.told(self.index).get("baselines", {}).get(key, 0)
+        counts = stored.astype(np.int64) + baseline
+        frames = counts.reshape(len(stored), len(feature.pads), sensor.rows, sensor.columns)[:, feature.pads.index(pad)]
+        return (frames.swapaxes(1, 2) if sensor.wire.transpose else frames).reshape(len(stored), -1)
+
+    def _film(self, key: str, inside: np.ndarray) -> contextlib.closing[Generator[np.ndarray, None, None]]:
+        rows = np.flatnonzero(inside)
+        first, end = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
+        return contextlib.closing(self.dataset.frames(self.index, key, first, end))
+
+
+def _inside(times_ns: np.ndarray, start_ns: int | None, end_ns: int | None) -> np.ndarray:
+    after = times_ns >= start_ns if start_ns is not None else np.ones(len(times_ns), dtype=bool)
+    return after & (times_ns <= end_ns) if end_ns is not None else after
+
+
+@contextlib.contextmanager
+def _as_recording_errors() -> Iterator[None]:
+    try:
+        yield
+    except DatasetError as error:
+        raise RecordingError(str(error)) from error

@@ -1,0 +1,362 @@
+"""Do the pads' taxels live? Dead, stuck, saturated, noisy or frozen ones, and how much of an episode is touch at all.
+
+Judged from one pad alone; ``grip_checks`` holds touch against the grippers. What one episode cannot show: a taxel that
+nothing touched (it is not called dead), the pads a and b of one gripper exchanged (both touch the same part at the
+same time), and a gain that is wrong for a whole pad.
+
+Letters in shapes: T time, R rows of taxels, C columns. Counts are above baseline.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from taccorl.data.episode import Episode
+from taccorl.data.finding import Finding, listed, not_judged, place
+from taccorl.data.joint_checks import FROZEN_S
+from taccorl.data.timing import runs
+
+JUDGE_S = 2.0
+"""Shorter episodes say too little about a taxel."""
+CONTACT_MIN_TAXELS = 1
+"""This many 3 × 3 means above the sensor's noise make contact: a mean, so that one stuck taxel is no contact."""
+DEAD_SHARE = 0.1
+"""A dead taxel shows less than this share of what its neighbours on both sides show."""
+DEAD_GAP = 2
+"""Two dead taxels side by side are still seen; wider gaps may be a hollow of the part."""
+DEAD_MIN_S = 0.3
+"""So long must a taxel lie inside a contact before it is called dead."""
+NOISE_VISIBLE_SHARE = 0.9
+"""If so many taxels of a pad ever change, the rest of them should too: then a constant one is dead or stuck."""
+RESTING_COUNT = 3
+"""A taxel whose resting count is lower clips at zero, where being constant is no fault, unless all others rest higher."""
+STUCK_S = 2.0
+"""A taxel with visible noise does not keep one value for 60 rows."""
+STUCK_ALWAYS = 0.95
+"""Share of rows in which a stuck taxel reads touch that none of its neighbours reads."""
+STUCK_BASELINE_FENCE = 1.5
+"""Tukey's fence: a constant taxel that rests so many quartile ranges above the pad's upper quartile is stuck, not dead."""
+SATURATED_S = 0.5
+SATURATED_SHARE = 0.05
+"""Of the rows in contact: from here on force magnitude is lost where it matters; below, it is a note."""
+NOISE_SIGMAS = 3.0
+"""The sensor's ``noise_count`` bounds an untouched taxel: noise of a third of it still keeps to that."""
+FROZEN_USUAL_SHARE = 0.1
+"""If a pad's frames repeat more often than this at all times, it has no visible noise, and repeats say nothing."""
+STRUCTURE = 0.25
+"""Correlation of neighbouring taxels: 0 for white noise, above 0.5 for any contact wider than one taxel."""
+
+
+@dataclass(frozen=True)
+class Pad:
+    """One pad's readings in one episode."""
+
+    name: str
+    counts: np.ndarray
+    """(T, R, C) float32 above baseline, newest reading of each row."""
+    baseline: np.ndarray | None
+    """(R, C) resting counts; None where the dataset does not hold them."""
+    noise_count: float
+    max_count: int
+    fps: int
+
+    @property
+    def arm(self) -> str:
+        """Prefix of the name: ``left_a`` is on the arm ``left``."""
+        return self.name.rpartition("_")[0]
+
+    @functools.cached_property
+    def repeated(self) -> np.ndarray:
+        """(T,) bool: the frame is bit-identical to the one before."""
+        return np.concatenate([[False], (np.diff(self.counts, axis=0) == 0).all(axis=(1, 2))])
+
+    @functools.cached_property
+    def stuck(self) -> np.ndarray:
+        """(R, C) bool. Repeated frames do not count: a hung driver is another fault."""
+        fresh = self.counts[~self.repeated]
+        return find_stuck(fresh, self.baseline, self.noise_count, self.max_count, self.fps)
+
+    @property
+    def shorted(self) -> np.ndarray:
+        """(R, C) bool: stuck at the wire's maximum."""
+        if self.baseline is None:
+            return np.zeros_like(self.stuck)
+        return self.stuck & (np.median(self.counts, axis=0) + self.baseline >= self.max_count)
+
+    @functools.cached_property
+    def smooth(self) -> np.ndarray:
+        """(T, R, C) means over 3 × 3 taxels, stuck ones taken as 0."""
+        living = np.where(self.stuck, np.float32(0), self.counts)
+        return uniform_filter1d(uniform_filter1d(living, 3, axis=1, mode="nearest"), 3, axis=2, mode="nearest")
+
+    @functools.cached_property
+    def structured(self) -> bool:
+        """Neighbouring taxels feel alike in the strongest frames: touch, not noise."""
+        return spatial_structure(np.where(self.stuck, np.float32(0), self.counts)) >= STRUCTURE
+
+    @functools.cached_property
+    def contact(self) -> np.ndarray:
+        """(T,) bool: the pad feels something."""
+        if not self.structured:
+            return np.zeros(len(self.counts), dtype=bool)
+        return (self.smooth >= self.noise_count).sum(axis=(1, 2)) >= CONTACT_MIN_TAXELS
+
+    @functools.cached_property
+    def noise_std(self) -> float:
+        """Counts from row to row of a typical taxel: most are untouched most of the time."""
+        return float(np.median(np.sqrt(np.mean(np.diff(self.counts, axis=0) ** 2, axis=0) / 2)))
+
+
+def read_pads(episode: Episode, key: str) -> list[Pad]:
+    """The pads of one tactile feature."""
+    sensor, fps = episode.spec.sensors[key], episode.spec.fps
+    counts = episode.pads(key)
+    shape = (len(counts), sensor.rows, sensor.columns)
+    stored = episode.baselines.get(key)
+    baselines = stored.reshape(shape) if stored is not None and stored.size == np.prod(shape) else [None] * len(counts)
+    return [
+        Pad(name, counts[name].astype(np.float32), baseline, sensor.noise_count, sensor.max_count, fps)
+        for name, baseline in zip(counts, baselines, strict=True)
+    ]
+
+
+def tactile_keys(episode: Episode) -> list[str]:
+    """Tactile features to judge: a window's newest reading repeats the plain feature, where there is one."""
+    keys = [k for k in episode.spec.sensors if k in episode.arrays]
+    plain = [k for k in keys if episode.spec.features[k].history == 1]
+    return plain or keys
+
+
+# ---- measures: arrays in, arrays out ----
+
+
+def constant_runs(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Per taxel: rows of the longest stretch without any change, and the value there; counts (T, ...)."""
+    row = np.arange(len(counts)).reshape(-1, *[1] * (counts.ndim - 1))
+    changed = np.diff(counts, axis=0, prepend=counts[:1] + 1) != 0
+    since = row - np.maximum.accumulate(np.where(changed, row, 0), axis=0)
+    last = since.argmax(axis=0)
+    return since.max(axis=0) + 1, np.take_along_axis(counts, last[None], axis=0)[0]
+
+
+def noise_visible(counts: np.ndarray) -> bool:
+    """Nearly all taxels of (T, R, C) ever change, so that one which does not is odd."""
+    return bool((np.ptp(counts, axis=0) > 0).mean() >= NOISE_VISIBLE_SHARE)
+
+
+def find_stuck(
+    counts: np.ndarray, baseline: np.ndarray | None, noise_count: float, max_count: int, fps: int
+) -> np.ndarray:
+    """(R, C) bool: constant far from its baseline, shorted from the start, or alone in feeling touch at all times."""
+    length, value = constant_runs(counts)
+    long = length >= min(STUCK_S * fps, len(counts))
+    stuck = np.zeros(counts.shape[1:], dtype=bool)
+    if noise_visible(counts):
+        stuck = long & (np.abs(value) > noise_count)
+        if baseline is not None:
+            # At the wire's maximum while others vary: saturated by a touch, unless it never comes down.
+            stuck &= (baseline + value < max_count) | (length == len(counts))
+            low, high = np.quantile(baseline, (0.25, 0.75))
+            stuck |= (length == len(counts)) & (baseline > high + STUCK_BASELINE_FENCE * (high - low))
+    always = ((np.abs(counts) > noise_count).mean(axis=0) >= STUCK_ALWAYS) & ~stuck
+    for r, c in np.argwhere(always):
+        around = np.abs(counts[:, max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]).reshape(len(counts), -1)
+        own = np.abs(counts[:, r, c])
+        alone = (around >= own[:, None] / 2).sum(axis=1) == 1
+        stuck[r, c] = alone.mean() >= STUCK_ALWAYS / 2
+    return stuck
+
+
+def inside_contact(counts: np.ndarray) -> np.ndarray:
+    """(T, R, C) counts that a taxel should at least show: the lesser of two neighbours that enclose it.
+
+    Enclosed along a row or a column (not a diagonal: the inner corner of an L-shaped contact is free), with at most
+    ``DEAD_GAP`` taxels between the two.
+    """
+    expected = np.zeros_like(counts)
+    for axis in (1, 2):
+        padded = np.pad(counts, [(DEAD_GAP, DEAD_GAP) if a == axis else (0, 0) for a in range(3)])
+
+        def shifted(by: int, axis: int = axis, padded: np.ndarray = padded) -> np.ndarray:
+            start = DEAD_GAP + by
+            return np.take(padded, range(start, start + counts.shape[axis]), axis=axis)
+
+        for before in range(1, DEAD_GAP + 1):
+            for after in range(1, DEAD_GAP + 2 - before):
+                np.maximum(expected, np.minimum(shifted(-before), shifted(after)), out=expected)
+    return expected
+
+
+def find_dead(
+    counts: np.ndarray, baseline: np.ndarray | None, stuck: np.ndarray, noise_count: float, fps: int
+) -> np.ndarray:
+    """(R, C) bool: no answer inside a contact, or no noise where all others have some."""
+    living = np.where(stuck, np.float32(0), counts)
+    touched = np.flatnonzero(living.max(axis=(1, 2)) > 2 * noise_count)
+    living = living[touched]
+    expected = inside_contact(living)
+    inside = expected > 2 * noise_count
+    num_inside = inside.sum(axis=0)
+    shown, due = (living * inside).sum(axis=0), (expected * inside).sum(axis=0)
+    highest = living.max(axis=0, initial=0.0)
+    dead = (num_inside >= DEAD_MIN_S * fps) & (shown < DEAD_SHARE * due) & (highest <= noise_count)
+    if noise_visible(counts):
+        constant = np.ptp(counts, axis=0) == 0
+        if baseline is not None and np.quantile(baseline, 0.05) < 2 * RESTING_COUNT:
+            constant &= baseline >= RESTING_COUNT
+        dead |= constant
+    return dead & ~stuck
+
+
+def spatial_structure(counts: np.ndarray) -> float:
+    """Correlation of next neighbours in the strongest tenth of the frames of (T, R, C), pad means removed."""
+    power = np.mean(np.square(counts), axis=(1, 2))
+    strongest = counts[np.argsort(power)[-max(len(counts) // 10, 1) :]]
+    x = strongest - strongest.mean(axis=(1, 2), keepdims=True)
+    energy = float(np.mean(x * x))
+    if energy == 0:
+        return 0.0
+    return float((np.mean(x[:, 1:] * x[:, :-1]) + np.mean(x[:, :, 1:] * x[:, :, :-1])) / (2 * energy))
+
+
+# ---- findings ----
+
+
+def taxel_list(mask: np.ndarray) -> str:
+    """``3 taxels: (4, 7), (4, 8), row 11`` for (R, C) bool; whole rows and columns by one name."""
+    rows, columns = np.flatnonzero(mask.all(axis=1)), np.flatnonzero(mask.all(axis=0))
+    rest = mask.copy()
+    rest[rows], rest[:, columns] = False, False
+    names = [f"row {r}" for r in rows] + [f"column {c}" for c in columns]
+    names += [f"({r}, {c})" for r, c in np.argwhere(rest)]
+    count = int(mask.sum())
+    return f"{count} taxel{'s' if count > 1 else ''} (row, column): {listed(names, 6)}"
+
+
+def check_pads(episode: Episode, key: str, pads: list[Pad]) -> list[Finding]:
+    """Everything that a pad says by itself."""
+    if episode.num_rows < JUDGE_S * episode.spec.fps:
+        seconds = episode.num_rows / episode.spec.fps
+        return [not_judged(key, "taxels", f"{seconds:.1f} s, it takes {JUDGE_S:g} s")]
+    findings = []
+    for pad in pads:
+        findings += [*_check_stuck(key, pad), *_check_dead(key, pad), *_check_saturated(key, pad)]
+        findings += [*_check_noise(key, pad), *_check_frozen(key, pad)]
+    if any(pad.baseline is None for pad in pads):
+        findings.append(not_judged(key, "saturation", "no baselines, so that counts on the wire are unknown"))
+    return [*findings, _coverage(key, pads)]
+
+
+def _check_stuck(key: str, pad: Pad) -> list[Finding]:
+    stuck = pad.stuck & ~pad.shorted
+    if not stuck.any():
+        return []
+    baseline = pad.baseline if pad.baseline is not None else np.zeros_like(pad.counts[0])
+    level = np.median(pad.counts[:, stuck] + baseline[stuck], axis=0)
+    where = "on the wire" if pad.baseline is not None else "above baseline"
+    return [
+        Finding(
+            "stuck_taxel",
+            "warning",
+            key,
+            f"{pad.name}: stuck at {listed([f'{v:.0f}' for v in level], 3)} counts {where}, {taxel_list(stuck)}: a taxel "
+            f"pinched by the mounting, or a trace shorted to its neighbour; mask them for training",
+        )
+    ]
+
+
+def _check_dead(key: str, pad: Pad) -> list[Finding]:
+    dead = find_dead(pad.counts, pad.baseline, pad.stuck, pad.noise_count, pad.fps)
+    if not dead.any():
+        return []
+    return [
+        Finding(
+            "dead_taxel",
+            "warning",
+            key,
+            f"{pad.name}: no answer while the taxels on both sides are pressed, or no noise, {taxel_list(dead)}: a broken "
+            f"trace (whole rows or columns: the connector), or a slot in the part just there",
+        )
+    ]
+
+
+def _check_saturated(key: str, pad: Pad) -> list[Finding]:
+    findings = []
+    if pad.shorted.any():
+        findings.append(
+            Finding(
+                "saturated",
+                "warning",
+                key,
+                f"{pad.name}: always at the wire's maximum ({pad.max_count} counts), {taxel_list(pad.shorted)}: a short to "
+                f"the supply; mask them for training",
+            )
+        )
+    if pad.baseline is None:
+        return findings
+    full = (pad.counts + pad.baseline >= pad.max_count) & ~pad.stuck
+    rows = np.flatnonzero(full.any(axis=(1, 2)))
+    if not len(rows):
+        return findings
+    share = len(rows) / max(int(pad.contact.sum()), len(rows))
+    bad = len(rows) / pad.fps >= SATURATED_S and share >= SATURATED_SHARE
+    where = (int(rows[0]), int(rows[-1]) + 1)
+    findings.append(
+        Finding(
+            "saturated",
+            "warning" if bad else "note",
+            key,
+            f"{pad.name}: up to {int(full.sum(axis=(1, 2)).max())} taxels at the wire's maximum ({pad.max_count} counts) "
+            f"in {len(rows)} rows, {share:.0%} of those in contact, {place(where, pad.fps)}: force is cut off there; grip "
+            f"less hard, or lower the board's gain",
+            where,
+        )
+    )
+    return findings
+
+
+def _check_noise(key: str, pad: Pad) -> list[Finding]:
+    limit = pad.noise_count / NOISE_SIGMAS
+    if pad.noise_std <= limit:
+        return []
+    return [
+        Finding(
+            "noisy_pad",
+            "warning",
+            key,
+            f"{pad.name}: a typical taxel jitters by {pad.noise_std:.1f} counts (standard deviation from row to row), the "
+            f"sensor's noise_count {pad.noise_count:g} allows {limit:.1f}: loose connector, missing ground, or a byte "
+            f"shift on the wire",
+        )
+    ]
+
+
+def _check_frozen(key: str, pad: Pad) -> list[Finding]:
+    same = pad.repeated
+    found = [(a - 1, b) for a, b in runs(same) if (b - a + 1) / pad.fps >= FROZEN_S]
+    num_frozen = sum(b - a for a, b in found)
+    elsewhere = len(same) - num_frozen
+    repeats = int(same.sum()) - (num_frozen - len(found))
+    if not found or elsewhere == 0 or repeats > FROZEN_USUAL_SHARE * elsewhere:
+        return []
+    rows = max(found, key=lambda r: r[1] - r[0])
+    return [
+        Finding(
+            "frozen_touch",
+            "warning",
+            key,
+            f"{pad.name}: frames repeat bit by bit for {(rows[1] - rows[0]) / pad.fps:.2f} s, {place(rows, pad.fps)}, "
+            f"{num_frozen} rows in all: its driver hung and published an old frame; cut these rows out",
+            rows,
+        )
+    ]
+
+
+def _coverage(key: str, pads: list[Pad]) -> Finding:
+    parts = []
+    for pad in pads:
+        ever = ((pad.counts >= pad.noise_count).any(axis=0) & ~pad.stuck).mean() if pad.structured else 0.0
+        parts.append(f"{pad.name} in {pad.contact.mean():.0%} of the rows, {ever:.0%} of its taxels ever active")
+    return Finding("contact_coverage", "note", key, f"contact (≥ {pads[0].noise_count:g} counts): {'; '.join(parts)}")

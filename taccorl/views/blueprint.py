@@ -1,0 +1,151 @@
+"""How an episode opens: left what it looked and felt like, right everything over time, on one linked time axis."""
+
+import itertools
+
+import rerun.blueprint as rrb
+
+from taccorl.data.episode import Episode
+from taccorl.views.colors import GROUND_COLOR
+from taccorl.views.figure import arms_of
+from taccorl.views.groups import groups_of
+from taccorl.views.touch import Pad, pads_of
+
+PAD_GAP_TAXELS = 3.0
+MOST_IN_A_ROW = 3
+
+
+def camera_name(key: str) -> str:
+    """``observation.images.front`` → ``front``."""
+    return key.removeprefix("observation.images.").removeprefix("observation.").replace(".", "_")
+
+
+def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blueprint:
+    """Views for what the episode holds.
+
+    Args:
+        at_s: stand still at this time (for pictures); None: play from the start.
+    """
+    pads = pads_of(episode)
+    parts = [part for part in (_space(episode, pads), _over_time(episode, pads)) if part is not None]
+    return rrb.Blueprint(
+        rrb.Horizontal(*parts),
+        _time_panel(at_s),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+    )
+
+
+def _time_panel(at_s: float | None) -> rrb.TimePanel:
+    if at_s is None:
+        return rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="all")
+    # A blueprint cannot set the cursor. A loop one nanosecond long, reached in the first frame, holds it there.
+    at_ns = round(at_s * 1e9)
+    return rrb.TimePanel(
+        state="collapsed",
+        timeline="time",
+        play_state="playing",
+        playback_speed=1e4,
+        loop_mode="selection",
+        time_selection=rrb.components.AbsoluteTimeRange(min=at_ns, max=at_ns + 1),
+    )
+
+
+def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:
+    """The arms, the pictures, the pads; and the page that says what all this is."""
+    page = rrb.TextDocumentView(origin="/provenance", name=_with_origin("provenance", episode))
+    rows, shares = [], []
+    if arms_of(episode):
+        figure = rrb.Spatial3DView(
+            origin="/figure",
+            name="arms (schematic): joints in the plots' colours",
+            background=GROUND_COLOR,
+            line_grid=rrb.LineGrid3D(visible=True, spacing=0.1, color=(71, 85, 105, 120)),
+            eye_controls=rrb.EyeControls3D(
+                position=(0.9, -0.44, 0.62), look_target=(0.17, -0.01, 0.15), eye_up=(0, 0, 1)
+            ),
+        )
+        rows.append(rrb.Horizontal(figure, page, column_shares=[1.1, 1.0]))
+    else:
+        rows.append(page)
+    shares.append(1.4)
+    if episode.picture_keys:
+        names = [camera_name(key) for key in episode.picture_keys]
+        rows.append(rrb.Horizontal(*[rrb.Spatial2DView(origin=f"/observation/images/{n}", name=n) for n in names]))
+        shares.append(1.05)
+    if pads:
+        rows.append(_heatmaps(pads))
+        shares.append(1.3)
+    return rrb.Vertical(*rows, row_shares=shares)
+
+
+def _heatmaps(pads: list[Pad]) -> rrb.Spatial2DView:
+    """All pads and the colour bar side by side, as ``episode.py`` places them."""
+    places = heatmap_places(pads)
+    height = max(pad.sensor.rows for pad in pads)
+    return rrb.Spatial2DView(
+        origin="/observation/tactile",
+        name=f"touch: counts above baseline, 0 … {max(pad.sensor.max_count for pad in pads)}, fixed colours",
+        background=GROUND_COLOR,
+        visual_bounds=rrb.VisualBounds2D(x_range=(-2.0, places["scale"] + 9.0), y_range=(-5.0, height + 1.5)),
+    )
+
+
+def heatmap_places(pads: list[Pad]) -> dict[str, float]:
+    """Pad name (and ``scale``) → its left edge (taxels)."""
+    places, x = {}, 0.0
+    for pad in pads:
+        places[pad.name] = x
+        x += pad.sensor.columns + PAD_GAP_TAXELS
+    places["scale"] = x + 1.0
+    return places
+
+
+def _over_time(episode: Episode, pads: list[Pad]) -> rrb.Container | None:
+    views, shares = [], []
+    lanes = {"contact gate": bool(pads), "outcome": episode.success is not None, "stage": bool(episode.stages)}
+    shown = [lane for lane, there in lanes.items() if there]
+    if shown:
+        views.append(rrb.StateTimelineView(origin="/events", name=_with_origin(", ".join(shown), episode)))
+        shares.append(0.35 + 0.25 * len(shown))
+    if pads:
+        for path, title in (
+            ("sum", "touch sum of active taxels [counts above baseline]"),
+            ("peak", "touch peak [counts above baseline]"),
+            ("active", f"active taxels, above the noise floor [of {pads[0].counts[0].size} a pad]"),
+        ):
+            views.append(_plot(title, [f"/touch/{path}/**"], rrb.Corner2D.LeftTop))
+            shares.append(1.0)
+    for row in itertools.batched(_joint_plots(episode), MOST_IN_A_ROW):
+        views.append(rrb.Horizontal(*row))
+        shares.append(1.35)
+    return rrb.Vertical(*views, row_shares=shares) if views else None
+
+
+def _joint_plots(episode: Episode) -> list[rrb.TimeSeriesView]:
+    """State and action of the same joints in one plot."""
+    keys = [key for key in ("observation.state", "action") if key in episode.arrays]
+    groups = {group.path: group for key in keys for group in groups_of(episode.spec.features[key])}
+    suffix = ": action thin" if len(keys) == 2 else f": {keys[0]}" if keys else ""
+    on_the_figure = set(arms_of(episode))
+    plots = []
+    for path, group in groups.items():
+        contents = [f"/{key.replace('.', '/')}/{path}" for key in keys]
+        # The figure's joints wear the lines' colours: no legend in the way.
+        corner = None if set(group.name.split()) & on_the_figure else rrb.Corner2D.LeftBottom
+        plots.append(_plot(group.title + suffix, contents, corner))
+    return plots
+
+
+def _plot(title: str, contents: list[str], legend: rrb.Corner2D | None) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=contents,
+        name=title,
+        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+        plot_legend=rrb.PlotLegend(legend or rrb.Corner2D.LeftTop, visible=legend is not None),
+    )
+
+
+def _with_origin(title: str, episode: Episode) -> str:
+    return f"{title} · {episode.origin}" if episode.origin else title

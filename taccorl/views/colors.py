@@ -1,0 +1,33 @@
+"""Colours that every view shares, RGB: a joint, a pad or a line looks the same in plots, heatmaps, figure and sheet.
+
+Lines stay apart on dark ground and for colour-blind eyes (Okabe and Ito's set, lightened).
+"""
+
+import cv2
+import numpy as np
+
+LINE_COLORS = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 190, 140),
+    (240, 228, 66),
+    (220, 110, 60),
+    (214, 140, 190),
+    (150, 150, 255),
+    (190, 190, 190),
+)
+PAD_COLORS = ((86, 180, 233), (0, 190, 140), (230, 159, 0), (214, 140, 190))
+ARM_COLORS = {"left": (96, 165, 250), "right": (251, 146, 60)}
+NOISE_COLOR = (148, 163, 184)
+CONTACT_COLOR = (220, 38, 38)
+GROUND_COLOR = (15, 23, 42)
+HEATMAP = "turbo"
+"""Rerun's name of the heatmaps' colour map: low counts stay visible on a scale that covers all the sensor can say."""
+
+
+def heat(share: np.ndarray) -> np.ndarray:
+    """(…, 3) uint8 RGB of the heatmaps' colour map; 0 … 1, beyond is the end's colour."""
+    share = np.asarray(share, dtype=float)
+    level = (255 * np.clip(share, 0.0, 1.0)).astype(np.uint8).reshape(-1, 1)
+    bgr = cv2.applyColorMap(level, cv2.COLORMAP_TURBO)
+    return bgr[:, 0, ::-1].reshape(*share.shape, 3)

@@ -1,0 +1,68 @@
+"""What an episode is and where it came from, as a page for people."""
+
+import numpy as np
+
+from taccorl.data.episode import ChannelTiming, Episode
+from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, pads_of
+
+TIMING_COLUMNS = "rate, gaps, longest gap (ms); age of the sample that a row shows, median and oldest (ms)"
+NO_ORIGIN = "not stated by the recording"
+
+
+def outcome(episode: Episode) -> str:
+    """``success``, ``failure``, or that nobody said."""
+    return {True: "success", False: "failure", None: "not stated"}[episode.success]
+
+
+def provenance(episode: Episode) -> str:
+    """Markdown: origin first, then what it is, the sensor's numbers, the channels' timing, and whatever else is known."""
+    spec = episode.spec
+    lines = [
+        f"**origin: {episode.origin or NO_ORIGIN}**",
+        "",
+        f"**{episode.name}**",
+        "",
+        f"- instruction: *{episode.instruction}*",
+        f"- outcome: {outcome(episode)}",
+        f"- {episode.num_rows} rows, {episode.num_rows / spec.fps:.2f} s at {spec.fps} fps",
+        f"- data spec {spec.name}, robot {spec.robot_type}",
+        *(f"- {name}: {value}" for name, value in episode.provenance.items()),
+        *_touch(episode),
+    ]
+    if episode.timing:
+        lines += ["", f"**timing**: {TIMING_COLUMNS}", "", *_timing_table(episode.timing)]
+    return "\n".join(lines)
+
+
+def _touch(episode: Episode) -> list[str]:
+    pads = pads_of(episode)
+    lines = []
+    for sensor in {pad.sensor.name: pad.sensor for pad in pads}.values():
+        own = [pad for pad in pads if pad.sensor.name == sensor.name]
+        lines.append(
+            f"- sensor {sensor.name}: {len(own)} pads of {sensor.rows} × {sensor.columns} taxels, counts above "
+            f"baseline up to {sensor.max_count}, noise floor {sensor.noise_count:g}"
+        )
+        lines.append(
+            f"- scheme {sensor.scheme}: reading = counts × {sensor.gain_per_count:.4g}; contact gate: "
+            f"≥ {MIN_ACTIVE_TAXELS} taxel beyond {CONTACT_THRESHOLD} ({own[0].gate_count:.3g} counts)"
+        )
+    for key, counts in episode.baselines.items():
+        lines.append(
+            f"- baseline subtracted from {key}: median {np.median(counts):.0f}, {counts.min():.0f} … {counts.max():.0f} counts"
+        )
+    return lines
+
+
+def _timing_table(timing: tuple[ChannelTiming, ...]) -> list[str]:
+    lines = ["| channel | align | Hz | gaps | ms | age | oldest |", "|:--|:--|--:|--:|--:|--:|--:|"]
+    lines += [
+        f"| {t.channel} | {t.align} | {t.rate_hz:.1f} | {t.gaps} | {1e3 * t.longest_gap_s:.0f} "
+        f"| {1e3 * t.age_median_s:.0f} | {1e3 * t.age_max_s:.0f} |"
+        for t in timing
+    ]
+    for name in ("duplicates", "out_of_order", "zero_stamps"):
+        odd = [f"{t.channel} {getattr(t, name)}" for t in timing if getattr(t, name)]
+        if odd:
+            lines += ["", f"{name.replace('_', ' ')}: {', '.join(odd)}"]
+    return lines

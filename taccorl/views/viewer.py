@@ -1,0 +1,110 @@
+"""The Rerun program on this machine: a window, a picture without a window, or a page for a browser (127.0.0.1 only)."""
+
+import contextlib
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+from taccorl.errors import TaccorlError
+
+LOOPBACK = "127.0.0.1"
+START_TIMEOUT_S = 60.0
+PICTURE_TIMEOUT_S = 180.0
+
+
+class ViewerError(TaccorlError):
+    """Nothing here can show or draw this: names what is missing and the command that installs it."""
+
+
+def open_window(rrd: Path) -> None:
+    """Show ``rrd`` in a window until that is closed.
+
+    Raises:
+        ViewerError: no screen, or the viewer could not open a window on it.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError(
+            "no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set): use --serve=true and a browser, "
+            "--save=episode.rrd to look elsewhere, or --screenshot=episode.png"
+        )
+    command = [_program(), str(rrd), "--bind", LOOPBACK, "--port", "auto", "--hide-welcome-screen"]
+    if subprocess.run(command, env=_environment(), check=False).returncode != 0:
+        raise ViewerError("the Rerun window did not open (its own words are above): use --serve=true and a browser")
+
+
+def picture_without_window(rrd: Path, png: Path, width_px: int, height_px: int) -> str | None:
+    """Draw ``rrd`` into ``png``; None, or why that cannot be done here."""
+    command = [_program(), str(rrd), "--headless", "--screenshot-to", str(png), "--bind", LOOPBACK, "--port", "auto"]
+    command += ["--window-size", f"{width_px}x{height_px}"]
+    with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
+        environment = _environment() | {"XDG_RUNTIME_DIR": folder}
+        try:
+            done = subprocess.run(
+                command, env=environment, check=False, capture_output=True, text=True, timeout=PICTURE_TIMEOUT_S
+            )
+        except subprocess.TimeoutExpired:
+            return f"the Rerun program drew nothing within {PICTURE_TIMEOUT_S:.0f} s"
+    if not png.is_file():
+        said = [line for line in done.stderr.splitlines() if line.strip()]
+        return f"the Rerun program drew nothing: {said[-1].strip() if said else f'exit status {done.returncode}'}"
+    return None
+
+
+@contextlib.contextmanager
+def served(rrd: Path) -> Iterator[str]:
+    """The address of a page that shows ``rrd``, for as long as the context lasts. Reachable from this machine only."""
+    page_port, data_port = _free_ports(2)
+    command = [_program(), str(rrd), "--serve-web", "--bind", LOOPBACK]
+    command += ["--web-viewer-port", str(page_port), "--port", str(data_port)]
+    data = urllib.parse.quote(f"rerun+http://{LOOPBACK}:{data_port}/proxy", safe="")
+    page = f"http://{LOOPBACK}:{page_port}/"
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(command, env=_environment(), stdout=log, stderr=log)
+        try:
+            _wait_for(page, process)
+            yield f"{page}?url={data}&hide_welcome_screen"
+        finally:
+            process.terminate()
+            process.wait(timeout=10)
+
+
+def can_decode(codec: str) -> bool:
+    """Can the Rerun program (not a browser) decode such a video here? AV1 it does itself, others it gives to ffmpeg."""
+    return codec == "av1" or shutil.which("ffmpeg") is not None
+
+
+def _program() -> str:
+    """The binary inside the rerun-sdk package; ``python -m rerun`` would leave it running when it is ended."""
+    import rerun_cli
+
+    return str(Path(rerun_cli.__file__).parent / "rerun")
+
+
+def _environment() -> dict[str, str]:
+    # Without this, notes like "Listening for connections" cover the views.
+    return os.environ | {"RUST_LOG": os.environ.get("RUST_LOG", "error")}
+
+
+def _free_ports(num: int) -> list[int]:
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(num)]
+        return [s.getsockname()[1] for s in sockets]
+
+
+def _wait_for(page: str, process: subprocess.Popen) -> None:
+    deadline_s = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < deadline_s:
+        if process.poll() is not None:
+            raise ViewerError(f"the Rerun web viewer ended at once (exit status {process.returncode})")
+        with contextlib.suppress(OSError), urllib.request.urlopen(page, timeout=2):
+            return
+        time.sleep(0.1)
+    raise ViewerError(f"the Rerun web viewer did not answer at {page} within {START_TIMEOUT_S:.0f} s")

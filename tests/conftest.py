@@ -1,0 +1,33 @@
+"""Shared by all tests: one small stand-in recording and the dataset made from it, by the real commands."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("SVT_LOG", "1")
+
+SPEC = "piper_flexitac_mcap"
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two 4 s stand-in recordings, three cameras at 240×320."""
+    from taccorl.demos.stand_in import StandInConfig, write_mcap
+
+    folder = tmp_path_factory.mktemp("recordings")
+    for k in range(2):
+        write_mcap(folder / f"stand_in_{k}.mcap", StandInConfig(duration_s=4.0, seed=k, camera_size=(240, 320)))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def dataset(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset that ``taccorl ingest`` makes of ``recordings``."""
+    from taccorl.cli.main import main
+
+    folder = tmp_path_factory.mktemp("ingested")
+    out = folder / "dataset"
+    assert main(["ingest", str(recordings), f"--spec={SPEC}", f"--out={out}", f"--store={folder / 'store'}"]) == 0
+    return out

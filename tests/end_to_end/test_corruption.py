@@ -1,0 +1,214 @@
+"""Damaged, wrong and odd recordings through the real command: each ends in its right outcome, and nothing readable is lost.
+
+All files go through one ``taccorl ingest``, so a bad one must not disturb its neighbours.
+"""
+
+import json
+import random
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+
+from taccorl.data.dataset import Dataset
+from taccorl.demos.stand_in import StandInConfig, write_mcap
+
+SECONDS, SEED = 4.0, 7
+CAMERAS = (96, 128)
+NUM_CUTS = 10
+BASE = StandInConfig(duration_s=SECONDS, seed=SEED, camera_size=CAMERAS, chunk_size_bytes=96 * 1024)
+
+
+def chunks(path: Path) -> list[tuple[int, int, int, int]]:
+    """(byte offset of the record, its length, first, last log time) of every chunk, by mcap's own reader."""
+    found = []
+    with path.open("rb") as file:
+        for record in StreamReader(file, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                size = 9 + 8 + 8 + 8 + 4 + 4 + len(record.compression) + 8 + len(record.data)
+                found.append((file.tell() - size, size, record.message_start_time, record.message_end_time))
+    return found
+
+
+def middle_chunk(path: Path) -> tuple[int, int, int, int]:
+    return chunks(path)[len(chunks(path)) // 2]
+
+
+def with_bytes(path: Path, start: int, replacement: bytes) -> bytes:
+    data = bytearray(path.read_bytes())
+    data[start : start + len(replacement)] = replacement
+    return bytes(data)
+
+
+def flipped(path: Path) -> bytes:
+    offset, size, *_ = middle_chunk(path)
+    at = offset + size // 2
+    return with_bytes(path, at, bytes([path.read_bytes()[at] ^ 0xFF]))
+
+
+def flipped_length(path: Path) -> bytes:
+    """The chunk's own length field points far beyond the file."""
+    return with_bytes(path, middle_chunk(path)[0] + 6, b"\xff")
+
+
+def zeroed_page(path: Path) -> bytes:
+    return with_bytes(path, middle_chunk(path)[0] + 64, bytes(4096))
+
+
+def wrong_schema(path: Path) -> bytes:
+    """Bytes of a JointState message under a name that says it is something else: rewritten uncompressed and unindexed."""
+    from mcap.reader import make_reader
+    from mcap.writer import CompressionType, Writer
+
+    out = path.with_suffix(".rewritten")
+    with path.open("rb") as source, out.open("wb") as sink:
+        writer = Writer(sink, compression=CompressionType.NONE)
+        writer.start()
+        ids: dict[str, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            assert schema is not None
+            if channel.topic not in ids:
+                wrong = channel.topic == "/joint_states_left"
+                name = "geometry_msgs/msg/PoseStamped" if wrong else schema.name
+                schema_id = writer.register_schema(name, schema.encoding, schema.data)
+                ids[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
+            writer.add_message(
+                ids[channel.topic], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        writer.finish()
+    data = out.read_bytes()
+    out.unlink()
+    return data
+
+
+# name → (how it is made, expected outcome, words that the reason must hold)
+FROM_BYTES: dict[str, tuple[Callable[[Path], bytes], str, tuple[str, ...]]] = {
+    "intact": (lambda p: p.read_bytes(), "written", ()),
+    "flipped_byte": (flipped, "split", ("chunk lost",)),
+    "flipped_chunk_length": (flipped_length, "split", ("record header",)),
+    "zeroed_page": (zeroed_page, "split", ("chunk lost",)),
+    # only the index at the end is gone: every message is there
+    "no_footer": (lambda p: p.read_bytes()[:-200], "written", ()),
+    "no_end_magic": (lambda p: p.read_bytes()[:-8], "written", ()),
+    "wrong_schema": (wrong_schema, "refused", ("/joint_states_left", "PoseStamped", "JointState")),
+    "empty": (lambda p: b"", "refused", ("empty",)),
+    "only_magic": (lambda p: p.read_bytes()[:8], "refused", ("/joint_states_left",)),
+    "not_mcap": (lambda p: b"X" + p.read_bytes()[1:], "refused", ("not an MCAP",)),
+    "garbage": (lambda p: random.Random(0).randbytes(50_000), "refused", ("not an MCAP",)),
+}
+FROM_CONFIG: dict[str, tuple[dict[str, Any], str, tuple[str, ...]]] = {
+    "degrees": ({"joints_in_degrees": True}, "quarantined", ("degrees?", "left_joint")),
+    "swapped_arms": ({"swap_arms": True}, "quarantined", ("arm",)),
+    "sim_time": ({"sim_time_stamps": True}, "refused", ("simulation time",)),
+    "swapped_pads": ({"swap_pads": ("left_robot_left_finger", "right_robot_left_finger")}, "quarantined", ("left_a", "right_a")),
+    "clock_offset": (
+        {"clock_offset_s": {"/camera_f/color/image_raw/compressed": 0.6}},
+        "refused",
+        ("/camera_f", "latency_s"),
+    ),
+    "gap": ({"gap": [("/camera_l/color/image_raw/compressed", 1.8, 2.3)]}, "split", ("left_wrist",)),
+}
+
+
+@pytest.fixture(scope="module")
+def ingested(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """All cases ingested by one real command: entries by name, and the command's exit code and output."""
+    folder = tmp_path_factory.mktemp("corruption")
+    base = folder / "base.mcap"
+    write_mcap(base, BASE)
+    inputs = folder / "inputs"
+    inputs.mkdir()
+    for name, (make, _, _) in FROM_BYTES.items():
+        (inputs / f"{name}.mcap").write_bytes(make(base))
+    for name, (faults, _, _) in FROM_CONFIG.items():
+        config = StandInConfig(duration_s=SECONDS, seed=SEED, camera_size=CAMERAS, chunk_size_bytes=96 * 1024, **faults)
+        write_mcap(inputs / f"{name}.mcap", config)
+    rng, data = random.Random(1), base.read_bytes()
+    cuts = {f"cut_{k}": rng.randrange(len(data) // 20, len(data) - 300) for k in range(NUM_CUTS)}
+    for name, size in cuts.items():
+        (inputs / f"{name}.mcap").write_bytes(data[:size])
+    before = {p.name: p.read_bytes() for p in inputs.iterdir()}
+    command = [sys.executable, "-m", "taccorl.cli.main", "ingest", str(inputs), "--spec=piper_flexitac_mcap"]
+    command += [f"--out={folder / 'out'}", f"--store={folder / 'store'}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert {p.name: p.read_bytes() for p in inputs.iterdir()} == before, "an original was touched"
+    report = json.loads((folder / "out.ingest_report.json").read_text())
+    entries = {Path(e["recording"]).stem: e for e in report["recordings"]}
+    return {"entries": entries, "done": done, "out": folder / "out", "base": base, "cuts": cuts, "inputs": inputs}
+
+
+@pytest.mark.parametrize("name", [*FROM_BYTES, *FROM_CONFIG])
+def test_each_case_ends_in_its_outcome_with_the_reason(ingested: dict[str, Any], name: str) -> None:
+    _, outcome, words = {**FROM_BYTES, **FROM_CONFIG}[name]
+    entry = ingested["entries"][name]
+    assert entry["outcome"] == outcome, (entry["reason"], entry["damage"], entry["losses"])
+    for word in words:
+        assert word in entry["reason"] + json.dumps(entry["damage"]) + json.dumps(entry["losses"]), (
+            word,
+            entry["reason"],
+        )
+    assert entry["command"].startswith("taccorl ")
+
+
+@pytest.mark.parametrize("number", range(NUM_CUTS))
+def test_a_cut_file_keeps_every_row_before_the_damaged_chunk(ingested: dict[str, Any], number: int) -> None:
+    entry, size = ingested["entries"][f"cut_{number}"], ingested["cuts"][f"cut_{number}"]
+    complete = [c for c in chunks(ingested["base"]) if c[0] + c[1] <= size]
+    kept_s = (complete[-1][3] - complete[0][2]) / 1e9 if complete else 0.0
+    if kept_s < 1.3:  # nothing as long as the spec's min_s of 1 s is left, or not even the pads' baseline
+        assert entry["outcome"] in ("split", "quarantined", "refused")
+        return
+    assert entry["outcome"] == "split", entry["reason"]
+    rows = sum(e["rows"] for e in entry["episodes"])
+    # every channel has samples up to 0.1 s (camera's latency and one frame) before the last complete chunk ends
+    assert rows >= (kept_s - 0.35) * 30, (rows, kept_s)
+    assert any("without a footer" in d["reason"] for d in entry["damage"])
+
+
+def test_damage_costs_only_its_own_chunk(ingested: dict[str, Any]) -> None:
+    _, _, first_ns, last_ns = middle_chunk(ingested["base"])
+    intact = sum(e["rows"] for e in ingested["entries"]["intact"]["episodes"])
+    for name in ("flipped_byte", "flipped_chunk_length", "zeroed_page"):
+        entry = ingested["entries"][name]
+        kept = sum(e["rows"] for e in entry["episodes"])
+        short = sum(round((x["end_s"] - x["start_s"]) * 30) + 1 for x in entry["losses"] if "shorter" in x["reason"])
+        lost_s = (last_ns - first_ns) / 1e9
+        assert intact - kept - short <= lost_s * 30 + 6, (name, intact, kept, short, lost_s)
+        assert len(entry["damage"]) == 1
+
+
+def test_rows_beside_the_damage_are_those_of_the_intact_recording(ingested: dict[str, Any]) -> None:
+    dataset = Dataset(ingested["out"])
+    of = {
+        name: [e["index_in_dataset"] for e in ingested["entries"][name]["episodes"] if e["outcome"] == "written"]
+        for name in ("intact", "flipped_byte")
+    }
+    whole = dataset.episode(of["intact"][0])
+    for index in of["flipped_byte"]:
+        part = dataset.episode(index)
+        shift = round((part.start_ns - whole.start_ns) / 1e9 * 30)
+        if part.start_ns != whole.start_ns + round(shift * 1e9 / 30):
+            continue  # cut anew after the gap: another grid
+        for key in ("observation.state", "observation.tactile"):
+            np.testing.assert_array_equal(part.arrays[key], whole.arrays[key][shift : shift + part.num_rows])
+
+
+def test_exit_code_tells_and_no_traceback_reaches_the_user(ingested: dict[str, Any]) -> None:
+    done = ingested["done"]
+    assert done.returncode == 1
+    assert "Traceback" not in done.stdout + done.stderr
+    assert "traceback" not in json.dumps(list(ingested["entries"].values())), "a fault of ours was met"
+    assert "quarantined" in done.stdout and "refused" in done.stdout
+
+
+def test_what_was_written_is_a_sound_dataset(ingested: dict[str, Any]) -> None:
+    dataset = Dataset(ingested["out"])
+    written = sum(e["outcome"] == "written" for r in ingested["entries"].values() for e in r["episodes"])
+    assert dataset.num_episodes == written
+    assert dataset.video_problems() == []

@@ -1,0 +1,94 @@
+"""The dataset under outside judges: LeRobot's loader, merge, viewer and trainer, and lerobot-doctor."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+BIN = Path(sys.executable).parent
+OFFLINE = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONWARNINGS": "ignore"}
+
+
+def run(*words: str, timeout_s: float = 400) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(BIN / words[0]), *words[1:]], capture_output=True, text=True, timeout=timeout_s, env=OFFLINE
+    )
+
+
+def test_lerobot_loads_every_row_with_touch_and_pictures(dataset: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    loaded = LeRobotDataset("local/demo", root=dataset, video_backend="pyav")
+    report = json.loads((dataset / "meta/taccorl/ingest_report.json").read_text())
+    assert len(loaded) == report["rows"]
+    for index in (0, len(loaded) // 2, len(loaded) - 1):
+        row = loaded[index]
+        assert row["observation.tactile"].shape == (1536,)
+        assert row["observation.state"].shape == (14,)
+        assert row["observation.images.front"].shape == (3, 224, 224)
+
+
+def test_features_carry_unit_frame_and_tactile_layout(dataset: Path) -> None:
+    features = json.loads((dataset / "meta/info.json").read_text())["features"]
+    assert features["observation.state"]["unit"][:7] == ["rad"] * 6 + ["m"]
+    tactile = features["observation.tactile"]
+    assert tactile["dtype"] == "int16"
+    assert tactile["tactile"]["layout"] == [1, 4, 32, 12]
+    assert tactile["tactile"]["pads"] == ["left_a", "left_b", "right_a", "right_b"]
+
+
+def test_lerobot_merges_it_with_itself_and_touch_survives(dataset: Path, tmp_path: Path) -> None:
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    from taccorl.data.dataset import Dataset
+
+    aggregate_datasets(["local/a", "local/b"], "local/ab", roots=[dataset, dataset], aggr_root=tmp_path / "ab")
+    one, two = Dataset(dataset), Dataset(tmp_path / "ab")
+    assert two.num_episodes == 2 * one.num_episodes
+    assert two.video_problems() == []
+    twin = two.episode(one.num_episodes).arrays["observation.tactile"]
+    np.testing.assert_array_equal(twin, one.episode(0).arrays["observation.tactile"])
+
+
+def test_lerobot_doctor_finds_nothing_to_fail(dataset: Path) -> None:
+    done = run("lerobot-doctor", "check", str(dataset), "--json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert '"FAIL"' not in done.stdout.upper().replace("'", '"')
+
+
+def test_lerobot_dataset_viz_writes_a_recording(dataset: Path, tmp_path: Path) -> None:
+    done = run(
+        "lerobot-dataset-viz", "--repo-id=local/demo", f"--root={dataset}", "--episode-index=0",
+        "--save=1", f"--output-dir={tmp_path}", "--mode=local", "--num-workers=0",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert sum(p.stat().st_size for p in tmp_path.rglob("*.rrd")) > 100_000
+
+
+def test_lerobot_trains_act_on_it_for_two_steps(dataset: Path, tmp_path: Path) -> None:
+    done = run(
+        "lerobot-train", "--policy.type=act", "--policy.push_to_hub=false", "--policy.device=cpu",
+        "--policy.pretrained_backbone_weights=null", "--policy.dim_model=64", "--policy.n_heads=2",
+        "--policy.dim_feedforward=128", "--policy.chunk_size=10", "--policy.n_action_steps=5",
+        "--dataset.repo_id=local/demo", f"--dataset.root={dataset}", "--dataset.video_backend=pyav",
+        "--steps=2", "--batch_size=2", "--num_workers=0", "--log_freq=1", "--save_freq=2",
+        f"--output_dir={tmp_path / 'act'}", "--wandb.enable=false",
+    )  # fmt: skip
+    assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
+    assert (tmp_path / "act/checkpoints/000002/pretrained_model/model.safetensors").is_file()
+
+
+def test_lerobot_train_help_loads_our_plugin_without_a_flag() -> None:
+    code = (
+        "import sys; sys.argv = ['lerobot-train', '--help']\n"
+        "from lerobot.scripts.lerobot_train import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "assert 'lerobot_policy_taccorl' in sys.modules and 'taccorl.lerobot_plugin' in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=OFFLINE)
+    assert done.returncode == 0, done.stderr
+    assert "--policy" in done.stdout
