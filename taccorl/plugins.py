@@ -10,6 +10,7 @@ import importlib
 import importlib.metadata
 import pkgutil
 from collections.abc import Callable, Iterator
+from typing import cast
 
 from taccorl.errors import TaccorlError, nearest
 
@@ -24,13 +25,13 @@ class Registry[T]:
         self._entries: dict[str, T] = {}
         self._loaded = False
 
-    def register(self, name: str) -> Callable[[T], T]:
-        """Class decorator: ``@readers.register("mcap")``."""
+    def register[E](self, name: str) -> Callable[[E], E]:
+        """Class decorator: ``@readers.register("mcap")``. The class keeps its own type."""
 
-        def add(entry: T) -> T:
+        def add(entry: E) -> E:
             if name in self._entries and self._entries[name] is not entry:
                 raise TaccorlError(f"{self.kind} {name!r} is registered twice: {self._entries[name]} and {entry}")
-            self._entries[name] = entry
+            self._entries[name] = cast("T", entry)
             return entry
 
         return add

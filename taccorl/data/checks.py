@@ -7,8 +7,8 @@ worth knowing; what could not be judged is a note too, never a pass in silence.
              action_lag (command after state), frozen_picture (half of the episode or more)
     warning  low_rate, gaps, old_samples, jump, idle, frozen_state, frozen_picture, action_lag (too long, or unlike the
              other arm or the other episodes), dead_taxel, stuck_taxel, saturated, noisy_pad, frozen_touch, silent_pad,
-             touch_lag, baseline_drift, baseline_offset
-    note     duplicates, out_of_order, zero_stamps, saturated (a few rows), contact_coverage, not_judged
+             touch_lag, pad_lag, baseline_drift, baseline_offset
+    note     duplicates, out_of_order, saturated (a few rows), contact_coverage, not_judged
 
 The parts are in ``joint_checks``, ``picture_checks``, ``touch_checks`` (a pad by itself) and ``grip_checks`` (pads
 against grippers). Thresholds stand there, with unit and reason.
@@ -20,12 +20,13 @@ import numpy as np
 
 from taccorl.data import joint_checks
 from taccorl.data.episode import ChannelTiming, Episode
-from taccorl.data.finding import Finding, Severity, not_judged
+from taccorl.data.finding import Finding, Severity, listed, not_judged
 from taccorl.data.grip_checks import (
     DRIFT_SHARE,
     TOUCH_LAG_S,
     Grippers,
     check_touch_and_grip,
+    lag_text,
     read_grippers,
     rest_level,
     touch_lags,
@@ -42,10 +43,12 @@ GAP_S = 0.1
 """Three rows at 30 fps: so long a policy would look at the past."""
 GAPS_SHARE = 0.05
 """Of a channel's samples: more dropped ones than leggedrobotics' recordings tolerate (5 %)."""
+GAPS_MIN = 3
+"""Fewer gaps are single dropped samples, whatever share of a short episode they are."""
 OLD_SAMPLES_PERIODS = 1.5
 """Median age of the sample in a row, in periods of the channel: half a period is usual, one the worst."""
-REPEAT_SHARE = 0.05
-"""PiPER's driver republishes values with one stamp; this many of them are worth a note."""
+REPEAT_SHARE = 0.5
+"""Of the episode's samples: PiPER's driver republishes a few per cent with an old stamp at all times."""
 EPISODE_LAG_S = 0.05
 """Lag of one episode against the median of its recording: more than a row and a half at 30 fps."""
 COMPARED_EPISODES = 3
@@ -58,9 +61,9 @@ def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
     Args:
         pictures: also decode the pictures, to find frozen ones.
     """
-    findings = [f for timing in episode.timing for f in check_timing(timing, episode)]
     if not episode.arrays or episode.num_rows < 2:
-        return [*findings, not_judged("", "episode", "it has less than two rows of numbers")]
+        return [not_judged("", "episode", "it has less than two rows of numbers")]
+    findings = [f for timing in episode.timing for f in check_timing(timing, episode)]
     values = joint_checks.check_values(episode)
     wrong = {f.feature for f in values}
     findings += values + _check_motion(episode, wrong)
@@ -121,7 +124,7 @@ def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
                 "warning",
                 f"{timing.rate_hz:.1f} Hz, the data spec says {promised_hz:g} Hz: a loaded host, a slower mode, or the spec",
             )
-        if timing.longest_gap_s > GAP_S or timing.gaps > GAPS_SHARE * samples:
+        if timing.longest_gap_s > GAP_S or timing.gaps >= max(GAPS_MIN, GAPS_SHARE * samples):
             add(
                 "gaps",
                 "warning",
@@ -135,12 +138,17 @@ def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
                 f"rows show samples {timing.age_median_s * 1000:.0f} ms old (median), {timing.age_max_s * 1000:.0f} ms at "
                 f"worst; a period is {1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`",
             )
+    # Duplicates and order are counted over the whole recording, which may hold many episodes.
     if timing.duplicates > REPEAT_SHARE * samples:
-        add("duplicates", "note", f"{timing.duplicates} samples repeat a stamp; the first of each was kept")
+        add(
+            "duplicates",
+            "note",
+            f"{timing.duplicates} samples of the recording repeat a stamp; the first of each was kept",
+        )
     if timing.out_of_order:
-        add("out_of_order", "note", f"{timing.out_of_order} samples were out of order; sorted by their stamps")
-    if timing.zero_stamps:
-        add("zero_stamps", "note", f"{timing.zero_stamps} samples were stamped 0 and dropped")
+        add(
+            "out_of_order", "note", f"{timing.out_of_order} samples of the recording were out of order; sorted by stamp"
+        )
     return findings
 
 
@@ -192,20 +200,22 @@ def _touch_lags(episodes: list[Episode]) -> list[Finding]:
     """All holds together: one row's resolution no longer matters, so the window is the plain one."""
     lags: dict[tuple[str, str], list[float]] = {}
     for episode, key, pads, grippers in _pads_and_grippers(episodes):
-        for arm, found in touch_lags(pads, grippers, episode.spec.fps).items():
-            lags.setdefault((key, arm), []).extend(found)
+        for pad in pads:
+            lags.setdefault((key, pad.name), []).extend(touch_lags(pad, grippers, episode.spec.fps))
+    low, high = TOUCH_LAG_S
     findings = []
-    for (key, arm), found in lags.items():
-        lag = float(np.median(found))
-        if not TOUCH_LAG_S[0] <= lag <= TOUCH_LAG_S[1]:
+    for key in sorted({key for key, _ in lags}):
+        medians = {pad: float(np.median(found)) for (k, pad), found in lags.items() if k == key and len(found) > 1}
+        odd = {pad: lag for pad, lag in medians.items() if not low <= lag <= high}
+        if odd:
+            each = ", ".join(f"{pad} {lag_text(lag)}" for pad, lag in odd.items())
             findings.append(
                 Finding(
                     "touch_lag",
                     "warning",
                     key,
-                    f"{arm} pads feel parts {abs(lag):.3f} s {'before' if lag < 0 else 'after'} the gripper stops on them "
-                    f"in all episodes (median of {len(found)}; plausible {TOUCH_LAG_S[0]:g} to {TOUCH_LAG_S[1]:g} s): set "
-                    f"`clock` or `latency_s` on the pads' channels",
+                    f"in all episodes together, pads first feel the part at odd times from the gripper's stop on it: {each} "
+                    f"(medians; plausible {low:g} to {high:g} s): set `clock` or `latency_s` on these pads' channels",
                 )
             )
     return findings
@@ -222,17 +232,20 @@ def _resting_levels(episodes: list[Episode]) -> list[Finding]:
             if level is not None:
                 levels.setdefault((key, pad.name), {})[episode.name] = level
     findings = []
-    for (key, pad), by_episode in levels.items():
-        low, high = min(by_episode, key=by_episode.__getitem__), max(by_episode, key=by_episode.__getitem__)
-        change = by_episode[high] - by_episode[low]
-        if change > limits[key]:
+    for key, limit in limits.items():
+        drifting = []
+        for (k, pad), level in levels.items():
+            low, high = min(level, key=level.__getitem__), max(level, key=level.__getitem__)
+            if k == key and level[high] - level[low] > limit:
+                drifting.append(f"{pad} {level[low]:+.1f} counts in {low}, {level[high]:+.1f} in {high}")
+        if drifting:
             findings.append(
                 Finding(
                     "baseline_drift",
                     "warning",
                     key,
-                    f"{pad} rests at {by_episode[low]:+.1f} counts in {low} and at {by_episode[high]:+.1f} in {high} (limit "
-                    f"{limits[key]:g} counts apart, a third of noise_count): record shorter, or a new baseline in between",
+                    f"untouched taxels rest at different levels: {listed(drifting)} (limit {limit:g} counts apart, a third "
+                    f"of noise_count): record shorter, or take a new baseline in between",
                 )
             )
     return findings

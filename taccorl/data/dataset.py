@@ -217,20 +217,19 @@ class Dataset:
 
 
 def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
-    """A dataset spec with its sensors as plain JSON values; endless ranges as the texts "inf" and "-inf"."""
+    """A dataset spec with its sensors as plain JSON values.
 
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(v) for key, v in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(v) for v in value]
-        return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-    return plain(dataclasses.asdict(spec))
+    Raises:
+        DatasetError: a feature without a range, as other people's datasets have: such a spec is derived, never written.
+    """
+    endless = [key for key, f in spec.features.items() if not np.isfinite(f.limits).all()]
+    if endless:
+        raise DatasetError(f"{spec.name}: {endless[0]} has no valid range; write one down in a spec of data_specs/")
+    return dataclasses.asdict(spec)
 
 
 def dataset_spec_from_json(path: Path) -> DatasetSpec:
-    """The spec that was written to ``path`` with ``dataset_spec_to_json``, exactly; read as strictly as the YAML files.
+    """The spec that ``dataset_spec_to_json`` gave, exactly; as strict as with the YAML files of ``data_specs/``.
 
     Raises:
         SpecError: with file, line, key and the way out.

@@ -6,6 +6,7 @@
 Letters in shapes: T rows.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.ndimage import binary_dilation, uniform_filter1d
 
 from taccorl.data.episode import Episode
 from taccorl.data.finding import Finding, listed, not_judged
-from taccorl.data.joint_checks import ACTION, STATE, episode_arms
+from taccorl.data.joint_checks import ACTION, LAG_SURE, STATE, episode_arms, find_lag
 from taccorl.data.timing import runs
 from taccorl.data.touch_checks import JUDGE_S, Pad
 
@@ -34,6 +35,8 @@ FEELS, SILENT = 0.8, 0.2
 TOUCH_LAG_S = (-0.05, 0.15)
 """Plausible first contact after the gripper's stop: soft parts are felt before it, 100 Hz scans and drivers come after."""
 TOUCH_LAG_SEARCH_S = 1.5
+PAD_LAG_S = 0.1
+"""Between the two pads of one gripper: a part may lean on one finger first, but not for three rows of force."""
 OPEN_SHARE = 0.8
 """Of the episode's widest opening: the gripper is open, nothing ought to touch the pads."""
 RELEASE_S = 0.3
@@ -130,15 +133,16 @@ def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad], grippers: 
         ]
     else:
         findings = _check_holds(key, own, grippers, fps)
-    return findings + [f for pad in own for f in _check_rest(key, pad, grippers.rest(pad.arm, fps))]
+    findings += _check_drift(key, own, grippers)
+    return findings + [f for pad in own for f in _check_offset(key, pad, grippers.rest(pad.arm, fps))]
 
 
 # ---- holds ----
 
 
-def _share(contact: np.ndarray, rows: np.ndarray, fps: int) -> float | None:
-    """Share of ``rows`` in contact; None where they are too few to say."""
-    return float(contact[rows].mean()) if rows.sum() >= HOLD_SUM_S * fps else None
+def _share(contact: np.ndarray, rows: np.ndarray, fps: int) -> float:
+    """Share of ``rows`` in contact; NaN where they are too few to say."""
+    return float(contact[rows].mean()) if rows.sum() >= HOLD_SUM_S * fps else math.nan
 
 
 def swapped_pads(pads: list[Pad], grippers: Grippers, fps: int) -> list[str] | None:
@@ -149,28 +153,55 @@ def swapped_pads(pads: list[Pad], grippers: Grippers, fps: int) -> list[str] | N
     """
     if len(grippers.opening) != 2:
         return []
-    edge = round(HOLD_EDGE_S * fps)
-    arms = list(grippers.opening)
-    alone = [grippers.held(a, cut=edge) & ~grippers.held(b, grow=edge) for a, b in (arms, reversed(arms))]
-    shares = {p.name: [_share(p.contact, rows, fps) for rows in alone] for p in pads}
-    if all(share is None for both in shares.values() for share in both):
+    edge, arms = round(HOLD_EDGE_S * fps), list(grippers.opening)
+    alone = {a: grippers.held(a, cut=edge) & ~grippers.held(b, grow=edge) for a, b in (arms, arms[::-1])}
+    shares = {(p.name, a): _share(p.contact, rows, fps) for p in pads for a, rows in alone.items()}
+    if np.isnan(list(shares.values())).all():
         return None
+
+    def feels(pad: Pad, arm: str) -> bool:
+        return shares[pad.name, arm] >= FEELS
+
+    def silent(pad: Pad, arm: str) -> bool:
+        return shares[pad.name, arm] <= SILENT
+
     found: set[str] = set()
-    for holding, resting in ((0, 1), (1, 0)):
-        own = [p for p in pads if p.arm == arms[holding]]
-        others = [p for p in pads if p.arm == arms[resting]]
-        if any(shares[p.name][holding] is None for p in pads):
-            continue
-        absent = [p for p in own if shares[p.name][holding] <= SILENT and shares[p.name][resting] in (None, *_feels)]
-        intruding = [p for p in others if shares[p.name][holding] >= FEELS]
+    for holding, resting in (arms, arms[::-1]):
+        own, others = [p for p in pads if p.arm == holding], [p for p in pads if p.arm == resting]
+        absent = [p for p in own if silent(p, holding) and not silent(p, resting)]
+        intruding = [p for p in others if feels(p, holding) and not feels(p, resting)]
+        if len(intruding) < len(others):  # not all exchanged: an absent pad must at least feel something elsewhere
+            absent = [p for p in absent if p.contact.sum() >= HOLD_SUM_S * fps]
+        if absent and intruding:
+            found |= {p.name for p in absent + intruding}
     return sorted(found)
+
+
+def _check_holds(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[Finding]:
+    swapped = swapped_pads(pads, grippers, fps)
+    if swapped:  # holds then say nothing about silence or time
+        return [
+            Finding(
+                "swapped_pads",
+                "error",
+                key,
+                f"{listed(swapped)} feel what the other arm's gripper holds, and not what their own holds: topics of left "
+                f"and right pads exchanged (or of left and right arms, if the pictures agree with the pads); mend "
+                f"`channels` in the recording spec",
+            )
+        ]
+    findings = [*_check_silence(key, pads, grippers, fps), *_check_lag(key, pads, grippers, fps)]
+    findings += _check_pad_lag(key, pads, fps)
+    if swapped is None:
+        findings.append(not_judged(key, "swapped pads", "the grippers hold only at the same time"))
+    return findings
 
 
 def _check_silence(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[Finding]:
     held = {a: grippers.held(a, cut=round(HOLD_EDGE_S * fps)) for a in grippers.opening}
     felt = {pad.name: _share(pad.contact, held[pad.arm], fps) for pad in pads}
-    judged = {name: share for name, share in felt.items() if share is not None}
-    silent = [name for name, share in judged.items() if share <= SILENT]
+    judged = [name for name, share in felt.items() if not math.isnan(share)]
+    silent = [name for name in judged if felt[name] <= SILENT]
     if not silent:
         return []
     loudest = max(float(np.abs(p.counts[held[p.arm]]).max()) for p in pads if p.name in silent)
@@ -197,20 +228,16 @@ def _check_silence(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> l
     ]
 
 
-def touch_lags(pads: list[Pad], grippers: Grippers, fps: int) -> dict[str, list[float]]:
-    """Arm → first contact after the gripper's stop (s), one per pad and hold that show both."""
-    lags: dict[str, list[float]] = {}
-    reach = round(TOUCH_LAG_SEARCH_S * fps)
-    for pad in pads:
-        for k, hold in enumerate(grippers.holds[pad.arm]):
-            if hold.stop_s is None:
-                continue
+def touch_lags(pad: Pad, grippers: Grippers, fps: int) -> list[float]:
+    """First contact after its gripper's stop (s), one per hold that shows both."""
+    lags, reach, before = [], round(TOUCH_LAG_SEARCH_S * fps), 0
+    for hold in grippers.holds[pad.arm]:
+        if hold.stop_s is not None:
             stop = round(hold.stop_s * fps)
-            before = grippers.holds[pad.arm][k - 1].end if k else 0
-            first, end = max(stop - reach, before), min(stop + reach, hold.end)
-            onset = _onset(pad, first, end)
+            onset = _onset(pad, max(stop - reach, before), min(stop + reach, hold.end))
             if onset is not None:
-                lags.setdefault(pad.arm, []).append(onset / fps - hold.stop_s)
+                lags.append(onset / fps - hold.stop_s)
+        before = hold.end
     return lags
 
 
@@ -224,24 +251,49 @@ def _onset(pad: Pad, first: int, end: int) -> float | None:
     return row - 1 + float(np.clip((pad.noise_count - level[0]) / max(level[1] - level[0], 1e-9), 0.0, 1.0))
 
 
+def lag_text(lag_s: float) -> str:
+    """``0.120 s before``, ``0.300 s after``"""
+    return f"{abs(lag_s):.3f} s {'before' if lag_s < 0 else 'after'}"
+
+
 def _check_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[Finding]:
-    findings = []
     low, high = TOUCH_LAG_S[0] - 1 / fps, TOUCH_LAG_S[1] + 1 / fps
-    for arm, lags in touch_lags(pads, grippers, fps).items():
-        lag = float(np.median(lags))
-        if low <= lag <= high:
-            continue
-        names = [pad.name for pad in pads if pad.arm == arm]
-        findings.append(
-            Finding(
-                "touch_lag",
-                "warning",
-                key,
-                f"{listed(names)} feel the part {abs(lag):.3f} s {'before' if lag < 0 else 'after'} the gripper stops on "
-                f"it (median of {len(lags)}; plausible {low:.2f} to {high:.2f} s): their clock is off by about "
-                f"{lag - sum(TOUCH_LAG_S) / 2:+.2f} s; set `clock` or `latency_s` on the pads' channels",
-            )
+    found = {pad.name: lags for pad in pads if (lags := touch_lags(pad, grippers, fps))}
+    odd = {name: lag for name, lags in found.items() if not low <= (lag := float(np.median(lags))) <= high}
+    if not odd:
+        return []
+    each = ", ".join(f"{name} {lag_text(lag)}" for name, lag in odd.items())
+    return [
+        Finding(
+            "touch_lag",
+            "warning",
+            key,
+            f"pads first feel the part at odd times from the gripper's stop on it: {each} (plausible {low:.2f} to "
+            f"{high:.2f} s): their clock is off by about that; set `clock` or `latency_s` on these pads' channels",
         )
+    ]
+
+
+def _check_pad_lag(key: str, pads: list[Pad], fps: int) -> list[Finding]:
+    """The two pads of a gripper feel the same part: their total counts must rise and fall together."""
+    findings = []
+    for arm in sorted({pad.arm for pad in pads}):
+        both = [pad for pad in pads if pad.arm == arm and pad.contact.any()]
+        if len(both) != 2:
+            continue
+        totals = [pad.smooth.mean(axis=(1, 2))[:, None] for pad in both]
+        lag = find_lag(totals[0], totals[1], fps, (-1.0, 1.0))
+        if lag.correlation >= LAG_SURE and abs(lag.lag_s) > PAD_LAG_S:
+            first, second = (both[0], both[1]) if lag.lag_s > 0 else (both[1], both[0])
+            findings.append(
+                Finding(
+                    "pad_lag",
+                    "warning",
+                    key,
+                    f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name}, though both hold the same "
+                    f"part (limit {PAD_LAG_S:g} s): one of them is on another clock; set `latency_s` on its channel",
+                )
+            )
     return findings
 
 
@@ -274,38 +326,44 @@ def rest_level(counts: np.ndarray, rest: np.ndarray, fps: int) -> float | None:
     return float(np.median(counts[slice(*found[0])].mean(axis=0))) if found else None
 
 
-def _check_rest(key: str, pad: Pad, rest: np.ndarray) -> list[Finding]:
+def _check_drift(key: str, pads: list[Pad], grippers: Grippers) -> list[Finding]:
+    found = {pad.name: rest_change(pad.counts, grippers.rest(pad.arm, pad.fps), pad.fps) for pad in pads}
+    unknown = [name for name, change in found.items() if change is None]
+    limit = DRIFT_SHARE * pads[0].noise_count
+    drifting = {name: change for name, change in found.items() if change is not None and abs(change[0]) > limit}
     findings = []
-    found = rest_change(pad.counts, rest, pad.fps)
-    limit = DRIFT_SHARE * pad.noise_count
-    if found is None:
-        findings.append(not_judged(key, f"baseline drift of {pad.name}", "its gripper does not rest open at both ends"))
-    elif abs(found[0]) > limit:
-        change, seconds = found
+    if drifting:
+        each = ", ".join(f"{n} {c:+.1f} counts in {s:.1f} s ({c / s:+.2f} counts/s)" for n, (c, s) in drifting.items())
         findings.append(
             Finding(
                 "baseline_drift",
                 "warning",
                 key,
-                f"{pad.name}: untouched taxels drift by {change:+.1f} counts in {seconds:.1f} s ({change / seconds:+.2f} "
-                f"counts/s; limit {limit:g} counts an episode, a third of noise_count): warm up the pads, take a new "
-                f"baseline for each recording",
+                f"untouched taxels drift: {each}; limit {limit:g} counts an episode, a third of noise_count: warm up the "
+                f"pads, take a new baseline for each recording",
             )
         )
-    if rest.sum() >= REST_MIN_S * pad.fps:
-        level = np.median(pad.counts[rest], axis=0)
-        off = (np.abs(level) > pad.noise_count) & ~pad.stuck
-        if off.mean() > OFFSET_SHARE:
-            way_out = (
-                "touched while the baseline was taken" if np.median(level[off]) < 0 else "still touched, or drifted"
-            )
-            findings.append(
-                Finding(
-                    "baseline_offset",
-                    "warning",
-                    key,
-                    f"{pad.name}: {int(off.sum())} taxels rest at {np.median(level[off]):+.0f} counts (median) with the "
-                    f"gripper open: {way_out}; record with the pads free for the first second",
-                )
-            )
+    if unknown:
+        why = "the gripper does not rest open at both ends"
+        findings.append(not_judged(key, f"baseline drift of {listed(unknown)}", why))
     return findings
+
+
+def _check_offset(key: str, pad: Pad, rest: np.ndarray) -> list[Finding]:
+    if rest.sum() < REST_MIN_S * pad.fps:
+        return []
+    level = np.median(pad.counts[rest], axis=0)
+    off = (np.abs(level) > pad.noise_count) & ~pad.stuck
+    if off.mean() <= OFFSET_SHARE:
+        return []
+    middle = float(np.median(level[off]))
+    return [
+        Finding(
+            "baseline_offset",
+            "warning",
+            key,
+            f"{pad.name}: {int(off.sum())} taxels rest at {middle:+.0f} counts (median) with the gripper open: "
+            f"{'touched while the baseline was taken' if middle < 0 else 'still touched, or drifted'}; record with the "
+            f"pads free for the first second",
+        )
+    ]

@@ -28,7 +28,7 @@ JUMP_MARGIN = 2.0
 """A row may show a sample one row older than its neighbour's, so that a step can hold the way of two rows."""
 STILL_RAD = 0.02
 """A joint that stays within this for a second is at rest: a trembling hand on the leader moves about half of it."""
-STILL_M = 0.001
+STILL_M = 0.002
 STILL_WINDOW_S = 1.0
 IDLE_END_S = 3.0
 """Longer rests at the start or end should be trimmed: a policy would learn to wait."""
@@ -132,6 +132,8 @@ def outside(values: np.ndarray, limits: np.ndarray, tolerance: float = LIMIT_TOL
 
 def unit_hint(values: np.ndarray, limit: np.ndarray, unit: str) -> str | None:
     """Which other unit would bring all of an element's values (T,) into its limits; None where none would."""
+    if unit == "m" and values.min() >= -0.05 and values.max() <= 1.05:
+        return "a normalised opening 0 to 1"
     candidates = {
         "rad": (("degrees", math.pi / 180), ("0.001 degrees, PiPER's SDK unit", math.pi / 180_000)),
         "m": (("millimetres", 1e-3), ("0.001 mm, PiPER's SDK unit", 1e-6)),
@@ -139,8 +141,6 @@ def unit_hint(values: np.ndarray, limit: np.ndarray, unit: str) -> str | None:
     for name, factor in candidates.get(unit, ()):
         if not outside(factor * values[:, None], limit[None]).any():
             return name
-    if unit == "m" and values.min() >= -0.05 and values.max() <= 1.05:
-        return "a normalised opening 0 to 1"
     return None
 
 
@@ -306,7 +306,7 @@ class Lag:
 def find_lag(action: np.ndarray, state: np.ndarray, fps: int, search_s: tuple[float, float] = LAG_SEARCH_S) -> Lag:
     """Lag of ``state`` (T, n) behind ``action`` (T, n) by cross-correlation of velocities; parabola through the peak.
 
-    Each joint counts alike, joints at rest (range below MOVING_RAD) not at all.
+    Each column counts alike; those at rest (range below MOVING_RAD, which fits counts as well) not at all.
     """
     moving = (np.ptp(action, axis=0) > MOVING_RAD) & (np.ptp(state, axis=0) > MOVING_RAD)
     if not moving.any():

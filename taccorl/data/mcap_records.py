@@ -17,7 +17,7 @@ import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, Message, MetadataIndex, Schema
+from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, Message, Metadata, MetadataIndex, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER_BYTES = 9
@@ -127,7 +127,9 @@ def find_record(
         if len(block) < HEADER_BYTES:
             return None
         heads = block[: len(block) - HEADER_BYTES + 1]
-        small = (block[6 : len(heads) + 6] == 0) & (block[7 : len(heads) + 7] == 0) & (block[8:] == 0)  # below 2⁴⁰ bytes
+        small = (
+            (block[6 : len(heads) + 6] == 0) & (block[7 : len(heads) + 7] == 0) & (block[8:] == 0)
+        )  # below 2⁴⁰ bytes
         for at in np.flatnonzero(np.isin(heads, list(opcodes)) & small):
             record = whole_record(file, offset + int(at), size)
             if record is not None and _is_sure(file, record, size, channels):
@@ -162,6 +164,7 @@ _PARSERS = {
     CHUNK: Chunk.read,
     CHUNK_INDEX: ChunkIndex.read,
     ATTACHMENT_INDEX: AttachmentIndex.read,
+    METADATA: Metadata.read,
     METADATA_INDEX: MetadataIndex.read,
 }
 
@@ -247,7 +250,7 @@ def chunk_records(chunk: Chunk) -> Iterator[Any]:
     Raises:
         ValueError: too large, does not decompress, wrong CRC, or not made of whole records.
     """
-    data = _contents(chunk)
+    data = memoryview(_contents(chunk))
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("its CRC does not match")
     if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
@@ -259,10 +262,10 @@ def chunk_records(chunk: Chunk) -> Iterator[Any]:
         if offset > len(data):
             raise ValueError("a record reaches beyond its end")
         if opcode in (SCHEMA, CHANNEL, MESSAGE):
-            yield parse(opcode, data[start:offset])
+            yield parse(opcode, bytes(data[start:offset]))
 
 
-def _contents(chunk: Chunk) -> bytes:
+def _contents(chunk: Chunk) -> bytes | bytearray:
     """Uncompressed, and never more than the chunk claims."""
     claims = chunk.uncompressed_size
     if claims > MAX_CHUNK_BYTES:
@@ -276,7 +279,7 @@ def _contents(chunk: Chunk) -> bytes:
         data += block
         if len(data) > claims:
             raise ValueError(f"it holds more than the {claims:,} bytes that it claims")
-    return bytes(data)
+    return data
 
 
 def _zstd_blocks(data: bytes) -> Iterator[bytes]:

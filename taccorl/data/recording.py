@@ -8,6 +8,7 @@ that memory does not grow with the recording.
 import contextlib
 import tempfile
 from abc import ABC, abstractmethod
+from array import array
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,7 +87,7 @@ class Reader(ABC):
         self.spec = spec
         """None while somebody only looks into a file."""
         self.damage: list[Damage] = []
-        """Filled while reading."""
+        """Known once ``messages`` has run to its end without bounds; a partial or abandoned read leaves it as it was."""
         self.metadata: dict[str, dict[str, str]] = {}
         """Named records beside the messages; filled while reading."""
 
@@ -190,16 +191,18 @@ class Recording:
         self, wanted: dict[str, list[tuple[int, int | None]]]
     ) -> Iterator[tuple[str, tuple[int, int | None], Any]]:
         """Encoded pictures by (log_ns, stamp_ns), as they come in the file: (channel, identity, payload)."""
-        by_topic = {self.spec.channels[name].topic: name for name in wanted}
+        by_topic: dict[str, list[str]] = {}
+        for name in wanted:
+            by_topic.setdefault(self.spec.channels[name].topic, []).append(name)
         sets = {name: set(ids) for name, ids in wanted.items()}
         logs = [log for ids in wanted.values() for log, _ in ids]
         if not logs:
             return
         for m in self.reader.messages(set(by_topic), start_ns=min(logs), end_ns=max(logs)):
-            name = by_topic[m.topic]
-            if (m.log_ns, m.stamp_ns) in sets[name]:
-                sets[name].discard((m.log_ns, m.stamp_ns))
-                yield name, (m.log_ns, m.stamp_ns), m.value
+            for name in by_topic[m.topic]:
+                if (m.log_ns, m.stamp_ns) in sets[name]:
+                    sets[name].discard((m.log_ns, m.stamp_ns))
+                    yield name, (m.log_ns, m.stamp_ns), m.value
 
 
 class Spool:
@@ -266,10 +269,12 @@ class _Loader:
             raise RecordingError(f"{', '.join(sorted(both))}: read both as pictures and as numbers")
         self.text_topics = {t for t in (spec.episodes.topic, spec.instruction.topic) if t}
         self.topics = set(self.by_topic) | self.text_topics
-        self.log: dict[str, list[int]] = {t: [] for t in self.topics}
-        self.stamp: dict[str, list[int | None]] = {t: [] for t in self.topics}
+        self.log = {t: array("q") for t in self.topics}  # 8 bytes a message; a list of ints takes 40
+        self.stamp = {t: array("q") for t in self.topics}
+        self.headless: set[str] = set()
         self.texts: dict[str, list[tuple[int, str]]] = {t: [] for t in self.text_topics}
-        self.spools = {c: Spool(scratch, c) for c in spec.channels if c not in pictures}
+        numbers = [c for c in spec.channels if c not in pictures]
+        self.spools = {c: Spool(scratch, f"channel_{k}") for k, c in enumerate(numbers)}
         self.extract = {
             c: decode.pad_extractor(spec.channels[c], pads[c])
             if c in pads
@@ -279,7 +284,9 @@ class _Loader:
 
     def take(self, m: Message) -> None:
         self.log[m.topic].append(m.log_ns)
-        self.stamp[m.topic].append(m.stamp_ns)
+        self.stamp[m.topic].append(m.stamp_ns or 0)
+        if m.stamp_ns is None:
+            self.headless.add(m.topic)
         if m.topic in self.text_topics:
             self.texts[m.topic].append((m.log_ns, decode.text(m.value, m.topic)))
         for name in self.by_topic.get(m.topic, ()):
@@ -287,6 +294,7 @@ class _Loader:
                 try:
                     self.spools[name].append(self.extract[name](m.value))
                 except RecordingError as error:
+                    self._check_type(name, self.reader.topics())  # another type explains more than what is odd in it
                     raise RecordingError(f"{m.topic}, message {len(self.log[m.topic]) - 1}: {error}") from error
 
     def finish(self) -> Recording:
@@ -302,23 +310,26 @@ class _Loader:
             raise RecordingError(
                 f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint})"
             )
-        for name, channel in self.spec.channels.items():
-            found = present[channel.topic].name
-            if channel.type is not None and decode.type_key(found) != decode.type_key(channel.type):
-                raise RecordingError(f"{channel.topic} is {found}, the spec's channel {name!r} says {channel.type}")
+        for name in self.spec.channels:
+            self._check_type(name, present)
         channels = {name: self._channel(name) for name in self.spec.channels}
         counts = {t: len(log) for t, log in self.log.items()}
         return Recording(self.reader.source, self.spec, self.reader, channels, self.texts, counts)
 
+    def _check_type(self, name: str, present: dict[str, TopicType]) -> None:
+        channel = self.spec.channels[name]
+        found = present[channel.topic].name
+        if channel.type is not None and decode.type_key(found) != decode.type_key(channel.type):
+            raise RecordingError(f"{channel.topic} is {found}, the spec's channel {name!r} says {channel.type}")
+
     def _channel(self, name: str) -> Channel:
         spec = self.spec.channels[name]
-        stamps = self.stamp[spec.topic]
-        if any(s is None for s in stamps):
+        if spec.topic in self.headless:
             if self.spec.clock_of(name) == "header":
                 raise RecordingError(f"{spec.topic} has no header stamp: write `clock: log` on channel {name!r}")
             stamp_ns = None
         else:
-            stamp_ns = np.array(stamps, dtype=np.int64)
+            stamp_ns = np.array(self.stamp[spec.topic], dtype=np.int64)
         values = self.spools[name].finish() if name in self.spools else None
         return Channel(name, spec, np.array(self.log[spec.topic], dtype=np.int64), stamp_ns, values)
 

@@ -6,6 +6,7 @@ Every feature states dtype, shape, unit, frame, rate and valid range. The files 
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
 import math
 from dataclasses import dataclass
@@ -402,10 +403,6 @@ def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mappi
     for name in mapping.channels:
         if name not in spec.channels:
             raise document.error(f"{where}/channels", f"no channel {name!r}; {nearest(name, spec.channels)}")
-        if feature.dtype == "video" or key in spec.target.sensors:
-            for option in ("pick", "scale"):
-                if getattr(spec.channels[name], option):
-                    raise document.error(f"channels/{name}/{option}", f"has no effect: {key} holds no named numbers")
         has_age = spec.channels[name].max_age_s is not None
         if has_age and mapping.align == "hold":
             raise document.error(
@@ -415,6 +412,10 @@ def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mappi
             raise document.error(f"channels/{name}", f"key 'max_age_s' is missing: {key} is aligned by {mapping.align}")
     if feature.dtype == "video" and (len(mapping.channels) != 1 or mapping.align not in ("hold", "asof")):
         raise document.error(where, "a picture comes from one channel, aligned by hold or asof")
+    if feature.dtype == "video" or key in spec.target.sensors:
+        for name, option in itertools.product(mapping.channels, ("pick", "scale")):
+            if getattr(spec.channels[name], option):
+                raise document.error(f"channels/{name}/{option}", f"has no effect: {key} holds no named numbers")
     if (mapping.align == "window") != (feature.history > 1):
         raise document.error(
             f"{where}/align", f"{mapping.align} with history: {feature.history}; a window needs history > 1"

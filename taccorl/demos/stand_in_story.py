@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from taccorl.demos.stand_in_robot import ARMS, link_poses, solve_joints
 
@@ -87,6 +86,17 @@ def _ramp(x: np.ndarray, start: float | np.ndarray, end: float | np.ndarray) -> 
     return s * s * s * (10 - 15 * s + 6 * s * s)
 
 
+def _follow(command: np.ndarray, time_constant_s: float) -> np.ndarray:
+    """Steps q̇ = (q* − q) / τ along the grid, exactly for a command that stays at the mean of its two ends."""
+    keep = math.exp(-1.0 / (_GRID_HZ * time_constant_s))
+    drive = 0.5 * (1 - keep) * (command[1:] + command[:-1])
+    state = np.empty_like(command)
+    state[0] = command[0]
+    for n in range(len(drive)):  # scipy.signal would do it too, and takes a second to import
+        state[n + 1] = keep * state[n] + drive[n]
+    return state
+
+
 class Story:
     """One recording's truth as functions of the time since its start. State and command are left arm first, (N, 14)."""
 
@@ -99,9 +109,7 @@ class Story:
         for a, arm in enumerate(ARMS):
             self._command[:, 7 * a : 7 * a + 6] = self._joint_commands(arm, np.random.default_rng([seed, 2, a]))
             self._command[:, 7 * a + 6] = self._gripper_commands(arm)
-        keep = math.exp(-1.0 / (_GRID_HZ * command_lead_s))
-        first, half = self._command[0], (1 - keep) / 2
-        self._state = first + lfilter([half, half], [1.0, -keep], self._command - first, axis=0)
+        self._state = _follow(self._command, command_lead_s)
         self._velocity = (self._command - self._state) / command_lead_s
         self._squeeze_m = np.empty((len(self.time_s), 2))
         for a, arm in enumerate(ARMS):
@@ -169,9 +177,10 @@ class Story:
 
     def _hold_times(self, arm: str) -> list[tuple[float, float]]:
         """From when to when the fingers are stopped by the part, one interval per episode."""
-        stopped = np.diff((self._squeeze_m[:, ARMS.index(arm)] > 0).astype(np.int8), prepend=0, append=0)
-        edges_s = self.time_s[np.minimum(np.flatnonzero(stopped), len(self.time_s) - 1)]
-        return [(float(a), float(b)) for a, b in zip(edges_s[::2], edges_s[1::2], strict=True)]
+        stopped = np.diff((self._squeeze_m[:, ARMS.index(arm)] > 0).astype(np.int8))
+        begins_s = self.time_s[:-1][stopped > 0]  # the last instant before, so that interpolation stays inside
+        ends_s = self.time_s[1:][stopped < 0]
+        return [(float(a), float(b)) for a, b in zip(begins_s, ends_s, strict=True)]
 
     def contact_s(self, arm: str) -> list[tuple[float, float]]:
         """From when to when the pads of an arm feel its part, one interval per episode."""
@@ -192,8 +201,8 @@ class Story:
         if arm == "right":  # tube: a stripe along the finger; pushing tilts it and digs its upper end in
             middle = 5.2 + 1.4 * load + (0.02 + 0.07 * load) * (col - 18)
             stripe = np.exp(-0.5 * ((row - middle) / 1.25) ** 2) / (1 + np.exp((9.0 - col) / 0.8))
-            ridge = 0.55 * load * np.exp(-0.5 * ((col - 11.0) / 1.1) ** 2 - 0.5 * ((row - middle) / 2.2) ** 2)
-            counts = 120.0 * grip**0.9 * (stripe + ridge)
+            ridge = 0.50 * load * np.exp(-0.5 * ((col - 11.0) / 1.1) ** 2 - 0.5 * ((row - middle) / 2.2) ** 2)
+            counts = 105.0 * grip**0.9 * (stripe + ridge)
         else:  # rack: a patch at the finger tip with a firmer edge; pushing shears it towards the tip
             top = 14.0 + 2.0 * load
             inside = 1 / (1 + np.exp((top - col) / 0.7)) / (1 + np.exp((np.abs(row - 5.5) - 5.0) / 0.6))

@@ -72,6 +72,7 @@ class _Tracer:
         self.store = store
         self.cache: DigestCache | None = store.digests if store else None
         self.said: set[Path] = set()
+        self.software: dict[str, str] = {}
 
     def artefact(self, folder: Path, recorded: str | None = None) -> Origin:
         manifest = read_manifest(folder)
@@ -82,11 +83,18 @@ class _Tracer:
             return Origin(f"{title}  (see above)")
         self.said.add(folder)
         now = digests_now(folder, self.cache)
-        origin = Origin(title, _lines(folder, manifest), _changes(manifest["files"], now))
+        origin = Origin(title, self.lines(folder, manifest), _changes(manifest["files"], now))
         if recorded not in (None, manifest["digest"], digest_files(now)):
             origin.problems.append(f"holds something else now: {_digest(str(recorded))} went into the step above")
         origin.inputs = [self.input(entry) for entry in manifest["inputs"]]
         return origin
+
+    def lines(self, folder: Path, manifest: dict[str, Any]) -> list[str]:
+        made = f"made {manifest['created']} in {manifest['seconds']} s"
+        if manifest["software"] != self.software:  # mostly the same for the whole tree: said once
+            self.software = manifest["software"]
+            made += " by " + ", ".join(f"{name} {version}" for name, version in self.software.items())
+        return [f"at {folder}: {len(manifest['files'])} files", made, f"config: {_config(manifest)}"]
 
     def input(self, entry: dict[str, Any]) -> Origin:
         path, recorded = Path(entry["path"]), entry["digest"]
@@ -109,15 +117,6 @@ class _Tracer:
 
 def _content(path: Path, cache: DigestCache | None) -> str:
     return digest_files(digests_now(path, cache)) if path.is_dir() else digest_file(path, cache)
-
-
-def _lines(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    versions = ", ".join(f"{name} {version}" for name, version in manifest["software"].items())
-    return [
-        f"at {folder}: {len(manifest['files'])} files",
-        f"made {manifest['created']} in {manifest['seconds']} s by {versions}",
-        f"config: {_config(manifest)}",
-    ]
 
 
 def _config(manifest: dict[str, Any]) -> str:
@@ -148,7 +147,11 @@ def _digest(digest: str) -> str:
 def render(origin: Origin) -> str:
     """The tree as text, one line per fact, and a last line that says whether all is as it was made."""
     wrong = origin.num_problems()
-    verdict = f"✗ {wrong} differ from the record" if wrong else "✓ everything is as it was recorded"
+    verdict = (
+        f"✗ differs from the record in {wrong} place{'s' * (wrong > 1)}"
+        if wrong
+        else "✓ everything is as it was recorded"
+    )
     return "\n".join([*_tree(origin), verdict])
 
 

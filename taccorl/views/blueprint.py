@@ -2,21 +2,20 @@
 
 import itertools
 
+import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
 
 from taccorl.data.episode import Episode
 from taccorl.views.colors import GROUND_COLOR
-from taccorl.views.figure import arms_of
-from taccorl.views.groups import groups_of
+from taccorl.views.figure import BASE_POS_WORLD, arms_of, floor_z_m, tool_paths
+from taccorl.views.groups import groups_of, short_name, vector_keys
 from taccorl.views.touch import Pad, pads_of
 
 PAD_GAP_TAXELS = 3.0
 MOST_IN_A_ROW = 3
-
-
-def camera_name(key: str) -> str:
-    """``observation.images.front`` → ``front``."""
-    return key.removeprefix("observation.images.").removeprefix("observation.").replace(".", "_")
+EYE_SIZES = 1.1
+"""The eye's distance from the figure, in sizes of the figure."""
 
 
 def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blueprint:
@@ -56,27 +55,40 @@ def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:
     page = rrb.TextDocumentView(origin="/provenance", name=_with_origin("provenance", episode))
     rows, shares = [], []
     if arms_of(episode):
-        figure = rrb.Spatial3DView(
-            origin="/figure",
-            name="arms (schematic): joints in the plots' colours",
-            background=GROUND_COLOR,
-            line_grid=rrb.LineGrid3D(visible=True, spacing=0.1, color=(71, 85, 105, 120)),
-            eye_controls=rrb.EyeControls3D(
-                position=(0.9, -0.44, 0.62), look_target=(0.17, -0.01, 0.15), eye_up=(0, 0, 1)
-            ),
-        )
+        figure = _figure(episode)
         rows.append(rrb.Horizontal(figure, page, column_shares=[1.1, 1.0]))
     else:
         rows.append(page)
     shares.append(1.4)
     if episode.picture_keys:
-        names = [camera_name(key) for key in episode.picture_keys]
+        names = [short_name(key) for key in episode.picture_keys]
         rows.append(rrb.Horizontal(*[rrb.Spatial2DView(origin=f"/observation/images/{n}", name=n) for n in names]))
         shares.append(1.05)
     if pads:
         rows.append(_heatmaps(pads))
         shares.append(1.3)
     return rrb.Vertical(*rows, row_shares=shares)
+
+
+def _figure(episode: Episode) -> rrb.Spatial3DView:
+    """Seen from the front right, near enough that arms and tool paths fill the view."""
+    points = np.concatenate([*tool_paths(episode).values(), list(BASE_POS_WORLD.values())])
+    low, high = points.min(axis=0), points.max(axis=0) + np.array([0, 0, 0.3])  # elbows rise above the bases
+    middle, size_m = (low + high) / 2, float(np.linalg.norm(high - low))
+    return rrb.Spatial3DView(
+        origin="/figure",
+        name="arms (schematic): joints in the plots' colours",
+        background=GROUND_COLOR,
+        line_grid=rrb.LineGrid3D(
+            visible=True,
+            spacing=0.1,
+            plane=rr.components.Plane3D.XY.with_distance(floor_z_m(episode)),
+            color=(71, 85, 105, 120),
+        ),
+        eye_controls=rrb.EyeControls3D(
+            position=middle + EYE_SIZES * size_m * np.array([0.85, -0.22, 0.45]), look_target=middle, eye_up=(0, 0, 1)
+        ),
+    )
 
 
 def _heatmaps(pads: list[Pad]) -> rrb.Spatial2DView:
@@ -123,17 +135,22 @@ def _over_time(episode: Episode, pads: list[Pad]) -> rrb.Container | None:
 
 
 def _joint_plots(episode: Episode) -> list[rrb.TimeSeriesView]:
-    """State and action of the same joints in one plot."""
-    keys = [key for key in ("observation.state", "action") if key in episode.arrays]
-    groups = {group.path: group for key in keys for group in groups_of(episode.spec.features[key])}
-    suffix = ": action thin" if len(keys) == 2 else f": {keys[0]}" if keys else ""
+    """State and action of the same joints share a plot."""
+    contents: dict[str, list[str]] = {}
+    groups = {}
+    for key in vector_keys(episode):
+        for group in groups_of(episode.spec.features[key]):
+            about = "joints" if key in ("observation.state", "action") else key
+            title = group.title if about == "joints" else f"{short_name(key)}: {group.title}"
+            contents.setdefault(title, []).append(f"/{key.replace('.', '/')}/{group.path}")
+            groups[title] = group
     on_the_figure = set(arms_of(episode))
     plots = []
-    for path, group in groups.items():
-        contents = [f"/{key.replace('.', '/')}/{path}" for key in keys]
+    for title, paths in contents.items():
+        suffix = ": action thin" if len(paths) == 2 else ""
         # The figure's joints wear the lines' colours: no legend in the way.
-        corner = None if set(group.name.split()) & on_the_figure else rrb.Corner2D.LeftBottom
-        plots.append(_plot(group.title + suffix, contents, corner))
+        corner = None if set(groups[title].name.split()) & on_the_figure else rrb.Corner2D.LeftBottom
+        plots.append(_plot(title + suffix, paths, corner))
     return plots
 
 

@@ -2,9 +2,9 @@
 
     /observation/images/<camera>     pictures: the dataset's own mp4 packets, or JPEG where there is no mp4 (a recording)
     /observation/tactile/<pad>       heatmaps, counts above baseline, one fixed colour scale
-    /observation/state/<group>, /action/<group>
+    /observation/state/<group>, /action/<group>, and every other feature of a few numbers
     /touch/{sum,peak,active}/<pad>, /touch/…/<line>
-    /events/{contact,stage,success}
+    /events/{contact_gate,outcome,stage}
     /figure                          the arms in 3-D
     /provenance                      what it is, where it is from, how its samples met its rows
 
@@ -13,6 +13,7 @@ Time lines: ``time`` (seconds since row 0) and ``frame_index``. ``blueprint.py``
 
 import itertools
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,13 +21,15 @@ import rerun as rr
 
 from taccorl.data.episode import Episode
 from taccorl.data.spec import SensorSpec
-from taccorl.views.blueprint import camera_name, heatmap_places
+from taccorl.views.blueprint import episode_blueprint, heatmap_places
 from taccorl.views.colors import CONTACT_COLOR, HEATMAP, LINE_COLORS, NOISE_COLOR, PAD_COLORS
 from taccorl.views.figure import log_figure
-from taccorl.views.groups import groups_of
+from taccorl.views.groups import groups_of, short_name, vector_keys
+from taccorl.views.outputs import check_free, replacing
 from taccorl.views.provenance import provenance
 from taccorl.views.touch import Pad, contact_gate, pads_of
-from taccorl.views.video import cut
+from taccorl.views.video import Clip, cut
+from taccorl.views.viewer import can_decode
 
 APPLICATION = "taccorl_episode"
 JPEG_QUALITY = 90
@@ -34,8 +37,11 @@ PICTURES_AT_ONCE = 64  # rows; keeps memory flat however long the episode is
 EVENT_COLORS = (0x2563EBFF, 0x0D9488FF, 0xCA8A04FF, 0x9333EAFF, 0xDB2777FF, 0x65A30DFF)
 
 
-def log_episode(rec: rr.RecordingStream, episode: Episode) -> None:
+def log_episode(rec: rr.RecordingStream, episode: Episode, *, native: bool = False) -> None:
     """Everything the episode holds; what it lacks is left out.
+
+    Args:
+        native: for the Rerun program on this machine: a video that it cannot decode here is logged as JPEG pictures.
 
     Raises:
         DatasetError: a video file that is not what the dataset says.
@@ -44,19 +50,33 @@ def log_episode(rec: rr.RecordingStream, episode: Episode) -> None:
     rec.send_recording_name(episode.name)
     document = rr.TextDocument(provenance(episode), media_type=rr.MediaType.MARKDOWN)
     rec.log("provenance", document, static=True)
-    for key in episode.picture_keys:
-        if key in episode.videos:
-            _log_video(rec, episode, key, indexes)
-    _log_pictures(rec, episode, [key for key in episode.picture_keys if key not in episode.videos])
-    for key in ("observation.state", "action"):
-        if key in episode.arrays:
-            _log_joints(rec, episode, key, indexes)
+    clips = {key: cut(episode.videos[key], episode.spec.fps) for key in episode.picture_keys if key in episode.videos}
+    if native:
+        clips = {key: clip for key, clip in clips.items() if can_decode(clip.codec)}
+    for key, clip in clips.items():
+        _log_video(rec, episode, key, clip, indexes)
+    _log_pictures(rec, episode, [key for key in episode.picture_keys if key not in clips])
+    for key in vector_keys(episode):
+        _log_vector(rec, episode, key, indexes)
     pads = pads_of(episode)
     if pads:
         _log_heatmaps(rec, pads, indexes)
         _log_touch(rec, pads, indexes)
     _log_events(rec, episode, pads)
     log_figure(rec, episode, pads, indexes)
+
+
+def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, native: bool = False) -> None:
+    """The episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as above.
+
+    Raises:
+        OutputError: ``rrd`` is somebody else's file.
+    """
+    check_free(rrd)
+    with replacing(rrd) as part, rr.RecordingStream(APPLICATION) as rec:
+        rec.save(part, default_blueprint=episode_blueprint(episode, at_s=at_s))
+        log_episode(rec, episode, native=native)
+        rec.disconnect()
 
 
 def time_columns(episode: Episode, rows: Sequence[int] | None = None) -> list[rr.TimeColumn]:
@@ -66,10 +86,9 @@ def time_columns(episode: Episode, rows: Sequence[int] | None = None) -> list[rr
     return [rr.TimeColumn("time", duration=episode.time_s[index]), rr.TimeColumn("frame_index", sequence=index)]
 
 
-def _log_video(rec: rr.RecordingStream, episode: Episode, key: str, indexes: list[rr.TimeColumn]) -> None:
-    clip = cut(episode.videos[key], episode.spec.fps)
+def _log_video(rec: rr.RecordingStream, episode: Episode, key: str, clip: Clip, indexes: list[rr.TimeColumn]) -> None:
     asset = rr.AssetVideo(contents=clip.mp4, media_type="video/mp4")
-    path = f"observation/images/{camera_name(key)}"
+    path = f"observation/images/{short_name(key)}"
     rec.log(path, asset, static=True)
     frames_ns = asset.read_frame_timestamps_nanos()[clip.first_frame :][: episode.num_rows]
     rr.send_columns(path, indexes, rr.VideoFrameReference.columns_nanos(frames_ns), recording=rec)
@@ -83,7 +102,7 @@ def _log_pictures(rec: rr.RecordingStream, episode: Episode, keys: list[str]) ->
         for key in keys:
             blobs = [_jpeg(pictures[key]) for _, pictures in batch]
             columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
-            rr.send_columns(f"observation/images/{camera_name(key)}", indexes, columns, recording=rec)
+            rr.send_columns(f"observation/images/{short_name(key)}", indexes, columns, recording=rec)
 
 
 def _jpeg(rgb: np.ndarray) -> bytes:
@@ -91,7 +110,7 @@ def _jpeg(rgb: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
-def _log_joints(rec: rr.RecordingStream, episode: Episode, key: str, indexes: list[rr.TimeColumn]) -> None:
+def _log_vector(rec: rr.RecordingStream, episode: Episode, key: str, indexes: list[rr.TimeColumn]) -> None:
     """State: thick; action: the same colours, thin and pale."""
     is_action = key == "action"
     for group in groups_of(episode.spec.features[key]):

@@ -82,6 +82,21 @@ def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
     return poses
 
 
+def tool_paths(episode: Episode) -> dict[str, np.ndarray]:
+    """Side → (T, 3) world positions of the middle between the pads."""
+    paths = {}
+    for side, joints in arms_of(episode).items():
+        faces = pad_poses(link_poses(joints[:, :6])[:, 6], joints[:, 6])
+        paths[side] = faces[:, :, :3, 3].mean(axis=1) + BASE_POS_WORLD[side]
+    return paths
+
+
+def floor_z_m(episode: Episode) -> float:
+    """World height of the drawn floor: just below the lowest finger, for nobody records how high the arms stand."""
+    lowest = min(path[:, 2].min() for path in tool_paths(episode).values())
+    return min(0.0, float(lowest) - FINGER_LENGTH_M / 2 - 0.01)
+
+
 def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], indexes: list[rr.TimeColumn]) -> None:
     """The arms under ``/figure``; a pad's colour is its sum on the pad's fixed scale."""
     rec.log("figure", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -89,7 +104,7 @@ def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], index
     for side, joints in arms_of(episode).items():
         root = f"figure/{side}"
         poses = link_poses(joints[:, :6])
-        _log_still_parts(rec, root, side)
+        _log_still_parts(rec, root, side, floor_z_m(episode))
         for i in range(1, 7):
             _send_poses(rec, f"{root}/link_{i}", poses[:, i], indexes)
         faces = pad_poses(poses[:, 6], joints[:, 6])
@@ -101,14 +116,14 @@ def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], index
             else:  # never static as well: what is static hides what changes
                 columns = rr.Boxes3D.columns(colors=pad_colors(pad))
                 rr.send_columns(f"{root}/finger_{name}/pad", indexes, columns, recording=rec)
-        path = faces[:, :, :3, 3].mean(axis=1)
+        path = tool_paths(episode)[side] - BASE_POS_WORLD[side]
         rec.log(
             f"{root}/tool_path", rr.LineStrips3D([path], colors=[(*ARM_COLORS[side], 120)], radii=0.0015), static=True
         )
 
 
 def pad_colors(pad: Pad) -> np.ndarray:
-    """(T,) RGBA as uint32: the heatmaps' colours, 0 at no active taxel, full where every taxel is at the contact threshold."""
+    """(T,) RGBA as uint32: the heatmaps' colours, 0 at no active taxel, full as ``Pad.full_sum_count`` says."""
     rgb = heat(pad.sum_count / pad.full_sum_count).astype(np.uint32)
     return (rgb[:, 0] << 24) | (rgb[:, 1] << 16) | (rgb[:, 2] << 8) | 255
 
@@ -119,15 +134,20 @@ def _send_poses(rec: rr.RecordingStream, path: str, poses: np.ndarray, indexes: 
     rr.send_columns(path, indexes, columns, recording=rec)
 
 
-def _log_still_parts(rec: rr.RecordingStream, root: str, side: str) -> None:
+def _log_still_parts(rec: rr.RecordingStream, root: str, side: str, floor_z: float) -> None:
     """Everything that does not change its shape, each in the frame of the link that carries it."""
     rec.log(root, rr.Transform3D(translation=BASE_POS_WORLD[side]), static=True)
-    plate = rr.Cylinders3D(
-        lengths=[0.03], radii=[0.07], centers=[(0, 0, 0.015)], colors=[PLATE_COLOR], fill_mode="solid"
+    height, top = 0.03 - floor_z, 0.03
+    stand = rr.Cylinders3D(
+        lengths=[height], radii=[0.07], centers=[(0, 0, top - height / 2)], colors=[PLATE_COLOR], fill_mode="solid"
     )
-    rec.log(f"{root}/plate", plate, static=True)
+    rec.log(f"{root}/stand", stand, static=True)
     label = rr.Points3D(
-        [(0, 0, -0.02)], labels=[f"{side} arm"], radii=0.001, colors=[ARM_COLORS[side]], show_labels=True
+        [(0, 0.17 * np.sign(BASE_POS_WORLD[side][1]), floor_z)],
+        labels=[f"{side} arm"],
+        radii=0.001,
+        colors=[ARM_COLORS[side]],
+        show_labels=True,
     )
     rec.log(f"{root}/label", label, static=True)
     ends = [xyz for xyz, _ in LINK_ORIGINS] + [(0.0, 0.0, 0.1)]

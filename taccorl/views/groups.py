@@ -3,8 +3,11 @@
 import re
 from dataclasses import dataclass
 
+from taccorl.data.episode import Episode
 from taccorl.data.spec import FeatureSpec
 
+MOST_NUMBERS = 64
+"""A feature of more numbers than this is no set of curves."""
 MOST_LINES = 8
 """More lines than this are hard to tell apart: split by the first word of their names (left, right)."""
 
@@ -26,6 +29,18 @@ class Group:
     def path(self) -> str:
         """The last part of its entity path, e.g. ``left_arm_rad``."""
         return re.sub(r"\W+", "_", self.title).strip("_")
+
+
+def short_name(key: str) -> str:
+    """``observation.images.front`` → ``front``."""
+    return key.removeprefix("observation.images.").removeprefix("observation.").replace(".", "_")
+
+
+def vector_keys(episode: Episode) -> list[str]:
+    """Features that are shown as curves: state and action first."""
+    keys = [key for key in episode.spec.keys("vector") if key in episode.arrays]
+    shown = [key for key in keys if episode.spec.features[key].size <= MOST_NUMBERS]
+    return sorted(shown, key=("observation.state", "action", *shown).index)
 
 
 def groups_of(feature: FeatureSpec) -> list[Group]:

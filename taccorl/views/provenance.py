@@ -1,5 +1,7 @@
 """What an episode is and where it came from, as a page for people."""
 
+import re
+
 import numpy as np
 
 from taccorl.data.episode import ChannelTiming, Episode
@@ -26,12 +28,22 @@ def provenance(episode: Episode) -> str:
         f"- outcome: {outcome(episode)}",
         f"- {episode.num_rows} rows, {episode.num_rows / spec.fps:.2f} s at {spec.fps} fps",
         f"- data spec {spec.name}, robot {spec.robot_type}",
-        *(f"- {name}: {value}" for name, value in episode.provenance.items()),
+        *(
+            f"- {name.replace('_', ' ')}: {_short(value)}"
+            for name, value in episode.provenance.items()
+            if value is not None
+        ),
         *_touch(episode),
     ]
     if episode.timing:
         lines += ["", f"**timing**: {TIMING_COLUMNS}", "", *_timing_table(episode.timing)]
     return "\n".join(lines)
+
+
+def _short(value: object) -> str:
+    """Digests by their first 12 digits, as `taccorl lineage` shows them."""
+    text = str(value)
+    return text[:12] if re.fullmatch(r"[0-9a-f]{32,}", text) else text
 
 
 def _touch(episode: Episode) -> list[str]:

@@ -53,8 +53,8 @@ class Pad:
 
     @property
     def full_sum_count(self) -> float:
-        """Fixed scale of the sum where it is a colour: every taxel of the pad at λ_f."""
-        return self.gate_count * self.sensor.rows * self.sensor.columns
+        """Fixed scale of the sum where it is a colour: every taxel of the pad at twice λ_f, a firm full-face grip."""
+        return 2.0 * self.gate_count * self.sensor.rows * self.sensor.columns
 
 
 def pads_of(episode: Episode) -> list[Pad]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -33,13 +34,29 @@ def cut(video: Video, fps: int) -> Clip:
     Raises:
         DatasetError: the file is not there, cannot be read, or holds fewer frames than the dataset says.
     """
+    with _opened(video) as source:
+        return _cut(source, video, fps)
+
+
+def codec_of(video: Video) -> str:
+    """``av1``, ``h264`` …; as for ``cut`` if the file cannot be read."""
+    with _opened(video) as source:
+        return _codec(source)
+
+
+@contextlib.contextmanager
+def _opened(video: Video) -> Iterator[InputContainer]:
     try:
         with contextlib.closing(av.open(str(video.path))) as source:
-            return _cut(source, video, fps)
+            yield source
     except (FFmpegError, OSError, IndexError) as error:
         raise DatasetError(
             f"{video.path}: cannot be read as a video ({error}): copy or write the dataset again"
         ) from error
+
+
+def _codec(source: InputContainer) -> str:
+    return source.streams.video[0].codec_context.codec.canonical_name
 
 
 def _cut(source: InputContainer, video: Video, fps: int) -> Clip:
@@ -75,4 +92,4 @@ def _cut(source: InputContainer, video: Video, fps: int) -> Clip:
         for packet in packets:
             packet.pts, packet.dts, packet.stream = packet.pts - start, packet.dts - start, copy
             target.mux(packet)
-    return Clip(buffer.getvalue(), sum(pts < begin_pts for pts in times), stream.codec_context.codec.canonical_name)
+    return Clip(buffer.getvalue(), sum(pts < begin_pts for pts in times), _codec(source))

@@ -24,17 +24,24 @@ class ViewerError(TaccorlError):
     """Nothing here can show or draw this: names what is missing and the command that installs it."""
 
 
-def open_window(rrd: Path) -> None:
-    """Show ``rrd`` in a window until that is closed.
-
+def require_screen() -> None:
+    """
     Raises:
-        ViewerError: no screen, or the viewer could not open a window on it.
+        ViewerError: there is no screen to open a window on; says what to do instead.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError(
             "no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set): use --serve=true and a browser, "
             "--save=episode.rrd to look elsewhere, or --screenshot=episode.png"
         )
+
+
+def open_window(rrd: Path) -> None:
+    """Show ``rrd`` in a window until that is closed.
+
+    Raises:
+        ViewerError: the Rerun program could not open one.
+    """
     command = [_program(), str(rrd), "--bind", LOOPBACK, "--port", "auto", "--hide-welcome-screen"]
     if subprocess.run(command, env=_environment(), check=False).returncode != 0:
         raise ViewerError("the Rerun window did not open (its own words are above): use --serve=true and a browser")

@@ -58,11 +58,13 @@ def test_velocity_is_the_rate_of_the_state():
 
 @pytest.mark.parametrize("lead_s", [0.08, 0.15])
 def test_commands_lead_states_by_the_stated_lag(lead_s):
-    """A first-order lag delays slow motion by its time constant: the best shift of the command is that, within 10 ms."""
+    """A first-order lag τ delays motion of frequency ω by atan(ωτ)/ω: τ for slow, at most 12 % less for this motion."""
     story, time_s, shifts_s = _story(lead_s=lead_s), np.arange(0.5, 5.5, 0.005), np.arange(0.0, 0.3, 0.002)
     for joint in (0, 1, 2, 7, 8, 9):
         error = [np.mean((story.command(time_s - s)[:, joint] - story.state(time_s)[:, joint]) ** 2) for s in shifts_s]
-        assert shifts_s[np.argmin(error)] == pytest.approx(lead_s, abs=0.010)
+        assert shifts_s[np.argmin(error)] == pytest.approx(0.94 * lead_s, rel=0.06)
+        behind = story.command(time_s)[:, joint] - story.state(time_s)[:, joint]
+        assert behind == pytest.approx(lead_s * story.velocity(time_s)[:, joint], abs=1e-6)
 
 
 def test_published_lag_is_the_true_one(record):
@@ -95,8 +97,8 @@ def test_touch_begins_30_ms_after_the_fingers_stop_and_only_while_they_are_close
         opening_m = story.state(time_s)[:, 7 * a + 6]
         assert len(story.contact_s(arm)) == 2
         for plan, (begin_s, end_s) in zip(story.plans, story.contact_s(arm), strict=True):
-            inside = (time_s > begin_s) & (time_s < end_s - 0.03)
-            assert np.all(opening_m[inside] == pytest.approx(PART_WIDTH_M[arm]))
+            inside = (time_s > begin_s) & (time_s < end_s - 0.035)
+            assert opening_m[inside] == pytest.approx(PART_WIDTH_M[arm])
             before = (time_s > plan.start_s) & (time_s < begin_s)
             stopped_s = time_s[before & (opening_m <= PART_WIDTH_M[arm] + 1e-9)].min()
             assert begin_s - stopped_s == pytest.approx(0.03, abs=0.003)
@@ -120,7 +122,7 @@ def test_pads_read_baseline_without_touch_and_more_with_it(record):
     for pad, topic in PAD_TOPICS.items():
         counts, time_s = recorded.counts(topic), recorded.truth.sampled_s[topic]
         (begin_s, end_s), baseline = recorded.truth.contact_s[pad.split("_")[0]][0], recorded.truth.baseline_counts[pad]
-        assert 10 <= baseline.min()
+        assert baseline.min() >= 10
         assert baseline.max() <= 40
         away = (time_s < begin_s - 0.01) | (time_s > end_s + 0.01)
         assert np.abs(counts[away].mean(axis=0) - baseline).max() < 0.6  # 1.3 counts of noise, ≥ 100 frames
@@ -158,9 +160,7 @@ def test_rows_are_scanned_one_after_the_other():
 
 
 def test_insertion_moves_the_footprint_and_a_miss_presses_harder():
-    hit, miss = (
-        Story(plan_episodes(6.0, 1, (outcome,), 0), 6.0, 0.08, 0.03, 0) for outcome in ("success", "failure")
-    )
+    hit, miss = (Story(plan_episodes(6.0, 1, (outcome,), 0), 6.0, 0.08, 0.03, 0) for outcome in ("success", "failure"))
     for story, harder in ((hit, 1.0), (miss, 1.1)):
         before, pushed = story.clean_counts(PADS[2], np.array([3.9, 4.55]))
         assert np.abs(pushed - before).max() > 30 * harder

@@ -22,7 +22,6 @@ from . import toys
 from .toys import INGEST, IngestConfig, make_raw
 
 ONE_AND_TWO_WORKERS = pytest.mark.parametrize("workers", [1, 2])
-TESTS_FOLDER = str(Path(__file__).parents[1])
 
 
 @ONE_AND_TWO_WORKERS
@@ -114,9 +113,8 @@ def test_script_without_a_main_guard_is_told_so_instead_of_hanging(tmp_path):
 
 
 def run_script(words: list[str]) -> subprocess.CompletedProcess:
-    environment = os.environ | {"PYTHONPATH": TESTS_FOLDER}
     return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, timeout=60, env=environment, check=False
+        [sys.executable, *words], capture_output=True, text=True, timeout=60, env=toys.ENVIRONMENT, check=False
     )
 
 
@@ -125,20 +123,20 @@ def run_script(words: list[str]) -> subprocess.CompletedProcess:
 PARENT = """
 import sys
 from pathlib import Path
-from lineage.toys import sleep_and_leave_pid
+from lineage import toys
 from taccorl.lineage.engines import LocalEngine
 if __name__ == "__main__":
-    LocalEngine(workers=2).map(sleep_and_leave_pid, [Path(sys.argv[1]) / "a", Path(sys.argv[1]) / "b"])
+    LocalEngine(workers=2).map(toys.sleep_and_leave_pid, [Path(sys.argv[1]) / "a", Path(sys.argv[1]) / "b"])
 """
 
 PARENT_WITHOUT_KERNEL_HELP = """
 import multiprocessing, sys, threading
 from pathlib import Path
-from lineage.toys import sleep_and_leave_pid
+from lineage import toys
 from taccorl.lineage.processes import _end_after_parent
 def child(path):
     threading.Thread(target=_end_after_parent, daemon=True).start()
-    sleep_and_leave_pid(path)
+    toys.sleep_and_leave_pid(path)
 if __name__ == "__main__":
     spawn = multiprocessing.get_context("spawn")
     for name in "ab":
@@ -146,30 +144,54 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("source", [PARENT, PARENT_WITHOUT_KERNEL_HELP], ids=["engine", "portable fallback"])
-def test_workers_die_with_a_sigkilled_parent(tmp_path, source):
-    (tmp_path / "parent.py").write_text(source)
-    environment = os.environ | {"PYTHONPATH": TESTS_FOLDER}
-    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py"), str(tmp_path)], env=environment)
-    notes = [tmp_path / "a", tmp_path / "b"]
+def start_parent(folder: Path, source: str) -> tuple[subprocess.Popen, list[int]]:
+    """A script with two busy children, and the children's process ids."""
+    (folder / "parent.py").write_text(source)
+    words = [sys.executable, str(folder / "parent.py"), str(folder)]
+    parent = subprocess.Popen(words, env=toys.ENVIRONMENT, stderr=subprocess.DEVNULL)
+    notes = [folder / "a", folder / "b"]
     assert within_30_s(lambda: all(note.exists() and note.read_text() for note in notes))
-    pids = [int(note.read_text()) for note in notes]
+    return parent, [int(note.read_text()) for note in notes]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        PARENT,
+        pytest.param(
+            PARENT.replace("sleep_and", "spin_and"), marks=pytest.mark.skipif(sys.platform != "linux", reason="prctl")
+        ),
+        PARENT_WITHOUT_KERNEL_HELP,
+    ],
+    ids=["asleep", "deep in C code", "without the kernel's help"],
+)
+def test_workers_die_with_a_sigkilled_parent(tmp_path, source):
+    parent, pids = start_parent(tmp_path, source)
     assert all(is_running(pid) for pid in pids)
     parent.kill()
     parent.wait()
-    assert within_30_s(lambda: not any(is_running(pid) for pid in pids))
+    try:
+        assert within_30_s(lambda: not any(is_running(pid) for pid in pids))
+    finally:
+        end(pids)
 
 
-def test_interrupted_engine_ends_its_workers(tmp_path):
-    (tmp_path / "parent.py").write_text(PARENT)
-    environment = os.environ | {"PYTHONPATH": TESTS_FOLDER}
-    words = [sys.executable, str(tmp_path / "parent.py"), str(tmp_path)]
-    parent = subprocess.Popen(words, env=environment, stderr=subprocess.PIPE)
-    notes = [tmp_path / "a", tmp_path / "b"]
-    assert within_30_s(lambda: all(note.exists() and note.read_text() for note in notes))
+def test_interrupted_engine_ends_its_workers_after_they_tidied_up(tmp_path):
+    parent, pids = start_parent(tmp_path, PARENT)
     parent.send_signal(signal.SIGINT)
-    parent.communicate(timeout=20)
-    assert not any(is_running(int(note.read_text())) for note in notes)
+    parent.wait(timeout=4)  # sooner than GRACE_S: they were asked to end, and did
+    try:
+        assert not any(is_running(pid) for pid in pids)
+        assert (tmp_path / "a.tidy").exists()
+        assert (tmp_path / "b.tidy").exists()
+    finally:
+        end(pids)
+
+
+def end(pids: list[int]) -> None:
+    for pid in pids:
+        if is_running(pid):
+            os.kill(pid, signal.SIGKILL)
 
 
 def within_30_s(condition) -> bool:

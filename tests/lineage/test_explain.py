@@ -45,6 +45,7 @@ def test_tree_names_stage_version_key_digest_config_date_and_raw_sources(world):
     assert lines[0] == f"merge v1  key {made['key']}  digest {made['digest'][:12]}"
     assert lines[1] == f"│  at {world.dataset}: 5 files"
     assert lines[2].startswith(f"│  made {made['created']} in {made['seconds']} s by python 3.12")
+    assert text.count("by python") == 1  # said once, as it is the same for the whole tree
     assert lines[3] == "│  config: all at its default"
     assert lines[4] == f"├─ ingest v1  key {episode['key']}  digest {episode['digest'][:12]}"
     assert "config: rate_hz=20.0 (all else at its default)" in lines[7]
@@ -72,7 +73,7 @@ def test_changed_missing_and_added_files_are_reported_by_name(world):
     assert changed.startswith("changed since: 0.bin, digest ")
     assert missing.startswith("missing: 1.bin, digest ")
     assert added == "added since: extra.txt"
-    assert explain(world.dataset, None).endswith("✗ 3 differ from the record")
+    assert explain(world.dataset, None).endswith("✗ differs from the record in 3 places")
 
 
 def test_changed_and_missing_raw_files_are_reported(world):

@@ -18,6 +18,7 @@ from taccorl.lineage.store import Store
 
 PAUSE_S = 0.004
 NUM_PARTS = 5
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +72,7 @@ def run_and_die(store_root: Path, destination: Path | None = None) -> None:
     """A run in another process that is killed while its stage works: leaves a temporary folder with 1000 bytes."""
     script = "import sys; from lineage.toys import start_dying; start_dying(*sys.argv[1:])"
     words = [sys.executable, "-c", script, str(store_root), *([str(destination)] if destination else [])]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    assert subprocess.run(words, env=environment, check=False).returncode == -signal.SIGKILL
+    assert subprocess.run(words, env=ENVIRONMENT, check=False).returncode == -signal.SIGKILL
 
 
 def start_dying(store_root: str, destination: str | None = None) -> None:
@@ -117,7 +117,15 @@ def crash_on_seven(x: int) -> int:
 
 def sleep_and_leave_pid(path: Path) -> None:
     path.write_text(str(os.getpid()))
-    time.sleep(60)
+    try:
+        time.sleep(60)
+    finally:
+        path.with_suffix(".tidy").touch()
+
+
+def spin_and_leave_pid(path: Path) -> None:
+    path.write_text(str(os.getpid()))
+    sum(range(10**11))  # a minute or more of C code that lets no other Python thread run
 
 
 if __name__ == "__main__":

@@ -69,6 +69,7 @@ class Db3Reader(Reader):
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[Message]:
+        found: list[Damage] = []
         between = (EVERY_TIME[0] if start_ns is None else start_ns, EVERY_TIME[1] if end_ns is None else end_ns)
         for path in self.source.files:
             with _File(path) as file:
@@ -85,7 +86,9 @@ class Db3Reader(Reader):
                         yield self._message(asked[topic_id], log_ns, data, topic_id in values)
                 if orphans:
                     file.lost(f"{orphans} messages of topics that the bag does not name")
-                self.damage += [d for d in file.damage if d not in self.damage]
+                found += [d for d in file.damage if d not in found]
+        if start_ns is None and end_ns is None:
+            self.damage += [d for d in found if d not in self.damage]
 
     def _message(self, topic: str, log_ns: int, data: bytes, with_value: bool) -> Message:
         if not with_value:

@@ -73,6 +73,7 @@ class Hdf5Reader(Reader):
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[Message]:
+        found: list[Damage] = []
         with self._open() as file:
             datasets = _datasets(file)
             self.metadata["attributes"] = {name: _text(value) for name, value in file.attrs.items()}
@@ -96,10 +97,14 @@ class Hdf5Reader(Reader):
                     try:
                         value = read[topic].row(k)
                     except OSError as error:
-                        self._lost(clock, topic, read[topic], error)
-                        continue
+                        value = None
+                        found.append(self._lost(clock, topic, read[topic], error))
+                    if value is None and _is_picture(datasets[topic]):
+                        value = b""  # a broken picture: who asked for it by its time must not wait for it
                     if value is not None:
                         yield Message(topic, log_ns, None, value)
+        if start_ns is None and end_ns is None:
+            self.damage += [d for d in found if d not in self.damage]
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[h5py.File]:
@@ -135,7 +140,9 @@ class Hdf5Reader(Reader):
             if not told:
                 self.metadata["time"] = {"rate": "the file names no rate: sample k is shown at k seconds"}
             return next(iter(told.values()), 1.0)
-        rates = {channel.rate_hz: name for name, channel in self.spec.channels.items()}
+        rates: dict[float, str] = {}
+        for channel, c in self.spec.channels.items():
+            rates.setdefault(c.rate_hz, channel)
         if len(rates) > 1:
             (a, first), (b, second) = list(rates.items())[:2]
             raise RecordingError(
@@ -149,10 +156,10 @@ class Hdf5Reader(Reader):
                 )
         return rate_hz
 
-    def _lost(self, clock: RowClock, topic: str, blocks: "_Blocks", error: OSError) -> None:
+    def _lost(self, clock: RowClock, topic: str, blocks: "_Blocks", error: OSError) -> Damage:
         first, last = blocks.start, blocks.stop - 1
         start, end = blocks.bytes_in_file() or (0, self.source.path.stat().st_size)
-        damage = Damage(
+        return Damage(
             str(self.source.path),
             start,
             end,
@@ -160,8 +167,6 @@ class Hdf5Reader(Reader):
             clock.time_ns(topic, first),
             clock.time_ns(topic, last),
         )
-        if damage not in self.damage:
-            self.damage.append(damage)
 
 
 class _Blocks:
@@ -235,6 +240,10 @@ def _topic_type(dataset: h5py.Dataset) -> TopicType:
 
 def _is_text(dataset: h5py.Dataset) -> bool:
     return h5py.check_string_dtype(dataset.dtype) is not None and not _is_compressed(dataset)
+
+
+def _is_picture(dataset: h5py.Dataset) -> bool:
+    return dataset.ndim == 4 or _is_compressed(dataset)
 
 
 def _is_compressed(dataset: h5py.Dataset) -> bool:

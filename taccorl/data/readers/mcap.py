@@ -1,41 +1,56 @@
 """MCAP with ROS 2 CDR, protobuf or JSON messages, read without ROS; damaged files are salvaged chunk by chunk.
 
 The file is walked record by record without trusting its index: every chunk's CRC is checked, a bad chunk costs only
-itself, and after a bad record the walk goes on at the next chunk. (mcap's own reader checks no CRC by default and reads
+itself, and after a bad record the walk goes on at the next one. (mcap's own reader checks no CRC by default and reads
 nothing at all from a file without a footer.)
 """
 
-import contextlib
-import json
-import re
-import struct
-import zlib
-from collections.abc import Callable, Collection, Iterator
-from io import BufferedReader, BytesIO
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
 import yaml
-from mcap.data_stream import ReadDataStream
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, DataEnd, Metadata, Schema
+from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import breakup_chunk
 
-from taccorl.data import decode
+from taccorl.data import decode, mcap_records
+from taccorl.data.mcap_messages import NO_SCHEMA, Decoder, Stamper, message_decoder, message_stamper, type_name
+from taccorl.data.mcap_records import ATTACHMENT, CHANNEL, CHUNK, DATA_END, MESSAGE, METADATA, SCHEMA, Record, Summary
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
 from taccorl.data.spec import RecordingSpec
 from taccorl.errors import RecordingError
 
-MAGIC = b"\x89MCAP0\r\n"
-RECORD_HEADER_BYTES = 9  # opcode (1), length (8)
-MAX_OPCODE = 0x0F
-SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0C, 0x0F
-# opcode, record length, start, end, uncompressed size, CRC, then the compression's name with its length before it
-CHUNK_START = re.compile(rb"\x06.{8}.{8}.{8}.{8}.{4}(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0).{8}", re.DOTALL)
-SEARCH_BYTES = 1 << 20
+MAX_TIME_NS = 2**63 - 1
+MAX_MISFITS = 10
+"""Messages of one channel, unprotected by a CRC, that may fail to decode as damage; more mean that its schema is wrong."""
 
-Decoder = Callable[[bytes], Any]
+
+@dataclass
+class _Definitions:
+    """What the messages of one file mean. Kept between reads: a part that is read later may hold no definitions."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    proven: set[tuple[type, int]] = field(default_factory=set)
+    """(kind, id) of definitions that a CRC vouches for."""
+    decoders: dict[int, Decoder] = field(default_factory=dict)
+    """By channel id, like the next."""
+    stampers: dict[int, Stamper] = field(default_factory=dict)
+
+    def schema(self, channel: Channel) -> Schema | None:
+        return self.schemas.get(channel.schema_id)
+
+    def decoder(self, channel: Channel) -> Decoder:
+        if channel.id not in self.decoders:
+            self.decoders[channel.id] = message_decoder(channel, self.schema(channel))
+        return self.decoders[channel.id]
+
+    def stamper(self, channel: Channel) -> Stamper:
+        if channel.id not in self.stampers:
+            self.stampers[channel.id] = message_stamper(channel, self.schema(channel))
+        return self.stampers[channel.id]
 
 
 @readers.register("mcap")
@@ -48,8 +63,7 @@ class McapReader(Reader):
         super().__init__(source, spec)
         self._topics: dict[str, TopicType] = {}
         self._chunk_times: dict[tuple[Path, int], tuple[int, int]] = {}
-        self._definitions: dict[Path, tuple[dict[int, Schema], dict[int, Channel]]] = {}
-        """By file: kept between reads, because a partial read may skip the chunk that defines a channel."""
+        self._definitions: dict[Path, _Definitions] = {}
         self._whole = False
 
     @classmethod
@@ -74,16 +88,11 @@ class McapReader(Reader):
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[Message]:
-        again, self.damage = self.damage, []
-        whole = False
-        try:
-            for path in self.source.files:
-                yield from _File(path, self, topics, stamps_only).messages(start_ns, end_ns)
-            whole = start_ns is None and end_ns is None
-        finally:
-            if self._whole and not whole:
-                self.damage = again  # a partial read saw only a part of it
-            self._whole = self._whole or whole
+        damage: list[Damage] = []
+        for path in self.source.files:
+            yield from _File(path, self, topics, stamps_only, damage).messages(start_ns, end_ns)
+        if start_ns is None and end_ns is None:  # a partial or abandoned read saw only a part of it
+            self.damage, self._whole = damage, True
 
 
 def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | None:
@@ -94,13 +103,16 @@ def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | N
     index = path / "metadata.yaml"
     if index.is_file():
         try:
-            named = yaml.safe_load(index.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
+            names = yaml.safe_load(index.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
+            named = [path / Path(n).name for n in names]
         except (yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError) as error:
             raise RecordingError(f"{index}: not rosbag2's metadata ({type(error).__name__}: {error})") from error
-        named = [path / Path(n).name for n in named]
         absent = [p.name for p in named if not p.is_file()]
         if absent:
             raise RecordingError(f"{index} names {', '.join(absent)}, which is not in {path}: copy the whole bag")
+        unnamed = [p.name for p in files if p not in named]
+        if unnamed:
+            raise RecordingError(f"{index} does not name {', '.join(unnamed)}: run `ros2 bag reindex`, or move it away")
         return [Source(path, tuple(named))]
     return [Source(path, tuple(files))] if split_bag else None
 
@@ -109,15 +121,20 @@ class _File:
     """One walk through one MCAP file."""
 
     def __init__(
-        self, path: Path, reader: McapReader, topics: Collection[str] | None, stamps_only: Collection[str]
+        self,
+        path: Path,
+        reader: McapReader,
+        topics: Collection[str] | None,
+        stamps_only: Collection[str],
+        damage: list[Damage],
     ) -> None:
         self.path, self.reader = path, reader
         self.topics, self.stamps_only = topics, stamps_only
-        self.schemas, self.channels = reader._definitions.setdefault(path, ({}, {}))
-        self.decoders: dict[int, Decoder] = {}
-        self.stampers: dict[int, Callable[[bytes], int | None]] = {}
-        self.orphans = 0
-        self.unchunked = 0
+        self.damage, self.already = damage, len(damage)
+        self.known = reader._definitions.setdefault(path, _Definitions())
+        self.misfits: dict[int, int] = {}
+        self.orphans = self.timeless = self.unchunked = 0
+        self.data_end: Record | None = None
 
     def messages(self, start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
         try:
@@ -126,254 +143,198 @@ class _File:
             raise RecordingError(f"{self.path}: cannot be opened: {error.strerror}") from error
         with file:
             size = self.path.stat().st_size
-            self._check_magic(file, size)
-            self._read_summary(file)
-            for opcode, offset, length in self._walk(file, size):
-                if opcode == CHUNK:
-                    records = self._chunk(file, offset, length, start_ns, end_ns)
-                elif opcode in (SCHEMA, CHANNEL, MESSAGE, METADATA):
-                    records = self._single(file, opcode, offset, length)
+            summary = mcap_records.read_summary(file, size)
+            for definition in (*summary.schemas, *summary.channels):
+                self._learn(definition, summary.proven, None)
+            for record in self._walk(file, size, summary):
+                if record.opcode == CHUNK:
+                    found, proven = self._chunk(file, record, start_ns, end_ns)
                 else:
-                    continue
-                yield from self._convert(records)
-            if self.unchunked:
-                self._check_data_crc(file, size)
+                    found, proven = self._single(file, record), False
+                yield from self._convert(found, proven, record)
+            if start_ns is None and end_ns is None:
+                self._check_ends(file, size, summary)
         if self.orphans:
             self._damaged(0, size, f"{self.orphans} messages of channels whose definition was lost")
+        if self.timeless:
+            self._damaged(0, size, f"{self.timeless} messages with a log time after the year 2262")
 
-    def _check_magic(self, file: BufferedReader, size: int) -> None:
-        head = file.read(len(MAGIC))
+    def _begin(self, file: BufferedReader, size: int) -> int:
+        """Offset of the first record."""
+        file.seek(0)
+        head = file.read(len(mcap_records.MAGIC))
         if size == 0:
             raise RecordingError(f"{self.path}: is empty (0 bytes)")
-        if head != MAGIC:
-            raise RecordingError(f"{self.path}: is not an MCAP file: begins with {head!r}, not {MAGIC!r}")
+        if head == mcap_records.MAGIC:
+            return len(head)
+        first = mcap_records.whole_record(file, len(head), size)
+        if first is not None and first.opcode == mcap_records.HEADER:
+            start = len(head)
+        else:
+            start = mcap_records.find_record(file, 0, size, size, {CHUNK})
+        if start is None:
+            raise RecordingError(
+                f"{self.path}: is not an MCAP file: begins with {head!r}, not {mcap_records.MAGIC!r}, and no chunk follows"
+            )
+        self._damaged(0, start, "not the beginning of an MCAP file")
+        return start
 
-    def _read_summary(self, file: BufferedReader) -> None:
-        """Definitions from the summary at the end, so that a bad first chunk does not take its topics' meaning along."""
-        file.seek(0)
-        try:
-            summary = SeekingReader(file).get_summary()
-        except Exception:  # mcap lets struct.error and others escape on damaged files; the walk reports the damage
-            return
-        if summary is not None:
-            self.schemas.update(summary.schemas)
-            for channel in summary.channels.values():
-                self._define(channel)
-
-    def _walk(self, file: BufferedReader, size: int) -> Iterator[tuple[int, int, int]]:
-        """(opcode, offset, length) of every record of the data section; goes on at the next chunk after a bad one."""
-        offset = len(MAGIC)
+    def _walk(self, file: BufferedReader, size: int, summary: Summary) -> Iterator[Record]:
+        """Every record of the data section that may be read; goes on at the next one after a bad one."""
+        offset, chunked = self._begin(file, size), summary.has_chunks
         while True:
-            file.seek(offset)
-            header = file.read(RECORD_HEADER_BYTES)
-            opcode, length = struct.unpack("<BQ", header) if len(header) == RECORD_HEADER_BYTES else (0, 0)
-            whole = 0 < opcode <= MAX_OPCODE and offset + RECORD_HEADER_BYTES + length <= size
-            if not whole:
-                following = _find_chunk(file, offset + 1, size)
+            record = mcap_records.whole_record(file, offset, size)
+            if record is None:
+                following = self._resume(file, offset + 1, size, summary, chunked)
                 if following is None:
-                    self._damaged(offset, size, "the file ends without a footer (cut by a crash?)")
+                    end = max(summary.end or size, offset)
+                    reason = "a damaged record" if summary.end else "the file ends without a footer (cut by a crash?)"
+                    self._damaged(offset, end, reason)
                     return
                 self._damaged(offset, following, "a record header that makes no sense")
                 offset = following
                 continue
-            if opcode == DATA_END:
+            if record.opcode == DATA_END:
+                self.data_end = record
                 return
-            yield opcode, offset, length
-            offset += RECORD_HEADER_BYTES + length
+            chunked = chunked or record.opcode == CHUNK
+            if record.opcode in (SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA):
+                yield record
+            elif record.opcode not in mcap_records.KNOWN_OPCODES and not self._is_private(record, summary):
+                self._damaged(offset, record.end, f"a record of unknown kind {record.opcode:#04x}")
+            offset = record.end
+
+    def _resume(self, file: BufferedReader, start: int, size: int, summary: Summary, chunked: bool) -> int | None:
+        """Where the walk goes on. Within chunked data only a chunk vouches for its messages by a CRC."""
+        stop = summary.next_start(start)
+        limit = min(size, stop if stop is not None else summary.end or size)
+        opcodes = {CHUNK, ATTACHMENT, METADATA, DATA_END} | (set() if chunked else {SCHEMA, CHANNEL, MESSAGE})
+        found = mcap_records.find_record(file, start, limit, size, opcodes, self.known.channels)
+        return stop if found is None else found
+
+    @staticmethod
+    def _is_private(record: Record, summary: Summary) -> bool:
+        """Somebody's own kind of record, rather than a chunk whose kind is damaged."""
+        sound = summary.proven and summary.has_chunks
+        return sound and record.opcode >= 0x80 and summary.next_start(record.offset) != record.offset
 
     def _chunk(
-        self, file: BufferedReader, offset: int, length: int, start_ns: int | None, end_ns: int | None
-    ) -> list[Any]:
-        times = self.reader._chunk_times.get((self.path, offset))
+        self, file: BufferedReader, record: Record, start_ns: int | None, end_ns: int | None
+    ) -> tuple[list[Any], bool]:
+        """Its records, and whether a CRC vouches for them."""
+        times = self.reader._chunk_times.get((self.path, record.offset))
         if times is not None and (
             (end_ns is not None and times[0] > end_ns) or (start_ns is not None and times[1] < start_ns)
         ):
-            return []
-        file.seek(offset + RECORD_HEADER_BYTES)
+            return [], True
         chunk = None
         try:
-            chunk = Chunk.read(ReadDataStream(BytesIO(file.read(length))))
-            records = breakup_chunk(chunk, validate_crc=True)
+            chunk = mcap_records.parse(CHUNK, mcap_records.read_body(file, record))
+            found = list(mcap_records.chunk_records(chunk))
         except Exception as error:  # CRC, decompression, struct: whatever it is, only this chunk is lost
             reason = f"chunk lost ({type(error).__name__}: {str(error)[:120]})"
-            end = offset + RECORD_HEADER_BYTES + length
-            self._damaged(offset, end, reason, chunk)
-            return []
-        logged = [r.log_time for r in records if isinstance(r, McapMessage)]
-        self.reader._chunk_times[self.path, offset] = (min(logged), max(logged)) if logged else (0, 0)
-        return records
+            self._damaged(record.offset, record.end, reason, chunk)
+            return [], True
+        logged = [r.log_time for r in found if isinstance(r, McapMessage)]
+        self.reader._chunk_times[self.path, record.offset] = (min(logged), max(logged)) if logged else (0, 0)
+        return found, chunk.uncompressed_crc != 0
 
-    def _single(self, file: BufferedReader, opcode: int, offset: int, length: int) -> list[Any]:
-        file.seek(offset + RECORD_HEADER_BYTES)
-        stream = ReadDataStream(BytesIO(file.read(length)))
+    def _single(self, file: BufferedReader, record: Record) -> list[Any]:
         try:
-            if opcode == MESSAGE:
-                self.unchunked += 1
-                return [McapMessage.read(stream, length)]
-            return [{SCHEMA: Schema, CHANNEL: Channel, METADATA: Metadata}[opcode].read(stream)]
+            found = [mcap_records.parse(record.opcode, mcap_records.read_body(file, record))]
         except Exception as error:
-            self._damaged(
-                offset, offset + RECORD_HEADER_BYTES + length, f"record lost ({type(error).__name__}: {error})"
-            )
+            self._damaged(record.offset, record.end, f"record lost ({type(error).__name__}: {error})")
             return []
+        self.unchunked += record.opcode == MESSAGE
+        return found
 
-    def _check_data_crc(self, file: BufferedReader, size: int) -> None:
-        """Messages outside chunks have only the data section's CRC."""
-        offset = None
-        for opcode, at, _ in self._records_quietly(file, size):
-            if opcode == DATA_END:
-                offset = at
-        if offset is None:
+    def _check_ends(self, file: BufferedReader, size: int, summary: Summary) -> None:
+        if self.data_end is None:
             return
-        file.seek(offset + RECORD_HEADER_BYTES)
-        expected = DataEnd.read(ReadDataStream(file)).data_section_crc
-        file.seek(0)
-        crc, left = 0, offset
-        while left and (block := file.read(min(left, SEARCH_BYTES))):
-            crc, left = zlib.crc32(block, crc), left - len(block)
-        if expected and crc != expected:
-            self._damaged(len(MAGIC), offset, "unchunked messages whose CRC does not match: at least one is wrong")
+        sound = len(self.damage) == self.already
+        if self.unchunked and sound and not mcap_records.data_crc_matches(file, self.data_end):
+            reason = "the CRC of messages outside chunks does not match: at least one is wrong"
+            self._damaged(len(mcap_records.MAGIC), self.data_end.offset, reason)
+        if summary.problem or (summary.end or size) > self.data_end.end:
+            problem = summary.problem or "it begins too late"
+            self._damaged(self.data_end.end, size, f"no index behind the data ({problem}): nothing there was read")
 
-    @staticmethod
-    def _records_quietly(file: BufferedReader, size: int) -> Iterator[tuple[int, int, int]]:
-        offset = len(MAGIC)
-        while offset + RECORD_HEADER_BYTES <= size:
-            file.seek(offset)
-            opcode, length = struct.unpack("<BQ", file.read(RECORD_HEADER_BYTES))
-            yield opcode, offset, length
-            if opcode == DATA_END:
-                return
-            offset += RECORD_HEADER_BYTES + length
-
-    def _convert(self, records: list[Any]) -> Iterator[Message]:
-        for r in records:
+    def _convert(self, found: list[Any], proven: bool, place: Record) -> Iterator[Message]:
+        for r in found:
             if isinstance(r, McapMessage):
-                channel = self.channels.get(r.channel_id)
-                if channel is None:
-                    self.orphans += 1
-                elif self.topics is None or channel.topic in self.topics:
-                    yield self._message(channel, r)
-            elif isinstance(r, Schema):
-                self.schemas[r.id] = r
-            elif isinstance(r, Channel):
-                self._define(r)
+                message = self._message(r, proven, place)
+                if message is not None:
+                    yield message
             elif isinstance(r, Metadata):
                 self.reader.metadata[r.name] = dict(r.metadata)
+            else:
+                self._learn(r, proven, place)
 
-    def _message(self, channel: Channel, m: McapMessage) -> Message:
-        stamper = self.stampers.get(channel.id)
-        if stamper is None:
-            stamper = self.stampers[channel.id] = self._stamper(channel)
+    def _message(self, m: McapMessage, proven: bool, place: Record) -> Message | None:
+        channel = self.known.channels.get(m.channel_id)
+        if channel is not None and self.topics is not None and channel.topic not in self.topics:
+            return None
+        if channel is None or (channel.message_encoding != "json" and self._lacks_schema(channel)):
+            self.orphans += 1
+            return None
+        if m.log_time > MAX_TIME_NS:
+            self.timeless += 1
+            return None
+        stamper = self.known.stamper(channel)
         if self.topics is None or channel.topic in self.stamps_only:
             return Message(channel.topic, m.log_time, stamper(m.data), None)
-        decoder = self.decoders.get(channel.id)
-        if decoder is None:
-            decoder = self.decoders[channel.id] = self._decoder(channel)
+        decoder = self.known.decoder(channel)
         try:
             value = decoder(m.data)
         except Exception as error:  # decoders raise what they like on bytes that do not fit the schema
-            raise RecordingError(
+            problem = (
                 f"{channel.topic}: a message at log time {m.log_time} ns does not fit its schema "
-                f"{self._type_name(channel)} ({type(error).__name__}: {error})"
-            ) from error
+                f"{type_name(self.known.schema(channel))} ({type(error).__name__}: {error})"
+            )
+            self.misfits[channel.id] = self.misfits.get(channel.id, 0) + 1
+            if proven or self.misfits[channel.id] > MAX_MISFITS:
+                raise RecordingError(problem) from error
+            self._damaged(place.offset, place.end, problem)
+            return None
         stamp = stamper(m.data) if channel.message_encoding == "cdr" else decode.stamp_ns(value)
         return Message(channel.topic, m.log_time, stamp, value)
 
-    def _define(self, channel: Channel) -> None:
-        if self.channels.get(channel.id) == channel:
-            return
-        self.channels[channel.id] = channel
-        if channel.topic in self.reader._topics:
+    def _lacks_schema(self, channel: Channel) -> bool:
+        return channel.schema_id != 0 and channel.schema_id not in self.known.schemas
+
+    def _learn(self, definition: Schema | Channel, proven: bool, place: Record | None) -> None:
+        """Take in a definition; one that no CRC vouches for does not replace one that has that."""
+        kind, number = type(definition), definition.id
+        table: dict[int, Any] = self.known.schemas if kind is Schema else self.known.channels
+        if table.get(number) != definition:
+            if (kind, number) in self.known.proven and not proven:
+                if place is not None:
+                    self._damaged(
+                        place.offset, place.end, f"a damaged {kind.__name__.lower()}; the index's copy is used"
+                    )
+                return
+            table[number] = definition
+            for channel in self.known.channels.values():
+                if number == (channel.schema_id if kind is Schema else channel.id):
+                    self._describe(channel)
+        if proven:
+            self.known.proven.add((kind, number))
+
+    def _describe(self, channel: Channel) -> None:
+        self.known.decoders.pop(channel.id, None)
+        self.known.stampers.pop(channel.id, None)
+        told = self.reader._topics.get(channel.topic)
+        if told is not None and told.name != NO_SCHEMA:
             return
         problem = None
         try:
-            self._decoder(channel)
+            self.known.decoder(channel)
         except RecordingError as error:
             problem = str(error)
-        self.reader._topics[channel.topic] = TopicType(self._type_name(channel), channel.message_encoding, problem)
-
-    def _type_name(self, channel: Channel) -> str:
-        schema = self.schemas.get(channel.schema_id)
-        return schema.name if schema else "no schema"
-
-    def _decoder(self, channel: Channel) -> Decoder:
-        schema, encoding = self.schemas.get(channel.schema_id), channel.message_encoding
-        try:
-            if encoding == "json":
-                return json.loads
-            if encoding == "cdr":
-                from mcap_ros2.decoder import DecoderFactory as Ros2
-
-                with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):  # it prints what it raises
-                    found = Ros2().decoder_for(encoding, schema)
-            elif encoding == "protobuf":
-                from mcap_protobuf.decoder import DecoderFactory as Protobuf
-
-                found = Protobuf().decoder_for(encoding, schema)
-            else:
-                found = None
-        except Exception as error:  # a schema text that does not parse: this topic only
-            raise RecordingError(
-                f"{channel.topic}: its schema {self._type_name(channel)} does not parse ({type(error).__name__}: {error})"
-            ) from error
-        if found is None:
-            described = f"{schema.encoding} schema {schema.name}" if schema else "no schema"
-            raise RecordingError(
-                f"{channel.topic}: {encoding!r} messages with {described} are not read (cdr with ros2msg, protobuf, json are)"
-            )
-        return found
-
-    def _stamper(self, channel: Channel) -> Callable[[bytes], int | None]:
-        """Stamp without decoding the message: a ROS 2 header that comes first lies at a fixed place."""
-        schema = self.schemas.get(channel.schema_id)
-        if channel.message_encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
-            return _cdr_stamp if _header_comes_first(schema.data.decode(errors="replace")) else lambda data: None
-        try:
-            decoder = self._decoder(channel)
-        except RecordingError:
-            return lambda data: None
-
-        def stamp(data: bytes) -> int | None:
-            try:
-                return decode.stamp_ns(decoder(data))
-            except Exception:  # only asked for its time: its content may be anything
-                return None
-
-        return stamp
+        self.reader._topics[channel.topic] = TopicType(
+            type_name(self.known.schema(channel)), channel.message_encoding, problem
+        )
 
     def _damaged(self, start: int, end: int, reason: str, chunk: Chunk | None = None) -> None:
         times = (chunk.message_start_time, chunk.message_end_time) if chunk is not None else (None, None)
-        self.reader.damage.append(Damage(str(self.path), start, end, reason, *times))
-
-
-def _header_comes_first(definition: str) -> bool:
-    for line in definition.splitlines():
-        words = line.split("#")[0].split()
-        if words and "=" not in line.split("#")[0]:
-            return words[0] in ("std_msgs/Header", "std_msgs/msg/Header", "Header")
-    return False
-
-
-def _cdr_stamp(data: bytes) -> int | None:
-    """header.stamp of a CDR message: 4 bytes of encapsulation (second byte 1: little-endian), then sec, nanosec."""
-    if len(data) < 12:
-        return None
-    sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-    return sec * 1_000_000_000 + nanosec
-
-
-def _find_chunk(file: BufferedReader, start: int, size: int) -> int | None:
-    """Offset of the next chunk record that is consistent in itself, at or after ``start``."""
-    offset = start
-    while offset < size:
-        file.seek(offset)
-        block = file.read(SEARCH_BYTES + 64)
-        for match in CHUNK_START.finditer(block):
-            at = offset + match.start()
-            length = struct.unpack_from("<Q", block, match.start() + 1)[0]
-            inner = struct.unpack_from("<Q", match.group(), len(match.group()) - 8)[0]
-            # the compressed bytes must fill the record exactly
-            if at + RECORD_HEADER_BYTES + length <= size and len(match.group()) - RECORD_HEADER_BYTES + inner == length:
-                return at
-        offset += SEARCH_BYTES
-    return None
+        self.damage.append(Damage(str(self.path), start, end, reason, *times))

@@ -1,0 +1,74 @@
+"""Files that views write: each says where it is from, and none lands on somebody else's file."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from taccorl.data.episode import Episode
+from taccorl.errors import TaccorlError
+
+SOFTWARE = "taccorl view"
+RRD_MAGIC = b"RRF2"
+
+
+class OutputError(TaccorlError):
+    """A file that is in the way."""
+
+
+def check_free(path: Path) -> None:
+    """May ``path`` be written? Yes if nothing is there, or an earlier file of ours: it says so itself.
+
+    Raises:
+        OutputError: something else is there, or there is no such folder.
+    """
+    if not path.parent.is_dir():
+        raise OutputError(f"{path.parent}: no such folder; make it first: mkdir -p {path.parent}")
+    if path.exists() and not _is_ours(path):
+        raise OutputError(f"{path}: is there already and not from `{SOFTWARE}`; give another name, or remove it")
+
+
+def _is_ours(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    if path.suffix == ".rrd":
+        return path.read_bytes()[:4] == RRD_MAGIC and _application(path).startswith("taccorl")
+    try:
+        with Image.open(path) as image:
+            return image.info.get("Software") == SOFTWARE
+    except OSError:
+        return False
+
+
+def _application(path: Path) -> str:
+    import rerun as rr
+
+    try:
+        return rr.recording.load_recording(path).application_id()
+    except (ValueError, OSError, RuntimeError):
+        return ""
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A name beside ``path`` to write to; at the end it takes ``path``'s place at once, or goes if there was an error."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def save_png(image: Image.Image, path: Path, episode: Episode) -> None:
+    """PNG with the episode's name and origin written inside."""
+    check_free(path)
+    note = PngInfo()
+    note.add_text("Software", SOFTWARE)
+    note.add_itxt("Title", episode.name)
+    note.add_itxt("Source", episode.origin)
+    with replacing(path) as part:
+        image.save(part, "PNG", pnginfo=note)

@@ -1,0 +1,47 @@
+"""A stretch of an episode, as an episode."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from taccorl.data.episode import Episode
+from taccorl.data.timing import NS_PER_S
+from taccorl.errors import TaccorlError
+
+
+def part_of(episode: Episode, start_s: float | None, end_s: float | None) -> Episode:
+    """Rows from ``start_s`` up to, but not at, ``end_s`` (seconds since row 0; None: the episode's own).
+
+    Raises:
+        TaccorlError: no row lies there.
+    """
+    if start_s is None and end_s is None:
+        return episode
+    fps, num_rows = episode.spec.fps, episode.num_rows
+    whole_s = num_rows / fps
+    begin_s, until_s = 0.0 if start_s is None else start_s, whole_s if end_s is None else end_s
+    first = max(int(np.ceil(begin_s * fps - 1e-6)), 0)
+    end = min(int(np.ceil(until_s * fps - 1e-6)), num_rows)
+    if first >= end:
+        raise TaccorlError(
+            f"no rows from --start_s={begin_s:g} to --end_s={until_s:g}: {episode.name} runs from 0 to {whole_s:.2f} s"
+        )
+    kept = slice(first, end)
+    before = [s for s in episode.stages if s[0] <= first][-1:]  # the stage that is on when the part begins
+    later = [s for s in episode.stages if first < s[0] < end]
+    note = f"{first / fps:.2f} to {end / fps:.2f} s of {whole_s:.2f} s; timing is that of the whole"
+    return dataclasses.replace(
+        episode,
+        name=f"{episode.name}, {first / fps:.2f} to {end / fps:.2f} s",
+        start_ns=episode.start_ns + round(first * NS_PER_S / fps),
+        arrays={key: array[kept] for key, array in episode.arrays.items()},
+        pictures=lambda: itertools.islice(episode.pictures(), first, end),
+        picture_rows={key: rows[kept] for key, rows in episode.picture_rows.items()},
+        videos={
+            key: dataclasses.replace(v, from_s=v.from_s + first / fps, num_frames=end - first)
+            for key, v in episode.videos.items()
+        },
+        stages=tuple((max(row - first, 0), name) for row, name in (*before, *later)),
+        provenance={**episode.provenance, "shown": note},
+    )

@@ -1,0 +1,102 @@
+"""A picture of the Rerun view, made without a screen: by the Rerun program itself, else by a browser."""
+
+import importlib.util
+import io
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from taccorl.data.episode import Episode
+from taccorl.views.episode import save_episode
+from taccorl.views.outputs import save_png
+from taccorl.views.touch import pads_of, peak_row
+from taccorl.views.viewer import PICTURE_TIMEOUT_S, ViewerError, picture_without_window, served
+
+WIDTH_PX, HEIGHT_PX = 1600, 1000
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+BROWSER_ARGUMENTS = (
+    "--no-sandbox",  # root in a container has none
+    "--use-angle=swiftshader",  # WebGL without a graphics card
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",  # the page may talk to nobody but us
+)
+SETTLE_S = 8.0
+"""A web viewer that loads slowly looks finished, and the same twice, before its first picture is decoded."""
+CALM_LEVELS = 0.2
+"""Mean difference of two shots (of 255) below which the page has come to rest."""
+BLANK_LEVELS = 4.0
+"""Standard deviation (of 255) below which a page shows nothing yet."""
+
+
+def screenshot(episode: Episode, png: Path, *, at_s: float | None = None) -> str:
+    """The episode's Rerun view as a PNG, at ``at_s`` or where touch is strongest. Returns who drew it.
+
+    Raises:
+        ViewerError: neither the Rerun program nor a browser can draw here.
+        OutputError: ``png`` is somebody else's file.
+    """
+    at_s = best_time_s(episode) if at_s is None else at_s
+    with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
+        rrd, drawn = Path(folder) / "episode.rrd", Path(folder) / "drawn.png"
+        save_episode(episode, rrd, at_s=at_s, native=True)
+        who, why_not = "the Rerun program", picture_without_window(rrd, drawn, WIDTH_PX, HEIGHT_PX)
+        if why_not is not None:
+            who, why_not_either = "a browser", picture_by_browser(rrd, drawn)
+            if why_not_either is not None:
+                raise ViewerError(
+                    f"no screenshot: {why_not}; {why_not_either}. On Debian either of these is enough: "
+                    f"apt-get install mesa-vulkan-drivers libvulkan1   or   apt-get install chromium && pip install playwright"
+                )
+        with Image.open(drawn) as image:
+            save_png(image.convert("RGB"), png, episode)
+    return who
+
+
+def best_time_s(episode: Episode) -> float:
+    """Where touch is strongest; the middle of an episode without touch."""
+    pads = pads_of(episode)
+    row = peak_row(pads) if pads else episode.num_rows // 2
+    return float(episode.time_s[row])
+
+
+def picture_by_browser(rrd: Path, png: Path) -> str | None:
+    """Draw ``rrd`` into ``png`` with Debian's chromium; None, or why that cannot be done here."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        return f"no browser: none of {', '.join(BROWSERS)} is installed"
+    if importlib.util.find_spec("playwright") is None:
+        return "no playwright to steer the browser"
+    from playwright.sync_api import Error, sync_playwright
+
+    try:
+        with served(rrd) as address, sync_playwright() as playwright:
+            chromium = playwright.chromium.launch(executable_path=browser, args=list(BROWSER_ARGUMENTS))
+            page = chromium.new_page(viewport={"width": WIDTH_PX, "height": HEIGHT_PX}, color_scheme="dark")
+            page.goto(f"{address}&renderer=webgl", wait_until="load", timeout=1e3 * PICTURE_TIMEOUT_S)
+            shot = _settled_shot(page)
+            chromium.close()
+    except Error as error:
+        return f"the browser gave up: {str(error).splitlines()[0]}"
+    if shot is None:
+        return f"the page in the browser did not come to rest within {PICTURE_TIMEOUT_S:.0f} s"
+    png.write_bytes(shot)
+    return None
+
+
+def _settled_shot(page) -> bytes | None:
+    """The first shot that shows something and is like the one before."""
+    begin_s, before = time.monotonic(), None
+    while time.monotonic() - begin_s < PICTURE_TIMEOUT_S:
+        page.wait_for_timeout(1000)
+        shot = page.screenshot(timeout=1e3 * PICTURE_TIMEOUT_S)
+        now = np.asarray(Image.open(io.BytesIO(shot)).convert("L"), dtype=float)
+        calm = before is not None and np.abs(now - before).mean() < CALM_LEVELS
+        if calm and now.std() > BLANK_LEVELS and time.monotonic() - begin_s > SETTLE_S:
+            return shot
+        before = now
+    return None

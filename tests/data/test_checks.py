@@ -1,0 +1,543 @@
+"""Planted faults in timing, joints and pictures are found where they were planted, and a good episode gives nothing."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from synthetic_episode import ACTION, FRONT, GRIPPER, LEFT_WRIST, NAMES, SPEC, STATE, TOUCH
+from synthetic_episode import copies, good_timing, make, with_arrays
+
+from taccorl.data import joint_checks, picture_checks
+from taccorl.data.checks import Finding, check_episode, check_recording_episodes, check_timing
+from taccorl.data.episode import Episode
+
+FPS = SPEC.fps
+NUM_SEEDS = 30
+Fault = Callable[[int], tuple[Episode, set[str]]]
+
+
+def serious(findings: list[Finding]) -> list[Finding]:
+    return [f for f in findings if f.severity != "note"]
+
+
+def found(episode: Episode, check: str, *, pictures: bool = False) -> list[Finding]:
+    return [f for f in check_episode(episode, pictures=pictures) if f.check == check]
+
+
+def one(episode: Episode, check: str, *, pictures: bool = False) -> Finding:
+    findings = found(episode, check, pictures=pictures)
+    assert len(findings) == 1, findings
+    return findings[0]
+
+
+@pytest.fixture(scope="module")
+def good() -> Episode:
+    return make(seed=100)
+
+
+# ---- good episodes ----
+
+
+@pytest.mark.parametrize("seed", range(NUM_SEEDS))
+def test_good_episode_gives_no_error_and_no_warning(seed: int) -> None:
+    rng = np.random.default_rng([seed, 77])
+    episode = make(
+        seed=seed,
+        duration_s=rng.uniform(6, 24),
+        lead_s=rng.uniform(0.04, 0.15),
+        touch_delay_s=rng.uniform(0.0, 0.06),
+    )
+    assert serious(check_episode(episode, pictures=seed % 5 == 0)) == []
+
+
+def test_720_rows_with_1536_taxels_take_less_than_half_a_cpu_second() -> None:
+    episode = make(seed=1, duration_s=24.0)
+    assert episode.num_rows == 720
+    start = time.process_time()
+    check_episode(episode, pictures=False)
+    assert time.process_time() - start < 0.5
+
+
+def test_findings_come_worst_first_and_name_their_place(good: Episode) -> None:
+    state, action, _ = copies(good)
+    state[50, 0] = np.nan
+    action[100, 3] += 1.0
+    findings = check_episode(with_arrays(good, state=state, action=action), pictures=False)
+    ranks = [("error", "warning", "note").index(f.severity) for f in findings]
+    assert ranks == sorted(ranks)
+    assert ranks[0] == 0
+    assert all(f.text and f.check for f in findings)
+
+
+def test_the_episode_itself_is_never_changed(good: Episode) -> None:
+    before = {key: value.copy() for key, value in good.arrays.items()}
+    check_episode(good, pictures=False)
+    assert all(np.array_equal(before[key], good.arrays[key]) for key in before)
+
+
+# ---- what is missing or short is not guessed at ----
+
+
+def without(episode: Episode, *keys: str) -> Episode:
+    return dataclasses.replace(episode, arrays={k: v for k, v in episode.arrays.items() if k not in keys})
+
+
+@pytest.mark.parametrize("gone", [(STATE,), (ACTION,), (TOUCH,), (STATE, ACTION), (STATE, TOUCH), (ACTION, TOUCH)])
+def test_missing_features_give_notes_only(good: Episode, gone: tuple[str, ...]) -> None:
+    assert serious(check_episode(without(good, *gone))) == []
+
+
+def test_no_numbers_at_all_is_a_note(good: Episode) -> None:
+    assert [f.check for f in check_episode(without(good, STATE, ACTION, TOUCH))] == ["not_judged"]
+
+
+@pytest.mark.parametrize("num_rows", [1, 2, 5, 20, 45])
+def test_short_episode_says_too_short_and_nothing_else(good: Episode, num_rows: int) -> None:
+    short = dataclasses.replace(good, arrays={k: v[:num_rows] for k, v in good.arrays.items()}, picture_keys=())
+    findings = check_episode(short)
+    assert serious(findings) == []
+    assert any(f.check == "not_judged" for f in findings)
+
+
+def respec(episode: Episode, key: str, **changes: object) -> Episode:
+    feature = dataclasses.replace(episode.spec.features[key], **changes)  # type: ignore[arg-type]
+    spec = dataclasses.replace(episode.spec, features=episode.spec.features | {key: feature})
+    return dataclasses.replace(episode, spec=spec)
+
+
+def test_unknown_units_skip_limits_speeds_and_rests(good: Episode) -> None:
+    state, action, _ = copies(good)
+    state[:, :] *= 57.3
+    state[30] += 500.0
+    episode = with_arrays(good, state=state, action=action)
+    for key in (STATE, ACTION):
+        episode = respec(episode, key, unit="unknown")
+    findings = check_episode(episode, pictures=False)
+    assert serious(findings) == []
+    assert any("idle" in f.text for f in findings if f.check == "not_judged")
+
+
+def test_one_arm_without_prefix_is_judged_too(good: Episode) -> None:
+    names = tuple(n.removeprefix("left_") for n in NAMES[:7])
+    limits = {n: tuple(SPEC.features[STATE].limits[i]) for i, n in enumerate(names)}
+    episode = with_arrays(good, state=good.arrays[STATE][:, :7], action=good.arrays[ACTION][:, :7])
+    for key in (STATE, ACTION):
+        units = SPEC.features[STATE].unit[:7]
+        episode = respec(episode, key, shape=(7,), names=names, unit=units, range=limits)
+    assert serious(check_episode(without(episode, TOUCH), pictures=False)) == []
+    late = episode.arrays[STATE].copy()
+    late[15:] = late[:-15].copy()  # 15 rows at 30 fps: 0.5 s later
+    assert found(without(with_arrays(episode, state=late), TOUCH), "action_lag")
+
+
+# ---- values ----
+
+
+def test_nan_is_an_error_with_name_and_rows(good: Episode) -> None:
+    state, _, _ = copies(good)
+    state[50:53, 4] = np.nan
+    state[60, 6] = np.inf
+    finding = one(with_arrays(good, state=state), "not_finite")
+    assert (finding.severity, finding.feature, finding.rows) == ("error", STATE, (50, 61))
+    assert "left_joint_5.pos, left_gripper.pos: 4 values are NaN or infinite in 4 rows" in finding.text
+
+
+def test_degrees_are_recognised(good: Episode) -> None:
+    state, _, _ = copies(good)
+    joints = [i for i in range(14) if i not in GRIPPER.values()]
+    state[:, joints] = np.degrees(state[:, joints])
+    finding = one(with_arrays(good, state=state), "joint_limit")
+    assert finding.severity == "error"
+    assert "degrees? " in finding.text
+    assert "rad" in finding.text
+
+
+def test_brief_example_reads_as_promised() -> None:
+    values = np.full((60, 14), 0.0)
+    values[:, 1], values[:, 2], values[:, 8], values[:, 9] = 57.3, -1.0, 1.0, -1.0
+    episode = with_arrays(make(seed=3), state=values.astype(np.float32))
+    finding = found(episode, "joint_limit")[0]
+    assert "left_joint_2.pos = 57.3 outside [0, 3.14] rad" in finding.text
+    assert "degrees?" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("unit", "limit", "factor", "hint"),
+    [
+        ("rad", (0.0, 3.14), 57.29578, "degrees"),
+        ("rad", (0.0, 3.14), 57_295.78, "0.001 degrees, PiPER's SDK unit"),
+        ("m", (0.0, 0.1), 1e3, "millimetres"),
+        ("m", (0.0, 0.1), 1e6, "0.001 mm, PiPER's SDK unit"),
+        ("m", (0.0, 0.1), 1 / 0.07, "a normalised opening 0 to 1"),
+    ],
+)
+def test_unit_hints(unit: str, limit: tuple[float, float], factor: float, hint: str) -> None:
+    true = np.linspace(0.0, 0.07 if unit == "m" else 3.1, 50)  # the whole stroke, the whole joint
+    assert joint_checks.unit_hint(true * factor, np.array(limit), unit) == hint
+    assert joint_checks.unit_hint(np.full(5, 1e12), np.array(limit), unit) is None
+
+
+@pytest.mark.parametrize("arm", ["left", "right"])
+def test_gripper_in_millimetres_is_recognised(good: Episode, arm: str) -> None:
+    state, _, _ = copies(good)
+    state[:, GRIPPER[arm]] *= 1000
+    finding = one(with_arrays(good, state=state), "joint_limit")
+    assert f"{arm}_gripper.pos" in finding.text
+    assert "millimetres?" in finding.text
+
+
+@pytest.mark.parametrize(("share", "is_error"), [(0.00, False), (0.019, False), (0.021, True), (0.1, True)])
+def test_limit_tolerance_is_two_per_cent_of_the_span(good: Episode, share: float, is_error: bool) -> None:
+    action = good.arrays[ACTION].astype(float)
+    action[100:110, 0] = 2.618 + share * 5.236  # joint 1: −2.618 … 2.618
+    action[90:120, 0] = np.interp(np.arange(90, 120), [90, 100, 109, 119], action[[90, 100, 109, 119], 0])
+    limits = [f for f in check_episode(with_arrays(good, action=action), pictures=False) if f.check == "joint_limit"]
+    assert bool(limits) == is_error
+    if is_error:
+        assert "2% of the span" in limits[0].text
+        assert limits[0].rows is not None
+        assert 90 <= limits[0].rows[0] <= 100
+        assert 110 <= limits[0].rows[1] <= 120
+
+
+def test_touch_outside_its_range_is_an_error(good: Episode) -> None:
+    _, _, touch = copies(good)
+    touch[10, 2, 3, 4] = 300
+    finding = one(with_arrays(good, touch=touch.reshape(len(touch), -1)), "out_of_range")
+    assert (finding.severity, finding.rows) == ("error", (10, 11))
+
+
+# ---- jumps, rests, frozen joints ----
+
+
+@pytest.mark.parametrize(("step_rad", "is_found"), [(0.20, False), (0.30, True), (1.0, True)])
+@pytest.mark.parametrize("key", ["state", "action"])
+def test_jumps_beyond_twice_the_joints_speed_are_found(good: Episode, key: str, step_rad: float, is_found: bool) -> None:
+    # 3.93 rad/s × 2 rows / 30 rows/s = 0.262 rad. Row 140 of 360: arms at rest between two moves.
+    values = good.arrays[STATE if key == "state" else ACTION].copy()
+    values[:, 5] = 0.1
+    values[140:, 5] += step_rad
+    findings = found(with_arrays(good, **{key: values}), "jump")
+    assert bool(findings) == is_found
+    if is_found:
+        assert findings[0].severity == "warning"
+        assert findings[0].rows == (139, 141)
+        assert "left_joint_6.pos" in findings[0].text
+
+
+def test_single_glitch_of_an_encoder_is_two_jumps(good: Episode) -> None:
+    state, _, _ = copies(good)
+    state[200, 8] += 0.6
+    assert "2 such steps" in one(with_arrays(good, state=state), "jump").text
+
+
+@pytest.mark.parametrize("window", [2, 5, 30, 31])
+def test_still_rows_are_those_of_every_still_window(window: int) -> None:
+    rng = np.random.default_rng(window)
+    moving = rng.random((200, 1)) < 0.03
+    values = np.cumsum(moving, axis=0).astype(float)
+    expected = np.zeros(200, dtype=bool)
+    for first in range(200 - window + 1):
+        if np.ptp(values[first : first + window]) == 0:
+            expected[first : first + window] = True
+    assert np.array_equal(joint_checks.still_rows(values, np.array([0.5]), window), expected)
+
+
+@pytest.mark.parametrize(("rest_s", "is_found"), [(1.5, False), (4.5, True)])
+@pytest.mark.parametrize("end", [0, 1])
+def test_long_rests_at_the_ends_are_found(rest_s: float, is_found: bool, end: int) -> None:
+    episode = make(seed=4, rest_s=(rest_s, 0.0) if end == 0 else (0.0, rest_s))
+    findings = found(episode, "idle")
+    assert bool(findings) == is_found
+    if is_found:
+        first, last = findings[0].rows  # type: ignore[misc]
+        assert (first == 0) if end == 0 else (last == episode.num_rows)
+        assert abs((last - first) / FPS - rest_s) < 1.0
+        assert ("start", "end")[end] in findings[0].text
+        assert findings[0].severity == "warning"
+
+
+@pytest.mark.parametrize(("rest_s", "is_found"), [(3.0, False), (7.0, True)])
+def test_long_rest_in_the_middle_is_found(good: Episode, rest_s: float, is_found: bool) -> None:
+    state, action, touch = copies(good)
+    row, rows = 230, int(rest_s * FPS)  # 0.64 of 12 s: the left arm holds, the pads feel a steady grip
+    noise = np.random.default_rng(0).normal(0, 2e-4, (rows, 14)).astype(np.float32)
+    state = np.concatenate([state[:row], state[row] + noise, state[row:]])
+    action = np.concatenate([action[:row], np.repeat(action[row : row + 1], rows, axis=0), action[row:]])
+    touch = np.concatenate([touch[:row], np.repeat(touch[row : row + 1], rows, axis=0), touch[row:]])
+    rested = with_arrays(good, state=state, action=action, touch=touch.reshape(len(touch), -1))
+    findings = found(dataclasses.replace(rested, picture_keys=()), "idle")
+    assert bool(findings) == is_found
+    if is_found:
+        assert "middle" in findings[0].text
+        first, last = findings[0].rows  # type: ignore[misc]
+        assert first <= row + 1
+        assert last >= row + rows - 1
+
+
+def test_pressing_with_arms_at_rest_is_not_idle() -> None:
+    num_rows = 300
+    still = np.tile(make(seed=4).arrays[STATE][:1], (num_rows, 1))
+    _, _, touch = copies(make(seed=4, duration_s=10.0))
+    episode = with_arrays(make(seed=4), state=still, action=still, touch=touch.reshape(num_rows, -1) * 0)
+    episode = dataclasses.replace(episode, picture_keys=())
+    assert found(episode, "idle")
+    touch[:, 0, 10:20] = (40 + 30 * np.sin(np.arange(num_rows) / 5))[:, None, None]
+    assert not found(with_arrays(episode, touch=touch.reshape(num_rows, -1).astype(np.int16)), "idle")
+
+
+def test_driver_that_repeats_old_joints_is_found(good: Episode) -> None:
+    state, _, _ = copies(good)
+    state[40:70, 0:7] = state[40, 0:7]  # the left arm reaches from 0.24 s to 2.64 s
+    finding = one(with_arrays(good, state=state), "frozen_state")
+    assert (finding.severity, finding.rows) == ("warning", (40, 70))
+    assert finding.text.startswith("left")
+
+
+# ---- command and state ----
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.04, 0.1, 0.21, 0.37, 0.9, -0.1, -0.4])
+def test_lag_is_measured_to_a_tenth_of_a_row(lag_s: float) -> None:
+    rng = np.random.default_rng(1)
+    time_s = np.arange(-600, 3600) / 300
+    smooth = np.stack([np.convolve(rng.normal(size=time_s.size), np.hanning(300), "same") for _ in range(6)], axis=1)
+    rows_s = np.arange(300) / FPS
+    action = np.stack([np.interp(rows_s, time_s, x) for x in smooth.T], axis=1)
+    state = np.stack([np.interp(rows_s - lag_s, time_s, x) for x in smooth.T], axis=1)
+    lag = joint_checks.find_lag(action, state, FPS)
+    assert lag.lag_s == pytest.approx(lag_s, abs=0.1 / FPS)
+    assert lag.correlation > 0.95
+
+
+@pytest.mark.parametrize(
+    ("clock_s", "severity"), [(0.0, None), (0.15, None), (0.40, "warning"), (-0.05, None), (-0.20, "error")]
+)
+def test_lag_of_state_behind_command_must_be_plausible(clock_s: float, severity: str | None) -> None:
+    # The good lag is about 0.08 s: together 0.08, 0.23, 0.48, 0.03 and −0.12 s; −1 row … 0.3 s + 1 row are allowed.
+    findings = found(make(seed=5, state_clock_s=clock_s), "action_lag")
+    assert [f.severity for f in findings] == ([severity, severity] if severity else [])
+
+
+def test_exchanged_action_and_state_are_an_error(good: Episode) -> None:
+    state, action, _ = copies(make(seed=6, lead_s=0.12))
+    findings = found(without(with_arrays(good, state=action, action=state), TOUCH), "action_lag")
+    assert {f.severity for f in findings} == {"error"}
+    assert "exchanged" in findings[0].text
+
+
+def test_state_that_is_the_action_has_lag_zero_and_is_no_fault(good: Episode) -> None:
+    same = with_arrays(without(good, TOUCH), state=good.arrays[ACTION])
+    assert found(same, "action_lag") == []
+
+
+def test_one_arm_on_another_clock_is_found(good: Episode) -> None:
+    state, _, _ = copies(good)
+    state[5:, :7] = good.arrays[STATE][:-5, :7]  # 5 rows: 0.167 s, together with 0.08 s still plausible by itself
+    finding = one(without(with_arrays(good, state=state), TOUCH), "action_lag")
+    assert finding.severity == "warning"
+    assert "differs between the arms" in finding.text
+
+
+@pytest.mark.parametrize("key", [STATE, ACTION])
+def test_swapped_arms_are_an_error(good: Episode, key: str) -> None:
+    values = np.roll(good.arrays[key], 7, axis=1)
+    name = "state" if key == STATE else "action"
+    finding = one(with_arrays(good, **{name: values}), "swapped_arms")
+    assert finding.severity == "error"
+
+
+def test_arms_that_move_alike_are_not_called_swapped(good: Episode) -> None:
+    state, action, _ = copies(good)
+    state[:, 7:], action[:, 7:] = state[:, :7], action[:, :7]
+    assert found(without(with_arrays(good, state=state, action=action), TOUCH), "swapped_arms") == []
+
+
+def test_swap_is_seen_when_only_one_arm_moves(good: Episode) -> None:
+    state, action, _ = copies(good)
+    state[:, :7], action[:, :7] = state[0, :7], action[0, :7]
+    still = without(with_arrays(good, state=state, action=action), TOUCH)
+    assert found(still, "swapped_arms") == []
+    assert found(with_arrays(still, action=np.roll(action, 7, axis=1)), "swapped_arms")
+
+
+def test_arms_at_rest_are_not_judged(good: Episode) -> None:
+    still = np.tile(good.arrays[STATE][:1], (90, 1))
+    findings = check_episode(without(with_arrays(good, state=still, action=still), TOUCH), pictures=False)
+    assert sum(f.check == "not_judged" for f in findings) >= 2
+    assert not any(f.check in ("swapped_arms", "action_lag") for f in findings)
+
+
+# ---- timing ----
+
+
+@pytest.mark.parametrize(
+    ("changes", "check", "severity"),
+    [
+        ({}, None, None),
+        ({"rate_hz": 165.0}, None, None),
+        ({"rate_hz": 155.0}, "low_rate", "warning"),  # 0.8 × 200 Hz
+        ({"longest_gap_s": 0.09}, None, None),
+        ({"longest_gap_s": 0.11}, "gaps", "warning"),
+        ({"gaps": 100}, None, None),  # of 200 Hz × 12 s = 2400 samples
+        ({"gaps": 130}, "gaps", "warning"),
+        ({"age_median_s": 0.007}, None, None),
+        ({"age_median_s": 0.008}, "old_samples", "warning"),  # 1.5 × 5 ms
+        ({"duplicates": 100}, None, None),
+        ({"duplicates": 1500}, "duplicates", "note"),
+        ({"out_of_order": 3}, "out_of_order", "note"),
+    ],
+)
+def test_timing_of_a_channel(good: Episode, changes: dict[str, float], check: str | None, severity: str | None) -> None:
+    findings = check_timing(good_timing(STATE, **changes), good)
+    assert [(f.check, f.severity, f.feature) for f in findings] == ([(check, severity, "state")] if check else [])
+
+
+def test_held_commands_may_come_rarely(good: Episode) -> None:
+    timing = good_timing(ACTION, align="hold", rate_hz=1.0, longest_gap_s=5.0, gaps=50, age_median_s=2.0)
+    assert check_timing(timing, good) == []
+
+
+# ---- pictures ----
+
+
+def freeze(episode: Episode, key: str, first: int, end: int, *, black: bool = False) -> Episode:
+    """The same picture with new stamps, as a hung camera driver sends it."""
+
+    def pictures():
+        held = None
+        for row, pictures in enumerate(episode.pictures()):
+            if row == first:
+                held = pictures[key] * (0 if black else 1)
+            yield pictures | {key: held} if first <= row < end else pictures
+
+    return dataclasses.replace(episode, pictures=pictures)
+
+
+def test_frozen_camera_is_found_with_its_rows(good: Episode) -> None:
+    finding = one(freeze(good, LEFT_WRIST, 20, 70), "frozen_picture", pictures=True)
+    assert (finding.severity, finding.feature) == ("warning", LEFT_WRIST)
+    assert finding.rows is not None
+    assert abs(finding.rows[0] - 20) <= 3
+    assert abs(finding.rows[1] - 70) <= 3
+
+
+def test_camera_frozen_for_most_of_the_episode_is_an_error(good: Episode) -> None:
+    finding = one(freeze(good, FRONT, 100, 360), "frozen_picture", pictures=True)
+    assert finding.severity == "error"
+
+
+def test_black_pictures_are_called_black(good: Episode) -> None:
+    assert "black pictures" in one(freeze(good, FRONT, 0, 360, black=True), "frozen_picture", pictures=True).text
+
+
+def test_pictures_that_rest_while_the_arms_rest_are_fine() -> None:
+    episode = make(seed=7, rest_s=(2.0, 2.0))
+    assert found(freeze(episode, FRONT, 0, 55), "frozen_picture", pictures=True) == []
+
+
+def test_wrist_camera_is_compared_with_its_own_arm(good: Episode) -> None:
+    state, action, _ = copies(good)
+    state[:, :7], action[:, :7] = state[0, :7], action[0, :7]
+    still_left = without(with_arrays(good, state=state, action=action), TOUCH)
+    frozen = freeze(still_left, LEFT_WRIST, 0, 360)
+    assert found(frozen, "frozen_picture", pictures=True) == []
+
+
+def test_repeated_source_picture_is_found_without_decoding(good: Episode) -> None:
+    numbers = np.arange(good.num_rows)
+    numbers[100:130] = 100
+    episode = dataclasses.replace(good, picture_rows={FRONT: numbers})
+    finding = one(episode, "frozen_picture")
+    assert (finding.severity, finding.feature, finding.rows) == ("warning", FRONT, (100, 130))
+
+
+def test_a_camera_at_half_the_rate_is_not_frozen(good: Episode) -> None:
+    episode = dataclasses.replace(good, picture_rows={FRONT: np.arange(good.num_rows) // 2})
+    assert found(episode, "frozen_picture", pictures=True) == []
+
+
+def test_slow_change_is_not_the_same_picture() -> None:
+    thumbs = np.arange(100)[:, None, None] * 0.1 * np.ones((1, 28, 28))  # 2 grey levels take 20 rows
+    assert {end - first for first, end in picture_checks.same_picture_runs(thumbs)} == {20}
+    assert picture_checks.same_picture_runs(np.zeros((40, 28, 28))) == [(0, 40)]
+
+
+# ---- episodes of one recording ----
+
+
+def test_lag_of_one_episode_unlike_the_others_is_found() -> None:
+    episodes = [make(seed=s, touch_delay_s=0.03, duration_s=8.0) for s in range(3)]
+    assert check_recording_episodes(episodes) == []
+    odd = make(seed=9, duration_s=8.0, state_clock_s=0.1, touch_clock_s=dict.fromkeys(SPEC.features[TOUCH].pads, 0.1))
+    findings = check_recording_episodes([*episodes, odd])
+    assert {f.check for f in findings} == {"action_lag"}
+    assert all("synthetic 9" in f.text for f in findings)
+
+
+def test_one_episode_alone_is_not_compared(good: Episode) -> None:
+    assert check_recording_episodes([good]) == []
+    assert check_recording_episodes([]) == []
+
+
+# ---- how often faults are found ----
+
+
+def _degrees(seed: int) -> Episode:
+    state, action, _ = copies(episode := make(seed=seed, duration_s=8.0))
+    for values in (state, action):
+        values[:, [i for i in range(14) if i not in GRIPPER.values()]] *= 57.29578
+    return with_arrays(episode, state=state, action=action)
+
+
+def _swap(seed: int) -> Episode:
+    episode = make(seed=seed, duration_s=8.0)
+    return with_arrays(episode, action=np.roll(episode.arrays[ACTION], 7, axis=1))
+
+
+def _glitch(seed: int) -> Episode:
+    rng = np.random.default_rng(seed)
+    state, _, _ = copies(episode := make(seed=seed, duration_s=8.0))
+    i = rng.choice([0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12])
+    low, high = SPEC.features[STATE].limits[i]
+    row = rng.integers(5, 235)
+    state[row, i] += 0.45 if state[row, i] < (low + high) / 2 else -0.45
+    return with_arrays(episode, state=state)
+
+
+def _idle(seed: int) -> Episode:
+    return make(seed=seed, duration_s=8.0, rest_s=(4.0, 0.0))
+
+
+def _late(seed: int) -> Episode:
+    return make(seed=seed, duration_s=8.0, state_clock_s=0.4)
+
+
+def _early(seed: int) -> Episode:
+    return make(seed=seed, duration_s=8.0, state_clock_s=-0.3)
+
+
+def _freeze(seed: int) -> Episode:
+    return freeze(make(seed=seed, duration_s=8.0), FRONT, 30, 60)
+
+
+@pytest.mark.parametrize(
+    ("fault", "check"),
+    [
+        (_degrees, "joint_limit"),
+        (_swap, "swapped_arms"),
+        (_glitch, "jump"),
+        (_idle, "idle"),
+        (_late, "action_lag"),
+        (_early, "action_lag"),
+        (_freeze, "frozen_picture"),
+    ],
+    ids=lambda x: getattr(x, "__name__", x),
+)
+def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(
+    fault: Callable[[int], Episode], check: str
+) -> None:
+    hits = sum(bool(found(fault(seed), check, pictures=check == "frozen_picture")) for seed in range(NUM_SEEDS))
+    assert hits >= 0.95 * NUM_SEEDS, f"{hits} of {NUM_SEEDS}"
