@@ -4,6 +4,7 @@ Recordings (MCAP, ROS 2 bags, HDF5, LeRobot datasets) into one LeRobot v3 datase
 ``taccorl ingest inspect FILE`` prints what a recording holds and a draft spec.
 """
 
+import ctypes
 import json
 import os
 from dataclasses import dataclass, field
@@ -56,7 +57,21 @@ def main(argv: list[str]) -> int:
     return _ingest(parse(IngestConfig, argv, positional="paths"))
 
 
+def _save_memory() -> None:
+    """One heap for all threads, freed memory given back: 60 MB less beside the encoders. Only in a process of our own."""
+    if os.environ.get("TACCORL_PROGRAM") != "1":
+        return
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+    try:
+        libc = ctypes.CDLL("libc.so.6")
+        libc.mallopt(-8, 2)  # M_ARENA_MAX
+        libc.mallopt(-1, 1 << 17)  # M_TRIM_THRESHOLD [bytes]
+    except (OSError, AttributeError):
+        pass  # not glibc: it works without
+
+
 def _ingest(config: IngestConfig) -> int:
+    _save_memory()
     from taccorl.cli.tables import Bars, ingest_table
     from taccorl.data.ingest import find_jobs, ingest
     from taccorl.data.spec import load_recording_spec

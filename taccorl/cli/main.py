@@ -18,7 +18,10 @@ VERBS = {
 
 def main(argv: list[str] | None = None) -> int:
     """Run one verb. 0: done; 1: done, but something was quarantined, refused or found wrong; 2: could not."""
-    words = sys.argv[1:] if argv is None else argv
+    if argv is None:  # we are the program and not a guest in somebody's process
+        os.environ["TACCORL_PROGRAM"] = "1"
+        argv = sys.argv[1:]
+    words = argv
     known = [verb for group in VERBS.values() for verb in group]
     if not words or words[0] in ("-h", "--help"):
         print("usage: taccorl <verb> [what] [--option=value …]      taccorl <verb> --help\n")

@@ -9,6 +9,8 @@ PATH is a LeRobot dataset's folder, or a recording with the spec that reads it. 
 """
 
 import contextlib
+import signal
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -119,7 +121,7 @@ def _write(config: ViewConfig, episode: "Episode") -> bool:
         from taccorl.views.episode import save_episode
 
         save_episode(episode, config.save)
-        print(f"wrote {config.save}: look at it with {_rerun()} {config.save}")
+        print(f"wrote {config.save}: look at it with {Path(sys.executable).with_name('rerun')} {config.save}")
     if config.screenshot is not None:
         from taccorl.views.screenshot import screenshot
 
@@ -133,12 +135,6 @@ def _write(config: ViewConfig, episode: "Episode") -> bool:
     return any(path is not None for path in (config.save, config.screenshot, config.sheet))
 
 
-def _rerun() -> str:
-    import sys
-
-    return str(Path(sys.executable).with_name("rerun"))
-
-
 def _serve(episode: "Episode") -> None:
     from taccorl.views.episode import save_episode
     from taccorl.views.viewer import served
@@ -146,9 +142,13 @@ def _serve(episode: "Episode") -> None:
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd = Path(folder) / "episode.rrd"
         save_episode(episode, rrd)
-        with served(rrd) as address, contextlib.suppress(KeyboardInterrupt):
+        asked_to_end = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):  # by hand, so that the server never outlives us
+            signal.signal(number, lambda *_: asked_to_end.set())
+        with served(rrd) as address:
             print(f"{address}\nopen this in a browser on this machine; Ctrl-C ends it", flush=True)
-            threading.Event().wait()
+            while not asked_to_end.wait(0.2):  # without a timeout, a signal that meets another thread wakes nobody
+                pass
 
 
 def _open_window(episode: "Episode") -> None:

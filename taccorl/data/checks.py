@@ -10,15 +10,16 @@ worth knowing; what could not be judged is a note too, never a pass in silence.
              touch_lag, pad_lag, baseline_drift, baseline_offset
     note     duplicates, out_of_order, saturated (a few rows), contact_coverage, not_judged
 
-The parts are in ``joint_checks``, ``picture_checks``, ``touch_checks`` (a pad by itself) and ``grip_checks`` (pads
-against grippers). Thresholds stand there, with unit and reason.
+The parts are in ``joint_checks``, ``lag_checks`` (state against command), ``picture_checks``, ``touch_checks`` (a pad by
+itself) and ``grip_checks`` (pads against grippers). Thresholds stand there, with unit and reason.
 """
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from taccorl.data import joint_checks
+from taccorl.data import joint_checks, lag_checks
+from taccorl.data.arms import ACTION, STATE, episode_arms
 from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.data.finding import Finding, Severity, listed, not_judged
 from taccorl.data.grip_checks import (
@@ -31,7 +32,6 @@ from taccorl.data.grip_checks import (
     rest_level,
     touch_lags,
 )
-from taccorl.data.joint_checks import ACTION, STATE
 from taccorl.data.picture_checks import check_pictures
 from taccorl.data.touch_checks import Pad, check_pads, read_pads, tactile_keys
 
@@ -86,13 +86,13 @@ def _check_motion(episode: Episode, wrong: set[str]) -> list[Finding]:
         findings += joint_checks.check_idle(episode, touch)
     if not all(np.isfinite(episode.arrays[key]).all() for key in vectors):
         return [*findings, not_judged(ACTION, "action lag, swapped arms", "values that are not finite")]
-    arms = joint_checks.episode_arms(episode)
+    arms = episode_arms(episode)
     if not any(len(arm.joints) for arm in arms):
         return [*findings, not_judged(ACTION, "action lag, swapped arms", "no joints in rad named alike in both")]
-    swapped = joint_checks.check_swapped_arms(episode)
+    swapped = lag_checks.check_swapped_arms(episode)
     findings += swapped
     if not any(f.severity == "error" for f in swapped):
-        findings += joint_checks.check_lag(episode)
+        findings += lag_checks.check_lag(episode)
         findings += [f for arm in arms for f in joint_checks.check_frozen_state(episode, arm)]
     return findings
 
@@ -166,7 +166,7 @@ def check_recording_episodes(episodes: Sequence[Episode]) -> list[Finding]:
 def _odd_lags(episodes: list[Episode]) -> list[Finding]:
     lags: dict[str, dict[str, float]] = {}
     for episode in episodes:
-        for arm, lag in joint_checks.arm_lags(episode).items():
+        for arm, lag in lag_checks.arm_lags(episode).items():
             lags.setdefault(arm, {})[episode.name] = lag.lag_s
     findings = []
     for arm, by_episode in lags.items():

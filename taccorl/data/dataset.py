@@ -414,7 +414,7 @@ def _read_records(root: Path, table: list[dict[str, Any]]) -> list[dict[str, Any
     if not path.is_file():
         return None
     records = _read_json(path, list)
-    rows = [r.get("rows") for r in records]
+    rows = [r.get("rows") if isinstance(r, dict) else None for r in records]
     if rows != [r["length"] for r in table]:
         raise DatasetError(
             f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, the dataset has {len(table)} episodes, "

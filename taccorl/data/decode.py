@@ -11,6 +11,8 @@ import numpy as np
 from taccorl.data.spec import ChannelSpec, SensorSpec
 from taccorl.errors import RecordingError, nearest
 
+MISSING = object()
+
 
 def natural_key(name: str) -> tuple[Any, ...]:
     """Sort key that puts episode_2 before episode_10."""
@@ -29,18 +31,29 @@ def get(value: Any, field: str) -> Any:
         RecordingError: there is no such field; names the nearest.
     """
     for part in field.split("."):
-        if isinstance(value, dict):
-            if part not in value:
-                raise RecordingError(f"no field {part!r}; {nearest(part, value)}")
-            value = value[part]
-        elif hasattr(value, part):
-            value = getattr(value, part)
-        else:
+        inner = _part(value, part)
+        if inner is MISSING:
             raise RecordingError(f"no field {part!r}; {nearest(part, _fields(value))}")
+        value = inner
+    return value
+
+
+def _part(value: Any, part: str) -> Any:
+    return value.get(part, MISSING) if isinstance(value, dict) else getattr(value, part, MISSING)
+
+
+def _maybe(value: Any, field: str) -> Any:
+    """``get``, or None; quick, because most messages lack most fields that are asked for."""
+    for part in field.split("."):
+        value = _part(value, part)
+        if value is MISSING:
+            return None
     return value
 
 
 def _fields(value: Any) -> list[str]:
+    if isinstance(value, dict):
+        return [str(key) for key in value]
     slots = getattr(type(value), "__slots__", None) or getattr(value, "__dict__", {})
     descriptor = getattr(value, "DESCRIPTOR", None)
     return [f.name for f in descriptor.fields] if descriptor is not None else [str(s).lstrip("_") for s in slots]
@@ -49,14 +62,11 @@ def _fields(value: Any) -> list[str]:
 def stamp_ns(value: Any) -> int | None:
     """Header stamp of a decoded message (ns): ``header.stamp``, or a Foxglove ``timestamp``; None if it has neither."""
     for field in ("header.stamp", "timestamp"):
-        try:
-            stamp = get(value, field)
-        except RecordingError:
-            continue
+        stamp = _maybe(value, field)
         for sec, nsec in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs")):
             try:
-                found = int(get(stamp, sec)) * 1_000_000_000 + int(get(stamp, nsec))
-            except (RecordingError, TypeError, ValueError, OverflowError):
+                found = int(_maybe(stamp, sec)) * 1_000_000_000 + int(_maybe(stamp, nsec))
+            except (TypeError, ValueError, OverflowError):
                 continue
             return found if abs(found) < 2**63 else None
     return None
@@ -79,9 +89,12 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
 
     def pick(value: Any, numbers: np.ndarray) -> np.ndarray:
         found = get(value, "name")
-        if isinstance(found, str | bytes) or not hasattr(found, "__iter__"):
+        try:
+            names = () if isinstance(found, str | bytes) else tuple(str(n) for n in found)
+        except TypeError:
+            names = ()
+        if not names:
             raise RecordingError(f"`name` is {found!r}, not a list of names")
-        names = tuple(str(n) for n in found)
         if names not in indices:
             for name in channel.pick:
                 if names.count(name) != 1:
@@ -235,13 +248,6 @@ def letterbox(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
     top, left = (rows - inner[0]) // 2, (columns - inner[1]) // 2
     out[top : top + inner[0], left : left + inner[1]] = scaled
     return out
-
-
-def _maybe(value: Any, field: str) -> Any:
-    try:
-        return get(value, field)
-    except RecordingError:
-        return None
 
 
 def _from_base64(data: str) -> bytes:

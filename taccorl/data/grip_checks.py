@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_dilation, uniform_filter1d
 
+from taccorl.data.arms import ACTION, STATE, episode_arms
 from taccorl.data.episode import Episode
 from taccorl.data.finding import Finding, listed, not_judged
-from taccorl.data.joint_checks import ACTION, LAG_SURE, STATE, episode_arms, find_lag
+from taccorl.data.lag_checks import LAG_SURE, find_lag
 from taccorl.data.timing import runs
 from taccorl.data.touch_checks import JUDGE_S, Pad
 

@@ -1,22 +1,17 @@
-"""Do joints and commands make sense? Limits and units, jumps, rests, who follows whom and how late.
+"""Do joints and commands make sense by themselves? Limits and units, jumps, rests, repeated values.
 
-    lag      argmax over k of Σ_t v_action[t] · v_state[t + k], the velocities of all moving joints of one arm
-    swapped  an arm's state lies near the other arm's command, and far from its own
-
-Letters in shapes: T rows, J elements of the vector. Velocities are differences of rows: what a policy will see.
+Letters in shapes: T rows, J elements of the vector.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+from taccorl.data.arms import ACTION, STATE, Arm, element_names, element_units
 from taccorl.data.episode import Episode
 from taccorl.data.finding import Finding, listed, not_judged, place
 from taccorl.data.timing import runs
-
-STATE, ACTION = "observation.state", "action"
 
 LIMIT_TOLERANCE = 0.02
 """Share of the valid span by which a value may lie outside: calibration offsets and the leader's own stops."""
@@ -37,64 +32,6 @@ FROZEN_S = 0.5
 """15 rows at 30 fps: bit-identical for so long while it should change is not chance."""
 MOVING_RAD = 0.05
 """A joint has moved: 2.9°, well above tremor."""
-LAG_SEARCH_S = (-0.5, 1.0)
-LAG_PLAUSIBLE_S = (0.0, 0.3)
-"""PiPER follows its command in about 0.1 s (CAN, controller, gear); 0.3 s would be slow."""
-LAG_TOLERANCE_ROWS = 1.0
-"""A sample is up to one row old, so that true lags near 0 measure as slightly negative."""
-LAG_SURE = 0.6
-"""Correlation below this says nothing about time."""
-ARM_LAG_SPREAD_S = 0.1
-"""Two arms of one make differ less."""
-LAG_MIN_S = 3.0
-"""Shorter episodes hold too little motion to correlate."""
-SWAP_RATIO = 3.0
-"""Own command must be this many times farther than the other arm's: symmetric motion never is."""
-
-
-@dataclass(frozen=True)
-class Arm:
-    """Which elements of ``observation.state`` and ``action`` are one arm's."""
-
-    name: str
-    """Prefix of its names without the underscore; empty for a robot with one arm."""
-    joints: np.ndarray
-    """(n,) element numbers in rad, base to wrist."""
-    gripper: int | None
-    """Element number of the opening in m."""
-
-
-def find_arms(names: tuple[str, ...], units: tuple[str, ...]) -> list[Arm]:
-    """Arms by the names' prefixes ``left_`` and ``right_``; elements with neither belong to the arm without a name."""
-    arms = []
-    prefixes = [next((p for p in ("left", "right") if n.startswith(f"{p}_")), "") for n in names]
-    for prefix in sorted(set(prefixes)):
-        own = [i for i, p in enumerate(prefixes) if p == prefix]
-        grippers = [i for i in own if units[i] == "m" and names[i].endswith("gripper.pos")]
-        joints = np.array([i for i in own if units[i] == "rad"], dtype=int)
-        arms.append(Arm(prefix, joints, grippers[0] if grippers else None))
-    return arms
-
-
-def element_units(episode: Episode, key: str) -> tuple[str, ...]:
-    """Unit of every element of a feature."""
-    feature = episode.spec.features[key]
-    return (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
-
-
-def element_names(episode: Episode, key: str) -> tuple[str, ...]:
-    """Name of every element; its number where the spec names none."""
-    feature = episode.spec.features[key]
-    return feature.names or tuple(f"{key}[{i}]" for i in range(feature.size))
-
-
-def episode_arms(episode: Episode) -> list[Arm]:
-    """The arms of an episode that holds both state and command under the same names; else none."""
-    if STATE not in episode.arrays or ACTION not in episode.arrays:
-        return []
-    if element_names(episode, STATE) != episode.spec.features[ACTION].names:
-        return []
-    return find_arms(element_names(episode, STATE), element_units(episode, STATE))
 
 
 # ---- values ----
@@ -287,154 +224,5 @@ def check_frozen_state(episode: Episode, arm: Arm) -> list[Finding]:
             f"by {moved:.2f} rad, {place(rows, fps)} ({len(found)} such times): arm disabled, or its driver repeats old "
             f"values",
             rows,
-        )
-    ]
-
-
-# ---- command and state ----
-
-
-@dataclass(frozen=True)
-class Lag:
-    """How long after the command an arm's state moves."""
-
-    lag_s: float
-    correlation: float
-    """Of the velocities at that lag; below LAG_SURE the lag means nothing."""
-
-
-def find_lag(action: np.ndarray, state: np.ndarray, fps: int, search_s: tuple[float, float] = LAG_SEARCH_S) -> Lag:
-    """Lag of ``state`` (T, n) behind ``action`` (T, n) by cross-correlation of velocities; parabola through the peak.
-
-    Each column counts alike; those at rest (range below MOVING_RAD, which fits counts as well) not at all.
-    """
-    moving = (np.ptp(action, axis=0) > MOVING_RAD) & (np.ptp(state, axis=0) > MOVING_RAD)
-    if not moving.any():
-        return Lag(0.0, 0.0)
-    v_action, v_state = (
-        uniform_filter1d(np.diff(x[:, moving].astype(float), axis=0), 3, axis=0) for x in (action, state)
-    )
-    v_action, v_state = v_action / v_action.std(axis=0), v_state / v_state.std(axis=0)
-    lags = np.arange(math.floor(search_s[0] * fps), math.ceil(search_s[1] * fps) + 1)
-    lags = lags[np.abs(lags) < len(v_action) - 2]
-    correlation = np.array([_correlation_at(v_action, v_state, int(k)) for k in lags])
-    peak = int(np.argmax(correlation))
-    shift = 0.0
-    if 0 < peak < len(lags) - 1:
-        before, at, after = correlation[peak - 1 : peak + 2]
-        bend = before - 2 * at + after
-        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return Lag(float((lags[peak] + shift) / fps), float(correlation[peak]))
-
-
-def _correlation_at(v_action: np.ndarray, v_state: np.ndarray, lag: int) -> float:
-    a, s = (v_action[: len(v_action) - lag], v_state[lag:]) if lag >= 0 else (v_action[-lag:], v_state[:lag])
-    norm = math.sqrt(float((a * a).sum()) * float((s * s).sum()))
-    return float((a * s).sum()) / norm if norm > 0 else 0.0
-
-
-def arm_lags(episode: Episode) -> dict[str, Lag]:
-    """Arm name → lag, for the arms that move enough to tell."""
-    if episode.num_rows < LAG_MIN_S * episode.spec.fps:
-        return {}
-    state, action = episode.arrays.get(STATE), episode.arrays.get(ACTION)
-    lags = {}
-    for arm in episode_arms(episode):
-        if state is None or action is None or not np.isfinite(state).all() or not np.isfinite(action).all():
-            continue
-        lag = find_lag(action[:, arm.joints], state[:, arm.joints], episode.spec.fps)
-        if lag.correlation >= LAG_SURE:
-            lags[arm.name] = lag
-    return lags
-
-
-def check_lag(episode: Episode) -> list[Finding]:
-    """Does the state follow the command, and within a plausible time?"""
-    fps = episode.spec.fps
-    if episode.num_rows < LAG_MIN_S * fps:
-        return [not_judged(ACTION, "action lag", f"{episode.num_rows / fps:.1f} s, it takes {LAG_MIN_S:g} s of motion")]
-    lags = arm_lags(episode)
-    if not lags:
-        why = f"no arm's state follows its command with a correlation of {LAG_SURE} or more"
-        return [not_judged(ACTION, "action lag", f"{why} (too little motion, or another quantity)")]
-    findings = []
-    low, high = LAG_PLAUSIBLE_S[0] - LAG_TOLERANCE_ROWS / fps, LAG_PLAUSIBLE_S[1] + LAG_TOLERANCE_ROWS / fps
-    for name, lag in lags.items():
-        arm = f"the {name} arm" if name else "the arm"
-        plausible = f"plausible {low:.2f} to {high:.2f} s"
-        if lag.lag_s < low:
-            findings.append(
-                Finding(
-                    "action_lag",
-                    "error",
-                    ACTION,
-                    f"{arm}'s command trails its state by {-lag.lag_s:.3f} s ({plausible}): action and state exchanged, "
-                    f"or their channels on different clocks; mend `channels`, `clock` or `latency_s`",
-                )
-            )
-        elif lag.lag_s > high:
-            findings.append(
-                Finding(
-                    "action_lag",
-                    "warning",
-                    ACTION,
-                    f"{arm}'s state follows its command after {lag.lag_s:.3f} s ({plausible}): channels on different "
-                    f"clocks, or a slow controller; set `latency_s` if the clock is off by a constant",
-                )
-            )
-    spread = max(x.lag_s for x in lags.values()) - min(x.lag_s for x in lags.values())
-    if spread > ARM_LAG_SPREAD_S and not findings:
-        each = ", ".join(f"{name} {lag.lag_s:.3f} s" for name, lag in lags.items())
-        findings.append(
-            Finding(
-                "action_lag",
-                "warning",
-                ACTION,
-                f"lag from command to state differs between the arms by {spread:.3f} s ({each}; expected below "
-                f"{ARM_LAG_SPREAD_S:g} s): one arm's channels are on another clock; set `latency_s` there",
-            )
-        )
-    return findings
-
-
-def arms_swapped(state: np.ndarray, action: np.ndarray, left: Arm, right: Arm, fps: int) -> bool | None:
-    """Does each arm's state follow the other arm's command? None where the arms move too little to tell."""
-    pairs = [(left, right), (right, left)]
-    if any(len(a.joints) != len(b.joints) or not len(a.joints) for a, b in pairs):
-        return None
-    if all(np.ptp(state[:, a.joints], axis=0).max() < MOVING_RAD for a, _ in pairs):
-        return None
-
-    def distance(a: Arm, b: Arm) -> float:
-        return float(np.sqrt(np.mean((state[:, a.joints] - action[:, b.joints]) ** 2)))
-
-    def follows(a: Arm, b: Arm) -> float:
-        return find_lag(action[:, b.joints], state[:, a.joints], fps).correlation
-
-    near_other = all(distance(a, a) > SWAP_RATIO * distance(a, b) for a, b in pairs)
-    follows_other = sum(follows(a, b) for a, b in pairs) > sum(follows(a, a) for a, _ in pairs)
-    return near_other and follows_other
-
-
-def check_swapped_arms(episode: Episode) -> list[Finding]:
-    """State of the left arm with the command of the right one, and the other way round."""
-    arms = {arm.name: arm for arm in episode_arms(episode)}
-    if not {"left", "right"} <= set(arms):
-        return []
-    if episode.num_rows < LAG_MIN_S * episode.spec.fps:
-        return []
-    state, action = episode.arrays[STATE].astype(float), episode.arrays[ACTION].astype(float)
-    swapped = arms_swapped(state, action, arms["left"], arms["right"], episode.spec.fps)
-    if swapped is None:
-        return [not_judged(ACTION, "swapped arms", "the arms hardly move")]
-    if not swapped:
-        return []
-    return [
-        Finding(
-            "swapped_arms",
-            "error",
-            ACTION,
-            "the left arm's state follows the right arm's command, and the right arm's the left one's: left and right "
-            "topics are exchanged in either observation.state or action; mend `channels` in the recording spec",
         )
     ]

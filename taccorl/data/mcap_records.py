@@ -67,88 +67,6 @@ class Record(NamedTuple):
         return self.body + self.length
 
 
-def whole_record(file: BinaryIO, offset: int, size: int) -> Record | None:
-    """The record at ``offset``, or None if what stands there cannot be one."""
-    record = _header(file, offset, size)
-    if record is None or record.end > size or record.opcode == 0:
-        return None
-    if record.opcode in _LAYOUTS:
-        return record if _fills(file, record) else None
-    if record.opcode == MESSAGE:
-        # Nothing inside a message says how long it is; and a damaged opcode must not make another record a message.
-        others = (HEADER, SCHEMA, CHANNEL, CHUNK, MESSAGE_INDEX, METADATA)
-        if record.length < MESSAGE_BYTES or any(_fills(file, record._replace(opcode=o)) for o in others):
-            return None
-    return record if _may_begin(file, record.end, size) else None
-
-
-def _header(file: BinaryIO, offset: int, size: int) -> Record | None:
-    if offset + HEADER_BYTES > size:
-        return None
-    file.seek(offset)
-    opcode, length = struct.unpack("<BQ", file.read(HEADER_BYTES))
-    return Record(opcode, offset, length)
-
-
-def _fills(file: BinaryIO, record: Record) -> bool:
-    """Do the lengths inside the body add up to the record's?"""
-    at = record.body
-    for part in _LAYOUTS[record.opcode]:
-        if isinstance(part, int):
-            at += part
-            continue
-        width = 4 if part == "short" else 8
-        if at + width > record.end:
-            return False
-        file.seek(at)
-        at += width + int.from_bytes(file.read(width), "little")
-    return at == record.end
-
-
-def _may_begin(file: BinaryIO, offset: int, size: int) -> bool:
-    """Could a record begin here? Yes at the end of the file, and where it was cut within a record."""
-    record = _header(file, offset, size)
-    if record is None:
-        return True
-    if record.opcode not in KNOWN_OPCODES and record.opcode < 0x80:
-        return False
-    if record.end > size or record.opcode not in _LAYOUTS:
-        return MESSAGE_BYTES <= record.length < 1 << 40
-    return _fills(file, record)
-
-
-def find_record(
-    file: BinaryIO, start: int, stop: int, size: int, opcodes: Collection[int], channels: Collection[int] = ()
-) -> int | None:
-    """Offset of the first whole record of one of ``opcodes`` in [start, stop); messages only of these channel ids."""
-    for offset in range(start, stop, BLOCK_BYTES):
-        file.seek(offset)
-        block = np.frombuffer(file.read(min(BLOCK_BYTES, stop - offset) + HEADER_BYTES - 1), np.uint8)
-        if len(block) < HEADER_BYTES:
-            return None
-        heads = block[: len(block) - HEADER_BYTES + 1]
-        small = (
-            (block[6 : len(heads) + 6] == 0) & (block[7 : len(heads) + 7] == 0) & (block[8:] == 0)
-        )  # below 2⁴⁰ bytes
-        for at in np.flatnonzero(np.isin(heads, list(opcodes)) & small):
-            record = whole_record(file, offset + int(at), size)
-            if record is not None and _is_sure(file, record, size, channels):
-                return record.offset
-    return None
-
-
-def _is_sure(file: BinaryIO, record: Record, size: int, channels: Collection[int]) -> bool:
-    if record.opcode == MESSAGE:
-        channel = int.from_bytes(read_body(file, record)[:2], "little")
-        return channel in channels and (record.end == size or whole_record(file, record.end, size) is not None)
-    return record.opcode != DATA_END or _may_begin(file, record.end, size)
-
-
-def read_body(file: BinaryIO, record: Record) -> bytes:
-    file.seek(record.body)
-    return file.read(record.length)
-
-
 def parse(opcode: int, body: bytes) -> Any:
     """A message, or a record of mcap's own kinds."""
     if opcode == MESSAGE:
@@ -183,7 +101,7 @@ class Summary:
     starts: list[int] = field(default_factory=list)
     """Offsets of its chunks, attachments and metadata records, ascending."""
     end: int | None = None
-    """Where the data section ends."""
+    """Where the data section ends; None where there is no sound footer: the file may have been cut."""
 
     def next_start(self, offset: int) -> int | None:
         """The first indexed record at or after ``offset``."""
@@ -191,31 +109,128 @@ class Summary:
         return self.starts[k] if k < len(self.starts) else None
 
 
-def read_summary(file: BinaryIO, size: int) -> Summary:
-    """The summary, if the file has a footer and what it points to is sound."""
-    footer = whole_record(file, size - _END_BYTES, size) if size >= len(MAGIC) + _END_BYTES else None
-    file.seek(max(size - len(MAGIC), 0))
-    if footer is None or footer.opcode != FOOTER or file.read() != MAGIC:
-        return Summary(problem="there is no footer")
-    start, _, crc = struct.unpack("<QQI", read_body(file, footer))
-    if start == 0:
-        return Summary(end=footer.offset)
-    if not len(MAGIC) <= start <= footer.offset:
-        return Summary(problem="its footer points nowhere")
-    if crc and _crc(file, start, footer.end - 4) != crc:
-        return Summary(problem="its CRC does not match")
-    summary, offset = Summary(proven=crc != 0, end=start), start
-    while offset < footer.offset:
-        record = whole_record(file, offset, footer.offset)
-        if record is None or record.opcode in (MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END):
-            return Summary(problem=f"no index record at byte {offset:,}")
-        try:
-            _add(summary, record.opcode, read_body(file, record))
-        except (ValueError, struct.error, McapError) as error:
-            return Summary(problem=f"unreadable at byte {offset:,}: {error}")
-        offset = record.end
-    summary.starts.sort()
-    return summary
+class McapFile:
+    """The records of one open file."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self.file, self.size = file, size
+        self.end = size
+        """Where the data section ends, as far as is known."""
+        self.chunked = False
+        """Messages are known to lie in chunks: one outside is more likely a message index gone wrong."""
+        self.summary = self._read_summary()
+        self.end = self.summary.end or size
+        self.chunked = self.summary.has_chunks
+
+    def record(self, offset: int) -> Record | None:
+        """The whole record at ``offset``, or None if what stands there cannot be one."""
+        record = self._header(offset)
+        if record is None or record.end > self.end or record.opcode == 0:
+            return None
+        if record.opcode in _LAYOUTS:
+            return record if self._fills(record) else None
+        if record.opcode == MESSAGE:
+            # Nothing inside a message says how long it is; and a damaged opcode must not make another record a message.
+            others = (HEADER, SCHEMA, CHANNEL, CHUNK, METADATA, *((MESSAGE_INDEX,) if self.chunked else ()))
+            if record.length < MESSAGE_BYTES or any(self._fills(record._replace(opcode=o)) for o in others):
+                return None
+        return record if self._may_begin(record.end) else None
+
+    def find(self, start: int, stop: int, opcodes: Collection[int], channels: Collection[int] = ()) -> int | None:
+        """Offset of the first whole record of one of ``opcodes`` in [start, stop); messages only of these channel ids."""
+        for offset in range(start, stop, BLOCK_BYTES):
+            self.file.seek(offset)
+            block = np.frombuffer(self.file.read(min(BLOCK_BYTES, stop - offset) + HEADER_BYTES - 1), np.uint8)
+            if len(block) < HEADER_BYTES:
+                return None
+            heads = block[: len(block) - HEADER_BYTES + 1]
+            small = (block[6:-2] == 0) & (block[7:-1] == 0) & (block[8:] == 0)  # lengths below 2⁴⁰ bytes
+            for at in np.flatnonzero(np.isin(heads, list(opcodes)) & small):
+                record = self.record(offset + int(at))
+                if record is not None and self._is_sure(record, channels):
+                    return record.offset
+        return None
+
+    def body(self, record: Record) -> bytes:
+        self.file.seek(record.body)
+        return self.file.read(record.length)
+
+    def data_crc_matches(self, data_end: Record) -> bool:
+        """Does the data section agree with the CRC in its last record? True where the writer left none."""
+        crc = int.from_bytes(self.body(data_end), "little")
+        return crc == 0 or self._crc(0, data_end.offset) == crc
+
+    def _header(self, offset: int) -> Record | None:
+        if not 0 <= offset <= self.end - HEADER_BYTES:
+            return None
+        self.file.seek(offset)
+        opcode, length = struct.unpack("<BQ", self.file.read(HEADER_BYTES))
+        return Record(opcode, offset, length)
+
+    def _fills(self, record: Record) -> bool:
+        """Do the lengths inside the body add up to the record's?"""
+        at = record.body
+        for part in _LAYOUTS[record.opcode]:
+            if isinstance(part, int):
+                at += part
+                continue
+            width = 4 if part == "short" else 8
+            if at + width > record.end:
+                return False
+            self.file.seek(at)
+            at += width + int.from_bytes(self.file.read(width), "little")
+        return at == record.end
+
+    def _may_begin(self, offset: int) -> bool:
+        """Could a record begin here? Also where a file without footer was cut within one."""
+        record = self._header(offset)
+        if record is None:
+            return offset == self.end or self.summary.end is None
+        if record.end > self.end:
+            return self.summary.end is None and record.opcode in KNOWN_OPCODES and record.length < 1 << 40
+        if record.opcode in _LAYOUTS:
+            return self._fills(record)
+        return record.length >= MESSAGE_BYTES if record.opcode == MESSAGE else record.opcode >= 0x80
+
+    def _is_sure(self, record: Record, channels: Collection[int]) -> bool:
+        if record.opcode == MESSAGE:
+            channel = int.from_bytes(self.body(record)[:2], "little")
+            return channel in channels and (record.end == self.end or self.record(record.end) is not None)
+        return record.opcode != DATA_END or self._may_begin(record.end)
+
+    def _crc(self, start: int, end: int) -> int:
+        self.file.seek(start)
+        crc = 0
+        while start < end and (block := self.file.read(min(BLOCK_BYTES, end - start))):
+            crc, start = zlib.crc32(block, crc), start + len(block)
+        return crc
+
+    def _read_summary(self) -> Summary:
+        """The summary, if the file has a footer and what it points to is sound."""
+        self.summary = Summary()
+        footer = self.record(self.size - _END_BYTES)
+        self.file.seek(max(self.size - len(MAGIC), 0))
+        if footer is None or footer.opcode != FOOTER or self.file.read() != MAGIC:
+            return Summary(problem="there is no footer")
+        start, _, crc = struct.unpack("<QQI", self.body(footer))
+        if start == 0:
+            return Summary(end=footer.offset)
+        if not len(MAGIC) <= start <= footer.offset:
+            return Summary(problem="its footer points nowhere")
+        if crc and self._crc(start, footer.end - 4) != crc:
+            return Summary(problem="its CRC does not match")
+        summary, offset = Summary(proven=crc != 0, end=start), start
+        while offset < footer.offset:
+            record = self.record(offset)
+            if record is None or record.opcode in (MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END):
+                return Summary(problem=f"no index record at byte {offset:,}")
+            try:
+                _add(summary, record.opcode, self.body(record))
+            except (ValueError, struct.error, McapError) as error:
+                return Summary(problem=f"unreadable at byte {offset:,}: {error}")
+            offset = record.end
+        summary.starts.sort()
+        return summary
 
 
 def _add(summary: Summary, opcode: int, body: bytes) -> None:
@@ -228,20 +243,6 @@ def _add(summary: Summary, opcode: int, body: bytes) -> None:
         summary.has_chunks = True
     elif opcode in (ATTACHMENT_INDEX, METADATA_INDEX):
         summary.starts.append(parse(opcode, body).offset)
-
-
-def data_crc_matches(file: BinaryIO, data_end: Record) -> bool:
-    """Does the data section agree with the CRC in its last record? True where the writer left none."""
-    crc = int.from_bytes(read_body(file, data_end), "little")
-    return crc == 0 or _crc(file, 0, data_end.offset) == crc
-
-
-def _crc(file: BinaryIO, start: int, end: int) -> int:
-    file.seek(start)
-    crc = 0
-    while start < end and (block := file.read(min(BLOCK_BYTES, end - start))):
-        crc, start = zlib.crc32(block, crc), start + len(block)
-    return crc
 
 
 def chunk_records(chunk: Chunk) -> Iterator[Any]:

@@ -7,9 +7,10 @@ change. Each picture is compared as block means in grey levels, so that neither 
 import cv2
 import numpy as np
 
-from taccorl.data.episode import Episode
+from taccorl.data.arms import STATE, element_names, element_units, find_arms
+from taccorl.data.episode import Episode, Pictures
 from taccorl.data.finding import Finding, not_judged, place
-from taccorl.data.joint_checks import FROZEN_S, STATE, element_names, element_units, find_arms
+from taccorl.data.joint_checks import FROZEN_S
 from taccorl.data.timing import runs
 
 THUMB_PX = 28
@@ -42,6 +43,23 @@ def same_picture_runs(thumbs: np.ndarray) -> list[tuple[int, int]]:
     return found
 
 
+class PictureWatch:
+    """Watches an episode's pictures go by, row after row, for whoever decodes them anyway (ingest, while it writes)."""
+
+    def __init__(self, episode: Episode) -> None:
+        self.episode = episode
+        self._thumbs: dict[str, list[np.ndarray]] = {key: [] for key in episode.picture_keys}
+
+    def see(self, pictures: Pictures) -> None:
+        """The next row's pictures."""
+        for key, thumbs in self._thumbs.items():
+            thumbs.append(thumbnail(pictures[key]))
+
+    def findings(self) -> list[Finding]:
+        """Frozen cameras, once all rows were seen."""
+        return [f for key, thumbs in self._thumbs.items() for f in _check_thumbs(self.episode, key, np.array(thumbs))]
+
+
 def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
     """Frozen cameras.
 
@@ -50,19 +68,14 @@ def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
     """
     findings = []
     for key in episode.picture_keys:
-        numbers = episode.picture_rows.get(key)
-        if numbers is not None:
-            findings += _check_sources(episode, key, numbers)
-    open_keys = [key for key in episode.picture_keys if key not in {f.feature for f in findings}]
-    if not decode or not open_keys:
+        if key in episode.picture_rows:
+            findings += _check_sources(episode, key, episode.picture_rows[key])
+    if not decode or not episode.picture_keys:
         return findings
-    thumbs: dict[str, list[np.ndarray]] = {key: [] for key in open_keys}
+    watch = PictureWatch(episode)
     for pictures in episode.pictures():
-        for key in open_keys:
-            thumbs[key].append(thumbnail(pictures[key]))
-    for key in open_keys:
-        findings += _check_thumbs(episode, key, np.array(thumbs[key]))
-    return findings
+        watch.see(pictures)
+    return findings + [f for f in watch.findings() if f.feature not in {g.feature for g in findings}]
 
 
 def _frozen(episode: Episode, key: str, rows: tuple[int, int], what: str, num_frozen: int) -> Finding:

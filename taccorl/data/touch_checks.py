@@ -43,8 +43,8 @@ SATURATED_SHARE = 0.05
 """Of the rows in contact: from here on force magnitude is lost where it matters; below, it is a note."""
 NOISE_SIGMAS = 3.0
 """The sensor's ``noise_count`` bounds an untouched taxel: noise of a third of it still keeps to that."""
-FROZEN_USUAL_SHARE = 0.1
-"""If a pad's frames repeat more often than this at all times, it has no visible noise, and repeats say nothing."""
+LIVELY_SHARE = 0.1
+"""If fewer taxels than this change from row to row at rest, noise is not visible, and a repeated frame says nothing."""
 STRUCTURE = 0.25
 """Correlation of neighbouring taxels: 0 for white noise, above 0.5 for any contact wider than one taxel."""
 
@@ -336,11 +336,12 @@ def _check_noise(key: str, pad: Pad) -> list[Finding]:
 def _check_frozen(key: str, pad: Pad) -> list[Finding]:
     same = pad.repeated
     found = [(a - 1, b) for a, b in runs(same) if (b - a + 1) / pad.fps >= FROZEN_S]
-    num_frozen = sum(b - a for a, b in found)
-    elsewhere = len(same) - num_frozen
-    repeats = int(same.sum()) - (num_frozen - len(found))
-    if not found or elsewhere == 0 or repeats > FROZEN_USUAL_SHARE * elsewhere:
+    at_rest = np.flatnonzero(~same[1:] & ~pad.contact[1:])
+    if not found or len(at_rest) < FROZEN_S * pad.fps:
         return []
+    if np.mean(pad.counts[at_rest + 1] != pad.counts[at_rest]) < LIVELY_SHARE:
+        return []
+    num_frozen = sum(b - a for a, b in found)
     rows = max(found, key=lambda r: r[1] - r[0])
     return [
         Finding(

@@ -13,9 +13,9 @@ from taccorl.views.groups import groups_of, short_name, vector_keys
 from taccorl.views.touch import Pad, pads_of
 
 PAD_GAP_TAXELS = 3.0
-MOST_IN_A_ROW = 3
-EYE_SIZES = 1.1
-"""The eye's distance from the figure, in sizes of the figure."""
+MOST_IN_A_ROW, MOST_ROWS = 3, 6
+EYE_SIZES, EYE_M = 1.1, 1.4
+"""The eye's distance from the figure: in sizes of the figure, and at least so far (m)."""
 
 
 def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blueprint:
@@ -53,13 +53,11 @@ def _time_panel(at_s: float | None) -> rrb.TimePanel:
 def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:
     """The arms, the pictures, the pads; and the page that says what all this is."""
     page = rrb.TextDocumentView(origin="/provenance", name=_with_origin("provenance", episode))
-    rows, shares = [], []
+    rows: list[rrb.View | rrb.Container] = [page]
+    shares = [0.7]
     if arms_of(episode):
-        figure = _figure(episode)
-        rows.append(rrb.Horizontal(figure, page, column_shares=[1.1, 1.0]))
-    else:
-        rows.append(page)
-    shares.append(1.4)
+        beside = rrb.Horizontal if episode.picture_keys or pads else rrb.Vertical
+        rows[0], shares[0] = beside(_figure(episode), page), 1.4
     if episode.picture_keys:
         names = [short_name(key) for key in episode.picture_keys]
         rows.append(rrb.Horizontal(*[rrb.Spatial2DView(origin=f"/observation/images/{n}", name=n) for n in names]))
@@ -86,7 +84,9 @@ def _figure(episode: Episode) -> rrb.Spatial3DView:
             color=(71, 85, 105, 120),
         ),
         eye_controls=rrb.EyeControls3D(
-            position=middle + EYE_SIZES * size_m * np.array([0.85, -0.22, 0.45]), look_target=middle, eye_up=(0, 0, 1)
+            position=middle + max(EYE_SIZES * size_m, EYE_M) * np.array([0.85, -0.22, 0.45]),
+            look_target=middle,
+            eye_up=(0, 0, 1),
         ),
     )
 
@@ -128,7 +128,9 @@ def _over_time(episode: Episode, pads: list[Pad]) -> rrb.Container | None:
         ):
             views.append(_plot(title, [f"/touch/{path}/**"], rrb.Corner2D.LeftTop))
             shares.append(1.0)
-    for row in itertools.batched(_joint_plots(episode), MOST_IN_A_ROW):
+    plots = _joint_plots(episode)
+    in_a_row = MOST_IN_A_ROW if pads or len(plots) > MOST_ROWS else 1
+    for row in itertools.batched(plots, in_a_row):
         views.append(rrb.Horizontal(*row))
         shares.append(1.35)
     return rrb.Vertical(*views, row_shares=shares) if views else None

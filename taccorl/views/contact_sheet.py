@@ -98,7 +98,7 @@ def draw_sheet(episode: Episode) -> tuple[Image.Image, Layout]:
 
 
 def _arrange(episode: Episode, pads: list[Pad], titles: list[str]) -> Layout:
-    instants = choose_instants(episode)
+    instants = choose_instants(episode) if episode.picture_keys or pads else ()
     widths = {}
     for key in episode.picture_keys:
         rows, columns, _ = episode.spec.features[key].shape
@@ -279,10 +279,20 @@ def _draw_plot(
     draw.rectangle((left, top, right, bottom), outline=FAINT)
     draw.text((left + 4, top - 5), title, INK, _font(15), anchor="ls")
     legend = [(line.name, line.color) for line in lines] + [(name, color) for name, _, color in marks]
-    for n, (name, color) in enumerate(legend):
-        y = top + 8 + 19 * n
-        draw.rectangle((right + 12, y - 2, right + 26, y + 2), fill=color)
-        draw.text((right + 33, y), name, INK, _font(14), anchor="lm")
+    _draw_legend(draw, legend, right, top)
+
+
+def _draw_legend(
+    draw: ImageDraw.ImageDraw, entries: list[tuple[str, tuple[int, int, int]]], left: int, top: int
+) -> None:
+    """One column, or two where one would be longer than the plot is high."""
+    columns = 1 if len(entries) <= 6 else 2
+    rows = math.ceil(len(entries) / columns)
+    step = min(19, PLOT_HEIGHT / rows)
+    for n, (name, color) in enumerate(entries):
+        x, y = left + 12 + (n // rows) * LEGEND_WIDTH / 2, top + 8 + step * (n % rows)
+        draw.rectangle((x, y - 2, x + 14, y + 2), fill=color)
+        draw.text((x + 21, y), name, INK, _font(14 if step > 15 else 11), anchor="lm")
 
 
 def _draw_time_axis(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout) -> None:

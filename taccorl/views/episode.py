@@ -25,13 +25,12 @@ from taccorl.views.blueprint import episode_blueprint, heatmap_places
 from taccorl.views.colors import CONTACT_COLOR, HEATMAP, LINE_COLORS, NOISE_COLOR, PAD_COLORS
 from taccorl.views.figure import log_figure
 from taccorl.views.groups import groups_of, short_name, vector_keys
-from taccorl.views.outputs import check_free, replacing
+from taccorl.views.outputs import APPLICATION, check_free, replacing
 from taccorl.views.provenance import provenance
 from taccorl.views.touch import Pad, contact_gate, pads_of
 from taccorl.views.video import Clip, cut
 from taccorl.views.viewer import can_decode
 
-APPLICATION = "taccorl_episode"
 JPEG_QUALITY = 90
 PICTURES_AT_ONCE = 64  # rows; keeps memory flat however long the episode is
 EVENT_COLORS = (0x2563EBFF, 0x0D9488FF, 0xCA8A04FF, 0x9333EAFF, 0xDB2777FF, 0x65A30DFF)
@@ -83,7 +82,8 @@ def time_columns(episode: Episode, rows: Sequence[int] | None = None) -> list[rr
     """Both time lines, for all rows or some."""
     rows = range(episode.num_rows) if rows is None else rows
     index = np.asarray(rows, dtype=np.int64)
-    return [rr.TimeColumn("time", duration=episode.time_s[index]), rr.TimeColumn("frame_index", sequence=index)]
+    time_ns = np.round(1e9 * episode.time_s[index]).astype("timedelta64[ns]")  # Rerun itself would round down
+    return [rr.TimeColumn("time", duration=time_ns), rr.TimeColumn("frame_index", sequence=index)]
 
 
 def _log_video(rec: rr.RecordingStream, episode: Episode, key: str, clip: Clip, indexes: list[rr.TimeColumn]) -> None:

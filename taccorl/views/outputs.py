@@ -12,7 +12,11 @@ from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
 
 SOFTWARE = "taccorl view"
+APPLICATION = "taccorl_episode"
+"""Rerun's application id of our files; the viewer keeps one blueprint for each."""
 RRD_MAGIC = b"RRF2"
+HEAD_BYTES = 1024
+"""An .rrd names its application in its first message."""
 
 
 class OutputError(TaccorlError):
@@ -34,22 +38,15 @@ def check_free(path: Path) -> None:
 def _is_ours(path: Path) -> bool:
     if not path.is_file():
         return False
-    if path.suffix == ".rrd":
-        return path.read_bytes()[:4] == RRD_MAGIC and _application(path).startswith("taccorl")
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    if head.startswith(RRD_MAGIC):
+        return APPLICATION.encode() in head
     try:
         with Image.open(path) as image:
             return image.info.get("Software") == SOFTWARE
     except OSError:
         return False
-
-
-def _application(path: Path) -> str:
-    import rerun as rr
-
-    try:
-        return rr.recording.load_recording(path).application_id()
-    except (ValueError, OSError, RuntimeError):
-        return ""
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -15,6 +16,9 @@ from taccorl.views.episode import save_episode
 from taccorl.views.outputs import save_png
 from taccorl.views.touch import pads_of, peak_row
 from taccorl.views.viewer import PICTURE_TIMEOUT_S, ViewerError, picture_without_window, served
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 WIDTH_PX, HEIGHT_PX = 1600, 1000
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -29,8 +33,8 @@ SETTLE_S = 8.0
 """A web viewer that loads slowly looks finished, and the same twice, before its first picture is decoded."""
 CALM_LEVELS = 0.2
 """Mean difference of two shots (of 255) below which the page has come to rest."""
-BLANK_LEVELS = 4.0
-"""Standard deviation (of 255) below which a page shows nothing yet."""
+BLANK_LEVELS = 15.0
+"""Standard deviation (of 255) below which a page shows nothing yet; measured: 8 while loading, 51 with all views."""
 
 
 def screenshot(episode: Episode, png: Path, *, at_s: float | None = None) -> str:
@@ -80,23 +84,28 @@ def picture_by_browser(rrd: Path, png: Path) -> str | None:
             page.goto(f"{address}&renderer=webgl", wait_until="load", timeout=1e3 * PICTURE_TIMEOUT_S)
             shot = _settled_shot(page)
             chromium.close()
-    except Error as error:
-        return f"the browser gave up: {str(error).splitlines()[0]}"
-    if shot is None:
-        return f"the page in the browser did not come to rest within {PICTURE_TIMEOUT_S:.0f} s"
+    except (Error, _NoPicture) as error:
+        return f"the browser gave up: {' '.join(str(error).split())[:200]}"
     png.write_bytes(shot)
     return None
 
 
-def _settled_shot(page) -> bytes | None:
+class _NoPicture(Exception):
+    """The page failed, or never came to rest."""
+
+
+def _settled_shot(page: "Page") -> bytes:
     """The first shot that shows something and is like the one before."""
     begin_s, before = time.monotonic(), None
     while time.monotonic() - begin_s < PICTURE_TIMEOUT_S:
         page.wait_for_timeout(1000)
+        text = page.inner_text("body")  # the viewer draws on a canvas: text is a note about loading, or about failure
+        if "error" in text.lower() or "crash" in text.lower():
+            raise _NoPicture(text)
         shot = page.screenshot(timeout=1e3 * PICTURE_TIMEOUT_S)
         now = np.asarray(Image.open(io.BytesIO(shot)).convert("L"), dtype=float)
         calm = before is not None and np.abs(now - before).mean() < CALM_LEVELS
         if calm and now.std() > BLANK_LEVELS and time.monotonic() - begin_s > SETTLE_S:
             return shot
         before = now
-    return None
+    raise _NoPicture(f"its page did not come to rest within {PICTURE_TIMEOUT_S:.0f} s")

@@ -77,6 +77,8 @@ def _cut(source: InputContainer, video: Video, fps: int) -> Clip:
         if packet.is_keyframe and packet.pts < begin_pts + 1 / fps / tick_s:
             packets.clear()
             times.clear()
+        if times and packet.pts < times[0]:  # leans on a group that was dropped, and is shown before what we want
+            continue
         num_found += begin_pts <= packet.pts < end_pts
         packets.append(packet)
         times.append(packet.pts)

@@ -61,7 +61,10 @@ def picture_without_window(rrd: Path, png: Path, width_px: int, height_px: int) 
             return f"the Rerun program drew nothing within {PICTURE_TIMEOUT_S:.0f} s"
     if not png.is_file():
         said = [line for line in done.stderr.splitlines() if line.strip()]
-        return f"the Rerun program drew nothing: {said[-1].strip() if said else f'exit status {done.returncode}'}"
+        why = next(
+            (line for line in said if "panicked" in line), said[-1] if said else f"exit status {done.returncode}"
+        )
+        return f"the Rerun program drew nothing: {why.strip()}"
     return None
 
 

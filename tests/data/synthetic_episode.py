@@ -7,6 +7,7 @@ touch     a stripe, patch or point, grip^0.9 × force × gain, ``touch_delay_s``
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 
 import numpy as np
@@ -94,10 +95,12 @@ class _Truth:
         return self.before_s + share * self.duration_s
 
     def _joint(self, limit: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        middle, span = limit.mean(), np.ptp(limit)
+        middle, span = float(limit.mean()), float(limit[1] - limit[0])
         poses = middle + span * np.clip(rng.normal(0, 0.12, 5), -0.3, 0.3)
         x = np.full(len(self.time_s), poses[0])
         for k, (a, b) in enumerate(((0.02, 0.22), (0.46, 0.56), (0.58, 0.68), (0.88, 0.98))):
+            fastest = 3.0 / 1.875 * (b - a) * self.duration_s  # minimum jerk at 3 rad/s
+            poses[k + 1] = poses[k] + np.clip(poses[k + 1] - poses[k], -fastest, fastest)
             x += (poses[k + 1] - poses[k]) * _ramp(self.time_s, self.at(a), self.at(b))
         working = _ramp(self.time_s, self.at(0.0), self.at(0.01)) - _ramp(self.time_s, self.at(0.99), self.at(1.0))
         for _ in range(3):
@@ -122,9 +125,7 @@ def _footprint(rng: np.random.Generator) -> np.ndarray:
     kind = rng.integers(3)
     if kind == 0:
         middle = rng.uniform(3, 8) + rng.uniform(-0.08, 0.08) * (row - 16)
-        return np.exp(-0.5 * ((column - middle) / rng.uniform(1.0, 2.0)) ** 2) / (
-            1 + np.exp((rng.uniform(4, 12) - row))
-        )
+        return np.exp(-0.5 * ((column - middle) / rng.uniform(1.0, 2.0)) ** 2) / (1 + np.exp(rng.uniform(4, 12) - row))
     if kind == 1:
         top, half = rng.uniform(10, 22), rng.uniform(2.5, 5)
         return 1 / (1 + np.exp((top - row) / 0.7)) / (1 + np.exp((np.abs(column - 5.5) - half) / 0.6))
@@ -146,7 +147,9 @@ def _touch(
         felt_at = time_s - recipe.touch_delay_s - recipe.touch_clock_s.get(pad, 0.0) - rng.uniform(0, 0.01, len(time_s))
         grip = truth.sample(truth.felt[arm], felt_at)[:, 0]
         contact = grip**0.9 * push[list(GRIPPER).index(arm)]
-        residue = 0.06 * lfilter([0.02], [1, -0.98], contact)  # the film gives back the rest within a second or two
+        residue = 0.06 * np.asarray(
+            lfilter([0.02], [1, -0.98], contact)
+        )  # the film gives back the rest within a second or two
         image = shape[arm] if pad.endswith("a") else shape[arm][:, ::-1]
         gain = np.clip(rng.normal(1, 0.12, (32, 12)), 0.6, 1.4)
         baseline = np.round(rng.uniform(10, 40, (32, 12)))
@@ -218,6 +221,12 @@ def make(recipe: Recipe | None = None, **changes: object) -> Episode:
     )
 
 
+@functools.lru_cache(maxsize=64)
+def base(seed: int) -> Episode:
+    """A good episode of 8 s, made once: faults are planted in copies of its arrays."""
+    return make(seed=seed, duration_s=8.0)
+
+
 def good_timing(key: str, **changes: object) -> ChannelTiming:
     """A channel that came at its rate."""
     rate_hz = SPEC.features[key].rate_hz
@@ -236,7 +245,3 @@ def copies(episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """State, action and (T, 4, 32, 12) touch, to be changed."""
     a = episode.arrays
     return a[STATE].copy(), a[ACTION].copy(), a[TOUCH].copy().reshape(-1, 4, 32, 12)
-
-
-def flat(touch: np.ndarray) -> np.ndarray:
-    return touch.reshape(len(touch), -1)

@@ -6,16 +6,28 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from synthetic_episode import ACTION, FRONT, GRIPPER, LEFT_WRIST, NAMES, SPEC, STATE, TOUCH
-from synthetic_episode import copies, good_timing, make, with_arrays
+from synthetic_episode import (
+    ACTION,
+    FRONT,
+    GRIPPER,
+    LEFT_WRIST,
+    NAMES,
+    SPEC,
+    STATE,
+    TOUCH,
+    base,
+    copies,
+    good_timing,
+    make,
+    with_arrays,
+)
 
-from taccorl.data import joint_checks, picture_checks
+from taccorl.data import joint_checks, lag_checks, picture_checks
 from taccorl.data.checks import Finding, check_episode, check_recording_episodes, check_timing
 from taccorl.data.episode import Episode
 
 FPS = SPEC.fps
 NUM_SEEDS = 30
-Fault = Callable[[int], tuple[Episode, set[str]]]
 
 
 def serious(findings: list[Finding]) -> list[Finding]:
@@ -99,6 +111,29 @@ def test_short_episode_says_too_short_and_nothing_else(good: Episode, num_rows: 
     findings = check_episode(short)
     assert serious(findings) == []
     assert any(f.check == "not_judged" for f in findings)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("num_rows", [1, 3, 11, 30, 61, 95, 200])
+@pytest.mark.parametrize("kind", ["zeros", "constant", "random", "steps", "int64", "nan"])
+def test_any_numbers_are_judged_without_a_fault_of_ours(kind: str, num_rows: int) -> None:
+    rng = np.random.default_rng(num_rows)
+
+    def numbers(size: int) -> np.ndarray:
+        return {
+            "zeros": lambda: np.zeros((num_rows, size), np.float32),
+            "constant": lambda: np.full((num_rows, size), 0.03, np.float32),
+            "random": lambda: rng.normal(0, 1, (num_rows, size)).astype(np.float32),
+            "steps": lambda: np.repeat(rng.integers(0, 2, (num_rows, 1)), size, axis=1).astype(np.float32),
+            "int64": lambda: rng.integers(-255, 256, (num_rows, size)),
+            "nan": lambda: np.full((num_rows, size), np.nan, np.float32),
+        }[kind]()
+
+    touch = np.nan_to_num(100 * numbers(1536)).clip(-255, 255).astype(np.int16)
+    episode = with_arrays(make(seed=1, duration_s=2.0), state=numbers(14), action=numbers(14), touch=touch)
+    episode = dataclasses.replace(episode, picture_keys=())
+    for finding in [*check_episode(episode), *check_recording_episodes([episode] * 3)]:
+        assert finding.rows is None or 0 <= finding.rows[0] < finding.rows[1] <= num_rows
 
 
 def respec(episode: Episode, key: str, **changes: object) -> Episode:
@@ -214,7 +249,9 @@ def test_touch_outside_its_range_is_an_error(good: Episode) -> None:
 
 @pytest.mark.parametrize(("step_rad", "is_found"), [(0.20, False), (0.30, True), (1.0, True)])
 @pytest.mark.parametrize("key", ["state", "action"])
-def test_jumps_beyond_twice_the_joints_speed_are_found(good: Episode, key: str, step_rad: float, is_found: bool) -> None:
+def test_jumps_beyond_twice_the_joints_speed_are_found(
+    good: Episode, key: str, step_rad: float, is_found: bool
+) -> None:
     # 3.93 rad/s × 2 rows / 30 rows/s = 0.262 rad. Row 140 of 360: arms at rest between two moves.
     values = good.arrays[STATE if key == "state" else ACTION].copy()
     values[:, 5] = 0.1
@@ -307,7 +344,7 @@ def test_lag_is_measured_to_a_tenth_of_a_row(lag_s: float) -> None:
     rows_s = np.arange(300) / FPS
     action = np.stack([np.interp(rows_s, time_s, x) for x in smooth.T], axis=1)
     state = np.stack([np.interp(rows_s - lag_s, time_s, x) for x in smooth.T], axis=1)
-    lag = joint_checks.find_lag(action, state, FPS)
+    lag = lag_checks.find_lag(action, state, FPS)
     assert lag.lag_s == pytest.approx(lag_s, abs=0.1 / FPS)
     assert lag.correlation > 0.95
 
@@ -429,6 +466,14 @@ def test_camera_frozen_for_most_of_the_episode_is_an_error(good: Episode) -> Non
     assert finding.severity == "error"
 
 
+def test_pictures_watched_while_they_are_written_give_the_same_findings(good: Episode) -> None:
+    frozen = freeze(good, FRONT, 20, 70)
+    watch = picture_checks.PictureWatch(frozen)
+    for pictures in frozen.pictures():
+        watch.see(pictures)
+    assert watch.findings() == found(frozen, "frozen_picture", pictures=True)
+
+
 def test_black_pictures_are_called_black(good: Episode) -> None:
     assert "black pictures" in one(freeze(good, FRONT, 0, 360, black=True), "frozen_picture", pictures=True).text
 
@@ -486,20 +531,20 @@ def test_one_episode_alone_is_not_compared(good: Episode) -> None:
 
 
 def _degrees(seed: int) -> Episode:
-    state, action, _ = copies(episode := make(seed=seed, duration_s=8.0))
+    state, action, _ = copies(episode := base(seed))
     for values in (state, action):
         values[:, [i for i in range(14) if i not in GRIPPER.values()]] *= 57.29578
     return with_arrays(episode, state=state, action=action)
 
 
 def _swap(seed: int) -> Episode:
-    episode = make(seed=seed, duration_s=8.0)
+    episode = base(seed)
     return with_arrays(episode, action=np.roll(episode.arrays[ACTION], 7, axis=1))
 
 
 def _glitch(seed: int) -> Episode:
     rng = np.random.default_rng(seed)
-    state, _, _ = copies(episode := make(seed=seed, duration_s=8.0))
+    state, _, _ = copies(episode := base(seed))
     i = rng.choice([0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12])
     low, high = SPEC.features[STATE].limits[i]
     row = rng.integers(5, 235)
@@ -520,7 +565,7 @@ def _early(seed: int) -> Episode:
 
 
 def _freeze(seed: int) -> Episode:
-    return freeze(make(seed=seed, duration_s=8.0), FRONT, 30, 60)
+    return freeze(base(seed), FRONT, 30, 60)
 
 
 @pytest.mark.parametrize(
@@ -536,8 +581,6 @@ def _freeze(seed: int) -> Episode:
     ],
     ids=lambda x: getattr(x, "__name__", x),
 )
-def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(
-    fault: Callable[[int], Episode], check: str
-) -> None:
+def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(fault: Callable[[int], Episode], check: str) -> None:
     hits = sum(bool(found(fault(seed), check, pictures=check == "frozen_picture")) for seed in range(NUM_SEEDS))
     assert hits >= 0.95 * NUM_SEEDS, f"{hits} of {NUM_SEEDS}"

@@ -5,6 +5,7 @@ Contact begins at 40 % and ends at 80 % of the episode; its peak is at 60 %. Not
 
 import dataclasses
 import io
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import numpy as np
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
 
+os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder is talkative
 ORIGIN = "surrogate: made by tests/views, not a robot"
 TOUCH = "observation.tactile"
 HOME_RAD = np.array([0.0, 1.35, -1.30, 0.0, 0.85, 0.0])
@@ -137,9 +139,11 @@ def without(episode: Episode, *keys: str) -> Episode:
     )
 
 
-def write_mp4(path: Path, images: Iterator[np.ndarray], *, fps: int, codec: str, keyframe_every: int = 2) -> None:
-    """As LeRobot writes it: ``libsvtav1`` or ``h264``, yuv420p."""
-    options = {"g": str(keyframe_every), "crf": "30"}
+def write_mp4(
+    path: Path, images: Iterator[np.ndarray], *, fps: int, codec: str, options: dict[str, str] | None = None
+) -> None:
+    """As LeRobot writes it unless told otherwise: ``libsvtav1`` or ``h264``, a keyframe every 2 frames, yuv420p."""
+    options = {"g": "2", "crf": "30"} | (options or {})
     if codec == "libsvtav1":
         options |= {"preset": "12", "svtav1-params": "lp=1"}
     buffer = io.BytesIO()

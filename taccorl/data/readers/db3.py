@@ -230,6 +230,7 @@ class _File:
         while True:
             try:
                 for row in self._connection.execute(query, (*between, after)):
+                    _check_row(row, after)
                     after, after_ns = row[0], row[2]
                     yield row
                 return
@@ -247,9 +248,12 @@ class _File:
         """(id, log time) of the next message that can be read, where the one after ``after`` cannot; None if there is none."""
 
         def look(behind: int) -> tuple[int, int] | None:
-            query = "SELECT id, timestamp, data FROM messages WHERE id > ? ORDER BY id LIMIT 1"
+            query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id LIMIT 1"
             found = self._connection.execute(query, (behind,)).fetchone()
-            return None if found is None else (found[0], found[1])
+            if found is None:
+                return None
+            _check_row(found, behind)
+            return found[0], found[2]
 
         def readable(behind: int) -> bool:
             try:
@@ -288,6 +292,16 @@ class _File:
         """Note a damage; without ``where`` SQLite did not tell at which bytes."""
         start, end = where or (0, self.path.stat().st_size)
         self.damage.append(Damage(str(self.path), start, end, reason, start_ns, end_ns))
+
+
+def _check_row(row: Any, after: int) -> None:
+    """
+    Raises:
+        sqlite3.DatabaseError: no message can be like this: a damage that SQLite itself did not notice.
+    """
+    whole = all(isinstance(number, int) for number in row[:3]) and isinstance(row[3], bytes | None)
+    if not whole or row[0] <= after:
+        raise sqlite3.DatabaseError("a message that makes no sense")
 
 
 def _bag_metadata(source: Source) -> dict[str, Any]:

@@ -7,7 +7,6 @@ nothing at all from a file without a footer.)
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
-from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,18 @@ from mcap.records import Message as McapMessage
 
 from taccorl.data import decode, mcap_records
 from taccorl.data.mcap_messages import NO_SCHEMA, Decoder, Stamper, message_decoder, message_stamper, type_name
-from taccorl.data.mcap_records import ATTACHMENT, CHANNEL, CHUNK, DATA_END, MESSAGE, METADATA, SCHEMA, Record, Summary
+from taccorl.data.mcap_records import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK,
+    DATA_END,
+    MAGIC,
+    MESSAGE,
+    METADATA,
+    SCHEMA,
+    McapFile,
+    Record,
+)
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
 from taccorl.data.spec import RecordingSpec
 from taccorl.errors import RecordingError
@@ -135,6 +145,7 @@ class _File:
         self.misfits: dict[int, int] = {}
         self.orphans = self.timeless = self.unchunked = 0
         self.data_end: Record | None = None
+        self.after_lost: int | None = None
 
     def messages(self, start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
         try:
@@ -142,54 +153,50 @@ class _File:
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be opened: {error.strerror}") from error
         with file:
-            size = self.path.stat().st_size
-            summary = mcap_records.read_summary(file, size)
-            for definition in (*summary.schemas, *summary.channels):
-                self._learn(definition, summary.proven, None)
-            for record in self._walk(file, size, summary):
+            mcap = McapFile(file, self.path.stat().st_size)
+            for definition in (*mcap.summary.schemas, *mcap.summary.channels):
+                self._learn(definition, mcap.summary.proven, None)
+            for record in self._walk(mcap):
                 if record.opcode == CHUNK:
-                    found, proven = self._chunk(file, record, start_ns, end_ns)
+                    found, proven = self._chunk(mcap, record, start_ns, end_ns)
                 else:
-                    found, proven = self._single(file, record), False
+                    found, proven = self._single(mcap, record), False
                 yield from self._convert(found, proven, record)
             if start_ns is None and end_ns is None:
-                self._check_ends(file, size, summary)
+                self._check_ends(mcap)
         if self.orphans:
-            self._damaged(0, size, f"{self.orphans} messages of channels whose definition was lost")
+            self._damaged(0, mcap.size, f"{self.orphans} messages of channels whose definition was lost")
         if self.timeless:
-            self._damaged(0, size, f"{self.timeless} messages with a log time after the year 2262")
+            self._damaged(0, mcap.size, f"{self.timeless} messages with a log time after the year 2262")
 
-    def _begin(self, file: BufferedReader, size: int) -> int:
+    def _begin(self, mcap: McapFile) -> int:
         """Offset of the first record."""
-        file.seek(0)
-        head = file.read(len(mcap_records.MAGIC))
-        if size == 0:
+        mcap.file.seek(0)
+        head = mcap.file.read(len(MAGIC))
+        if not head:
             raise RecordingError(f"{self.path}: is empty (0 bytes)")
-        if head == mcap_records.MAGIC:
-            return len(head)
-        first = mcap_records.whole_record(file, len(head), size)
-        if first is not None and first.opcode == mcap_records.HEADER:
-            start = len(head)
-        else:
-            start = mcap_records.find_record(file, 0, size, size, {CHUNK})
+        if head == MAGIC:
+            return len(MAGIC)
+        first = mcap.record(len(MAGIC))
+        known = first is not None and first.opcode == mcap_records.HEADER
+        start = len(MAGIC) if known else mcap.find(0, mcap.end, {CHUNK})
         if start is None:
             raise RecordingError(
-                f"{self.path}: is not an MCAP file: begins with {head!r}, not {mcap_records.MAGIC!r}, and no chunk follows"
+                f"{self.path}: is not an MCAP file: begins with {head!r}, not {MAGIC!r}, and holds no chunk"
             )
         self._damaged(0, start, "not the beginning of an MCAP file")
         return start
 
-    def _walk(self, file: BufferedReader, size: int, summary: Summary) -> Iterator[Record]:
+    def _walk(self, mcap: McapFile) -> Iterator[Record]:
         """Every record of the data section that may be read; goes on at the next one after a bad one."""
-        offset, chunked = self._begin(file, size), summary.has_chunks
+        offset = self._begin(mcap)
         while True:
-            record = mcap_records.whole_record(file, offset, size)
+            record = mcap.record(offset)
             if record is None:
-                following = self._resume(file, offset + 1, size, summary, chunked)
+                following = self._resume(mcap, offset + 1)
                 if following is None:
-                    end = max(summary.end or size, offset)
-                    reason = "a damaged record" if summary.end else "the file ends without a footer (cut by a crash?)"
-                    self._damaged(offset, end, reason)
+                    cut = "the file ends without a footer (cut by a crash?)"
+                    self._damaged(offset, mcap.end, cut if mcap.summary.end is None else "a damaged record")
                     return
                 self._damaged(offset, following, "a record header that makes no sense")
                 offset = following
@@ -197,29 +204,43 @@ class _File:
             if record.opcode == DATA_END:
                 self.data_end = record
                 return
-            chunked = chunked or record.opcode == CHUNK
+            mcap.chunked = mcap.chunked or record.opcode == CHUNK
             if record.opcode in (SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA):
                 yield record
-            elif record.opcode not in mcap_records.KNOWN_OPCODES and not self._is_private(record, summary):
-                self._damaged(offset, record.end, f"a record of unknown kind {record.opcode:#04x}")
-            offset = record.end
+            elif record.opcode not in mcap_records.KNOWN_OPCODES and not self._is_private(mcap, record):
+                self._damaged(record.offset, record.end, f"a record of unknown kind {record.opcode:#04x}")
+            offset, self.after_lost = self.after_lost or record.end, None
+            if offset == mcap.summary.end:  # what was before it was no end-of-data record
+                return
 
-    def _resume(self, file: BufferedReader, start: int, size: int, summary: Summary, chunked: bool) -> int | None:
-        """Where the walk goes on. Within chunked data only a chunk vouches for its messages by a CRC."""
-        stop = summary.next_start(start)
-        limit = min(size, stop if stop is not None else summary.end or size)
-        opcodes = {CHUNK, ATTACHMENT, METADATA, DATA_END} | (set() if chunked else {SCHEMA, CHANNEL, MESSAGE})
-        found = mcap_records.find_record(file, start, limit, size, opcodes, self.known.channels)
-        return stop if found is None else found
+    def _resume(self, mcap: McapFile, start: int) -> int | None:
+        """Where the walk goes on. Within chunked data only a chunk vouches for its messages, by its CRC."""
+        indexed = mcap.summary.next_start(start)
+        opcodes = {CHUNK, ATTACHMENT, METADATA, DATA_END} | (set() if mcap.chunked else {SCHEMA, CHANNEL, MESSAGE})
+        found = mcap.find(start, mcap.end if indexed is None else indexed, opcodes, self.known.channels)
+        return indexed if found is None else found
 
     @staticmethod
-    def _is_private(record: Record, summary: Summary) -> bool:
-        """Somebody's own kind of record, rather than a chunk whose kind is damaged."""
-        sound = summary.proven and summary.has_chunks
-        return sound and record.opcode >= 0x80 and summary.next_start(record.offset) != record.offset
+    def _end_of_lost(mcap: McapFile, record: Record) -> int:
+        """Where a lost chunk ends: as it says, but before the next one if bytes are missing and that has moved into it."""
+        moved = None
+        if mcap.summary.end is None:
+            moved = mcap.find(record.offset + 1, record.end, {CHUNK, ATTACHMENT, METADATA, DATA_END})
+        return record.end if moved is None else moved
+
+    @staticmethod
+    def _is_private(mcap: McapFile, record: Record) -> bool:
+        """An application's own kind of record, rather than one whose kind is damaged."""
+        indexed = mcap.summary.proven and mcap.summary.has_chunks and record.offset > len(MAGIC)
+        return (
+            indexed
+            and record.opcode >= 0x80
+            and record.end != mcap.end
+            and mcap.summary.next_start(record.offset) != record.offset
+        )
 
     def _chunk(
-        self, file: BufferedReader, record: Record, start_ns: int | None, end_ns: int | None
+        self, mcap: McapFile, record: Record, start_ns: int | None, end_ns: int | None
     ) -> tuple[list[Any], bool]:
         """Its records, and whether a CRC vouches for them."""
         times = self.reader._chunk_times.get((self.path, record.offset))
@@ -229,35 +250,36 @@ class _File:
             return [], True
         chunk = None
         try:
-            chunk = mcap_records.parse(CHUNK, mcap_records.read_body(file, record))
+            chunk = mcap_records.parse(CHUNK, mcap.body(record))
             found = list(mcap_records.chunk_records(chunk))
         except Exception as error:  # CRC, decompression, struct: whatever it is, only this chunk is lost
+            self.after_lost = self._end_of_lost(mcap, record)
             reason = f"chunk lost ({type(error).__name__}: {str(error)[:120]})"
-            self._damaged(record.offset, record.end, reason, chunk)
+            self._damaged(record.offset, self.after_lost, reason, chunk)
             return [], True
         logged = [r.log_time for r in found if isinstance(r, McapMessage)]
         self.reader._chunk_times[self.path, record.offset] = (min(logged), max(logged)) if logged else (0, 0)
         return found, chunk.uncompressed_crc != 0
 
-    def _single(self, file: BufferedReader, record: Record) -> list[Any]:
+    def _single(self, mcap: McapFile, record: Record) -> list[Any]:
         try:
-            found = [mcap_records.parse(record.opcode, mcap_records.read_body(file, record))]
+            found = [mcap_records.parse(record.opcode, mcap.body(record))]
         except Exception as error:
             self._damaged(record.offset, record.end, f"record lost ({type(error).__name__}: {error})")
             return []
         self.unchunked += record.opcode == MESSAGE
         return found
 
-    def _check_ends(self, file: BufferedReader, size: int, summary: Summary) -> None:
+    def _check_ends(self, mcap: McapFile) -> None:
         if self.data_end is None:
             return
         sound = len(self.damage) == self.already
-        if self.unchunked and sound and not mcap_records.data_crc_matches(file, self.data_end):
+        if self.unchunked and sound and not mcap.data_crc_matches(self.data_end):
             reason = "the CRC of messages outside chunks does not match: at least one is wrong"
-            self._damaged(len(mcap_records.MAGIC), self.data_end.offset, reason)
-        if summary.problem or (summary.end or size) > self.data_end.end:
-            problem = summary.problem or "it begins too late"
-            self._damaged(self.data_end.end, size, f"no index behind the data ({problem}): nothing there was read")
+            self._damaged(len(MAGIC), self.data_end.offset, reason)
+        if mcap.summary.problem or self.data_end.end != mcap.end:
+            problem = mcap.summary.problem or "it begins elsewhere"
+            self._damaged(self.data_end.end, mcap.size, f"no index behind the data ({problem}): nothing there was read")
 
     def _convert(self, found: list[Any], proven: bool, place: Record) -> Iterator[Message]:
         for r in found:

@@ -1,7 +1,6 @@
 """ROS 2 SQLite bags: written here by rosbags, and then damaged; other people's are in test_bags."""
 
 import hashlib
-import os
 import shutil
 import sqlite3
 from pathlib import Path
@@ -132,12 +131,12 @@ def test_reading_leaves_no_trace_beside_a_bag(bag: Path) -> None:
         return {p.name: (hashlib.sha256(p.read_bytes()).hexdigest(), p.stat().st_mtime_ns) for p in bag.iterdir()}
 
     before = state()
-    os.chmod(db3_of(bag), 0o444)
-    os.chmod(bag, 0o555)
+    db3_of(bag).chmod(0o444)
+    bag.chmod(0o555)
     for k, _ in enumerate(reader_of(bag).messages({"/pad", "/joints"})):
         if k % 100 == 0:
-            assert set(p.name for p in bag.iterdir()) == set(before)  # no -journal, -wal, -shm while reading either
-    os.chmod(bag, 0o755)
+            assert {p.name for p in bag.iterdir()} == set(before)  # no -journal, -wal, -shm while reading either
+    bag.chmod(0o755)
     assert state() == before
 
 
@@ -342,7 +341,7 @@ def test_files_of_a_split_bag_are_one_recording_in_the_order_of_metadata_yaml(tm
     assert frames(list(reader_of(bag).messages({"/pad"}))) == [0, 2, 0, 2]
     ((_, source),) = find_sources(bag)
     assert [p.name for p in source.files] == ["split_1.db3", "split_0.db3"]
-    found = [m for m in reader_of(bag).messages({"/joints"})]
+    found = list(reader_of(bag).messages({"/joints"}))
     assert [round((m.log_ns - LATE_NS - START_NS) / 5e6) for m in found] == [0, 1, 2, 3, 0, 1, 2]
 
 

@@ -1,0 +1,54 @@
+"""Which elements of ``observation.state`` and ``action`` are which arm's: by their names and units, never by position."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.data.episode import Episode
+
+STATE, ACTION = "observation.state", "action"
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Which elements of ``observation.state`` and ``action`` are one arm's."""
+
+    name: str
+    """Prefix of its names without the underscore; empty for a robot with one arm."""
+    joints: np.ndarray
+    """(n,) element numbers in rad, base to wrist."""
+    gripper: int | None
+    """Element number of the opening in m."""
+
+
+def find_arms(names: tuple[str, ...], units: tuple[str, ...]) -> list[Arm]:
+    """Arms by the names' prefixes ``left_`` and ``right_``; elements with neither belong to the arm without a name."""
+    arms = []
+    prefixes = [next((p for p in ("left", "right") if n.startswith(f"{p}_")), "") for n in names]
+    for prefix in sorted(set(prefixes)):
+        own = [i for i, p in enumerate(prefixes) if p == prefix]
+        grippers = [i for i in own if units[i] == "m" and names[i].endswith("gripper.pos")]
+        joints = np.array([i for i in own if units[i] == "rad"], dtype=int)
+        arms.append(Arm(prefix, joints, grippers[0] if grippers else None))
+    return arms
+
+
+def element_units(episode: Episode, key: str) -> tuple[str, ...]:
+    """Unit of every element of a feature."""
+    feature = episode.spec.features[key]
+    return (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
+
+
+def element_names(episode: Episode, key: str) -> tuple[str, ...]:
+    """Name of every element; its number where the spec names none."""
+    feature = episode.spec.features[key]
+    return feature.names or tuple(f"{key}[{i}]" for i in range(feature.size))
+
+
+def episode_arms(episode: Episode) -> list[Arm]:
+    """The arms of an episode that holds both state and command under the same names; else none."""
+    if STATE not in episode.arrays or ACTION not in episode.arrays:
+        return []
+    if element_names(episode, STATE) != episode.spec.features[ACTION].names:
+        return []
+    return find_arms(element_names(episode, STATE), element_units(episode, STATE))

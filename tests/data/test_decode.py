@@ -1,0 +1,438 @@
+"""Decoding: numbers by name in any order, pad frames in the pad's own order, pictures to the pixel, and no silent guesses."""
+
+import base64
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from taccorl.data import decode
+from taccorl.data.spec import ChannelSpec, SensorSpec, data_specs_folder, load_sensor_spec
+from taccorl.errors import RecordingError
+
+FLEXITAC = load_sensor_spec(data_specs_folder() / "sensors" / "flexitac_v2.yaml")
+NAMES = ["joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "gripper"]
+
+
+def channel(**options: Any) -> ChannelSpec:
+    return ChannelSpec(topic="/t", rate_hz=100.0, **options)
+
+
+def sensor(rows: int, columns: int, *, dtype: Any = "uint8", transpose: bool = False, adc_bits: int = 8) -> SensorSpec:
+    wire = dataclasses.replace(
+        FLEXITAC.wire,
+        rows=columns if transpose else rows,
+        columns=rows if transpose else columns,
+        dtype=dtype,
+        transpose=transpose,
+    )
+    return dataclasses.replace(
+        FLEXITAC, name="pad", rows=rows, columns=columns, wire=wire, adc_bits=adc_bits, wire_shift_bits=0
+    )
+
+
+def joints(names: list[str], position: list[float], **more: Any) -> SimpleNamespace:
+    """sensor_msgs/JointState as mcap_ros2 decodes it: attributes and lists."""
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=12, nanosec=34), frame_id="")
+    return SimpleNamespace(header=header, name=names, position=position, **more)
+
+
+def protobuf_class(name: str, /, **fields: Any) -> Any:
+    """A message class described at run time: field → (type constant, repeated)."""
+    kinds = descriptor_pb2.FieldDescriptorProto
+    file = descriptor_pb2.FileDescriptorProto(name=f"{name}.proto", package="t", syntax="proto3")
+    message = file.message_type.add(name=name)
+    for number, (field, (kind, repeated)) in enumerate(fields.items(), start=1):
+        label = kinds.LABEL_REPEATED if repeated else kinds.LABEL_OPTIONAL
+        message.field.add(name=field, number=number, type=kind, label=label)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"t.{name}"))
+
+
+# --- names
+
+
+def test_numbers_in_names_sort_as_numbers():
+    assert sorted(["e_10", "e_9", "e_2", "e"], key=decode.natural_key) == ["e", "e_2", "e_9", "e_10"]
+    assert sorted(["10", "9", "a1", "1a", "²", "x²3"], key=decode.natural_key)[:3] == ["1a", "9", "10"]
+
+
+def test_a_type_is_the_same_with_and_without_msg_in_the_middle():
+    assert decode.type_key("sensor_msgs/msg/JointState") == decode.type_key("sensor_msgs/JointState")
+    assert decode.type_key("sensor_msgs/msg/JointState") != decode.type_key("sensor_msgs/msg/Joy")
+
+
+def test_fields_are_found_in_objects_and_in_keys_alike():
+    as_object = SimpleNamespace(pose=SimpleNamespace(position=SimpleNamespace(x=1.5)))
+    assert (
+        decode.get(as_object, "pose.position.x")
+        == decode.get({"pose": {"position": {"x": 1.5}}}, "pose.position.x")
+        == 1.5
+    )
+
+
+@pytest.mark.parametrize("value", [SimpleNamespace(position=1, velocity=2), {"position": 1, "velocity": 2}])
+def test_a_missing_field_names_the_nearest(value):
+    with pytest.raises(RecordingError, match="no field 'postion'; did you mean 'position'"):
+        decode.get(value, "postion")
+
+
+def test_a_missing_protobuf_field_names_the_nearest():
+    kinds = descriptor_pb2.FieldDescriptorProto
+    message = protobuf_class("Joints", position=(kinds.TYPE_DOUBLE, True), velocity=(kinds.TYPE_DOUBLE, True))()
+    with pytest.raises(RecordingError, match="no field 'positions'; did you mean 'position'"):
+        decode.get(message, "positions")
+
+
+# --- stamps
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (joints([], []), 12 * 10**9 + 34),
+        ({"header": {"stamp": {"sec": 1_700_000_000, "nanosec": 999_999_999}}}, 1_700_000_000_999_999_999),
+        ({"header": {"stamp": {"sec": 1, "nsec": 2}}}, 1_000_000_002),
+        ({"header": {"stamp": {"secs": 1, "nsecs": 2}}}, 1_000_000_002),
+        ({"timestamp": {"seconds": 3, "nanos": 4}}, 3_000_000_004),
+        (SimpleNamespace(timestamp=SimpleNamespace(sec=3, nanosec=4)), 3_000_000_004),
+        ({"header": {"stamp": {"sec": 0, "nanosec": 0}}}, 0),
+        ({"data": [1]}, None),
+        ([1, 2], None),
+        (3.5, None),
+        ({"header": {"stamp": 12.5}}, None),
+        ({"header": {"stamp": {"sec": "soon", "nanosec": 0}}}, None),
+        ({"timestamp": {"seconds": 10**12, "nanos": 0}}, None),  # 31,709 years: no time that int64 nanoseconds can hold
+        ({"timestamp": {"sec": float("inf"), "nsec": 0}}, None),
+    ],
+)
+def test_stamps_of_every_kind_of_header(value, expected):
+    assert decode.stamp_ns(value) == expected
+
+
+# --- texts
+
+
+@pytest.mark.parametrize("value", ["go", {"data": "go"}, SimpleNamespace(data="go")])
+def test_a_text_is_read_from_a_string_or_its_data(value):
+    assert decode.text(value, "/episode") == "go"
+
+
+@pytest.mark.parametrize("value", [{"data": 3}, {"text": "go"}, SimpleNamespace(), 4, None, {"data": b"go"}])
+def test_anything_else_is_no_text_and_names_the_topic(value):
+    with pytest.raises(RecordingError, match=r"^/episode: expected a text \(std_msgs/String\), found "):
+        decode.text(value, "/episode")
+
+
+# --- vectors
+
+
+def test_joints_are_picked_by_name_in_any_order():
+    extract = decode.vector_extractor(channel(field="position", pick=("joint1", "joint2", "gripper")))
+    assert extract(joints(["joint1", "joint2", "gripper"], [1, 2, 3])).tolist() == [1, 2, 3]
+    assert extract(joints(["gripper", "spare", "joint2", "joint1"], [3, 9, 2, 1])).tolist() == [1, 2, 3]
+    assert extract({"name": ["joint2", "joint1", "gripper"], "position": [2, 1, 3]}).tolist() == [1, 2, 3]
+
+
+def test_scale_multiplies_after_picking_in_the_order_of_pick():
+    extract = decode.vector_extractor(channel(field="position", pick=("gripper", "joint1"), scale=(0.001, 2.0)))
+    assert extract(joints(["joint1", "gripper"], [10.0, 70.0])).tolist() == [0.07, 20.0]
+    one_for_all = decode.vector_extractor(channel(field="position", scale=(2.0,)))
+    assert one_for_all(joints([], [1, 2, 3])).tolist() == [2, 4, 6]
+
+
+def test_protobuf_joints_are_picked_like_any_other():
+    kinds = descriptor_pb2.FieldDescriptorProto
+    made = protobuf_class("Joints", name=(kinds.TYPE_STRING, True), position=(kinds.TYPE_DOUBLE, True))
+    message = made(name=["b", "a"], position=[2.0, 1.0])
+    assert decode.vector_extractor(channel(field="position", pick=("a", "b")))(message).tolist() == [1.0, 2.0]
+
+
+def test_pipers_six_velocities_for_seven_names_are_not_guessed_at():
+    message = joints(NAMES, [0.0] * 7, velocity=[0.1] * 6)
+    extract = decode.vector_extractor(channel(field="velocity", pick=("joint1",)))
+    with pytest.raises(RecordingError, match="6 values for 7 names in 'velocity'"):
+        extract(message)
+    with pytest.raises(RecordingError, match="8 values for 7 names"):
+        decode.vector_extractor(channel(field="position", pick=("joint1",)))(joints(NAMES, [0.0] * 8))
+
+
+def test_a_missing_joint_names_the_nearest():
+    with pytest.raises(RecordingError, match="'joint7' is not among its names; did you mean 'joint6'"):
+        decode.vector_extractor(channel(field="position", pick=("joint7",)))(joints(NAMES, [0.0] * 7))
+
+
+def test_a_name_that_two_arms_share_is_not_taken_from_the_first():
+    message = joints([*NAMES, *NAMES], [float(k) for k in range(14)])
+    with pytest.raises(RecordingError, match="'joint1' stands twice among its names"):
+        decode.vector_extractor(channel(field="position", pick=("joint1",)))(message)
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        ({"position": [1.0]}, "no field 'name'"),
+        ({"name": "joint1", "position": [1.0]}, "not a list of names"),
+        ({"name": None, "position": [1.0]}, "not a list of names"),
+        ({"name": [{"a": 1}], "position": [1.0]}, "is not among its names"),
+        ({"name": ["a"], "position": "1.5"}, "is no list of numbers"),
+        ({"name": ["a"], "position": ["1.5"]}, "is no list of numbers"),
+        ({"name": ["a"], "position": [None]}, "is no list of numbers"),
+        ({"name": ["a"], "position": None}, "is no list of numbers"),
+        ({"name": ["a"], "position": {"a": 1}}, "is no list of numbers"),
+        ({"name": ["a", "b"], "position": [[1, 2], [3]]}, "is no list of numbers"),
+        ({"name": ["a"], "position": b"\x01\x02"}, "is no list of numbers"),
+        ({"name": [], "position": []}, "position is empty"),
+    ],
+)
+def test_what_is_no_list_of_named_numbers_is_refused(message, reason):
+    with pytest.raises(RecordingError, match=reason):
+        decode.vector_extractor(channel(field="position", pick=("a",)))(message)
+
+
+def test_a_vector_without_a_field_is_the_message_itself():
+    assert decode.vector_extractor(channel())(np.arange(3, dtype=np.float32)).tolist() == [0, 1, 2]
+    assert decode.vector_extractor(channel(field="x"))({"x": 2}).tolist() == [2.0]
+
+
+def test_factors_must_fit_the_values():
+    with pytest.raises(RecordingError, match="3 values, the spec scales 2"):
+        decode.vector_extractor(channel(field="p", scale=(1.0, 2.0)))({"p": [1, 2, 3]})
+
+
+# --- pads
+
+
+def test_the_wires_12_by_32_frame_becomes_the_pads_32_by_12():
+    """Taxel (row r, column c) of the pad is value c · 32 + r on the wire: the board scans 12 rows of 32."""
+    wire = np.arange(12 * 32) % 251
+    pad = decode.pad_extractor(channel(field="data"), FLEXITAC)(SimpleNamespace(data=wire.astype(np.uint8).tobytes()))
+    assert pad.shape == (384,)
+    for row, column in [(0, 0), (0, 1), (1, 0), (31, 11), (17, 5)]:
+        assert pad.reshape(32, 12)[row, column] == (column * 32 + row) % 251
+
+
+def test_a_hand_made_frame_is_transposed_as_written():
+    wire = bytes([1, 2, 3, 4, 5, 6])  # rows (1 2), (3 4), (5 6)
+    assert decode.pad_extractor(channel(), sensor(2, 3, transpose=True))(wire).tolist() == [1, 3, 5, 2, 4, 6]
+    assert decode.pad_extractor(channel(), sensor(2, 3))(wire).tolist() == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        bytes([0, 1, 254, 255]),
+        bytearray([0, 1, 254, 255]),
+        memoryview(bytes([0, 1, 254, 255])),
+        [0, 1, 254, 255],
+        [0.0, 1.0, 254.0, 255.0],
+        np.array([0, 1, 254, 255], dtype=np.int64),
+        np.array([[0, 1], [254, 255]], dtype=np.uint8),
+        base64.b64encode(bytes([0, 1, 254, 255])).decode(),
+    ],
+    ids=lambda f: type(f).__name__,
+)
+def test_counts_are_the_same_from_bytes_lists_arrays_and_base64(frame):
+    counts = decode.pad_extractor(channel(), sensor(2, 2))(frame)
+    assert counts.tolist() == [0, 1, 254, 255]
+    assert counts.dtype == np.uint8
+
+
+def test_sixteen_bit_counts_come_little_endian():
+    pad = sensor(1, 2, dtype="uint16", adc_bits=12)
+    assert decode.pad_extractor(channel(), pad)(b"\x01\x00\xff\x0f").tolist() == [1, 4095]
+
+
+def test_counts_that_the_adc_cannot_send_are_refused():
+    """1 and 4095 with their bytes swapped: 256 and 65295."""
+    pad = sensor(1, 2, dtype="uint16", adc_bits=12)
+    with pytest.raises(RecordingError, match="a count of 65295, pad sends at most 4095"):
+        decode.pad_extractor(channel(), pad)(b"\x00\x01\x0f\xff")
+
+
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [
+        ([0.0, 0.5, 1.0, 0.2], "counts that are not uint8 .normalised by the driver.*: record raw counts"),
+        ([0.0, float("nan"), 1.0, 0.2], "normalised by the driver"),
+        ([0, 1, 2, 256], "counts that are not uint8"),
+        ([0, 1, 2, -1], "counts that are not uint8"),
+        ([0, 1, 2], "3 taxels, sensor pad has 2×2; other layouts: a file in data_specs/sensors/"),
+        (bytes(5), "5 taxels, sensor pad has 2×2"),
+        ([], "0 taxels"),
+        (b"", "0 taxels"),
+        (np.zeros((1, 4), np.uint8), "a frame of 1×4 taxels, the wire of pad is 2×2: transposed already"),
+        (["a", "b", "c", "d"], "no list of counts"),
+        ([None] * 4, "no list of counts"),
+        ([[0, 1], [2]], "no list of counts"),
+        ({"a": 1}, "no list of counts"),
+        (None, "no list of counts"),
+        ("not base64!", "text that is not base64"),
+        ("é", "text that is not base64"),
+    ],
+)
+def test_what_is_no_frame_of_counts_is_refused(frame, reason):
+    with pytest.raises(RecordingError, match=reason):
+        decode.pad_extractor(channel(), sensor(2, 2))(frame)
+
+
+def test_half_a_sixteen_bit_count_is_refused():
+    with pytest.raises(RecordingError, match="3 bytes are no whole number of uint16 counts"):
+        decode.pad_extractor(channel(), sensor(1, 2, dtype="uint16", adc_bits=12))(bytes(3))
+
+
+# --- pictures
+
+
+def rainbow(rows: int = 8, columns: int = 12) -> np.ndarray:
+    """(rows, columns, 3) uint8 RGB, every pixel different."""
+    grid = np.arange(rows * columns, dtype=np.uint8).reshape(rows, columns)
+    return np.stack([grid, 255 - grid, grid[::-1]], axis=2)
+
+
+def encoded(image: np.ndarray, ending: str) -> bytes:
+    return cv2.imencode(ending, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def test_png_comes_back_to_the_pixel_and_red_stays_red():
+    image = rainbow()
+    message = SimpleNamespace(format="png", data=encoded(image, ".png"))
+    assert np.array_equal(decode.picture(message, channel()), image)
+
+
+def test_jpeg_comes_back_nearly():
+    image = np.full((32, 32, 3), (200, 40, 90), np.uint8)
+    found = decode.picture({"format": "jpeg", "data": base64.b64encode(encoded(image, ".jpg")).decode()}, channel())
+    assert np.abs(found.astype(int) - image).max() <= 3
+
+
+def test_a_picture_is_not_turned_by_its_exif_note():
+    image = rainbow(16, 24)
+    jpeg = encoded(image, ".jpg")
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # orientation 6: turned by 90°
+    turned = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    assert decode.picture(turned, channel()).shape == (16, 24, 3)
+
+
+RAW = {
+    "rgb8": lambda rgb: rgb,
+    "bgr8": lambda rgb: rgb[..., ::-1],
+    "rgba8": lambda rgb: np.dstack([rgb, np.full(rgb.shape[:2], 7, np.uint8)]),
+    "bgra8": lambda rgb: np.dstack([rgb[..., ::-1], np.full(rgb.shape[:2], 7, np.uint8)]),
+    "mono8": lambda rgb: rgb[..., :1],
+}
+
+
+@pytest.mark.parametrize("encoding", RAW)
+@pytest.mark.parametrize("padding", [0, 5])
+def test_raw_pictures_with_and_without_padded_rows(encoding, padding):
+    image = rainbow(4, 6)
+    wire = np.ascontiguousarray(RAW[encoding](image)).reshape(4, -1)
+    rows = np.hstack([wire, np.full((4, padding), 99, np.uint8)])
+    message = SimpleNamespace(height=4, width=6, encoding=encoding, step=rows.shape[1], data=rows.tobytes())
+    expected = np.repeat(image[..., :1], 3, axis=2) if encoding == "mono8" else image
+    found = decode.picture(message, channel())
+    assert np.array_equal(found, expected)
+    assert found.flags.c_contiguous
+    if not padding:
+        as_json = {"height": 4, "width": 6, "encoding": encoding, "data": base64.b64encode(rows.tobytes()).decode()}
+        assert np.array_equal(decode.picture(as_json, channel()), expected)
+
+
+def test_stored_arrays_follow_the_spec_channel_order():
+    image = rainbow()
+    assert np.array_equal(decode.picture(image, channel()), image)
+    assert np.array_equal(decode.picture(image, channel(channel_order="bgr")), image[..., ::-1])
+    stored = np.frombuffer(encoded(image, ".png"), np.uint8)
+    assert np.array_equal(decode.picture(np.concatenate([stored, np.zeros(40, np.uint8)]), channel()), image)
+
+
+def raw(**changes: Any) -> dict[str, Any]:
+    return {
+        "height": 4,
+        "width": 6,
+        "encoding": "rgb8",
+        "step": 18,
+        "data": base64.b64encode(bytes(72)).decode(),
+        **changes,
+    }
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        ({"format": "jpeg", "data": ""}, "a picture of format 'jpeg' that OpenCV cannot decode"),
+        ({"format": "jpeg", "data": base64.b64encode(b"\xff\xd8no").decode()}, "OpenCV cannot decode"),
+        (encoded(rainbow(64, 64), ".jpg")[:900], "OpenCV cannot decode"),
+        (encoded(rainbow(64, 64), ".png")[:900], "OpenCV cannot decode"),
+        ({"data": 5}, "a picture as int"),
+        ({"data": None}, "a picture as NoneType"),
+        ({"data": [1, 2]}, "a picture as list"),
+        ({"data": "é"}, "not base64"),
+        ({"format": "jpeg"}, "no field 'data'"),
+        (np.zeros((4, 4, 3), np.float32), "a picture of float32"),
+        (np.zeros((3, 4, 4), np.uint8), r"a picture of uint8 \(3, 4, 4\)"),
+        (raw(encoding="yuv422"), "raw pictures in 'yuv422' are not read; known: bgr8, bgra8, mono8, rgb8, rgba8"),
+        (raw(encoding="rgb"), "did you mean 'rgb8'"),
+        (raw(data=base64.b64encode(bytes(71)).decode()), "71 bytes for a picture of 4×18 bytes"),
+        (raw(step=17), "a raw picture of 4×6 rgb8 pixels, 17 bytes a row"),
+        (raw(height=0), "a raw picture of 0×6"),
+        (raw(height=-4), "a raw picture of -4×6"),
+        (raw(width=None), "without whole numbers for its size"),
+        (raw(height=10**9), "18 bytes"),
+    ],
+)  # fmt: skip
+def test_what_is_no_picture_is_refused(value, reason, capfd):
+    with pytest.raises(RecordingError, match=reason):
+        decode.picture(value, channel())
+    capfd.readouterr()  # libjpeg and libpng complain on their own
+
+
+# --- letterbox
+
+
+def test_letterbox_puts_a_4_to_3_picture_between_two_bars():
+    """480 × 640 into 224: factor 0.35, 168 rows, 28 black rows above and below."""
+    out = decode.letterbox(np.full((480, 640, 3), 200, np.uint8), 224, 224)
+    assert out.shape == (224, 224, 3)
+    assert not out[:28].any()
+    assert not out[196:].any()
+    assert (out[28:196] == 200).all()
+
+
+def test_letterbox_puts_a_tall_picture_between_bars_left_and_right():
+    out = decode.letterbox(np.full((640, 480, 3), 200, np.uint8), 224, 224)
+    assert not out[:, :28].any()
+    assert not out[:, 196:].any()
+    assert (out[:, 28:196] == 200).all()
+
+
+def test_letterbox_leaves_a_picture_of_the_right_size_alone():
+    image = rainbow(224, 224)
+    assert decode.letterbox(image, 224, 224) is image
+
+
+def test_letterbox_averages_when_it_shrinks_and_fills_when_it_grows():
+    image = np.zeros((4, 4, 3), np.uint8)
+    image[::2, ::2] = 200  # one pixel of every 2 × 2 block: mean 50
+    assert (decode.letterbox(image, 2, 2) == 50).all()
+    assert decode.letterbox(np.full((2, 4, 3), 9, np.uint8), 8, 8)[2:6].min() == 9
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 500), (500, 1), (333, 777), (225, 223), (1080, 1920), (223, 224)])
+def test_letterbox_keeps_the_aspect_and_centres(size):
+    out = decode.letterbox(np.full((*size, 3), 255, np.uint8), 224, 224)
+    assert out.shape == (224, 224, 3)
+    lit = out[..., 0] == 255
+    rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
+    factor = 224 / max(size)
+    assert abs(len(rows) - size[0] * factor) <= max(0.5, 1 - size[0] * factor)
+    assert abs(len(columns) - size[1] * factor) <= max(0.5, 1 - size[1] * factor)
+    assert lit.sum() == len(rows) * len(columns)  # one solid rectangle
+    assert rows[0] == (224 - len(rows)) // 2
+    assert columns[0] == (224 - len(columns)) // 2

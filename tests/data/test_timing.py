@@ -1,0 +1,380 @@
+"""Clocks and alignment: closed-form examples, then properties under jitter and loss. Above all: no row shows the future."""
+
+import numpy as np
+import pytest
+
+from taccorl.data.timing import ClockReading, check_clocks, make_grid, match, read_clock, runs
+from taccorl.errors import RecordingError
+
+S = 1_000_000_000
+MS = 1_000_000
+NOW = 1_700_000_000 * S  # a wall clock: large enough to lose digits in a float
+
+
+def ns(*milliseconds: float) -> np.ndarray:
+    return NOW + np.array([round(m * MS) for m in milliseconds], dtype=np.int64)
+
+
+def jittery(rng: np.random.Generator, rate_hz: float, duration_s: float, loss: float = 0.1) -> np.ndarray:
+    """Sample times with ±40 % jitter, each lost with probability ``loss``; strictly increasing."""
+    number = int(rate_hz * duration_s)
+    times = NOW + ((np.arange(number) + rng.uniform(-0.4, 0.4, number)) * S / rate_hz).astype(np.int64)
+    return times[rng.random(number) >= loss]
+
+
+# --- the grid
+
+
+def test_grid_begins_at_the_start_and_ends_at_or_before_the_end():
+    assert make_grid(0, 100 * MS, 30).tolist() == [0, 33_333_333, 66_666_667, 100_000_000]
+    assert make_grid(0, 100 * MS - 1, 30).tolist() == [0, 33_333_333, 66_666_667]
+    assert make_grid(NOW, NOW, 30).tolist() == [NOW]
+    assert make_grid(5, 4, 30).tolist() == []
+
+
+def test_grid_does_not_drift_over_ten_hours():
+    grid = make_grid(NOW, NOW + 36_000 * S, 30)
+    assert len(grid) == 36_000 * 30 + 1
+    assert grid[-1] - NOW == 36_000 * S  # a step of 33,333,333 ns added up would be 0.36 ms off
+    assert (grid[::30] - NOW == np.arange(36_001) * S).all()
+    exact = np.arange(len(grid)) * (S / 30)
+    assert np.abs((grid - NOW) - exact).max() <= 0.5
+
+
+@pytest.mark.parametrize("fps", [7, 24, 30, 50, 60, 100])
+def test_grid_steps_differ_by_at_most_one_nanosecond(fps):
+    grid = make_grid(NOW + 123, NOW + 10 * S, fps)
+    assert set(np.diff(grid)) <= {S // fps, S // fps + 1}
+    assert 0 <= NOW + 10 * S - int(grid[-1]) < S / fps + 1
+
+
+# --- which sample a row shows
+
+
+def test_hold_shows_the_last_sample_however_old():
+    m = match(ns(0, 10, 20, 1000), ns(5, 20), "hold")
+    assert m.index[:, 0].tolist() == [-1, 0, 1, 1]
+    assert m.fresh.tolist() == [False, True, True, True]
+    assert m.age_s.tolist() == [np.inf, 0.005, 0.0, 0.98]
+
+
+def test_asof_is_stale_beyond_max_age_and_not_at_it():
+    m = match(ns(4, 5, 35, 36, 50), ns(5, 50), "asof", max_age_s=0.03)
+    assert m.index[:, 0].tolist() == [-1, 0, 0, 0, 1]
+    assert m.fresh.tolist() == [False, True, True, False, True]
+    assert m.age_s[1:].tolist() == [0.0, 0.03, 0.031, 0.0]
+
+
+def test_interpolate_weighs_by_time_and_needs_both_neighbours_fresh():
+    samples = ns(0, 10, 100, 110)
+    m = match(ns(-1, 0, 2.5, 10, 15, 55, 95, 105, 110, 115), samples, "interpolate", max_age_s=0.02)
+    #                 before | exact | ¼ | exact | next is 85 ms ahead | both far | last is 85 ms old | ½ | exact | no next
+    assert m.fresh.tolist() == [False, True, True, True, False, False, False, True, True, False]
+    assert m.weight is not None
+    assert m.weight[[1, 2, 3, 7, 8]].tolist() == [0.0, 0.25, 0.0, 0.5, 0.0]
+    assert m.index[:, 0].tolist() == [-1, 0, 0, 1, 1, 1, 1, 2, 3, 3]
+    assert m.age_s[0] == np.inf
+    assert m.age_s[[1, 2, 7]].tolist() == [0.0, -0.0075, -0.005]  # the look-ahead is told
+
+
+def test_window_holds_the_last_readings_oldest_first():
+    m = match(ns(20, 30, 34, 40), ns(0, 10, 20, 30, 40), "window", max_age_s=0.005, history=3, rate_hz=100)
+    assert m.index.tolist() == [[0, 1, 2], [1, 2, 3], [1, 2, 3], [2, 3, 4]]
+    assert m.fresh.all()
+    early = match(ns(10, 19), ns(0, 10, 20), "window", max_age_s=0.02, history=3, rate_hz=100)
+    assert not early.fresh.any()
+    assert (early.index == -1).all()
+
+
+def test_window_is_stale_while_a_gap_lies_inside_it():
+    """3 readings at 100 Hz span 20 ms; with max_age 5 ms the oldest may be 25 ms old."""
+    samples = ns(0, 10, 20, 50, 60, 70)
+    m = match(ns(20, 25, 26, 50, 60, 69, 70), samples, "window", max_age_s=0.005, history=3, rate_hz=100)
+    #               oldest 20 | 25 | newest 6 old | oldest 40 | oldest 40 | newest 9 old | oldest 20
+    assert m.fresh.tolist() == [True, True, False, False, False, False, True]
+
+
+@pytest.mark.parametrize("align", ["hold", "asof", "interpolate", "window"])
+def test_without_samples_no_row_is_fresh(align):
+    m = match(ns(0, 10), np.empty(0, dtype=np.int64), align, max_age_s=1.0, history=3, rate_hz=100)
+    assert not m.fresh.any()
+    assert (m.index == -1).all()
+    assert m.index.shape == (2, 3 if align == "window" else 1)
+    assert np.isinf(m.age_s).all()
+    assert (m.weight is not None) == (align == "interpolate")
+
+
+@pytest.mark.parametrize("align", ["hold", "asof", "interpolate", "window"])
+def test_without_rows_there_is_nothing(align):
+    m = match(np.empty(0, dtype=np.int64), ns(0, 10), align, max_age_s=1.0, history=3, rate_hz=100)
+    assert len(m.index) == len(m.age_s) == len(m.fresh) == 0
+
+
+OPTIONS = {"max_age_s": 0.04, "history": 5, "rate_hz": 100.0}
+
+
+def shown(grid: np.ndarray, times: np.ndarray, values: np.ndarray, align: str) -> list[tuple[float, ...] | None]:
+    """What every row shows, None where it is stale."""
+    m = match(grid, times, align, **OPTIONS)  # pyright: ignore[reportArgumentType]
+    rows: list[tuple[float, ...] | None] = []
+    for k in range(len(grid)):
+        if not m.fresh[k]:
+            rows.append(None)
+            continue
+        row = values[m.index[k]]
+        if m.weight is not None and m.weight[k] > 0:
+            row = row + m.weight[k] * (values[m.index[k] + 1] - row)
+        rows.append(tuple(row))
+    return rows
+
+
+@pytest.mark.parametrize("align", ["hold", "asof", "window"])
+@pytest.mark.parametrize("seed", range(5))
+def test_no_row_ever_shows_the_future(align, seed):
+    """Whatever happens after a row's time (other values, other times, no samples at all), the row stays the same."""
+    rng = np.random.default_rng(seed)
+    times = jittery(rng, 100, 3.0, loss=0.2)
+    values = rng.normal(size=len(times))
+    grid = make_grid(NOW, NOW + 3 * S, 30)
+    before = shown(grid, times, values, align)
+    assert any(row is not None for row in before)
+    for k in rng.choice(len(grid), 12, replace=False):
+        past = times <= grid[k]
+        other_values = np.where(past, values, 1e9)
+        assert shown(grid, times, other_values, align)[: k + 1] == before[: k + 1]
+        assert shown(grid, times[past], values[past], align)[: k + 1] == before[: k + 1]
+        moved = np.concatenate([times[past], np.sort(grid[k] + 1 + rng.integers(0, S, 50))])
+        moved = np.unique(moved)
+        padded = np.concatenate([values[past], np.full(len(moved) - past.sum(), 1e9)])
+        assert shown(grid, moved, padded, align)[: k + 1] == before[: k + 1]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_interpolate_looks_ahead_to_the_next_sample_only_and_never_beyond_max_age(seed):
+    rng = np.random.default_rng(seed)
+    times = jittery(rng, 40, 3.0, loss=0.3)
+    values = rng.normal(size=len(times))
+    grid = make_grid(NOW, NOW + 3 * S, 30)
+    before = shown(grid, times, values, "interpolate")
+    m = match(grid, times, "interpolate", **OPTIONS)
+    for k in range(len(grid)):
+        following = int(np.searchsorted(times, grid[k], side="right"))
+        after_next = np.where(np.arange(len(times)) <= following, values, 1e9)
+        assert shown(grid[k : k + 1], times, after_next, "interpolate") == before[k : k + 1]
+        exact = following > 0 and times[following - 1] == grid[k]
+        if before[k] is not None and not exact:
+            assert 0 < times[following] - grid[k] <= OPTIONS["max_age_s"] * S
+            assert m.age_s[k] == pytest.approx((grid[k] - times[following]) / S)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_interpolate_is_exact_on_a_straight_line(seed):
+    """x(t) = 3 − 0.7 t, sampled at jittery times: every fresh row lies on the line."""
+    rng = np.random.default_rng(seed)
+    times = jittery(rng, 200, 5.0, loss=0.3)
+    grid = make_grid(NOW, NOW + 5 * S, 30)
+    line = lambda t: 3.0 - 0.7 * (t - NOW) / S  # noqa: E731
+    rows = shown(grid, times, line(times), "interpolate")
+    fresh = [k for k, row in enumerate(rows) if row is not None]
+    assert len(fresh) > 120
+    found = np.array([row[0] for row in rows if row is not None])
+    assert np.abs(found - line(grid[fresh])).max() < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_asof_and_hold_agree_with_a_plain_loop(seed):
+    rng = np.random.default_rng(seed)
+    times = jittery(rng, 50, 4.0, loss=0.4)
+    grid = make_grid(NOW - S // 10, NOW + 4 * S, 30)
+    for align in ("asof", "hold"):
+        m = match(grid, times, align, max_age_s=0.05)
+        for k, t in enumerate(grid):
+            past = [i for i, s in enumerate(times) if s <= t]
+            assert m.index[k, 0] == (past[-1] if past else -1)
+            age = (t - times[past[-1]]) / S if past else np.inf
+            assert m.age_s[k] == age
+            assert m.fresh[k] == (bool(past) if align == "hold" else age <= 0.05)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_window_agrees_with_a_plain_loop(seed):
+    rng = np.random.default_rng(seed)
+    times = jittery(rng, 100, 3.0, loss=0.15)
+    grid = make_grid(NOW, NOW + 3 * S, 30)
+    m = match(grid, times, "window", max_age_s=0.02, history=4, rate_hz=100.0)
+    for k, t in enumerate(grid):
+        past = np.flatnonzero(times <= t)[-4:]
+        whole = len(past) == 4
+        assert m.index[k].tolist() == (past.tolist() if whole else [-1] * 4)
+        assert m.fresh[k] == (whole and t - times[past[-1]] <= 20 * MS and t - times[past[0]] <= 50 * MS)
+
+
+# --- where an episode splits
+
+
+def test_runs_are_the_stretches_of_true():
+    assert runs(np.array([], dtype=bool)) == []
+    assert runs(np.array([False, False])) == []
+    assert runs(np.array([True, True])) == [(0, 2)]
+    assert runs(np.array([False, True, False, True, True])) == [(1, 2), (3, 5)]
+
+
+def test_a_silent_camera_splits_the_episode_where_its_picture_got_too_old():
+    """30 Hz camera silent from 1.0 s to 2.0 s, max_age 80 ms: its picture of 0.9667 s carries rows up to 1.0333 s."""
+    grid = make_grid(NOW, NOW + 3 * S, 30)
+    camera = np.concatenate([grid[:30], grid[60:]])
+    m = match(grid, camera, "asof", max_age_s=0.08)
+    assert runs(m.fresh) == [(0, 32), (60, 91)]  # rows 30 and 31 are 33 and 67 ms old, row 32 is 100 ms
+    assert m.age_s[31] == pytest.approx(0.0667, abs=1e-4)
+
+
+# --- which clock a channel keeps
+
+
+def test_header_clock_takes_the_stamps_and_log_clock_the_log_times():
+    log, stamp = ns(5, 15, 25), ns(0, 10, 20)
+    header = read_clock(log, stamp, clock="header")
+    assert header.time_ns.tolist() == stamp.tolist()
+    assert header.skew_s == 0.005
+    on_log = read_clock(log, stamp, clock="log")
+    assert on_log.time_ns.tolist() == log.tolist()
+    assert on_log.skew_s == 0.0
+    assert read_clock(log, None, clock="log").time_ns.tolist() == log.tolist()
+
+
+def test_a_header_clock_without_headers_is_never_replaced_in_silence():
+    with pytest.raises(AssertionError, match="header clock without headers"):
+        read_clock(ns(0), None, clock="header")
+
+
+def test_latency_moves_samples_back_to_the_event():
+    """A pad frame is read 10 ms after its scan began: the row at 10 ms shows the frame stamped 20 ms."""
+    pad = read_clock(ns(10, 20, 30), None, clock="log", latency_s=0.010)
+    assert pad.time_ns.tolist() == ns(0, 10, 20).tolist()
+    m = match(ns(10), pad.time_ns, "asof", max_age_s=0.04)
+    assert pad.order[m.index[0, 0]] == 1
+    ahead = read_clock(ns(10), ns(10), clock="header", latency_s=-0.38)
+    assert ahead.time_ns.tolist() == ns(390).tolist()
+
+
+def test_order_duplicates_and_zero_stamps_are_counted_and_nothing_else_is_lost():
+    stamp = np.array([0, *ns(0, 10, 10, 30, 20, 30, 40), 0])
+    log = ns(1, 2, 12, 13, 32, 33, 34, 42, 43)
+    c = read_clock(log, stamp, clock="header", drop_zero_stamp=True)
+    assert c.time_ns.tolist() == ns(0, 10, 20, 30, 40).tolist()
+    assert c.order.tolist() == [1, 2, 5, 4, 7]  # of equal stamps the first message counts
+    assert (c.zero_stamps, c.duplicates, c.out_of_order) == (2, 2, 1)
+    assert len(c.time_ns) + c.zero_stamps + c.duplicates == len(stamp)
+    kept = read_clock(log, stamp, clock="header")
+    assert (kept.zero_stamps, kept.duplicates) == (0, 3)
+    assert kept.time_ns[0] == 0
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_every_message_is_kept_or_counted_whatever_the_stamps(seed):
+    rng = np.random.default_rng(seed)
+    number = int(rng.integers(0, 200))
+    stamp = NOW + rng.integers(0, 60, number) * MS
+    stamp[rng.random(number) < 0.2] = 0
+    log = NOW + np.arange(number) * MS
+    for drop in (False, True):
+        c = read_clock(log, stamp, clock="header", drop_zero_stamp=drop, latency_s=0.003)
+        assert len(c.time_ns) + c.duplicates + c.zero_stamps == number
+        assert (np.diff(c.time_ns) > 0).all()
+        assert (stamp[c.order] - 3 * MS == c.time_ns).all()
+        for time, index in zip(c.time_ns, c.order, strict=True):
+            assert index == np.flatnonzero(stamp - 3 * MS == time)[0]
+        assert c.zero_stamps == (int((stamp == 0).sum()) if drop else 0)
+
+
+def test_nothing_left_is_an_empty_clock():
+    c = read_clock(ns(0, 1), np.zeros(2, dtype=np.int64), clock="header", drop_zero_stamp=True)
+    assert len(c.time_ns) == 0
+    assert (c.zero_stamps, c.skew_s) == (2, 0.0)
+
+
+def test_times_keep_their_nanoseconds():
+    """Wall-clock nanoseconds do not fit a float64: 256 ns would be lost."""
+    stamp = NOW + np.array([1, 2, 3], dtype=np.int64)
+    assert read_clock(stamp, stamp, clock="header").time_ns.tolist() == [NOW + 1, NOW + 2, NOW + 3]
+    assert match(np.array([NOW + 2]), stamp, "asof", max_age_s=1.0).index[0, 0] == 1
+
+
+# --- are all channels on one clock?
+
+USUAL = {
+    "/joints_left": 0.001,
+    "/joints_right": 0.0012,
+    "/camera_f": 0.030,
+    "/camera_l": 0.032,
+    "/pad_a": 0.009,
+    "/pad_b": 0.0,
+}
+
+
+def test_realistic_delays_are_one_clock():
+    check_clocks(USUAL, 0.25)
+    check_clocks({}, 0.25)
+    check_clocks({"/alone": 1e9}, 0.25)  # alone, even simulation time is one clock
+
+
+def test_a_spread_of_exactly_the_limit_is_allowed():
+    check_clocks({"/a": 0.0, "/b": 0.25}, 0.25)
+    with pytest.raises(RecordingError):
+        check_clocks({"/a": 0.0, "/b": 0.2500001}, 0.25)
+
+
+def test_simulation_time_is_named_with_the_way_out():
+    """evo's nav2_turtlebot.mcap: log time − stamp = 1,778,233,424.927 s."""
+    with pytest.raises(RecordingError) as caught:
+        check_clocks({**USUAL, "/odom": 1_778_233_424.927}, 0.25)
+    assert str(caught.value).startswith("stamps of /odom are 1.77823e+09 s behind their log time (simulation time?)")
+    assert "`clock: log`" in str(caught.value)
+
+
+def test_all_but_the_pads_on_simulation_time_names_those_on_simulation_time():
+    with pytest.raises(RecordingError) as caught:
+        check_clocks({"/joints": 1.7e9, "/camera": 1.7e9 + 0.02, "/pad": 0.0}, 0.25)
+    assert "stamps of /joints, /camera are 1.7e+09 s behind" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("offset", "word", "advice"), [(0.38, "behind", "add -0.380"), (-0.38, "ahead of", "add 0.380")]
+)
+def test_an_offset_of_380_ms_is_named_and_the_advice_mends_it(offset, word, advice):
+    """Two logging processes 0.38 s apart, as measured on the velostat recordings."""
+    skews = {"/joints": 0.001, "/camera": 0.001, "/pad_a": 0.001 + offset, "/pad_b": 0.001 + offset}
+    skews["/camera_l"] = 0.001
+    with pytest.raises(RecordingError) as caught:
+        check_clocks(skews, 0.25)
+    message = str(caught.value)
+    assert message.startswith(f"stamps of /pad_a, /pad_b are 0.380 s {word} the other channels'")
+    assert f"{advice} to their `latency_s`" in message
+    assert "max_clock_spread_s" in message
+
+    log = ns(*range(0, 100, 10))
+    latency_s = float(message.split("add ")[1].split(" ")[0])
+    mended = {t: read_clock(log, log - round(s * S), clock="header", latency_s=latency_s if "pad" in t else 0.0).skew_s
+              for t, s in skews.items()}  # fmt: skip
+    check_clocks(mended, 0.25)
+    assert max(mended.values()) - min(mended.values()) < 1e-9
+
+
+def test_of_two_channels_the_one_further_from_log_time_is_named():
+    with pytest.raises(RecordingError, match=r"stamps of /pad are 0\.380 s behind"):
+        check_clocks({"/joints": 0.002, "/pad": 0.382}, 0.25)
+    with pytest.raises(RecordingError, match=r"stamps of /pad are 0\.380 s ahead of"):
+        check_clocks({"/joints": 0.002, "/pad": -0.378}, 0.25)
+
+
+def test_skew_is_a_median_and_forgives_a_few_late_messages():
+    stamp = ns(*range(0, 1000, 10))
+    log = stamp + 10 * MS
+    log[::10] += 2 * S  # the recorder hiccuped
+    assert read_clock(log, stamp, clock="header").skew_s == 0.01
+
+
+def test_clock_reading_is_plain_data():
+    c = read_clock(ns(0), None, clock="log")
+    assert isinstance(c, ClockReading)
+    assert c.time_ns.dtype == np.int64

@@ -1,0 +1,299 @@
+"""What was logged is read back with Rerun's own reader and compared with the episode, number by number."""
+
+import dataclasses
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+import rerun.blueprint as rrb
+
+from taccorl.data.episode import Episode
+from taccorl.data.spec import FeatureSpec
+from taccorl.views.blueprint import episode_blueprint
+from taccorl.views.episode import save_episode
+from taccorl.views.touch import pads_of
+
+from .made_episode import ORIGIN, TOUCH, draw, in_dataset, made_episode, touch_counts, without
+from .readback import Column, read_rrd
+from .regions import view_regions
+
+ROWS, SIZE = 90, 64
+Logged = dict[str, dict[str, Column]]
+
+
+def logged(episode: Episode, folder: Path, **options: bool) -> Logged:
+    path = folder / "episode.rrd"
+    save_episode(episode, path, **options)
+    return read_rrd(path)
+
+
+@pytest.fixture(scope="module")
+def episode() -> Episode:
+    return made_episode(ROWS, picture_size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def from_recording(episode: Episode, tmp_path_factory: pytest.TempPathFactory) -> Logged:
+    return logged(episode, tmp_path_factory.mktemp("recording"))
+
+
+@pytest.fixture(scope="module")
+def in_file(episode: Episode, tmp_path_factory: pytest.TempPathFactory) -> Episode:
+    return in_dataset(episode, tmp_path_factory.mktemp("mp4"), rows_before=7)
+
+
+@pytest.fixture(scope="module")
+def from_dataset(in_file: Episode, tmp_path_factory: pytest.TempPathFactory) -> Logged:
+    return logged(in_file, tmp_path_factory.mktemp("dataset"))
+
+
+@pytest.mark.parametrize("pad", range(4))
+def test_heatmaps_hold_the_counts_with_negative_ones_drawn_as_zero(from_recording: Logged, pad: int):
+    name = ("left_a", "left_b", "right_a", "right_b")[pad]
+    column = from_recording[f"/observation/tactile/{name}"]["DepthImage:buffer"]
+    shown = np.array([np.array(v[0], np.uint8) for v in column.values]).reshape(ROWS, 32, 12)
+    assert np.array_equal(shown, np.maximum(touch_counts(ROWS)[:, pad], 0))
+    assert column.frame_index == list(range(ROWS))
+
+
+def test_colour_scale_is_fixed_for_all_pads_and_rows(from_recording: Logged):
+    for name in ("left_a", "left_b", "right_a", "right_b", "scale"):
+        column = from_recording[f"/observation/tactile/{name}"]["DepthImage:depth_range"]
+        assert column.frame_index == [], "said once, not per frame"
+        assert column.values == [[[0.0, 255.0]]]  # 0 … (2^10 − 1) >> 2 counts
+
+
+def test_both_time_lines_run_at_30_rows_a_second(from_recording: Logged, from_dataset: Logged):
+    for found in (from_recording, from_dataset):
+        for path, component in (
+            ("/observation/state/left_arm_rad", "Scalars:scalars"),
+            ("/figure/left/link_1", "Transform3D:translation"),
+        ):
+            assert found[path][component].frame_index == list(range(ROWS))
+            assert np.allclose(found[path][component].time_s, np.arange(ROWS) / 30, atol=1e-9)
+
+
+@pytest.mark.parametrize("key", ["observation.state", "action"])
+def test_joints_are_the_datasets_numbers_in_plots_of_one_unit(episode: Episode, from_recording: Logged, key: str):
+    root = "/" + key.replace(".", "/")
+    groups = {"left_arm_rad": list(range(6)), "right_arm_rad": list(range(7, 13)), "grippers_m": [6, 13]}
+    for group, columns in groups.items():
+        values = np.array(from_recording[f"{root}/{group}"]["Scalars:scalars"].values)
+        assert np.array_equal(values.astype(np.float32), episode.arrays[key][:, columns])
+    names = from_recording[f"{root}/grippers_m"]["SeriesLines:names"].values
+    assert names == [["left", "right"]]
+
+
+def test_touch_curves_are_sum_peak_and_active_taxels(from_recording: Logged):
+    counts = touch_counts(ROWS)[:, 2].astype(int)
+    active = counts > 15
+    for name, expected in (
+        ("sum", np.where(active, counts, 0).sum(axis=(1, 2))),
+        ("peak", counts.max(axis=(1, 2))),
+        ("active", active.sum(axis=(1, 2))),
+    ):
+        values = np.array(from_recording[f"/touch/{name}/right_a"]["Scalars:scalars"].values)[:, 0]
+        assert np.array_equal(values, expected), name
+
+
+def test_noise_floor_and_contact_threshold_are_drawn_with_the_peak(from_recording: Logged):
+    lines = {p: c for p, c in from_recording.items() if p.startswith("/touch/peak/")}
+    for path, count in (("/touch/peak/noise_floor_15", 15.0), ("/touch/peak/contact_30", 30.0)):
+        assert np.allclose(lines[path]["Scalars:scalars"].values, count, atol=1e-6)
+
+
+def test_gate_stage_and_outcome_change_where_the_episode_says(from_recording: Logged):
+    over = (np.abs(touch_counts(ROWS)) > 30).any(axis=(1, 2, 3))
+    opens, closes = np.flatnonzero(np.diff(over.astype(int))) + 1
+    gate = from_recording["/events/contact_gate"]["StateChange:state"]
+    assert [v[0] for v in gate.values] == ["no contact", "contact", "no contact"]
+    assert gate.frame_index == [0, opens, closes]
+    stage = from_recording["/events/stage"]["StateChange:state"]
+    assert [v[0] for v in stage.values] == ["reach", "hold", "release"]
+    assert stage.frame_index == [0, int(0.4 * ROWS), int(0.8 * ROWS)]
+    assert from_recording["/events/outcome"]["StateChange:state"].values == [["success"]]
+
+
+def test_recording_shows_every_rows_own_picture_as_jpeg(from_recording: Logged):
+    for camera in ("front", "left_wrist", "right_wrist"):
+        column = from_recording[f"/observation/images/{camera}"]["EncodedImage:blob"]
+        assert column.frame_index == list(range(ROWS))
+        for row in (0, 63, 64, ROWS - 1):  # 64 rows a batch
+            shown = cv2.imdecode(np.array(column.values[row][0], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+            truth = draw(f"observation.images.{camera}", row, ROWS, SIZE)
+            assert np.abs(shown.astype(int) - truth).mean() < 3
+
+
+def test_dataset_shows_its_own_mp4_from_the_episodes_first_frame_on(from_dataset: Logged):
+    entity = from_dataset["/observation/images/front"]
+    frames = entity["VideoFrameReference:timestamp"]
+    assert frames.frame_index == list(range(ROWS))
+    times_s = np.array(frames.values)[:, 0] / 1e9
+    # The episode begins at frame 7, a keyframe stands every 2 frames: the clip begins at frame 6.
+    assert np.allclose(times_s, (np.arange(ROWS) + 1) / 30, atol=1e-6)
+    assert len(entity["AssetVideo:blob"].values) == 1
+    assert "EncodedImage:blob" not in entity
+
+
+def test_h264_becomes_pictures_where_the_rerun_program_could_not_decode_it(
+    episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    in_h264 = in_dataset(episode, tmp_path, codec="h264")
+    assert "AssetVideo:blob" in logged(in_h264, tmp_path)["/observation/images/front"]
+    monkeypatch.setenv("PATH", str(tmp_path))  # a machine without ffmpeg
+    native = logged(in_h264, tmp_path, native=True)["/observation/images/front"]
+    assert "AssetVideo:blob" not in native
+    assert native["EncodedImage:blob"].frame_index == list(range(ROWS))
+
+
+def test_av1_stays_video_for_the_rerun_program(in_file: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "AssetVideo:blob" in logged(in_file, tmp_path, native=True)["/observation/images/front"]
+
+
+def test_page_says_origin_sensor_scheme_baseline_and_timing(from_recording: Logged):
+    text = from_recording["/provenance"]["TextDocument:text"].values[0][0]
+    assert text.startswith(f"**origin: {ORIGIN}**")
+    for words in (
+        "instruction: *put the test tube into the rack*",
+        "outcome: success",
+        f"{ROWS} rows, 3.00 s at 30 fps",
+        "sensor flexitac_v2: 4 pads of 32 × 12 taxels, counts above baseline up to 255, noise floor 15",
+        "scheme fixed_scale: reading = counts × 0.01333; contact gate: ≥ 1 taxel beyond 0.4 (30 counts)",
+        "baseline subtracted from observation.tactile: median 22, 22 … 22 counts",
+        "| front | asof | 30.0 | 1 | 67 | 16 | 49 |",
+    ):
+        assert words in text, words
+
+
+def test_fingers_in_the_figure_open_as_the_state_says(episode: Episode, from_recording: Logged):
+    a, b = (np.array(from_recording[f"/figure/left/finger_{f}"]["Transform3D:translation"].values)[:, 0] for f in "ab")
+    assert np.allclose(np.linalg.norm(a - b, axis=1), episode.arrays["observation.state"][:, 6], atol=1e-6)
+
+
+VIEWS = {
+    "arms (schematic): joints in the plots' colours",
+    f"provenance · {ORIGIN}",
+    "front",
+    "left_wrist",
+    "right_wrist",
+    "touch: counts above baseline, 0 … 255, fixed colours",
+    f"contact gate, outcome, stage · {ORIGIN}",
+    "touch sum of active taxels [counts above baseline]",
+    "touch peak [counts above baseline]",
+    "active taxels, above the noise floor [of 384 a pad]",
+    "left arm [rad]: action thin",
+    "right arm [rad]: action thin",
+    "grippers [m]: action thin",
+}
+
+
+def test_blueprint_has_a_view_for_everything_and_says_surrogate(episode: Episode):
+    assert set(view_regions(episode_blueprint(episode))) == VIEWS
+    assert "surrogate" in ORIGIN
+
+
+def views(part: object) -> list[rrb.View]:
+    if isinstance(part, rrb.Container):
+        return [view for child in part.contents for view in views(child)]
+    assert isinstance(part, rrb.View)
+    return [part]
+
+
+def assert_no_view_is_empty(episode: Episode, folder: Path) -> set[str]:
+    found = logged(episode, folder)
+    shown = views(episode_blueprint(episode).root_container)
+    for view in shown:
+        contents = view.contents if isinstance(view.contents, list) else [f"{view.origin}/**"]
+        for content in contents:
+            root = str(content).removesuffix("/**")
+            assert any(p == root or p.startswith(f"{root}/") for p in found), f"{view.name}: nothing at {content}"
+    return {str(view.name) for view in shown}
+
+
+def test_episode_without_touch_opens_without_touch_views(episode: Episode, tmp_path: Path):
+    names = assert_no_view_is_empty(without(episode, TOUCH), tmp_path)
+    assert not any("touch" in name or "taxel" in name or "contact" in name for name in names)
+    assert f"outcome, stage · {ORIGIN}" in names
+
+
+def test_episode_with_one_camera_shows_one(episode: Episode, tmp_path: Path):
+    fewer = without(episode, "observation.images.left_wrist", "observation.images.right_wrist")
+    names = assert_no_view_is_empty(fewer, tmp_path)
+    assert "front" in names
+    assert not names & {"left_wrist", "right_wrist"}
+
+
+def test_episode_of_numbers_only_opens(episode: Episode, tmp_path: Path):
+    bare = without(episode, TOUCH, *episode.picture_keys)
+    bare = dataclasses.replace(bare, stages=(), success=None, origin="", timing=(), instruction="")
+    names = assert_no_view_is_empty(bare, tmp_path)
+    assert "provenance" in names
+    assert not any("outcome" in name for name in names)
+
+
+def test_somebody_elses_robot_opens(tmp_path: Path, episode: Episode):
+    """16 unnamed joints without unit, another camera, velocities, and a feature too large for curves."""
+    spec = episode.spec
+
+    def numbers(size: int) -> FeatureSpec:
+        return FeatureSpec(dtype="float32", shape=(size,), unit="", frame="", rate_hz=10, range=(-9, 9))
+
+    camera = dataclasses.replace(spec.features["observation.images.front"], shape=(48, SIZE, 3))
+    features = {
+        "observation.state": numbers(16),
+        "action": numbers(16),
+        "observation.velocity": numbers(6),
+        "observation.embedding": numbers(512),
+        "observation.images.top": camera,
+    }
+    rng = np.random.default_rng(0)
+    arrays = {
+        key: rng.normal(size=(20, f.size)).astype(np.float32) for key, f in features.items() if f.dtype == "float32"
+    }
+    picture = {"observation.images.top": np.full((48, SIZE, 3), 90, np.uint8)}
+    other = Episode(
+        name="theirs",
+        spec=dataclasses.replace(spec, name="theirs", robot_type="so101", fps=10, features=features, sensors={}),
+        start_ns=0,
+        arrays=arrays,
+        pictures=lambda: iter([picture] * 20),
+        picture_keys=("observation.images.top",),
+        instruction="do it",
+    )
+    names = assert_no_view_is_empty(other, tmp_path)
+    assert names == {"provenance", "top", "joints: action thin", "velocity: joints"}
+
+
+def test_cursor_stands_still_for_a_picture(episode: Episode, tmp_path: Path):
+    panel = vars(episode_blueprint(episode, at_s=1.5).time_panel)
+    window = panel["time_selection"]
+    assert (window.min.value, window.max.value) == (1_500_000_000, 1_500_000_001)
+    assert episode_blueprint(episode).time_panel.play_state == "playing"
+
+
+def test_720_rows_are_logged_within_seconds_of_work(tmp_path: Path):
+    episode = made_episode(720, picture_size=SIZE)
+    begin_s = time.process_time()
+    save_episode(without(episode, *episode.picture_keys), tmp_path / "long.rrd")
+    assert time.process_time() - begin_s < 5  # measured: 0.1 s
+    assert len(pads_of(episode)) == 4
+
+
+def test_a_failed_save_leaves_the_earlier_file(episode: Episode, tmp_path: Path):
+    path = tmp_path / "episode.rrd"
+    save_episode(episode, path)
+    before = path.read_bytes()
+
+    def broken():
+        raise OSError("the disk is gone")
+        yield {}
+
+    with pytest.raises(OSError, match="the disk is gone"):
+        save_episode(dataclasses.replace(episode, pictures=broken), path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["episode.rrd"]
+    assert rr.__version__.startswith("0.33")

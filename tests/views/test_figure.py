@@ -1,0 +1,120 @@
+"""The figure's kinematics against arithmetic, symmetry and the stand-in's own kinematics."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from taccorl.demos import stand_in_robot
+from taccorl.views.colors import heat
+from taccorl.views.figure import (
+    BASE_POS_WORLD,
+    FINGER_Z_M,
+    LINK_ORIGINS,
+    arms_of,
+    floor_z_m,
+    link_poses,
+    pad_colors,
+    pad_poses,
+    tool_paths,
+)
+from taccorl.views.touch import pads_of
+
+from .made_episode import made_episode
+
+RNG = np.random.default_rng(3)
+JOINTS_RAD = RNG.uniform(-1.2, 1.2, (50, 6))
+
+
+def test_at_zero_the_shoulder_and_elbow_are_where_the_urdf_puts_them():
+    poses = link_poses(np.zeros((1, 6)))[0]
+    assert np.allclose(poses[0], np.eye(4))
+    assert np.allclose(poses[1, :3, 3], [0, 0, 0.123])
+    assert np.allclose(poses[2, :3, 3], [0, 0, 0.123])
+    # Link 2's x axis: R_z(−π) R_y(−0.1359) e_x = (−cos 0.1359, 0, sin 0.1359); the elbow lies 0.28503 m along it.
+    elbow = [-0.28503 * math.cos(0.1359), 0.0, 0.123 + 0.28503 * math.sin(0.1359)]
+    assert np.allclose(poses[3, :3, 3], elbow, atol=1e-5)
+
+
+def test_links_are_rigid_whatever_the_joints_do():
+    poses = link_poses(JOINTS_RAD)
+    length_m = np.linalg.norm(np.diff(poses[:, :, :3, 3], axis=1), axis=2)
+    assert np.allclose(length_m, [np.linalg.norm(xyz) for xyz, _ in LINK_ORIGINS])
+    rotations = poses[:, :, :3, :3]
+    assert np.allclose(rotations @ rotations.swapaxes(-1, -2), np.eye(3), atol=1e-9)
+
+
+def test_joint_1_turns_everything_about_the_bases_z_axis():
+    turned = JOINTS_RAD + np.array([math.pi / 2, 0, 0, 0, 0, 0])
+    before, after = link_poses(JOINTS_RAD)[:, 6, :3, 3], link_poses(turned)[:, 6, :3, 3]
+    assert np.allclose(after, before @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]))  # (x, y) → (−y, x)
+
+
+def test_mirrored_joints_give_a_mirrored_arm():
+    right = link_poses(JOINTS_RAD)[:, :, :3, 3]
+    left = link_poses(JOINTS_RAD * [-1, 1, 1, -1, 1, -1])[:, :, :3, 3]
+    assert np.allclose(left, right * [1, -1, 1], atol=1e-4)  # J6's origin is 0.09 mm off the arm's middle
+
+
+def test_figure_agrees_with_the_stand_ins_kinematics():
+    for arm, mount in stand_in_robot.MOUNT_POS_WORLD.items():
+        theirs = stand_in_robot.link_poses(arm, JOINTS_RAD)[:, :, :3, 3] - np.array(mount)
+        assert np.allclose(link_poses(JOINTS_RAD)[:, 1:, :3, 3], theirs, atol=2e-4)  # they leave those 0.09 mm out
+
+
+@pytest.mark.parametrize("opening_m", [0.0, 0.02, 0.07])
+def test_gripper_opening_is_the_distance_between_the_pads(opening_m: float):
+    link6 = link_poses(JOINTS_RAD)[:, 6]
+    pads = pad_poses(link6, np.full(50, opening_m))
+    gap = pads[:, 0, :3, 3] - pads[:, 1, :3, 3]
+    assert np.allclose(np.linalg.norm(gap, axis=1), opening_m)
+    assert np.allclose(gap, opening_m * link6[:, :3, 1]), "along y of link 6, finger a on the positive side"
+    middle_in_link6 = np.einsum("tji,tj->ti", link6[:, :3, :3], pads[:, :, :3, 3].mean(axis=1) - link6[:, :3, 3])
+    assert np.allclose(middle_in_link6[:, :2], 0, atol=1e-12)
+    assert (middle_in_link6[:, 2] > FINGER_Z_M).all()
+
+
+def test_arms_are_found_by_name_whatever_their_order():
+    episode = made_episode(10, picture_size=32)
+    feature = episode.spec.features["observation.state"]
+    order = RNG.permutation(14)
+    shuffled = dataclasses.replace(
+        episode,
+        spec=dataclasses.replace(
+            episode.spec,
+            features={
+                **episode.spec.features,
+                "observation.state": dataclasses.replace(feature, names=tuple(feature.names[i] for i in order)),
+            },
+        ),
+        arrays={**episode.arrays, "observation.state": episode.arrays["observation.state"][:, order]},
+    )
+    for side in ("left", "right"):
+        assert np.array_equal(arms_of(shuffled)[side], arms_of(episode)[side])
+
+
+def test_other_robots_have_no_piper_figure():
+    episode = made_episode(10, picture_size=32)
+    other = dataclasses.replace(episode, spec=dataclasses.replace(episode.spec, robot_type="aloha"))
+    assert arms_of(other) == {}
+
+
+def test_mirrored_episode_has_mirrored_tool_paths_above_the_floor():
+    episode = made_episode(60, picture_size=32)
+    paths = tool_paths(episode)
+    assert np.allclose(paths["left"], paths["right"] * [1, -1, 1], atol=2e-4)
+    assert BASE_POS_WORLD["left"] == (0.0, 0.3, 0.0)
+    assert floor_z_m(episode) < min(path[:, 2].min() for path in paths.values())
+
+
+def test_pads_wear_the_heatmaps_colours_by_their_sum():
+    pads = pads_of(made_episode(101, picture_size=32))
+    colors = pad_colors(pads[2])
+    assert colors.dtype == np.uint32
+    red, green, blue = (int(c) for c in heat(np.array(0.0)))
+    assert colors[0] == (red << 24 | green << 16 | blue << 8 | 255), "nothing touches: the scale's zero"
+    share = pads[2].sum_count[60] / pads[2].full_sum_count
+    assert 0.1 < share < 1
+    red, green, blue = (int(c) for c in heat(np.array(share)))
+    assert colors[60] == (red << 24 | green << 16 | blue << 8 | 255)

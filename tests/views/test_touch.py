@@ -1,0 +1,76 @@
+"""Active taxels, sum, peak and contact gate on numbers small enough to add up by hand."""
+
+import dataclasses
+
+import numpy as np
+
+from taccorl.data.spec import data_specs_folder, load_sensor_spec
+from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, Pad, contact_gate, pads_of, peak_row
+
+from .made_episode import TOUCH, made_episode, touch_counts, without
+
+FLEXITAC = load_sensor_spec(data_specs_folder() / "sensors" / "flexitac_v2.yaml")
+SMALL = dataclasses.replace(FLEXITAC, rows=2, columns=2)
+
+
+def pad(*frames: list[list[int]]) -> Pad:
+    return Pad("left_a", SMALL, np.array(frames, dtype=np.int16))
+
+
+def test_active_sum_and_peak_are_what_one_adds_up_by_hand():
+    assert SMALL.noise_count == 15
+    rows = pad([[16, 15], [-40, 31]], [[0, 3], [14, 15]])
+    assert rows.num_active.tolist() == [2, 0]  # 16 and 31 are above 15; 15 is not
+    assert rows.sum_count.tolist() == [16 + 31, 0]
+    assert rows.peak_count.tolist() == [31, 15]
+
+
+def test_sum_of_a_saturated_pad_does_not_overflow_int16():
+    full = Pad("left_a", FLEXITAC, np.full((1, 32, 12), 255, dtype=np.int16))
+    assert full.sum_count.tolist() == [32 * 12 * 255]  # 97920 > 32767
+
+
+def test_gate_opens_beyond_30_counts_which_is_the_papers_threshold():
+    assert (CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS) == (0.4, 1)
+    assert np.isclose(pad([[0, 0], [0, 0]]).gate_count, 30.0)  # 0.4 / (1/75)
+    rows = pad([[30, 30], [30, 30]], [[31, 0], [0, 0]], [[0, 0], [0, -31]], [[0, 0], [0, 0]])
+    assert contact_gate([rows]).tolist() == [False, True, True, False]  # |f|: the paper's eq. counts both signs
+
+
+def test_gate_asks_all_pads_together():
+    quiet, loud = pad([[0, 0], [0, 0]]), pad([[0, 0], [0, 90]])
+    assert contact_gate([quiet, loud]).tolist() == [True]
+    assert contact_gate([quiet, quiet]).tolist() == [False]
+
+
+def test_pads_come_in_the_specs_order_with_the_counts_of_the_dataset():
+    pads = pads_of(made_episode(20, picture_size=32))
+    assert [p.name for p in pads] == ["left_a", "left_b", "right_a", "right_b"]
+    for i, p in enumerate(pads):
+        assert np.array_equal(p.counts, touch_counts(20)[:, i])
+
+
+def test_a_window_feature_shows_its_newest_reading_and_no_pad_twice():
+    episode = made_episode(5, picture_size=32)
+    spec, counts = episode.spec, episode.arrays[TOUCH]
+    window = np.zeros((5, 10, 1536), dtype=np.int16)
+    window[:, -1] = counts
+    feature = dataclasses.replace(spec.features[TOUCH], shape=(15360,), history=10)
+    both = dataclasses.replace(
+        episode,
+        spec=dataclasses.replace(
+            spec,
+            features={**spec.features, "observation.tactile_window": feature},
+            sensors={**spec.sensors, "observation.tactile_window": spec.sensors[TOUCH]},
+        ),
+        arrays={**episode.arrays, "observation.tactile_window": window.reshape(5, -1)},
+    )
+    assert [p.name for p in pads_of(both)] == ["left_a", "left_b", "right_a", "right_b"]
+    only_window = pads_of(without(both, TOUCH))
+    assert np.array_equal(only_window[2].counts, pads_of(episode)[2].counts)
+
+
+def test_peak_row_is_where_the_grip_is_firmest():
+    pads = pads_of(made_episode(101, picture_size=32))
+    assert abs(peak_row(pads) - 60) <= 1  # made so: at 60 % of the episode
+    assert peak_row([]) == 0
