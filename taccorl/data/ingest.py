@@ -9,8 +9,9 @@ import dataclasses
 import errno
 import json
 import shlex
+import shutil
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +19,8 @@ from typing import Any, Literal
 from taccorl.data.checks import Finding, check_episode, check_recording_episodes
 from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Loss, Unfit
 from taccorl.data.dataset import dataset_spec_to_json, episode_record
-from taccorl.data.episode import Episode
+from taccorl.data.episode import Episode, Pictures
+from taccorl.data.picture_checks import PictureWatch
 from taccorl.data.recording import Damage, Recording, Source, find_sources, opened
 from taccorl.data.spec import RecordingSpec
 from taccorl.errors import RecordingError, TaccorlError
@@ -146,39 +148,65 @@ def _stored(job: Job, progress: Progress | None) -> dict[str, Any]:
 def _dry(job: Job) -> dict[str, Any]:
     with opened(job.source, job.spec) as recording:
         cut = Cutter(recording).cut()
-        _, entry = _judge(recording, cut)
+        _, entry = _judge(recording, cut, {})
     return entry
 
 
 def _build(job: Job, folder: Path, progress: Progress | None) -> None:
     """Stage ``recording``: dataset/, entry.json and episodes.json of one recording."""
-    from taccorl.data.lerobot_format import write_episodes
-
     with opened(job.source, job.spec) as recording:
-        cutter, broken = Cutter(recording), 0
-        while True:
-            good, entry = _judge(recording, cutter.cut())
-            if broken:
-                entry["broken_pictures"] = broken
-            if not good:
-                raise NothingToWrite(entry)
-            rows = sum(e.num_rows for e in good)
-            report = None if progress is None else lambda done, rows=rows: progress(job.source.name, done, rows)
-            try:
-                write_episodes(good, folder / "dataset", progress=report)
-                break
-            except BrokenPicture:
-                if broken:
-                    raise
-                broken = cutter.drop_broken_pictures()
+        cutter = Cutter(recording)
+        try:
+            good, entry = _write(cutter, {}, job, folder, progress)
+        except BrokenPicture:
+            broken = cutter.drop_broken_pictures()
+            good, entry = _write(cutter, {}, job, folder, progress)
+            entry["broken_pictures"] = broken
         records = [episode_record(e, "") for e in good]
     _dump(folder / "entry.json", entry)
     _dump(folder / "episodes.json", records)
 
 
-def _judge(recording: Recording, cut: Cut) -> tuple[list[Episode], dict[str, Any]]:
-    """Which episodes are fit for the dataset, and the recording's report entry."""
-    findings = [check_episode(e, pictures=False) for e in cut.episodes]
+def _write(
+    cutter: Cutter, seen: dict[str, list[Finding]], job: Job, folder: Path, progress: Progress | None
+) -> tuple[list[Episode], dict[str, Any]]:
+    """Judge and write; what only the pictures show is known afterwards, and may make it necessary to write again.
+
+    Args:
+        seen: episode name → findings from its pictures, of an earlier attempt.
+    """
+    from taccorl.data.lerobot_format import write_episodes
+
+    good, entry = _judge(cutter.recording, cutter.cut(), seen)
+    if not good:
+        raise NothingToWrite(entry)
+    watches = [PictureWatch(e) for e in good]
+    rows = sum(e.num_rows for e in good)
+    report = None if progress is None else lambda done: progress(job.source.name, done, rows)
+    watched = [dataclasses.replace(e, pictures=_watched(e, w)) for e, w in zip(good, watches, strict=True)]
+    write_episodes(watched, folder / "dataset", progress=report)
+    found = {e.name: w.findings() for e, w in zip(good, watches, strict=True)}
+    if seen or not any(f.severity != "note" for findings in found.values() for f in findings):
+        return good, entry
+    if any(f.severity == "error" for findings in found.values() for f in findings):
+        shutil.rmtree(folder / "dataset")
+        return _write(cutter, found, job, folder, progress)
+    return good, _judge(cutter.recording, cutter.cut(), found)[1]
+
+
+def _watched(episode: Episode, watch: PictureWatch) -> Callable[[], Iterator[Pictures]]:
+    def pictures() -> Iterator[Pictures]:
+        watch.restart()
+        for shown in episode.pictures():
+            watch.see(shown)
+            yield shown
+
+    return pictures
+
+
+def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tuple[list[Episode], dict[str, Any]]:
+    """Which episodes are fit for the dataset, and the recording's report entry; ``seen``: findings from pictures."""
+    findings = [check_episode(e, pictures=False) + seen.get(e.name, []) for e in cut.episodes]
     good = [e for e, found in zip(cut.episodes, findings, strict=True) if not any(f.severity == "error" for f in found)]
     across = check_recording_episodes(good) if len(good) > 1 else []
     origin_ns = min((e.start_ns for e in cut.episodes), default=0)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import av.logging
 import numpy as np
 
 from taccorl.data.dataset import Dataset
@@ -227,6 +228,7 @@ def quiet_lerobot() -> Iterator[None]:
         from lerobot.utils import import_utils
 
         import_utils._transformers_available = False
+    av.logging.set_libav_level(av.logging.ERROR)
     root = logging.getLogger()
     level = root.level
     root.setLevel(logging.ERROR)

@@ -48,7 +48,11 @@ class PictureWatch:
 
     def __init__(self, episode: Episode) -> None:
         self.episode = episode
-        self._thumbs: dict[str, list[np.ndarray]] = {key: [] for key in episode.picture_keys}
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was seen: the episode is shown again from its first row."""
+        self._thumbs: dict[str, list[np.ndarray]] = {key: [] for key in self.episode.picture_keys}
 
     def see(self, pictures: Pictures) -> None:
         """The next row's pictures."""

@@ -23,6 +23,7 @@ from taccorl.data.mcap_records import (
     DATA_END,
     MAGIC,
     MESSAGE,
+    MESSAGE_INDEX,
     METADATA,
     SCHEMA,
     McapFile,
@@ -189,17 +190,18 @@ class _File:
 
     def _walk(self, mcap: McapFile) -> Iterator[Record]:
         """Every record of the data section that may be read; goes on at the next one after a bad one."""
-        offset = self._begin(mcap)
+        offset = sure = self._begin(mcap)
         while True:
             record = mcap.record(offset)
             if record is None:
-                following = self._resume(mcap, offset + 1)
+                following = self._resume(mcap, sure)
                 if following is None:
                     cut = "the file ends without a footer (cut by a crash?)"
                     self._damaged(offset, mcap.end, cut if mcap.summary.end is None else "a damaged record")
                     return
-                self._damaged(offset, following, "a record header that makes no sense")
-                offset = following
+                start = offset if offset < following else sure
+                self._damaged(start, following, "a record header that makes no sense")
+                offset = sure = following
                 continue
             if record.opcode == DATA_END:
                 self.data_end = record
@@ -210,6 +212,10 @@ class _File:
             elif record.opcode not in mcap_records.KNOWN_OPCODES and not self._is_private(mcap, record):
                 self._damaged(record.offset, record.end, f"a record of unknown kind {record.opcode:#04x}")
             offset, self.after_lost = self.after_lost or record.end, None
+            if (
+                record.opcode != MESSAGE_INDEX
+            ):  # it holds nothing, and where bytes are missing the next chunk begins within it
+                sure = offset
             if offset == mcap.summary.end:  # what was before it was no end-of-data record
                 return
 
