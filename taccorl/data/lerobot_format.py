@@ -17,6 +17,7 @@ from typing import Any
 
 import av.logging
 import numpy as np
+import pyarrow as pa
 
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode
@@ -25,7 +26,7 @@ from taccorl.errors import DatasetError
 
 QUEUE_FRAMES = 4
 """Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at 480×640."""
-EXACT_STATS_FROM = 256
+LARGE_FEATURE = 256
 """Features with at least this many elements get exact quantiles in blocks, instead of LeRobot's 5000-bin histogram for each
 element: 80 kB an element, 123 MB for the taxels of a row and 1.2 GB for their window."""
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
@@ -127,7 +128,7 @@ def _write(episodes: Sequence[Episode], root: Path, progress: Callable[[int], No
                     done += 1
                     if progress is not None:
                         progress(done)
-                with _exact_large_stats():
+                with _large_features_in_blocks(dataset.writer):
                     dataset.save_episode()
             dataset.finalize()
         except BaseException:
@@ -145,22 +146,37 @@ def _rows(episode: Episode) -> Iterator[dict[str, Any]]:
 
 
 @contextlib.contextmanager
-def _exact_large_stats() -> Iterator[None]:
-    """While open, LeRobot's writer takes the statistics of large features from ``exact_stats``."""
+def _large_features_in_blocks(writer: Any) -> Iterator[None]:
+    """While open, LeRobot's writer handles features with many elements without a Python object or a histogram for each.
+
+    Statistics come from ``exact_stats``; values reach the parquet file as one Arrow array (``datasets`` turns an array of
+    numbers into lists first: 530 MB for four minutes of touch). What is written is the same.
+    """
     from lerobot.datasets import dataset_writer
 
-    original = dataset_writer.compute_episode_stats
+    def is_large(value: Any) -> bool:
+        return isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] >= LARGE_FEATURE
 
-    def compute(data: dict[str, Any], features: dict[str, Any], *args: Any) -> dict[str, Any]:
-        large = {k for k in data if isinstance(data[k], np.ndarray) and data[k][0].size >= EXACT_STATS_FROM}
-        stats = original({k: v for k, v in data.items() if k not in large}, features, *args)
+    compute, save = dataset_writer.compute_episode_stats, writer._save_episode_data
+
+    def compute_in_blocks(data: dict[str, Any], features: dict[str, Any], *args: Any) -> dict[str, Any]:
+        large = {k for k, v in data.items() if is_large(v)}
+        stats = compute({k: v for k, v in data.items() if k not in large}, features, *args)
         return stats | {k: exact_stats(data[k]) for k in large}
 
-    dataset_writer.compute_episode_stats = compute
+    def save_as_arrow(episode_buffer: dict[str, Any]) -> dict[str, Any]:
+        return save({k: as_arrow(v) if is_large(v) else v for k, v in episode_buffer.items()})
+
+    dataset_writer.compute_episode_stats, writer._save_episode_data = compute_in_blocks, save_as_arrow
     try:
         yield
     finally:
-        dataset_writer.compute_episode_stats = original
+        dataset_writer.compute_episode_stats, writer._save_episode_data = compute, save
+
+
+def as_arrow(values: np.ndarray) -> pa.Array:
+    """(T, size) numbers as T fixed-size lists, without copying."""
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
 
 
 def exact_stats(values: np.ndarray, block: int = 128) -> dict[str, np.ndarray]:

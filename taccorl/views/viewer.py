@@ -99,6 +99,11 @@ def _program() -> str:
 
 
 def _environment() -> dict[str, str]:
+    """For a program that is about to be started; also sees to it that it starts with ordinary priority."""
+    # Run as root, the AV1 encoder (SVT-AV1) makes the thread that opened it real-time, priority 99. Whatever that thread
+    # starts inherits it, and a viewer that renders in software then keeps everybody else off the processor.
+    if sys.platform == "linux" and os.sched_getscheduler(0) == os.SCHED_FIFO:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     # Without this, notes like "Listening for connections" cover the views.
     return os.environ | {"RUST_LOG": os.environ.get("RUST_LOG", "error")}
 

@@ -154,6 +154,8 @@ def write_mp4(
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
         container.mux(stream.encode(None))
     path.write_bytes(buffer.getvalue())
+    if os.geteuid() == 0:  # SVT-AV1 has made this thread real-time: see taccorl/views/viewer.py
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def in_dataset(episode: Episode, folder: Path, *, codec: str = "libsvtav1", rows_before: int = 7) -> Episode:
