@@ -20,6 +20,10 @@ class DatasetError(TaccorlError):
     """A dataset that is incomplete, of another kind, or in the way."""
 
 
+class InTheWayError(DatasetError):
+    """Something else lies where a dataset is to be; it was not touched."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """`` did you mean 'x'? `` for the closest known name, else the list of all; ends without a full stop."""
     names = sorted(str(k) for k in known)

@@ -5,9 +5,14 @@ A recording needs its spec; a dataset is checked against the spec it carries.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import parse
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, nearest
+
+if TYPE_CHECKING:
+    from taccorl.data.cutting import Cutter
+    from taccorl.data.finding import Finding
 
 
 @dataclass(kw_only=True)
@@ -27,6 +32,11 @@ def main(argv: list[str]) -> int:
     config = parse(CheckConfig, argv, positional="path")
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)
+    if not config.path.exists():
+        siblings = config.path.parent.iterdir() if config.path.parent.is_dir() else []
+        raise TaccorlError(
+            f"{config.path}: no such file or folder; {nearest(config.path.name, [p.name for p in siblings])}"
+        )
     if config.spec is None:
         raise TaccorlError(
             f"{config.path} is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"
@@ -55,8 +65,8 @@ def _check_dataset(config: CheckConfig) -> int:
 
 def _check_recordings(config: CheckConfig) -> int:
     from taccorl.cli.tables import findings_table
-    from taccorl.data.checks import Finding, check_episode, check_recording_episodes
-    from taccorl.data.cutting import Cutter
+    from taccorl.data.checks import Finding
+    from taccorl.data.cutting import BrokenPicture, Cutter
     from taccorl.data.recording import find_sources, opened
     from taccorl.data.spec import load_recording_spec
 
@@ -66,25 +76,39 @@ def _check_recordings(config: CheckConfig) -> int:
     for _, source in find_sources(config.path, reader=spec.reader, split_bag=spec.split_bag):
         try:
             with opened(source, spec) as recording:
-                cut = Cutter(recording).cut()
-                findings = [Finding("damage", "warning", "file", str(d)) for d in recording.damage]
-                for loss in cut.losses:
-                    severity = "warning" if loss.wanted else "note"
-                    findings.append(
-                        Finding("lost", severity, "rows", f"{loss.start_s:.2f} to {loss.end_s:.2f} s: {loss.reason}")
-                    )
-                findings += check_recording_episodes(cut.episodes) if len(cut.episodes) > 1 else []
-                findings_table(source.name, findings)
-                worst = max(worst, _worst(findings))
-                for episode in cut.episodes:
-                    found = check_episode(episode, pictures=config.pictures)
-                    label = episode.name.removeprefix(source.name).strip() or "episode"
-                    findings_table(f"  {label}: {episode.num_rows} rows, {episode.instruction!r}", found)
-                    worst = max(worst, _worst(found))
+                cutter = Cutter(recording)
+                try:
+                    found = _recording_findings(cutter, config.pictures)
+                except BrokenPicture:  # as ingest does: leave it out, look at the rest
+                    cutter.drop_broken_pictures()
+                    found = _recording_findings(cutter, config.pictures)
         except TaccorlError as error:
-            findings_table(source.name, [Finding("unreadable", "error", "file", str(error))])
-            worst = 1
+            found = [(source.name, [Finding("unreadable", "error", "file", str(error))])]
+        for label, findings in found:
+            findings_table(label, findings)
+            worst = max(worst, _worst(findings))
     return worst
+
+
+def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, list["Finding"]]]:
+    """(what, findings): the recording first, then each of its episodes."""
+    from taccorl.data.checks import Finding, check_episode, check_recording_episodes
+
+    recording, cut = cutter.recording, cutter.cut()
+    findings = [Finding("damage", "warning" if d.lost else "note", "file", str(d)) for d in recording.damage]
+    for channel, times_s in cutter.broken_pictures_s.items():
+        text = f"{channel}: {len(times_s)} pictures do not decode, first at {times_s[0]:.2f} s"
+        findings.append(Finding("broken_picture", "warning", channel, text))
+    for loss in cut.losses:
+        text = f"{loss.start_s:.2f} to {loss.end_s:.2f} s: {loss.reason}"
+        findings.append(Finding("lost", "warning" if loss.wanted else "note", "rows", text))
+    findings += check_recording_episodes(cut.episodes) if len(cut.episodes) > 1 else []
+    found = [(recording.source.name, findings)]
+    for episode in cut.episodes:
+        label = episode.name.removeprefix(recording.source.name).strip() or "episode"
+        label = f"  {label}: {episode.num_rows} rows, {episode.instruction!r}"
+        found.append((label, check_episode(episode, pictures=pictures)))
+    return found
 
 
 def _worst(findings: list) -> int:

@@ -7,12 +7,13 @@ Recordings (MCAP, ROS 2 bags, HDF5, LeRobot datasets) into one LeRobot v3 datase
 import ctypes
 import json
 import os
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from taccorl.cli.parse import parse
-from taccorl.errors import DatasetError, TaccorlError
+from taccorl.errors import DatasetError, InTheWayError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 
 
@@ -79,40 +80,46 @@ def _ingest(config: IngestConfig) -> int:
 
     spec = load_recording_spec(config.spec)
     jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run)
-    _check_out(config)
-    store = Store(config.store)
+    _check_out(config, [file for job in jobs for file in job.source.files])
+    store = None if config.dry_run else Store(config.store)
+    moved: list[Path] = []
+    replace = moved.append if config.replace else None
     with Bars(len(jobs)) as bars:
         try:
-            report = ingest(jobs, config.out, store, engine=config.engine, progress=bars.update)
-        except DatasetError as error:
-            if not config.replace or not config.out.exists():
-                raise
-            aside = _aside(config.out)
-            config.out.rename(aside)
-            print(f"moved what was at {config.out} to {aside} ({str(error).split(':')[0]})")
-            report = ingest(jobs, config.out, store, engine=config.engine, progress=bars.update)
+            report = ingest(jobs, config.out, store, engine=config.engine, progress=bars.update, replace=replace)
+        except InTheWayError as error:
+            raise InTheWayError(f"{error} --replace=true moves it aside.") from error
     ingest_table(report)
+    for aside in moved:
+        print(f"what was at {config.out} is now at {aside}")
     _write_report(report, config)
     wrong = report["outcomes"]["quarantined"] + report["outcomes"]["refused"]
     return 1 if wrong else 0
 
 
-def _check_out(config: IngestConfig) -> None:
+def _check_out(config: IngestConfig, inputs: list[Path]) -> None:
     """What is certain to be in the way is told before an hour of work, not after it."""
-    out = config.out
-    if config.dry_run or config.replace or not out.exists():
+    out, whole = config.out, config.out.resolve()
+    if out.name in ("", ".."):
+        raise DatasetError(f"--out={out} has no name of its own: give a folder's name")
+    inside = [path for path in inputs if path.resolve().is_relative_to(whole)]
+    if inside:
+        raise DatasetError(f"{inside[0]} is read, and lies in --out={out}: give another --out")
+    if config.dry_run:
         return
-    if not (out / "meta/taccorl/manifest.json").is_file():
+    store = config.store.resolve()
+    if whole.is_relative_to(store) or store.is_relative_to(whole):
+        raise DatasetError(f"--out={out} and --store={config.store} lie in one another: choose another")
+    for place in (whole.parent, store):
+        folder = next(p for p in (place, *place.parents) if p.exists())
+        if not folder.is_dir():
+            raise DatasetError(f"{place}: {folder} is no folder")
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise DatasetError(f"{place}: nothing may be written in {folder}")
+    if out.exists() and not config.replace and not (out / "meta/taccorl/manifest.json").is_file():
         raise DatasetError(
             f"{out} exists and is no dataset of taccorl: give another --out, or --replace=true to move it aside"
         )
-
-
-def _aside(out: Path) -> Path:
-    number = 1
-    while (aside := out.with_name(f"{out.name}.old-{number}")).exists():
-        number += 1
-    return aside
 
 
 def _write_report(report: dict[str, Any], config: IngestConfig) -> None:
@@ -137,9 +144,17 @@ def _inspect(config: InspectConfig) -> int:
 
     if config.draft is not None and config.draft.exists():
         raise TaccorlError(f"{config.draft} exists; give another --draft, it would be overwritten")
-    failed = 0
+    failed, found = 0, []
     for path in config.paths:
-        for name, source in find_sources(path, reader=config.reader, split_bag=config.split_bag):
+        try:
+            found.append((path, find_sources(path, reader=config.reader, split_bag=config.split_bag)))
+        except TaccorlError as error:
+            if len(config.paths) == 1:
+                raise
+            print(error)
+            failed += 1
+    for path, sources in found:
+        for name, source in sources:
             try:
                 inventory = inspect_source(name, source)
             except TaccorlError as error:
@@ -147,13 +162,13 @@ def _inspect(config: InspectConfig) -> int:
                 failed += 1
                 continue
             inventory_table(inventory)
-            text = draft_spec(inventory)
+            text = draft_spec(inventory, config.draft.parent if config.draft else None)
             if config.draft is not None:
                 config.draft.write_text(text, encoding="utf-8")
                 print(f"draft spec: {config.draft}")
                 config.draft = None
             elif inventory.fits:
-                print(f"fits the shipped spec: taccorl ingest {path} --spec={inventory.fits[0]}\n")
+                print(f"fits the shipped spec: taccorl ingest {shlex.quote(str(path))} --spec={inventory.fits[0]}\n")
             else:
                 print("draft spec (--draft=FILE writes it):\n\n" + text)
     return 1 if failed else 0

@@ -3,17 +3,23 @@
 Bare words fill one named field: ``taccorl view episode.mcap`` is ``taccorl view --path=episode.mcap``.
 """
 
+import argparse
 import dataclasses
 import json
 import sys
+import types
 import typing
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from taccorl.errors import TaccorlError, nearest
 
+HELP = ("-h", "--help")
+
 
 def parse[ConfigT](config_class: type[ConfigT], argv: Sequence[str], *, positional: str | None = None) -> ConfigT:
-    """``argv`` as ``config_class``.
+    """``argv`` as ``config_class``. Paths and texts are taken as they are typed; other values are YAML, as in LeRobot.
 
     Args:
         positional: field that bare words fill; a list field takes all of them.
@@ -23,39 +29,125 @@ def parse[ConfigT](config_class: type[ConfigT], argv: Sequence[str], *, position
     """
     words = [a for a in argv if not a.startswith("-")]
     options = [a for a in argv if a.startswith("-")]
-    fields = {f.name: f for f in dataclasses.fields(config_class)}  # pyright: ignore[reportArgumentType]
+    hints = typing.get_type_hints(config_class)
+    if any(option in HELP for option in options):
+        return _draccus(config_class, options)
     for option in options:
-        name = option.lstrip("-").partition("=")[0].split(".")[0]
-        if name not in fields and name not in ("config_path", "help", "h"):
-            raise TaccorlError(f"unknown option {option!r}; {nearest(name, fields)}")
-        if name in fields and "=" not in option:
-            raise TaccorlError(f"option {option!r} needs a value: {option}=…")
+        _check_option(option, hints)
     if words:
         if positional is None:
-            raise TaccorlError(f"did not expect {words[0]!r}; options: {', '.join(f'--{n}=' for n in fields)}")
-        hint = typing.get_type_hints(config_class)[positional]
-        if typing.get_origin(hint) is list:
-            options.append(f"--{positional}={json.dumps(words)}")
-        elif len(words) == 1:
-            options.append(f"--{positional}={words[0]}")
-        else:
+            raise TaccorlError(f"did not expect {words[0]!r}; options: {', '.join(f'--{n}=' for n in hints)}")
+        if any(o.startswith(f"--{positional}=") for o in options):
+            raise TaccorlError(f"{words[0]!r} and --{positional}=…: give {positional} one way")
+        if not all(words):
+            raise TaccorlError(f"{positional} is empty: a shell variable that is not set?")
+        if len(words) > 1 and _text_kind(hints[positional]) != "list":
             raise TaccorlError(f"one {positional} at a time, found {' '.join(words)}")
+        options += [f"--{positional}={word}" for word in words]
+    texts, rest = _take_texts(options, hints)
     given = {o.lstrip("-").partition("=")[0] for o in options}
+    fields = {f.name: f for f in dataclasses.fields(config_class)}  # pyright: ignore[reportArgumentType]
     required = [
         n
         for n, f in fields.items()
         if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and n not in given
     ]
-    if required and not given & {"config_path", "help", "h"}:
+    if required and "config_path" not in given:
         raise TaccorlError(f"missing {', '.join(f'--{n}=' for n in required)}; --help says more")
-    import draccus
-    from draccus.utils import DecodingError
+    rest += _implied_types(rest, fields)
+    # YAML would read a path 2024-01-01 as a date, and cut "run #3" at the number sign.
+    rest += [f"--{name}={json.dumps(['x'] if isinstance(value, list) else 'x')}" for name, value in texts.items()]
+    return dataclasses.replace(_draccus(config_class, rest), **texts)  # pyright: ignore[reportArgumentType]
 
+
+def _check_option(option: str, hints: dict[str, Any]) -> None:
+    """A known name with a value."""
+    name, equals, value = option.lstrip("-").partition("=")
+    known = ["config_path", *hints, *(f"{n}.{inner}" for n, hint in hints.items() for inner in _inner_names(hint))]
+    if name not in known or not option.startswith("--"):
+        raise TaccorlError(f"unknown option {option!r}; {nearest(name, known)}")
+    if not equals or not value:
+        raise TaccorlError(f"option {option!r} needs a value: --{name}=…")
+
+
+def _inner_names(hint: Any) -> list[str]:
+    """Names below a field that is a dataclass, or one of several by ``type``."""
+    choices = getattr(hint, "get_known_choices", dict)()
+    kinds = [*choices.values(), hint] if choices else [hint]
+    inner = [f.name for kind in kinds if dataclasses.is_dataclass(kind) for f in dataclasses.fields(kind)]
+    return [*(["type"] if choices else []), *dict.fromkeys(inner)]
+
+
+def _text_kind(hint: Any) -> str | None:
+    """``one`` for a path or text, perhaps absent; ``list`` for a list of them; None for anything else."""
+    if typing.get_origin(hint) is list:
+        return "list" if typing.get_args(hint)[0] in (Path, str) else None
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        kinds = [k for k in typing.get_args(hint) if k is not type(None)]
+        return _text_kind(kinds[0]) if len(kinds) == 1 else None
+    return "one" if hint in (Path, str) else None
+
+
+def _take_texts(options: list[str], hints: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Values of fields that are paths or texts, and the options that draccus is to read."""
+    texts: dict[str, Any] = {}
+    rest: list[str] = []
+    for option in options:
+        name, _, value = option.removeprefix("--").partition("=")
+        hint = hints.get(name)
+        kind = _text_kind(hint)
+        convert = _path if hint is Path or Path in typing.get_args(hint) else str
+        if kind == "list" and not (value.startswith("[") and value.endswith("]")):
+            texts.setdefault(name, []).append(convert(value))
+        elif kind == "one" and not (value == "null" and hint not in (Path, str)):
+            texts[name] = convert(value)
+        else:
+            rest.append(option)
+    return texts, rest
+
+
+def _path(value: str) -> Path:
+    """The shell leaves the ~ of --out=~/data alone: a folder named ~ is never meant."""
+    return Path(value).expanduser() if value.startswith("~/") else Path(value)
+
+
+def _implied_types(options: list[str], fields: dict[str, Any]) -> list[str]:
+    """``--engine.workers=2`` means the default engine's workers: draccus wants its type said."""
+    names = {o.removeprefix("--").partition("=")[0] for o in options}
+    if "config_path" in names:
+        return []
+    implied = []
+    for field in {n.split(".")[0] for n in names if "." in n}:
+        factory = fields[field].default_factory
+        if f"{field}.type" not in names and hasattr(factory, "get_choice_name"):
+            implied.append(f"--{field}.type={factory.get_choice_name(factory)}")
+    return implied
+
+
+def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> ConfigT:
+    import draccus
+    import yaml
+    from draccus.utils import DraccusException
+
+    for option in options:
+        if option.startswith("--config_path="):
+            _check_config_file(Path(option.partition("=")[2]))
     try:
-        return draccus.parse(config_class, args=options)
-    except DecodingError as error:
+        return draccus.parse(config_class, args=options, exit_on_error=False)
+    except (DraccusException, argparse.ArgumentError, yaml.YAMLError) as error:
         raise TaccorlError(" ".join(str(error).split())) from error
     except SystemExit as stop:
         if stop.code in (0, None):
             sys.stdout.flush()
         raise
+
+
+def _check_config_file(path: Path) -> None:
+    import yaml
+
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise TaccorlError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(found, dict):
+        raise TaccorlError(f"{path}: expected options and their values, found {type(found).__name__}")

@@ -11,6 +11,8 @@ from taccorl.data.inspection import Inventory
 
 WIDE = 150
 """Columns of a log file or pipe, which has no width of its own."""
+LONG_TEXT = 400
+"""Characters of a metadata record to show: rosbag2 writes pages of settings into one."""
 COLORS = {"written": "green", "split": "yellow", "quarantined": "red", "refused": "red"}
 SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
 
@@ -51,12 +53,13 @@ def ingest_table(report: dict[str, Any]) -> None:
         written = [e for e in r["episodes"] if e["outcome"] == "written"]
         name = r["recording"] + (f"#{r['part']}" if r["part"] else "")
         rows = str(sum(e["rows"] for e in written))
-        table.add_row(_shorten(name), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows, r["reason"])
+        cells = (Text(_shorten(name)), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows)
+        table.add_row(*cells, Text(r["reason"]))
     out = console()
     out.print(table)
     for r in report["recordings"]:
         if r["outcome"] != "written":
-            out.print(f"  look: [bold]{r['command']}[/bold]", highlight=False, soft_wrap=True)
+            out.print(Text("  look: ") + Text(r["command"], "bold"), soft_wrap=True)
         for e in r["episodes"]:
             for f in e["findings"]:
                 if f["severity"] != "note":
@@ -82,22 +85,23 @@ def inventory_table(inventory: Inventory) -> None:
     """Channels, rates, gaps, clock skew and damage of one recording."""
     out = console()
     files = f" ({len(inventory.source.files)} files)" if len(inventory.source.files) > 1 else ""
-    out.print(
-        f"[bold]{inventory.source.name}[/bold]{files}  {inventory.reader}, {inventory.duration_s:.2f} s",
-        highlight=False,
-    )
+    about = f"{files}  {inventory.reader}, {inventory.duration_s:.2f} s"
+    out.print(Text(inventory.source.name, "bold") + Text(about), soft_wrap=True)
     table = Table(box=None, pad_edge=False)
     for column in ("topic", "type", "messages", "rate [Hz]", "gaps", "longest gap [s]", "clock"):
         table.add_column(column, justify="left" if column in ("topic", "type", "clock") else "right", overflow="fold")
     for t in inventory.topics:
         rate, gap = (f"{t.rate_hz:.1f}", f"{t.longest_gap_s:.3f}") if t.rate_hz else ("–", "–")
-        table.add_row(t.topic, t.type.name, str(t.num_messages), rate, str(t.num_gaps), gap, _clock(t))
+        numbers = (str(t.num_messages), rate, str(t.num_gaps), gap)
+        table.add_row(Text(t.topic), Text(t.type.name), *numbers, _clock(t))
     out.print(table)
     for t in inventory.topics:
         if t.type.undecodable:
-            out.print(f"  [yellow]not decodable[/yellow] {t.type.undecodable}", highlight=False, soft_wrap=True)
+            out.print(Text("  not decodable ", "yellow") + Text(t.problem), soft_wrap=True)
     for name, record in inventory.metadata.items():
-        out.print(f"  metadata {name}: {record}", highlight=False, soft_wrap=True, markup=False)
+        text = str(record)
+        shown = text if len(text) <= LONG_TEXT else f"{text[:LONG_TEXT]} … ({len(text):,} characters)"
+        out.print(Text(f"  metadata {name}: {shown}"), soft_wrap=True)
     for d in inventory.damage:
         out.print(Text("  damage ", "red") + Text(str(d)), soft_wrap=True)
 

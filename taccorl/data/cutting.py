@@ -43,6 +43,8 @@ class Loss:
 class Cut:
     """What a recording gave."""
 
+    origin_ns: int = 0
+    """The recording's first sample, on its channels' clock: where the losses' seconds count from."""
     episodes: list[Episode] = field(default_factory=list)
     losses: list[Loss] = field(default_factory=list)
 
@@ -70,6 +72,8 @@ class Cutter:
     def __init__(self, recording: Recording) -> None:
         self.recording, self.spec = recording, recording.spec
         self.dropped: dict[str, set[tuple[int, int | None]]] = {}
+        self.broken_pictures_s: dict[str, list[float]] = {}
+        """Channel → when the dropped pictures were logged, in seconds since the recording's first sample."""
         self.clocks = self._read_clocks()
         self.baselines = {
             key: self._baseline(key, sensor)
@@ -83,6 +87,7 @@ class Cutter:
         for name, channel in self.recording.channels.items():
             bad = self.dropped.get(name, set())
             stamps = channel.stamp_ns
+            self._check_zero_stamps(name)
             keep = np.array([i for i in range(len(channel.log_ns)) if self._identity(name, i) not in bad], dtype=int)
             reading = timing.read_clock(
                 channel.log_ns[keep],
@@ -100,6 +105,18 @@ class Cutter:
             {self.spec.channels[name].topic: r.skew_s for name, r in readings.items()}, self.spec.max_clock_spread_s
         )
         return readings
+
+    def _check_zero_stamps(self, name: str) -> None:
+        """Stamps of 0 among wall-clock stamps are no times; a spec has to say so, or the recording begins in 1970."""
+        channel = self.recording.channels[name]
+        if channel.stamp_ns is None or channel.spec.drop_zero_stamp or self.spec.clock_of(name) == "log":
+            return
+        zeros = int((channel.stamp_ns == 0).sum())
+        if zeros and int(channel.stamp_ns.max()) > timing.SIM_TIME_S * NS_PER_S:
+            raise RecordingError(
+                f"{channel.spec.topic}: {zeros} of {len(channel.stamp_ns)} messages are stamped 0: add "
+                f"`drop_zero_stamp: true` to channel {name!r} to leave them out"
+            )
 
     def _identity(self, name: str, index: int) -> tuple[int, int | None]:
         channel = self.recording.channels[name]
@@ -131,7 +148,7 @@ class Cutter:
 
     def cut(self) -> Cut:
         """All episodes, with what was lost between them."""
-        result = Cut()
+        result = Cut(self.origin_ns)
         intervals = self._intervals(result)
         for number, interval in enumerate(intervals):
             self._cut_interval(interval, f"episode {number}" if len(intervals) > 1 else "", result)
@@ -202,9 +219,14 @@ class Cutter:
                 start, end = (self._common_ns(int(record[k])) for k in ("start", "end"))
             except (KeyError, ValueError) as error:
                 raise RecordingError(f"metadata record {name!r}: {record} has no start and end in ns") from error
+            if end < start:
+                raise RecordingError(
+                    f"metadata record {name!r}: ends {(start - end) / NS_PER_S:.3f} s before it starts"
+                )
             told = record.get("success", "").lower()
             success = {"true": True, "false": False}.get(told)
-            found.append(_Interval(start, end, record.get("instruction") or self._instruction(), success, marked=True))
+            instruction = record.get("instruction", "").strip() or self._instruction()
+            found.append(_Interval(start, end, instruction, success, marked=True))
         if not found:
             raise RecordingError(
                 "no metadata record episode_<id> in the recording; has "
@@ -218,15 +240,15 @@ class Cutter:
             return rule.text or ""
         if rule.from_ == "topic":
             assert rule.topic is not None
-            texts = {text for _, text in self.recording.texts[rule.topic]}
+            texts = {text.strip() for _, text in self.recording.texts[rule.topic]} - {""}
             if len(texts) != 1:
                 raise RecordingError(
                     f"{rule.topic} holds {len(texts)} different instructions {sorted(texts)[:3]}; one is needed"
                 )
             return texts.pop()
         for record in self.recording.reader.metadata.values():
-            if rule.key in record:
-                return record[rule.key]
+            if record.get(rule.key or "", "").strip():
+                return record[rule.key or ""].strip()
         known = sorted({k for r in self.recording.reader.metadata.values() for k in r})
         raise RecordingError(f"no metadata key {rule.key!r} for the instruction; the recording has {known or 'none'}")
 
@@ -236,13 +258,7 @@ class Cutter:
 
     def _cut_interval(self, interval: _Interval, label: str, result: Cut) -> None:
         start_ns = max([interval.start_ns, *(self._first_usable_ns(key) for key in self.spec.mapped)])
-        ends = [
-            int(self.clocks[c].time_ns[-1])
-            for key in self.spec.mapped
-            for c in self.spec.features[key].channels
-            if self.spec.features[key].align != "hold"
-        ]
-        end_ns = min([interval.end_ns, *ends])
+        end_ns = min([interval.end_ns, *self._last_ns().values()])
         self._report_ends(interval, start_ns, end_ns, result)
         grid_ns = timing.make_grid(start_ns, end_ns, self.spec.target.fps)
         matches = {key: self._match(key, grid_ns) for key in self.spec.mapped}
@@ -262,6 +278,16 @@ class Cutter:
             name = " ".join(w for w in (self.recording.source.name, label, part) if w)
             result.episodes.append(self._episode(name, interval, grid_ns[a:b], matches, slice(a, b)))
 
+    def _last_ns(self) -> dict[str, int]:
+        """Channel → time of its last sample; a held one goes on for ever."""
+        channels = [
+            c
+            for key in self.spec.mapped
+            for c in self.spec.features[key].channels
+            if self.spec.features[key].align != "hold"
+        ]
+        return {c: int(self.clocks[c].time_ns[-1]) for c in channels}
+
     def _first_usable_ns(self, key: str) -> int:
         mapping, history = self.spec.features[key], self.spec.target.features[key].history
         firsts = []
@@ -274,13 +300,18 @@ class Cutter:
 
     def _report_ends(self, interval: _Interval, start_ns: int, end_ns: int, result: Cut) -> None:
         slack_ns = round((0.0 if interval.marked else START_UP_S) * NS_PER_S) + NS_PER_S // 4
+        late = max(self.clocks, key=lambda c: int(self.clocks[c].time_ns[0]))
+        last_ns = self._last_ns()
+        early = min(last_ns, key=last_ns.__getitem__, default=late)
+        begin_s, finish_s = self.seconds(interval.start_ns), self.seconds(interval.end_ns)
+        if end_ns < start_ns:  # not one row
+            reason = f"{early} ends early" if start_ns <= interval.end_ns else f"{late} begins late"
+            result.losses.append(Loss(begin_s, finish_s, reason))
+            return
         if start_ns - interval.start_ns > slack_ns:
-            late = max(self.clocks, key=lambda c: int(self.clocks[c].time_ns[0]))
-            begin, end = self.seconds(interval.start_ns), self.seconds(min(start_ns, interval.end_ns))
-            result.losses.append(Loss(begin, end, f"{late} begins late"))
-        if interval.end_ns - end_ns > slack_ns and end_ns >= start_ns:
-            early = min(self.clocks, key=lambda c: int(self.clocks[c].time_ns[-1]))
-            result.losses.append(Loss(self.seconds(end_ns), self.seconds(interval.end_ns), f"{early} ends early"))
+            result.losses.append(Loss(begin_s, self.seconds(start_ns), f"{late} begins late"))
+        if interval.end_ns - end_ns > slack_ns:
+            result.losses.append(Loss(self.seconds(end_ns), finish_s, f"{early} ends early"))
 
     def _match(self, key: str, grid_ns: np.ndarray) -> dict[str, timing.Matched]:
         mapping, feature = self.spec.features[key], self.spec.target.features[key]
@@ -377,13 +408,18 @@ class Cutter:
         if not sources:
             return
         identities = {key: [self._identity(c, int(i)) for i in index] for key, (c, index) in sources.items()}
-        key_of = {channel: key for key, (channel, _) in sources.items()}
+        keys_of: dict[str, list[str]] = {}
+        for key, (channel, _) in sources.items():
+            keys_of.setdefault(channel, []).append(key)
         waiting: dict[str, dict[tuple[int, int | None], Any]] = {key: {} for key in sources}
         shown: dict[str, tuple[tuple[int, int | None], np.ndarray]] = {}
         row = 0
-        wanted = {channel: identities[key] for channel, key in key_of.items()}
+        wanted = {channel: [i for key in keys for i in identities[key]] for channel, keys in keys_of.items()}
+        needed = {key: set(ids) for key, ids in identities.items()}
         for channel, identity, payload in self.recording.pictures(wanted):
-            waiting[key_of[channel]][identity] = payload
+            for key in keys_of[channel]:
+                if identity in needed[key]:
+                    waiting[key][identity] = payload
             if sum(map(len, waiting.values())) > MAX_WAITING_PICTURES:
                 raise RecordingError(
                     f"{MAX_WAITING_PICTURES} pictures wait for other cameras': cameras are not interleaved in the file"
@@ -429,6 +465,7 @@ class Cutter:
                 decode.picture(payload, self.spec.channels[channel])
             except RecordingError:
                 self.dropped.setdefault(channel, set()).add(identity)
+                self.broken_pictures_s.setdefault(channel, []).append(self.seconds(self._common_ns(identity[0])))
                 broken += 1
         self.clocks = self._read_clocks()
         return broken

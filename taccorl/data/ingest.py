@@ -5,11 +5,14 @@ what was lost is listed); ``quarantined`` (readable, but its data is wrong); ``r
 spec). Originals are only ever read.
 """
 
+import contextlib
 import dataclasses
 import errno
 import json
+import os
 import shlex
 import shutil
+import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,7 +26,7 @@ from taccorl.data.episode import Episode, Pictures
 from taccorl.data.picture_checks import PictureWatch
 from taccorl.data.recording import Damage, Recording, Source, find_sources, opened
 from taccorl.data.spec import RecordingSpec
-from taccorl.errors import RecordingError, TaccorlError
+from taccorl.errors import InTheWayError, RecordingError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
@@ -34,6 +37,13 @@ Progress = Callable[[str, int, int], None]
 
 PROVENANCE = "meta/taccorl"
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
+MACHINE_FAULTS = {
+    errno.ENOSPC: "no space left",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "a file larger than this user may write (ulimit -f)",
+    errno.EROFS: "the disk is read-only",
+}
+"""Faults that no other recording would escape: the whole run stops."""
 RECORDING_STAGE_VERSION = 1
 DATASET_STAGE_VERSION = 1
 
@@ -58,25 +68,34 @@ class NothingToWrite(RecordingError):
 
 
 def find_jobs(paths: Sequence[Path], spec: RecordingSpec, spec_name: str, store: Path, dry_run: bool) -> list[Job]:
-    """One job per recording under ``paths``, in the order given, folders in natural order; a path twice is one input.
+    """One job per recording under ``paths``, in the order given, folders in natural order; a file twice is one input.
 
     Raises:
         RecordingError: a path holds no recording.
     """
-    jobs: dict[str, Job] = {}
+    jobs: dict[tuple[Path, str | None], Job] = {}
     for path in paths:
         for _, source in find_sources(path, reader=spec.reader, split_bag=spec.split_bag):
-            jobs.setdefault(source.name, Job(source, spec, spec_name, store, dry_run))
+            jobs.setdefault((source.path.resolve(), source.part), Job(source, spec, spec_name, store, dry_run))
     return list(jobs.values())
 
 
 def ingest(
-    jobs: Sequence[Job], out: Path, store: Store, *, engine: Engine | None = None, progress: Progress | None = None
+    jobs: Sequence[Job],
+    out: Path,
+    store: Store | None,
+    *,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
+    replace: Callable[[Path], None] | None = None,
 ) -> dict[str, Any]:
-    """Ingest all jobs and publish the dataset at ``out``; returns the report.
+    """Ingest all jobs and publish the dataset at ``out``; returns the report. A dry run needs no store.
+
+    Args:
+        replace: if given, whatever else is at ``out`` is moved aside, and this is told to where.
 
     Raises:
-        DatasetError: ``out`` holds something else; checked before any work is done as far as possible.
+        InTheWayError: ``out`` holds something else.
         TaccorlError: the machine failed (disk full); what was finished is kept and not done again.
     """
     if engine is None or (isinstance(engine, LocalEngine) and engine.workers <= 1):
@@ -93,7 +112,7 @@ def ingest(
     shards = [(entry, Path(entry["artefact"])) for entry in entries if entry.get("artefact")]
     for entry in entries:
         entry.pop("artefact", None)
-    if not shards or any(job.dry_run for job in jobs):
+    if not shards or store is None or any(job.dry_run for job in jobs):
         return report
     spec = jobs[0].spec
     stage = Stage(
@@ -106,8 +125,35 @@ def ingest(
     named = [[Path(e["recording"]).name, e["part"], e["outcome"]] for e in entries]
     config = {"spec": spec.digest, "recordings": named}
     inputs = [Artefact(path, json.loads((path / "manifest.json").read_text())["digest"]) for _, path in shards]
-    store.run(stage, config, inputs, destination=out)
+    try:
+        try:
+            store.run(stage, config, inputs, destination=out)
+        except InTheWayError:
+            if replace is None:
+                raise
+            with _moved_aside(out) as aside:
+                store.run(stage, config, inputs, destination=out)
+            replace(aside)
+    except Exception as error:
+        if (fault := _machine_fault(error)) is not None:
+            raise _stopped(fault, out) from error
+        raise
     return report
+
+
+@contextlib.contextmanager
+def _moved_aside(out: Path) -> Iterator[Path]:
+    """What is at ``out`` lies under another name; it comes back if the work fails."""
+    number = 1
+    while os.path.lexists(aside := out.with_name(f"{out.name}.old-{number}")):
+        number += 1
+    out.rename(aside)
+    try:
+        yield aside
+    except BaseException:
+        if not os.path.lexists(out):
+            aside.rename(out)
+        raise
 
 
 def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
@@ -120,20 +166,30 @@ def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
         entry = _entry("quarantined", str(error))
     except TaccorlError as error:
         entry = _entry("refused", str(error))
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise TaccorlError(
-                f"no space left on the disk of {job.store}; what was finished is kept: free space, run again"
-            ) from error
-        entry = _entry("refused", f"{error.strerror or error} ({error.filename or job.source.name})")
     except MemoryError:
         raise
-    except (
-        Exception
-    ) as error:  # our fault, not the user's: no traceback on the screen, but the whole of it in the report
-        entry = _entry("refused", f"a fault in taccorl, please report it: {type(error).__name__}: {error}")
-        entry["traceback"] = traceback.format_exc()
+    except Exception as error:
+        if (fault := _machine_fault(error)) is not None:
+            raise _stopped(fault, job.store) from error
+        if isinstance(error, OSError):
+            entry = _entry("refused", f"{error.strerror or error} ({error.filename or job.source.name})")
+        else:  # our fault, not the user's: no traceback on the screen, but the whole of it in the report
+            entry = _entry("refused", f"a fault in taccorl, please report it: {type(error).__name__}: {error}")
+            entry["traceback"] = traceback.format_exc()
     return _named(entry, job)
+
+
+def _machine_fault(error: Exception) -> str | None:
+    """What of the machine failed, if it did. LeRobot's encoder threads and shutil hand an OSError on as text only."""
+    told = (text for number, text in MACHINE_FAULTS.items() if f"[Errno {number}]" in str(error))
+    return MACHINE_FAULTS.get(getattr(error, "errno", None) or 0) or next(told, None)
+
+
+def _stopped(fault: str, place: Path) -> TaccorlError:
+    return TaccorlError(
+        f"{fault} at {place} or in {tempfile.gettempdir()} (scratch files); what was finished is kept: "
+        f"make room, then run the same command again"
+    )
 
 
 def _stored(job: Job, progress: Progress | None) -> dict[str, Any]:
@@ -159,9 +215,13 @@ def _build(job: Job, folder: Path, progress: Progress | None) -> None:
         try:
             good, entry = _write(cutter, {}, job, folder, progress)
         except BrokenPicture:
-            broken = cutter.drop_broken_pictures()
+            cutter.drop_broken_pictures()
             good, entry = _write(cutter, {}, job, folder, progress)
-            entry["broken_pictures"] = broken
+            entry["broken_pictures_s"] = cutter.broken_pictures_s
+            if entry["outcome"] == "written":
+                broken = ", ".join(f"{len(times)} of {channel}" for channel, times in cutter.broken_pictures_s.items())
+                reason = f"pictures that do not decode: {broken}; their rows show the one before"
+                entry |= {"outcome": "split", "reason": reason}
         records = [episode_record(e, "") for e in good]
     _dump(folder / "entry.json", entry)
     _dump(folder / "episodes.json", records)
@@ -209,10 +269,9 @@ def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tu
     findings = [check_episode(e, pictures=False) + seen.get(e.name, []) for e in cut.episodes]
     good = [e for e, found in zip(cut.episodes, findings, strict=True) if not any(f.severity == "error" for f in found)]
     across = check_recording_episodes(good) if len(good) > 1 else []
-    origin_ns = min((e.start_ns for e in cut.episodes), default=0)
     episodes = []
     for e, found in zip(cut.episodes, findings, strict=True):
-        start_s = (e.start_ns - origin_ns) / 1e9
+        start_s = (e.start_ns - cut.origin_ns) / 1e9
         episodes.append(
             {
                 "name": e.name.removeprefix(recording.source.name).strip(),
@@ -245,11 +304,12 @@ def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damag
         return "quarantined", f"{wrong} of {len(findings)} episodes: {errors[0].text}"
     if not cut.episodes:
         return "quarantined", "; ".join(_describe(loss) for loss in cut.losses[:3]) or "no rows"
-    if lost or damage:
-        reasons = [str(d) for d in damage[:1]] + [_describe(loss) for loss in lost[:1]]
-        more = len(lost) + len(damage) - len(reasons)
+    gone = [d for d in damage if d.lost]
+    if lost or gone:
+        reasons = [str(d) for d in gone[:1]] + [_describe(loss) for loss in lost[:1]]
+        more = len(lost) + len(gone) - len(reasons)
         return "split", "; ".join(reasons) + (f"; {more} more in the report" if more > 0 else "")
-    return "written", ""
+    return "written", f"nothing lost; {damage[0]}" if damage else ""
 
 
 def _describe(loss: Loss) -> str:
@@ -265,8 +325,7 @@ def _entry(outcome: Outcome, reason: str) -> dict[str, Any]:
 def _named(entry: dict[str, Any], job: Job) -> dict[str, Any]:
     """The entry with what depends on where the recording lies: kept out of the store, which knows contents only."""
     path, spec = shlex.quote(str(job.source.path)), shlex.quote(job.spec_name)
-    readable = entry["outcome"] != "refused"
-    command = f"taccorl view {path} --spec={spec}" if readable else f"taccorl ingest inspect {path}"
+    command = f"taccorl view {path} --spec={spec}" if entry["episodes"] else f"taccorl ingest inspect {path}"
     head = {
         "recording": str(job.source.path),
         "part": job.source.part,

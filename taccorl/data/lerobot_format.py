@@ -29,6 +29,7 @@ QUEUE_FRAMES = 4
 LARGE_FEATURE = 256
 """Features with at least this many elements get exact quantiles in blocks, instead of LeRobot's 5000-bin histogram for each
 element: 80 kB an element, 123 MB for the taxels of a row and 1.2 GB for their window."""
+PRIORITY_ROWS = 16
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 ENCODERS: dict[str, dict[str, Any]] = {
     # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
@@ -126,6 +127,8 @@ def _write(episodes: Sequence[Episode], root: Path, progress: Callable[[int], No
                     _wait_for_room(dataset)
                     dataset.add_frame(row)
                     done += 1
+                    if done % PRIORITY_ROWS == 1:
+                        _normal_priority()
                     if progress is not None:
                         progress(done)
                 with _large_features_in_blocks(dataset.writer):
@@ -143,6 +146,18 @@ def _rows(episode: Episode) -> Iterator[dict[str, Any]]:
     for k, shown in enumerate(pictures):
         numbers = {key: values[k] for key, values in episode.arrays.items()}
         yield {**numbers, **shown, "task": episode.instruction}
+
+
+def _normal_priority() -> None:
+    """Run as root, SVT-AV1 puts its threads and the one that opens it under real-time scheduling (first in, first out, 99),
+    which starves the whole machine and is inherited by every child: back to normal."""
+    tasks = Path("/proc/self/task")
+    if not hasattr(os, "sched_setscheduler") or os.geteuid() != 0 or not tasks.is_dir():
+        return
+    for task in tasks.iterdir():
+        with contextlib.suppress(OSError):  # a thread that ended meanwhile
+            if os.sched_getscheduler(int(task.name)) != os.SCHED_OTHER:
+                os.sched_setscheduler(int(task.name), os.SCHED_OTHER, os.sched_param(0))
 
 
 @contextlib.contextmanager

@@ -125,7 +125,7 @@ class McapFile:
     def record(self, offset: int) -> Record | None:
         """The whole record at ``offset``, or None if what stands there cannot be one."""
         record = self._header(offset)
-        if record is None or record.end > self.end or record.opcode == 0:
+        if record is None or record.end > self.end:
             return None
         if record.opcode in _LAYOUTS:
             return record if self._fills(record) else None
@@ -134,6 +134,8 @@ class McapFile:
             others = (HEADER, SCHEMA, CHANNEL, CHUNK, METADATA, *((MESSAGE_INDEX,) if self.chunked else ()))
             if record.length < MESSAGE_BYTES or any(self._fills(record._replace(opcode=o)) for o in others):
                 return None
+        elif not self._is_private(record):
+            return None
         return record if self._may_begin(record.end) else None
 
     def find(self, start: int, stop: int, opcodes: Collection[int], channels: Collection[int] = ()) -> int | None:
@@ -190,7 +192,13 @@ class McapFile:
             return self.summary.end is None and record.opcode in KNOWN_OPCODES and record.length < 1 << 40
         if record.opcode in _LAYOUTS:
             return self._fills(record)
-        return record.length >= MESSAGE_BYTES if record.opcode == MESSAGE else record.opcode >= 0x80
+        return record.length >= MESSAGE_BYTES if record.opcode == MESSAGE else self._is_private(record)
+
+    def _is_private(self, record: Record) -> bool:
+        """An application's own kind (0x80 and above), rather than a chunk or the end-of-data record with a damaged opcode."""
+        indexed = self.summary.proven and self.summary.has_chunks
+        place = len(MAGIC) < record.offset != self.summary.next_start(record.offset) and record.end != self.end
+        return record.opcode >= 0x80 and indexed and place
 
     def _is_sure(self, record: Record, channels: Collection[int]) -> bool:
         if record.opcode == MESSAGE:

@@ -58,6 +58,8 @@ class Damage:
     reason: str
     start_ns: int | None = None
     end_ns: int | None = None
+    lost: bool = True
+    """False: no message can have been there (an index that only says again what the data holds)."""
 
     def __str__(self) -> str:
         return f"{Path(self.file).name} bytes {self.byte_start:,} to {self.byte_end:,}: {self.reason}"

@@ -114,7 +114,7 @@ class DatasetSpec:
     robot_type: str
     fps: int
     features: dict[str, FeatureSpec]
-    video_codec: Literal["h264", "libsvtav1"] = "libsvtav1"
+    video_codec: Literal["h264", "libsvtav1"] = "h264"
     sensors: dict[str, SensorSpec] = dataclasses.field(default_factory=dict)
     """Filled on loading: feature key → its sensor. Not a key of the file."""
 
@@ -439,8 +439,8 @@ def _check_sources(document: Document[Any], spec: RecordingSpec) -> None:
         if given != (field == needs):
             verb = "is missing" if not given else "has no effect"
             raise document.error("instruction", f"`{field}` {verb} with `from: {instruction.from_}`")
-    if instruction.text is not None and not instruction.text.strip():
-        raise document.error("instruction/text", "is empty; the policy reads it")
+    if instruction.text is not None and instruction.text.strip() in ("", "TODO"):
+        raise document.error("instruction/text", "is empty or still to do; the policy reads it")
     if instruction.from_ == "markers" and episodes.by != "markers":
         raise document.error("instruction/from", "markers name the instruction only with `episodes: by: markers`")
 

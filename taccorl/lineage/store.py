@@ -26,7 +26,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from taccorl.errors import DatasetError
+from taccorl.errors import DatasetError, InTheWayError
 from taccorl.lineage.canonical import canonical, canonical_text, differences, not_default
 from taccorl.lineage.digest import (
     DigestCache,
@@ -157,7 +157,7 @@ class Store:
     def _existing(self, job: "_Job") -> Artefact | None:
         found = _with_key(job.final, job.key)
         if found is None and os.path.lexists(job.final):
-            raise DatasetError(_in_the_way(job))
+            raise InTheWayError(_in_the_way(job))
         return found
 
     def _place(self, stage: Stage, key: str) -> Path:

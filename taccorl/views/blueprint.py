@@ -14,7 +14,7 @@ from taccorl.views.touch import Pad, pads_of
 
 PAD_GAP_TAXELS = 3.0
 MOST_IN_A_ROW, MOST_ROWS = 3, 6
-EYE_SIZES, EYE_M = 1.1, 1.4
+EYE_SIZES, EYE_M = 1.1, 1.15
 """The eye's distance from the figure: in sizes of the figure, and at least so far (m)."""
 
 
@@ -57,7 +57,7 @@ def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:
     shares = [0.7]
     if arms_of(episode):
         beside = rrb.Horizontal if episode.picture_keys or pads else rrb.Vertical
-        rows[0], shares[0] = beside(_figure(episode), page), 1.4
+        rows[0], shares[0] = beside(_figure(episode), page), 1.4 if pads else 1.0
     if episode.picture_keys:
         names = [short_name(key) for key in episode.picture_keys]
         rows.append(rrb.Horizontal(*[rrb.Spatial2DView(origin=f"/observation/images/{n}", name=n) for n in names]))
@@ -121,13 +121,13 @@ def _over_time(episode: Episode, pads: list[Pad]) -> rrb.Container | None:
         views.append(rrb.StateTimelineView(origin="/events", name=_with_origin(", ".join(shown), episode)))
         shares.append(0.35 + 0.25 * len(shown))
     if pads:
-        for path, title in (
-            ("sum", "touch sum of active taxels [counts above baseline]"),
-            ("peak", "touch peak [counts above baseline]"),
-            ("active", f"active taxels, above the noise floor [of {pads[0].counts[0].size} a pad]"),
+        for path, share, title in (
+            ("sum", 0.9, "touch sum of active taxels [counts above baseline]"),
+            ("peak", 1.25, "touch peak [counts above baseline]"),  # two more lines in its legend
+            ("active", 0.85, f"active taxels, above the noise floor [of {pads[0].counts[0].size} a pad]"),
         ):
             views.append(_plot(title, [f"/touch/{path}/**"], rrb.Corner2D.LeftTop))
-            shares.append(1.0)
+            shares.append(share)
     plots = _joint_plots(episode)
     in_a_row = MOST_IN_A_ROW if pads or len(plots) > MOST_ROWS else 1
     for row in itertools.batched(plots, in_a_row):

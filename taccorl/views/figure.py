@@ -143,7 +143,7 @@ def _log_still_parts(rec: rr.RecordingStream, root: str, side: str, floor_z: flo
     )
     rec.log(f"{root}/stand", stand, static=True)
     label = rr.Points3D(
-        [(0, 0.17 * np.sign(BASE_POS_WORLD[side][1]), floor_z)],
+        [(0, 0.12 * np.sign(BASE_POS_WORLD[side][1]), floor_z)],
         labels=[f"{side} arm"],
         radii=0.001,
         colors=[ARM_COLORS[side]],

@@ -20,6 +20,8 @@ from taccorl.data.dataset import Dataset
 from taccorl.demos.stand_in import StandInConfig, write_mcap
 
 SECONDS, SEED = 4.0, 7
+FAULTY_SECONDS = 6.0
+"""In 6 s the grippers close one after the other, so that exchanged arms and pads can be told apart."""
 CAMERAS = (96, 128)
 NUM_CUTS = 10
 BASE = StandInConfig(duration_s=SECONDS, seed=SEED, camera_size=CAMERAS, chunk_size_bytes=96 * 1024)
@@ -94,12 +96,12 @@ FROM_BYTES: dict[str, tuple[Callable[[Path], bytes], str, tuple[str, ...]]] = {
     "flipped_chunk_length": (flipped_length, "split", ("record header",)),
     "zeroed_page": (zeroed_page, "split", ("chunk lost",)),
     # only the index at the end is gone: every message is there
-    "no_footer": (lambda p: p.read_bytes()[:-200], "written", ()),
-    "no_end_magic": (lambda p: p.read_bytes()[:-8], "written", ()),
+    "no_footer": (lambda p: p.read_bytes()[:-200], "written", ("nothing lost", "no index")),
+    "no_end_magic": (lambda p: p.read_bytes()[:-8], "written", ("nothing lost", "no index")),
     "wrong_schema": (wrong_schema, "refused", ("/joint_states_left", "PoseStamped", "JointState")),
     "empty": (lambda p: b"", "refused", ("empty",)),
     "only_magic": (lambda p: p.read_bytes()[:8], "refused", ("/joint_states_left",)),
-    "not_mcap": (lambda p: b"X" + p.read_bytes()[1:], "refused", ("not an MCAP",)),
+    "wrong_first_byte": (lambda p: b"X" + p.read_bytes()[1:], "split", ("not the beginning of an MCAP file",)),
     "garbage": (lambda p: random.Random(0).randbytes(50_000), "refused", ("not an MCAP",)),
 }
 FROM_CONFIG: dict[str, tuple[dict[str, Any], str, tuple[str, ...]]] = {
@@ -127,7 +129,7 @@ def ingested(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     for name, (make, _, _) in FROM_BYTES.items():
         (inputs / f"{name}.mcap").write_bytes(make(base))
     for name, (faults, _, _) in FROM_CONFIG.items():
-        config = StandInConfig(duration_s=SECONDS, seed=SEED, camera_size=CAMERAS, chunk_size_bytes=96 * 1024, **faults)
+        config = StandInConfig(duration_s=FAULTY_SECONDS, seed=SEED, camera_size=CAMERAS, **faults)
         write_mcap(inputs / f"{name}.mcap", config)
     rng, data = random.Random(1), base.read_bytes()
     cuts = {f"cut_{k}": rng.randrange(len(data) // 20, len(data) - 300) for k in range(NUM_CUTS)}

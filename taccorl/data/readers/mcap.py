@@ -23,7 +23,6 @@ from taccorl.data.mcap_records import (
     DATA_END,
     MAGIC,
     MESSAGE,
-    MESSAGE_INDEX,
     METADATA,
     SCHEMA,
     McapFile,
@@ -81,6 +80,9 @@ class McapReader(Reader):
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
         """A file; a bag folder with metadata.yaml; with ``split_bag``, a folder whose files x_0, x_1, … belong together."""
         if path.is_dir():
+            packed = sorted(path.glob("*.mcap.zstd"))
+            if packed:
+                raise RecordingError(f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`")
             return bag_sources(path, ".mcap", split_bag=split_bag)
         return super().sources(path, split_bag=split_bag)
 
@@ -194,7 +196,7 @@ class _File:
         while True:
             record = mcap.record(offset)
             if record is None:
-                following = self._resume(mcap, sure)
+                following = self._resume(mcap, sure, offset)
                 if following is None:
                     cut = "the file ends without a footer (cut by a crash?)"
                     self._damaged(offset, mcap.end, cut if mcap.summary.end is None else "a damaged record")
@@ -209,21 +211,21 @@ class _File:
             mcap.chunked = mcap.chunked or record.opcode == CHUNK
             if record.opcode in (SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA):
                 yield record
-            elif record.opcode not in mcap_records.KNOWN_OPCODES and not self._is_private(mcap, record):
-                self._damaged(record.offset, record.end, f"a record of unknown kind {record.opcode:#04x}")
             offset, self.after_lost = self.after_lost or record.end, None
-            if (
-                record.opcode != MESSAGE_INDEX
-            ):  # it holds nothing, and where bytes are missing the next chunk begins within it
+            if record.opcode in (CHUNK, MESSAGE):  # the others may have eaten a chunk's beginning if bytes are missing
                 sure = offset
             if offset == mcap.summary.end:  # what was before it was no end-of-data record
                 return
 
-    def _resume(self, mcap: McapFile, start: int) -> int | None:
+    def _resume(self, mcap: McapFile, sure: int, bad: int) -> int | None:
         """Where the walk goes on. Within chunked data only a chunk vouches for its messages, by its CRC."""
-        indexed = mcap.summary.next_start(start)
+        if mcap.summary.end is None:
+            moved = mcap.find(sure, bad, {CHUNK, DATA_END})
+            if moved is not None:
+                return moved
+        indexed = mcap.summary.next_start(bad + 1)
         opcodes = {CHUNK, ATTACHMENT, METADATA, DATA_END} | (set() if mcap.chunked else {SCHEMA, CHANNEL, MESSAGE})
-        found = mcap.find(start, mcap.end if indexed is None else indexed, opcodes, self.known.channels)
+        found = mcap.find(bad + 1, mcap.end if indexed is None else indexed, opcodes, self.known.channels)
         return indexed if found is None else found
 
     @staticmethod
@@ -233,17 +235,6 @@ class _File:
         if mcap.summary.end is None:
             moved = mcap.find(record.offset + 1, record.end, {CHUNK, ATTACHMENT, METADATA, DATA_END})
         return record.end if moved is None else moved
-
-    @staticmethod
-    def _is_private(mcap: McapFile, record: Record) -> bool:
-        """An application's own kind of record, rather than one whose kind is damaged."""
-        indexed = mcap.summary.proven and mcap.summary.has_chunks and record.offset > len(MAGIC)
-        return (
-            indexed
-            and record.opcode >= 0x80
-            and record.end != mcap.end
-            and mcap.summary.next_start(record.offset) != record.offset
-        )
 
     def _chunk(
         self, mcap: McapFile, record: Record, start_ns: int | None, end_ns: int | None
@@ -285,7 +276,8 @@ class _File:
             self._damaged(len(MAGIC), self.data_end.offset, reason)
         if mcap.summary.problem or self.data_end.end != mcap.end:
             problem = mcap.summary.problem or "it begins elsewhere"
-            self._damaged(self.data_end.end, mcap.size, f"no index behind the data ({problem}): nothing there was read")
+            reason = f"no index behind the data ({problem}): nothing there was read"
+            self.damage.append(Damage(str(self.path), self.data_end.end, mcap.size, reason, lost=False))
 
     def _convert(self, found: list[Any], proven: bool, place: Record) -> Iterator[Message]:
         for r in found:

@@ -115,7 +115,7 @@ def content(topic: str, value: Any) -> Any:
         return {"name": list(value.name), "position": list(value.position)}
     if topic == "/camera":
         return {"format": value.format, "data": value.data}
-    return list(value.v) if topic == "/proto" else value["data"]
+    return list(value.v) if topic == "/proto" else value.get("data")  # absent where its key was hit
 
 
 def topic_of(k: int) -> str:
@@ -673,12 +673,17 @@ def test_a_chunk_is_found_again_beside_what_only_looks_like_one(tmp_path):
     ]
 
 
-def test_a_record_of_a_later_version_is_passed_over(tmp_path):
-    """The MCAP specification reserves 0x80 and above for applications: not damage, and nothing else is lost."""
-    data, index = FILES["zstd"], place_of("zstd", 0x06, 1)[0]
+def test_an_applications_own_record_is_passed_over(tmp_path):
+    """The MCAP specification leaves kinds 0x80 and above to applications. Here one stands before the end-of-data record."""
+    data, (at, summary) = FILES["zstd"], place_of("zstd", 0x0F)
     private = struct.pack("<BQ", 0x90, 50) + bytes(50)
-    reader = reader_of(write(tmp_path, data[:index] + private + data[index:]))
+    moved, footer = data[summary : place_of("zstd", 0x02)[0]], struct.pack("<BQQQ", 0x02, 20, summary + len(private), 0)
+    crc = struct.pack("<I", zlib.crc32(moved + footer))
+    reader = reader_of(
+        write(tmp_path, data[:at] + private + data[at:summary] + moved + footer + crc + mcap_records.MAGIC)
+    )
     assert delivered(reader) == EXPECTED
+    assert reader.damage == []
 
 
 # --- bombs
@@ -900,6 +905,13 @@ def test_a_metadata_file_of_something_else_is_refused(tmp_path, text):
     folder = bag(tmp_path / "b", 0)
     (folder / "metadata.yaml").write_bytes(text)
     with pytest.raises(RecordingError, match="not rosbag2's metadata"):
+        find_sources(folder, reader="mcap")
+
+
+def test_a_bag_compressed_file_by_file_says_what_to_do(tmp_path):
+    folder = bag(tmp_path / "b", 0)
+    (folder / "x_0.mcap").rename(folder / "x_0.mcap.zstd")
+    with pytest.raises(RecordingError, match=r"a compressed bag file: unpack it with `unzstd x_0\.mcap\.zstd`"):
         find_sources(folder, reader="mcap")
 
 

@@ -1,0 +1,468 @@
+"""A whole recording read once: numbers as arrays, pictures as stamps, and an error that names what does not meet the spec."""
+
+import base64
+import json
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mcap.writer import CompressionType, Writer
+
+from taccorl.data.recording import Recording, RecordingSpec, Source, Spool, find_sources, load_recording, opened
+from taccorl.data.spec import load_recording_spec
+from taccorl.errors import RecordingError
+
+T0_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+SENSOR = {
+    "spec_version": 1, "name": "little_pad", "rows": 2, "columns": 3, "adc_bits": 8, "wire_shift_bits": 0, "rate_hz": 100,
+    "wire": {"rows": 3, "columns": 2, "dtype": "uint8", "transpose": True}, "scan_time_s": 0.01, "unit": "adc_count",
+    "baseline": {"rule": "median_of_first", "frames": 2, "max_spread_count": 12}, "noise_count": 15, "scheme": "fixed_scale",
+    "gain_per_count": 0.01,
+}  # fmt: skip
+VECTOR = {"dtype": "float32", "shape": [2], "unit": "rad", "frame": "joint", "rate_hz": 100, "range": [-4, 4]}
+PICTURE = {"dtype": "video", "shape": [8, 8, 3], "unit": "rgb8", "frame": "camera", "rate_hz": 30, "range": [0, 255]}
+DATASET = {
+    "spec_version": 1, "name": "little", "robot_type": "one_arm", "fps": 30,
+    "features": {
+        "observation.state": VECTOR,
+        "action": VECTOR,
+        "observation.images.front": PICTURE,
+        "observation.tactile": {
+            "dtype": "int16", "shape": [6], "unit": "adc_count", "frame": "pad", "rate_hz": 100, "range": [-255, 255],
+            "sensor": "pad.yaml", "pads": ["a"],
+        },
+    },
+}  # fmt: skip
+JOINTS = {
+    "type": "sensor_msgs/msg/JointState",
+    "field": "position",
+    "pick": ["j1", "g"],
+    "rate_hz": 100,
+    "max_age_s": 0.05,
+}
+
+
+def recording_spec(folder: Path, **channels: dict[str, Any] | None) -> RecordingSpec:
+    """A spec whose channels are the usual ones with the given keys changed (None removes a key)."""
+    usual: dict[str, dict[str, Any]] = {
+        "state": {"topic": "/joints", "scale": [2.0, 1.0], **JOINTS},
+        "command": {"topic": "/command", **JOINTS},
+        "front": {"topic": "/camera", "rate_hz": 30, "max_age_s": 0.1},
+        "pad": {"topic": "/pad", "field": "data", "clock": "log", "rate_hz": 100, "max_age_s": 0.05},
+    }
+    for name, change in channels.items():
+        merged = {**usual[name], **(change or {})}
+        usual[name] = {k: v for k, v in merged.items() if v is not None}
+    document = {
+        "spec_version": 1, "dataset": "dataset.yaml", "reader": "mcap", "clock": "header", "channels": usual,
+        "episodes": {"by": "markers", "topic": "/episode"}, "instruction": {"from": "markers"},
+        "features": {
+            "observation.state": {"channels": ["state"], "align": "asof"},
+            "action": {"channels": ["command"], "align": "asof"},
+            "observation.images.front": {"channels": ["front"], "align": "asof"},
+            "observation.tactile": {"channels": ["pad"], "align": "asof"},
+        },
+    }  # fmt: skip
+    for name, content in (("pad", SENSOR), ("dataset", DATASET), ("recording", document)):
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    return load_recording_spec(folder / "recording.yaml")
+
+
+TYPES = {
+    "/joints": "sensor_msgs/msg/JointState",
+    "/command": "sensor_msgs/msg/JointState",
+    "/camera": "sensor_msgs/msg/CompressedImage",
+    "/pad": "std_msgs/msg/UInt8MultiArray",
+    "/episode": "std_msgs/msg/String",
+}
+
+
+def header(stamp_ns: int) -> dict[str, Any]:
+    return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}}
+
+
+def joint_state(stamp_ns: int, *position: float) -> dict[str, Any]:
+    return {"header": header(stamp_ns), "name": ["g", "j1"], "position": list(position)}
+
+
+def picture(stamp_ns: int, text: bytes) -> dict[str, Any]:
+    return {"header": header(stamp_ns), "format": "jpeg", "data": base64.b64encode(text).decode()}
+
+
+Sent = tuple[str, int, Any]
+
+
+def usual_messages() -> list[Sent]:
+    """Three ticks 10 ms apart; stamps 1 ms before the log time."""
+    sent: list[Sent] = [("/episode", T0_NS, {"data": "start:insert"})]
+    for k in range(3):
+        log = T0_NS + k * 10 * MS
+        stamp = log - MS
+        sent.append(("/joints", log, joint_state(stamp, 0.07, k)))
+        sent.append(("/command", log, joint_state(stamp, 0.08, k + 0.5)))
+        sent.append(("/camera", log, picture(stamp, b"picture %d" % k)))
+        sent.append(("/pad", log, {"data": [10 * k + i for i in range(6)]}))
+        sent.append(("/unwanted", log, {"x": 1}))
+    sent.append(("/episode", T0_NS + 30 * MS, {"data": "success"}))
+    return sent
+
+
+def write(path: Path, sent: Iterable[Sent], types: dict[str, str] = TYPES, **options: Any) -> Source:
+    """The messages as JSON in an MCAP file."""
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start()
+        ids: dict[str, int] = {}
+        for topic, log_ns, message in sent:
+            if topic not in ids:
+                schema = writer.register_schema(types.get(topic, "T"), "jsonschema", b"{}")
+                ids[topic] = writer.register_channel(topic, "json", schema)
+            writer.add_message(ids[topic], log_ns, json.dumps(message).encode(), log_ns)
+        writer.finish()
+    return Source(path, (path,))
+
+
+def load(folder: Path, sent: Iterable[Sent], types: dict[str, str] = TYPES, **channels: Any) -> Recording:
+    spec = recording_spec(folder, **channels)
+    scratch = folder / "scratch"
+    scratch.mkdir(exist_ok=True)
+    return load_recording(write(folder / "a.mcap", sent, types), spec, scratch)
+
+
+def refusal(folder: Path, sent: Iterable[Sent], types: dict[str, str] = TYPES, **channels: Any) -> str:
+    with pytest.raises(RecordingError) as caught:
+        load(folder, sent, types, **channels)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# --- what is loaded
+
+
+def test_a_recording_becomes_channels_with_their_own_times(tmp_path):
+    recording = load(tmp_path, usual_messages())
+    state = recording.channels["state"]
+    assert state.values is not None
+    assert state.values.tolist() == [[0.0, 0.07], [2.0, 0.07], [4.0, 0.07]]  # j1 × 2, then g, by name
+    assert (state.log_ns - T0_NS).tolist() == [0, 10 * MS, 20 * MS]
+    assert state.stamp_ns is not None
+    assert (state.log_ns - state.stamp_ns).tolist() == [MS] * 3
+    pad = recording.channels["pad"]
+    assert pad.stamp_ns is None
+    assert pad.values is not None
+    assert pad.values.dtype == np.uint8
+    assert pad.values[1].tolist() == [10, 12, 14, 11, 13, 15]  # 3 × 2 on the wire, 2 × 3 on the pad
+    assert recording.channels["front"].values is None
+    assert recording.texts == {"/episode": [(T0_NS, "start:insert"), (T0_NS + 30 * MS, "success")]}
+    assert recording.counts == {"/joints": 3, "/command": 3, "/camera": 3, "/pad": 3, "/episode": 2}
+    assert recording.damage == []
+
+
+def test_two_channels_may_share_a_topic(tmp_path):
+    recording = load(tmp_path, usual_messages(), command={"topic": "/joints", "pick": ["g", "j1"]})
+    assert recording.channels["command"].values is not None
+    assert recording.channels["command"].values.tolist() == [[0.07, 0.0], [0.07, 1.0], [0.07, 2.0]]
+
+
+def test_a_channel_may_have_any_name(tmp_path):
+    """A channel's name is no file name."""
+    spec = recording_spec(tmp_path)
+    text = (
+        (tmp_path / "recording.yaml")
+        .read_text()
+        .replace("- state\n", "- ../left/state\n")
+        .replace(" state:", " ../left/state:")
+    )
+    (tmp_path / "recording.yaml").write_text(text)
+    renamed = load_recording_spec(tmp_path / "recording.yaml")
+    assert set(renamed.channels) ^ set(spec.channels) == {"state", "../left/state"}
+    (tmp_path / "scratch").mkdir()
+    recording = load_recording(write(tmp_path / "a.mcap", usual_messages()), renamed, tmp_path / "scratch")
+    assert recording.channels["../left/state"].values is not None
+    assert {p.name for p in tmp_path.iterdir()} >= {"scratch", "a.mcap"}
+    assert len(list(tmp_path.rglob("*.spool"))) == len(list((tmp_path / "scratch").iterdir())) == 3
+
+
+def test_the_schema_name_may_leave_msg_out(tmp_path):
+    load(tmp_path, usual_messages(), {**TYPES, "/joints": "sensor_msgs/JointState"})
+
+
+def test_progress_is_told_now_and_then(tmp_path):
+    told: list[int] = []
+    spec = recording_spec(tmp_path)
+    many = usual_messages() + [("/pad", T0_NS + k * MS, {"data": [0] * 6}) for k in range(5000)]
+    load_recording(write(tmp_path / "a.mcap", many), spec, tmp_path, told.append)
+    assert told == [0, 2000, 4000]
+
+
+def test_opened_removes_its_scratch_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    import tempfile
+
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    with opened(write(tmp_path / "a.mcap", usual_messages()), recording_spec(tmp_path)) as recording:
+        assert len(list(tmp_path.glob("taccorl_*"))) == 1
+        assert recording.counts["/pad"] == 3
+    assert list(tmp_path.glob("taccorl_*")) == []
+
+
+def test_damage_is_handed_on(tmp_path):
+    source = write(tmp_path / "a.mcap", usual_messages(), chunk_size=300)
+    data = source.path.read_bytes()
+    source.path.write_bytes(data[:-40])
+    recording = load_recording(source, recording_spec(tmp_path), tmp_path)
+    assert len(recording.damage) == 1
+    assert recording.damage[0].byte_end == len(data) - 40
+
+
+# --- pictures
+
+
+def test_pictures_come_back_by_their_times_once_each(tmp_path):
+    recording = load(tmp_path, [*usual_messages(), ("/camera", T0_NS + 20 * MS, picture(T0_NS + 19 * MS, b"twin"))])
+    ids = [(T0_NS + k * 10 * MS, T0_NS + k * 10 * MS - MS) for k in range(3)]
+    assert recording.channels["front"].stamp_ns is not None
+    found = list(recording.pictures({"front": [ids[2], ids[0], ids[2]]}))
+    assert [(name, identity) for name, identity, _ in found] == [("front", ids[0]), ("front", ids[2])]
+    assert [base64.b64decode(value["data"]) for _, _, value in found] == [b"picture 0", b"picture 2"]
+    assert list(recording.pictures({"front": []})) == []
+    assert list(recording.pictures({"front": [(ids[0][0], None)]})) == []  # another identity is another picture
+    assert recording.damage == []
+
+
+def test_two_features_may_show_one_camera(tmp_path):
+    recording = load(tmp_path, usual_messages())
+    recording.spec.channels["other"] = recording.spec.channels["front"]
+    identity = (T0_NS, T0_NS - MS)
+    found = list(recording.pictures({"front": [identity], "other": [identity]}))
+    assert sorted(name for name, _, _ in found) == ["front", "other"]
+
+
+# --- what is refused
+
+
+def without(topic: str) -> list[Sent]:
+    return [m for m in usual_messages() if m[0] != topic]
+
+
+def instead(topic: str, message: Any) -> list[Sent]:
+    """The second message of ``topic`` replaced."""
+    sent = usual_messages()
+    index = [i for i, m in enumerate(sent) if m[0] == topic][1]
+    sent[index] = (topic, sent[index][1], message)
+    return sent
+
+
+def test_a_missing_topic_names_the_nearest_in_the_file(tmp_path):
+    renamed = [("/joint_states" if t == "/joints" else t, log, m) for t, log, m in usual_messages()]
+    assert refusal(tmp_path, renamed) == (
+        "topics in the spec but without messages in the recording: /joints (/joints: did you mean '/joint_states'?)"
+    )
+    message = refusal(tmp_path, without("/pad"))
+    assert message.startswith(
+        "topics in the spec but without messages in the recording: /pad (/pad: known: /camera, /command,"
+    )
+
+
+def test_all_missing_topics_are_named_at_once_and_markers_too(tmp_path):
+    message = refusal(tmp_path, [m for m in usual_messages() if m[0] in ("/joints", "/camera")])
+    assert "without messages in the recording: /command, /pad, /episode (" in message
+    assert "the file names no topics" in refusal(tmp_path, [])
+
+
+def test_another_type_is_named_even_where_its_content_does_not_fit_either(tmp_path):
+    types = {**TYPES, "/joints": "sensor_msgs/msg/Joy"}
+    expected = "/joints is sensor_msgs/msg/Joy, the spec's channel 'state' says sensor_msgs/msg/JointState"
+    assert refusal(tmp_path, usual_messages(), types) == expected
+    assert refusal(tmp_path, instead("/joints", {"axes": [1.0]}), types) == expected
+
+
+def test_a_header_clock_without_headers_is_refused(tmp_path):
+    expected = "/pad has no header stamp: write `clock: log` on channel 'pad'"
+    assert refusal(tmp_path, usual_messages(), pad={"clock": "header"}) == expected
+    headless = {"name": ["g", "j1"], "position": [0.0, 0.0]}  # one message among many is enough
+    assert "/joints has no header stamp" in refusal(tmp_path, instead("/joints", headless))
+
+
+def test_a_topic_is_either_pictures_or_numbers(tmp_path):
+    message = refusal(tmp_path, usual_messages(), pad={"topic": "/camera"})
+    assert message == "/camera: read both as pictures and as numbers"
+
+
+H = header(T0_NS)
+
+
+@pytest.mark.parametrize(
+    ("topic", "message", "expected"),
+    [
+        ("/pad", {"data": [1] * 5}, "message 1: 5 taxels, sensor little_pad has 3×2; other layouts: a file in data_specs/sensors/"),
+        ("/pad", {"data": [0.5] * 6}, "message 1: counts that are not uint8 (normalised by the driver?): record raw counts"),
+        ("/pad", {"data": [[1, 2, 3]] * 2}, "message 1: a frame of 2×3 taxels, the wire of little_pad is 3×2: transposed"),
+        ("/pad", {"date": [1]}, "message 1: no field 'data'; did you mean 'date'?"),
+        ("/joints", joint_state(T0_NS, 1.0), "message 1: 1 values for 2 names in 'position'"),
+        ("/joints", {"header": H, "name": ["g", "j2"], "position": [0, 0]}, "message 1: 'j1' is not among its names"),
+        ("/joints", {"header": H, "name": ["g", "j1"], "position": "no"}, "message 1: position is no list of numbers"),
+        ("/episode", {"data": 3}, "expected a text (std_msgs/String), found int"),
+        ("/episode", {"text": "x"}, "expected a text (std_msgs/String), found dict"),
+    ],
+)  # fmt: skip
+def test_a_message_that_does_not_fit_names_its_topic_and_number(tmp_path, topic, message, expected):
+    told = refusal(tmp_path, instead(topic, message))
+    assert told.startswith(f"{topic}, {expected}" if expected.startswith("message") else f"{topic}: {expected}")
+
+
+def test_a_vector_that_changes_its_size_is_refused(tmp_path):
+    sent = instead("/joints", {"header": header(T0_NS), "position": [1, 2, 3]})
+    message = refusal(tmp_path, sent, state={"pick": None, "scale": None})
+    assert message == "/joints, message 1: 3 values after messages with 2"
+
+
+def test_an_empty_vector_is_refused(tmp_path):
+    empty = [
+        ("/joints", log, {**m, "position": []}) if t == "/joints" else (t, log, m) for t, log, m in usual_messages()
+    ]
+    message = refusal(tmp_path, empty, state={"pick": None, "scale": None})
+    assert message == "/joints, message 0: position is empty"
+
+
+def test_an_unknown_reader_names_the_nearest(tmp_path):
+    spec = recording_spec(tmp_path)
+    text = (tmp_path / "recording.yaml").read_text().replace("reader: mcap", "reader: mcpa")
+    (tmp_path / "recording.yaml").write_text(text)
+    source = write(tmp_path / "a.mcap", usual_messages())
+    from taccorl.errors import TaccorlError
+
+    with pytest.raises(TaccorlError, match="no reader 'mcpa'; did you mean 'mcap'"):
+        load_recording(source, load_recording_spec(tmp_path / "recording.yaml"), tmp_path)
+    assert spec.reader == "mcap"
+
+
+# --- the spool
+
+
+def test_spool_gives_back_its_rows_as_one_array(tmp_path):
+    spool = Spool(tmp_path, "x")
+    rows = np.random.default_rng(0).normal(size=(1000, 7))
+    for row in rows:
+        spool.append(row)
+    found = spool.finish()
+    assert isinstance(found, np.memmap)
+    assert found.dtype == np.float64
+    assert np.array_equal(found, rows)
+
+
+def test_spool_keeps_the_dtype_of_the_first_row_and_refuses_another_size(tmp_path):
+    spool = Spool(tmp_path, "x")
+    spool.append(np.array([1, 255], dtype=np.uint8))
+    spool.append(np.array([2, 3]))
+    with pytest.raises(RecordingError, match="3 values after messages with 2"):
+        spool.append(np.array([1, 2, 3]))
+    found = spool.finish()
+    assert found.dtype == np.uint8
+    assert found.tolist() == [[1, 255], [2, 3]]
+
+
+def test_a_spool_without_rows_is_empty(tmp_path):
+    assert Spool(tmp_path, "x").finish().shape == (0, 0)
+
+
+# --- finding recordings
+
+
+def test_a_missing_path_names_its_neighbour(tmp_path):
+    (tmp_path / "demo_07.mcap").touch()
+    with pytest.raises(RecordingError, match=r"demo_7\.mcap: no such file or folder; did you mean 'demo_07\.mcap'"):
+        find_sources(tmp_path / "demo_7.mcap")
+    with pytest.raises(RecordingError, match="no such file or folder; known: none"):
+        find_sources(tmp_path / "nowhere" / "demo_7.mcap")
+
+
+def test_a_folder_holds_its_recordings_in_natural_order(tmp_path):
+    for name in ("demo_10.mcap", "demo_9.mcap", "notes.txt"):
+        write(tmp_path / name, [])
+    (tmp_path / "deeper").mkdir()
+    found = find_sources(tmp_path, reader="mcap")
+    assert [(name, source.path.name, source.name) for name, source in found] == [
+        ("mcap", "demo_9.mcap", str(tmp_path / "demo_9.mcap")),
+        ("mcap", "demo_10.mcap", str(tmp_path / "demo_10.mcap")),
+    ]
+
+
+def test_a_folder_without_recordings_says_what_would_be_one(tmp_path):
+    with pytest.raises(RecordingError, match=r"no recording here; readers .*mcap.* open .*\.mcap"):
+        find_sources(tmp_path)
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(RecordingError, match="no recording here"):
+        find_sources(tmp_path / "a.txt")
+
+
+def test_an_odd_ending_goes_to_the_reader_that_was_named(tmp_path):
+    source = write(tmp_path / "a.bin", usual_messages())
+    assert find_sources(source.path, reader="mcap") == [("mcap", source)]
+
+
+# --- memory
+
+MEASURE = """
+import resource, sys, tempfile
+from pathlib import Path
+from taccorl.data.recording import Source, load_recording, readers
+from taccorl.data.spec import load_recording_spec
+import mcap_ros2.decoder
+
+list(readers)  # imports them all
+
+def peak_mb():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+folder = Path(sys.argv[1])
+spec, path = load_recording_spec(folder / "recording.yaml"), folder / "big.mcap"
+with tempfile.TemporaryDirectory(dir=folder) as scratch:
+    before = peak_mb()
+    recording = load_recording(Source(path, (path,)), spec, Path(scratch))
+    loaded = peak_mb() - before
+    front = recording.channels["front"]
+    ids = [(int(log), None) for log in front.log_ns]
+    number = sum(1 for _ in recording.pictures({"front": ids}))
+    print(loaded, peak_mb() - before, number, len(recording.channels["state"].values))
+"""
+
+
+def test_300_mb_of_pictures_do_not_enter_memory(tmp_path):
+    """Loading keeps stamps and numbers only; asking for the pictures streams them. Bound: 40 MB above the imports."""
+    recording_spec(tmp_path, front={"clock": "log"})
+    noise = np.random.default_rng(0).integers(0, 256, 100_000, dtype=np.uint8).tobytes()
+    with (tmp_path / "big.mcap").open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        ids = {
+            t: writer.register_channel(t, "json", writer.register_schema(n, "jsonschema", b"{}"))
+            for t, n in TYPES.items()
+        }
+        # a picture's bytes as ROS 2 sends them: CDR of a string and uint8[]
+        schema = writer.register_schema("sensor_msgs/msg/CompressedImage", "ros2msg", b"string format\nuint8[] data")
+        ids["/camera"] = writer.register_channel("/camera", "cdr", schema)
+        cdr = b"\0\1\0\0" + (5).to_bytes(4, "little") + b"jpeg\0\0\0\0" + len(noise).to_bytes(4, "little") + noise
+        for topic, log_ns, message in without("/camera"):
+            if topic in ids:
+                writer.add_message(ids[topic], log_ns, json.dumps(message).encode(), log_ns)
+        for k in range(3000):
+            log_ns = T0_NS + k * 33 * MS
+            writer.add_message(ids["/camera"], log_ns, cdr, log_ns)
+            state = json.dumps(joint_state(log_ns, 0.0, 1.0)).encode()
+            writer.add_message(ids["/joints"], log_ns, state, log_ns)
+        writer.finish()
+    assert (tmp_path / "big.mcap").stat().st_size > 300_000_000
+    run = subprocess.run([sys.executable, "-c", MEASURE, tmp_path], capture_output=True, text=True, check=True)
+    (tmp_path / "big.mcap").unlink()
+    loaded_mb, streamed_mb, pictures, states = map(float, run.stdout.split())
+    assert (pictures, states) == (3000, 3003)
+    assert loaded_mb < 40
+    assert streamed_mb < 40

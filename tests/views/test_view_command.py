@@ -1,0 +1,115 @@
+"""``taccorl view`` on a real dataset and a real recording of the stand-in, as a user types it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+from urllib.parse import urlparse
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from taccorl.cli.main import main
+from taccorl.data.dataset import Dataset
+
+from .readback import read_rrd
+
+SPEC = "--spec=piper_flexitac_mcap"
+
+
+@pytest.fixture(scope="module")
+def recording(recordings: Path) -> Path:
+    return sorted(recordings.glob("*.mcap"))[0]
+
+
+def test_dataset_becomes_an_rrd_with_its_own_numbers_and_videos(dataset: Path, tmp_path: Path, capsys):
+    out = tmp_path / "episode.rrd"
+    assert main(["view", str(dataset), "--episode=1", f"--save={out}"]) == 0
+    assert f"wrote {out}" in capsys.readouterr().out
+    found, episode = read_rrd(out), Dataset(dataset).episode(1)
+    frames = found["/observation/images/front"]["VideoFrameReference:timestamp"]
+    assert frames.frame_index == list(range(episode.num_rows))
+    shown = np.array([v[0] for v in found["/observation/tactile/left_a"]["DepthImage:buffer"].values], dtype=np.uint8)
+    pad = episode.pads("observation.tactile")["left_a"]
+    assert np.array_equal(shown.reshape(pad.shape), np.clip(pad, 0, 255))
+    page = found["/provenance"]["TextDocument:text"].values[0][0]
+    assert page.startswith("**origin: surrogate stand-in, not a robot**")
+    assert "| left_a | asof |" in page
+
+
+def test_recording_is_shown_without_a_dataset(recording: Path, dataset: Path, tmp_path: Path):
+    out = tmp_path / "episode.rrd"
+    assert main(["view", str(recording), SPEC, f"--save={out}"]) == 0
+    found, episode = read_rrd(out), Dataset(dataset).episode(0)
+    pictures = found["/observation/images/left_wrist"]["EncodedImage:blob"]
+    assert pictures.frame_index == list(range(episode.num_rows))
+    grippers = np.array(found["/observation/state/grippers_m"]["Scalars:scalars"].values, dtype=np.float32)
+    assert np.array_equal(grippers, episode.arrays["observation.state"][:, [6, 13]])
+
+
+def test_sheet_of_a_part_holds_that_part(dataset: Path, tmp_path: Path):
+    out = tmp_path / "sheet.png"
+    assert main(["view", str(dataset), f"--sheet={out}", "--start_s=1", "--end_s=2"]) == 0
+    with Image.open(out) as image:
+        assert image.info["Title"].endswith("episode 0, 1.00 to 2.00 s")
+        assert image.info["Source"] == "surrogate stand-in, not a robot"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{dataset}", "--episode=7", "--save={tmp}/x.rrd"], "no episode 7; it has 2, counted from 0"),
+        (["{recording}", "--save={tmp}/x.rrd"], "for a recording give --spec="),
+        (["{recording}", SPEC, "--episode=1", "--save={tmp}/x.rrd"], "no episode 1; it has 1, counted from 0"),
+        (["{tmp}/nothing", "--save={tmp}/x.rrd"], "nothing: no such file or folder"),
+        (["{dataset}", "--save={tmp}/x.png"], "must end in .rrd"),
+        (["{dataset}", "--sheet={tmp}/no/x.png"], "mkdir -p"),
+        (["{dataset}", "--sheet={tmp}/theirs.png"], "is there already and not from `taccorl view`"),
+        (["{dataset}", "--save={tmp}/theirs.rrd"], "is there already and not from `taccorl view`"),
+        (["{dataset}", "--start_s=60", "--save={tmp}/x.rrd"], "no rows from --start_s=60"),
+        (["{dataset}"], "use --serve=true and a browser"),
+    ],
+)
+def test_what_cannot_be_done_says_why_and_what_to_do(
+    words: list[str], message: str, dataset: Path, recording: Path, tmp_path: Path, capsys, monkeypatch
+):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    Image.new("RGB", (4, 4)).save(tmp_path / "theirs.png")
+    (tmp_path / "theirs.rrd").write_bytes(b"RRF2 of somebody else")
+    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
+    filled = [w.format(dataset=dataset, recording=recording, tmp=tmp_path) for w in words]
+    assert main(["view", *filled]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("taccorl view: ")
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_serve_answers_this_machine_only_and_ends_cleanly(dataset: Path, number: signal.Signals):
+    command = [sys.executable, "-m", "taccorl.cli.main", "view", str(dataset), "--serve=true"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2])
+    try:
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        port = urlparse(address).port
+        assert address.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(address, timeout=20) as page:
+            assert page.status == 200
+        for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
+            local, state = line.split()[1], line.split()[3]
+            if state == "0A" and int(local.split(":")[1], 16) == port:
+                assert local.startswith("0100007F"), "listens on more than 127.0.0.1"
+        os.kill(process.pid, number)
+        assert process.wait(timeout=20) == 0
+    finally:
+        process.kill()
+        process.wait()
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", port), timeout=2)
