@@ -29,7 +29,8 @@ class Registry[T]:
         """Class decorator: ``@readers.register("mcap")``. The class keeps its own type."""
 
         def add(entry: E) -> E:
-            if name in self._entries and self._entries[name] is not entry:
+            # By name, not by identity: a module that failed half-way is imported afresh when somebody asks again.
+            if name in self._entries and repr(self._entries[name]) != repr(entry):
                 raise TaccorlError(f"{self.kind} {name!r} is registered twice: {self._entries[name]} and {entry}")
             self._entries[name] = cast("T", entry)
             return entry

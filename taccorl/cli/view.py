@@ -107,11 +107,12 @@ def _opened(config: ViewConfig) -> Iterator["Episode"]:
 
 def _note_codecs(config: ViewConfig, episode: "Episode") -> None:
     from taccorl.views.video import codec_of
+    from taccorl.views.viewer import can_decode
 
-    codecs = {codec_of(video) for video in episode.videos.values()} - {"av1"}
+    codecs = sorted(c for c in {codec_of(video) for video in episode.videos.values()} if not can_decode(c))
     if config.save is not None and codecs:
         print(
-            f"note: to show {', '.join(sorted(codecs))} video, the Rerun program needs ffmpeg beside it; browsers do not"
+            f"note: the Rerun program needs ffmpeg for {', '.join(codecs)} video and finds none: saved as JPEG pictures"
         )
 
 
@@ -120,7 +121,7 @@ def _write(config: ViewConfig, episode: "Episode") -> bool:
     if config.save is not None:
         from taccorl.views.episode import save_episode
 
-        save_episode(episode, config.save)
+        save_episode(episode, config.save, native=True)
         print(f"wrote {config.save}: look at it with {Path(sys.executable).with_name('rerun')} {config.save}")
     if config.screenshot is not None:
         from taccorl.views.screenshot import screenshot

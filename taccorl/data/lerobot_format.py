@@ -251,7 +251,6 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
 def quiet_lerobot() -> Iterator[None]:
     """LeRobot offline and without its progress bars, encoder banners and download attempts; errors still show."""
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
-    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
     os.environ.setdefault("SVT_LOG", "1")
     os.environ.setdefault("TQDM_DISABLE", "1")
     if os.environ.get("TACCORL_PROGRAM") == "1" and "lerobot.processor" not in sys.modules:

@@ -15,7 +15,7 @@ from taccorl.demos.stand_in import EPISODE_TOPIC, START_UNIX_NS
 SIZE = (96, 128)  # rows, columns of pictures: as small as a frame id allows to be quick
 NATIVE = ("[224, 224, 3]", f"[{SIZE[0]}, {SIZE[1]}, 3]")
 H264 = ("video_codec: libsvtav1", "video_codec: h264")
-NO_HEADER = ("Array", "String")  # types whose messages carry no time of their own
+STAMPED = ("JointState", "CompressedImage")
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Raw:
     @property
     def time_s(self) -> float:
         """When it happened, as the shipped spec understands it: header stamp, or log time less a pad's 10 ms."""
-        if self.type.endswith(NO_HEADER):
-            return self.log_s - 0.010
-        return (self.stamp_ns - START_UNIX_NS) * 1e-9
+        if self.type.endswith(STAMPED):
+            return (self.stamp_ns - START_UNIX_NS) * 1e-9
+        return self.log_s - (0.010 if self.type.endswith("Array") else 0.0)
 
 
 def read_raw(path: Path) -> list[Raw]:

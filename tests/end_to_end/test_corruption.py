@@ -20,8 +20,8 @@ from taccorl.data.dataset import Dataset
 from taccorl.demos.stand_in import StandInConfig, write_mcap
 
 SECONDS, SEED = 4.0, 7
-FAULTY_SECONDS = 6.0
-"""In 6 s the grippers close one after the other, so that exchanged arms and pads can be told apart."""
+FAULTY_SECONDS = 8.0
+"""In 8 s the grippers close one after the other, so that exchanged arms and pads can be told apart."""
 CAMERAS = (96, 128)
 NUM_CUTS = 10
 BASE = StandInConfig(duration_s=SECONDS, seed=SEED, camera_size=CAMERAS, chunk_size_bytes=96 * 1024)

@@ -1,0 +1,335 @@
+"""Made-up episodes through LeRobot's own writer: every row keeps its own picture, or somebody hears of it."""
+
+import dataclasses
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from edited import SIZE
+
+from taccorl.data import lerobot_format
+from taccorl.data.dataset import Dataset
+from taccorl.data.episode import Episode, Pictures
+from taccorl.data.lerobot_format import QUANTILES, exact_stats, lerobot_features, merge, quiet_lerobot, write_episodes
+from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
+from taccorl.demos.stand_in import read_frame_id
+from taccorl.demos.stand_in_frame_id import draw_frame_id
+from taccorl.errors import DatasetError, RecordingError
+
+CAMERA, TOUCH = "observation.images.front", "observation.tactile"
+SPEC = f"""
+spec_version: 1
+name: small
+robot_type: one_finger
+fps: 30
+video_codec: h264
+features:
+  observation.state: {{dtype: float32, shape: [2], names: [a, b], unit: [rad, m], frame: joint, rate_hz: 30, range: [-9, 9]}}
+  action: {{dtype: float32, shape: [2], names: [a, b], unit: [rad, m], frame: joint, rate_hz: 30, range: [-9, 9]}}
+  observation.images.front: {{dtype: video, shape: [{SIZE[0]}, {SIZE[1]}, 3], unit: rgb8, frame: cam, rate_hz: 30, range: [0, 255]}}
+  observation.tactile: {{dtype: int16, shape: [384], unit: adc_count, frame: pad, rate_hz: 100, range: [-255, 255],
+    sensor: {data_specs_folder()}/sensors/flexitac_v2.yaml, pads: [tip]}}
+"""
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory: pytest.TempPathFactory) -> DatasetSpec:
+    path = tmp_path_factory.mktemp("spec") / "small.yaml"
+    path.write_text(SPEC)
+    return load_dataset_spec(path)
+
+
+def made_up(
+    spec: DatasetSpec, num_rows: int = 40, first_id: int = 0, fail_at: int | None = None, seed: int = 0
+) -> Episode:
+    """Row k shows picture first_id + k, state (first_id + k, k / 7) and random touch."""
+    rng = np.random.default_rng(seed)
+    k = np.arange(num_rows)
+
+    def pictures() -> Iterator[Pictures]:
+        for row in range(num_rows):
+            if row == fail_at:
+                raise RecordingError("picture 7 is broken")
+            picture = np.full((*SIZE, 3), 60 + row % 100, np.uint8)
+            draw_frame_id(picture, first_id + row)
+            yield {CAMERA: picture}
+
+    numbers = np.stack([first_id + k, k / 7], axis=1).astype(np.float32)
+    touch = rng.integers(-20, 235, (num_rows, 384)).astype(np.int16)
+    touch[:, 5], touch[0, 6] = 3, -255  # a constant taxel and an outlier
+    arrays = {"observation.state": numbers, "action": -numbers, TOUCH: touch}
+    return Episode("made up", spec, 0, arrays, pictures, (CAMERA,), "touch it")
+
+
+def row_ids(root: Path, index: int = 0) -> list[int]:
+    """Frame ids that the rows of an episode show, found by time as a reader does."""
+    return [read_frame_id(frame) for frame in Dataset(root).frames(index, CAMERA)]
+
+
+def encoder_threads() -> list[threading.Thread]:
+    return [t for t in threading.enumerate() if "EncoderThread" in type(t).__name__]
+
+
+@pytest.fixture
+def slow_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot's encoder takes 0.15 s a frame; LeRobot waits 0.1 s for room in its queue, then drops the frame."""
+    import queue
+
+    from lerobot.datasets import video_utils
+
+    class SlowQueue(queue.Queue):
+        def get(self, *args: Any, **kwargs: Any) -> Any:
+            time.sleep(0.15)
+            return super().get(*args, **kwargs)
+
+    class Queues:  # video_utils.queue, but for its Queue
+        Queue, Full, Empty = SlowQueue, queue.Full, queue.Empty
+
+    monkeypatch.setattr(video_utils, "queue", Queues)
+
+
+# ---- every row its own picture ----
+
+
+def test_rows_keep_their_pictures_and_numbers(spec: DatasetSpec, tmp_path: Path) -> None:
+    episodes = [made_up(spec, 33), made_up(spec, 35, first_id=500, seed=1)]
+    told: list[int] = []
+    write_episodes(episodes, tmp_path / "ds", progress=told.append)
+    dataset = Dataset(tmp_path / "ds")
+    assert dataset.num_episodes == 2
+    for index, episode in enumerate(episodes):
+        assert row_ids(dataset.root, index) == [round(x) for x in episode.arrays["observation.state"][:, 0]]
+        for key, values in episode.arrays.items():
+            np.testing.assert_array_equal(dataset.episode(index).arrays[key], values)
+        assert dataset.episode(index).instruction == "touch it"
+    assert told == list(range(1, 69))
+    assert encoder_threads() == []
+
+
+def test_a_slow_encoder_loses_no_frame(spec: DatasetSpec, tmp_path: Path, slow_encoder: None) -> None:
+    write_episodes([made_up(spec, 20)], tmp_path / "ds")
+    assert row_ids(tmp_path / "ds") == list(range(20))
+
+
+def test_dropped_frames_are_found_and_the_dataset_is_written_again_exactly(
+    spec: DatasetSpec,
+    tmp_path: Path,
+    slow_encoder: None,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(lerobot_format, "_wait_for_room", lambda dataset: None)  # no back-pressure
+    attempts: list[tuple[bool, list[str]]] = []
+    original = lerobot_format._write
+
+    def watched(episodes: Any, root: Path, progress: Any, streaming: bool) -> None:
+        original(episodes, root, progress, streaming)
+        attempts.append((streaming, Dataset(root).video_problems()))
+
+    monkeypatch.setattr(lerobot_format, "_write", watched)
+    with caplog.at_level(logging.WARNING):
+        write_episodes([made_up(spec, 40)], tmp_path / "ds")
+    (first_streams, first_problems), (second_streams, second_problems) = attempts
+    assert (first_streams, second_streams) == (True, False)
+    assert "frames for 40 rows" in first_problems[0], "the planted fault was felt"
+    assert second_problems == []
+    assert "writing again without streaming" in caplog.text
+    assert row_ids(tmp_path / "ds") == list(range(40))
+    assert not list((tmp_path / "ds").rglob("*.png"))
+
+
+def test_a_dataset_that_stays_wrong_is_an_error(
+    spec: DatasetSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Dataset, "video_problems", lambda self: ["front: 3 frames for 9 rows"])
+    with pytest.raises(DatasetError, match="3 frames for 9 rows"):
+        write_episodes([made_up(spec, 9)], tmp_path / "ds", streaming=False)
+
+
+def test_an_episode_without_pictures_is_written(spec: DatasetSpec, tmp_path: Path) -> None:
+    blind = dataclasses.replace(made_up(spec, 9), picture_keys=())
+    write_episodes([blind], tmp_path / "ds")
+    np.testing.assert_array_equal(Dataset(tmp_path / "ds").episode(0).arrays[TOUCH], blind.arrays[TOUCH])
+
+
+# ---- what goes wrong ----
+
+
+@pytest.mark.parametrize(("fail_at", "streaming"), [(0, True), (25, True), (25, False)])
+def test_an_error_in_the_middle_leaves_nothing_behind(
+    spec: DatasetSpec, tmp_path: Path, fail_at: int, streaming: bool
+) -> None:
+    episodes = [made_up(spec, 10), made_up(spec, 40, fail_at=fail_at)]
+    with pytest.raises(RecordingError, match="picture 7 is broken"):
+        write_episodes(episodes, tmp_path / "ds", streaming=streaming)
+    assert list(tmp_path.iterdir()) == []
+    assert encoder_threads() == []
+
+
+def test_a_stopped_run_leaves_nothing_behind(spec: DatasetSpec, tmp_path: Path) -> None:
+    def stop(done: int) -> None:
+        if done == 12:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_episodes([made_up(spec)], tmp_path / "ds", progress=stop)
+    assert list(tmp_path.iterdir()) == []
+    assert encoder_threads() == []
+
+
+def test_what_exists_is_never_touched(spec: DatasetSpec, tmp_path: Path) -> None:
+    (tmp_path / "ds").mkdir()
+    (tmp_path / "ds/mine.txt").write_text("keep")
+    with pytest.raises(DatasetError, match="exists already"):
+        write_episodes([made_up(spec)], tmp_path / "ds")
+    assert (tmp_path / "ds/mine.txt").read_text() == "keep"
+
+
+def test_statistics_are_lerobots_own_again_afterwards(spec: DatasetSpec, tmp_path: Path) -> None:
+    from lerobot.datasets import dataset_writer
+
+    before = dataset_writer.compute_episode_stats
+    write_episodes([made_up(spec, 5)], tmp_path / "ds")
+    assert dataset_writer.compute_episode_stats is before
+    assert logging.getLogger().level == logging.WARNING
+
+
+# ---- statistics ----
+
+
+def test_exact_statistics_are_lerobots_within_one_histogram_bin() -> None:
+    from lerobot.datasets.compute_stats import compute_episode_stats
+
+    rng = np.random.default_rng(3)
+    values = rng.integers(-255, 256, (200, 300)).astype(np.int16)
+    values[:, 7] = 4
+    values[:, 8] = np.arange(200)
+    ours = exact_stats(values)
+    with quiet_lerobot():
+        theirs = compute_episode_stats({"x": values}, {"x": {"dtype": "int16", "shape": (300,)}})["x"]
+    assert set(ours) == set(theirs)
+    for name in ours:
+        assert ours[name].shape == theirs[name].shape, name
+    for name in ("min", "max", "mean", "std", "count"):
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-6, atol=1e-6, err_msg=name)
+    for q in QUANTILES:
+        name = f"q{round(100 * q):02d}"
+        # LeRobot's histogram has 5000 bins over (max − min); integers sit apart by up to a few of them at these ranks
+        gap = np.abs(ours[name] - theirs[name])
+        assert gap.max() <= 510 / 200 * 3, (name, gap.max())
+    # by hand: 0 … 199 has its median at 99.5, its 1 % quantile at 1.99
+    assert ours["q50"][8] == pytest.approx(99.5)
+    assert ours["q01"][8] == pytest.approx(1.99)
+    assert (ours["std"][7], ours["q99"][7]) == (0.0, 4.0)
+
+
+def test_written_statistics_of_touch_are_the_exact_ones(spec: DatasetSpec, tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
+
+    episode = made_up(spec, 33)
+    write_episodes([episode], tmp_path / "ds")
+    stats = LeRobotDatasetMetadata("local/ds", root=tmp_path / "ds").stats
+    assert stats is not None
+    touch = episode.arrays[TOUCH]
+    np.testing.assert_allclose(stats[TOUCH]["max"], touch.max(axis=0))
+    np.testing.assert_allclose(stats[TOUCH]["mean"], touch.mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(stats[TOUCH]["q90"], np.quantile(touch, 0.9, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(stats["observation.state"]["max"], [32, 32 / 7], rtol=1e-6)
+
+
+# ---- the features' own words ----
+
+
+def test_features_say_what_their_numbers_mean(spec: DatasetSpec, tmp_path: Path) -> None:
+    write_episodes([made_up(spec, 5)], tmp_path / "ds")
+    features = Dataset(tmp_path / "ds").info["features"]
+    assert features["observation.state"]["unit"] == ["rad", "m"]
+    assert features["observation.state"]["range"] == [-9, 9]
+    assert features["observation.state"]["frame"] == "joint"
+    assert features[TOUCH]["tactile"] == {
+        "sensor": "flexitac_v2",
+        "layout": [1, 1, 32, 12],
+        "layout_names": ["history", "pad", "row", "column"],
+        "pads": ["tip"],
+        "signal": "counts above baseline",
+        "scheme": "fixed_scale",
+        "gain_per_count": 0.0133333333,
+    }
+    assert list(lerobot_features(spec, [CAMERA])) == [CAMERA]
+
+
+# ---- merging ----
+
+
+@pytest.fixture(scope="module")
+def shards(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("shards")
+    write_episodes([made_up(spec, 31), made_up(spec, 32, first_id=100, seed=1)], folder / "a")
+    write_episodes([made_up(spec, 33, first_id=200, seed=2)], folder / "b")
+    write_episodes([made_up(spec, 34, first_id=300, seed=3)], folder / "c")
+    return [folder / name for name in "abc"]
+
+
+def test_merging_keeps_rows_touch_pictures_and_feature_words(
+    spec: DatasetSpec, shards: list[Path], tmp_path: Path
+) -> None:
+    merge(shards, tmp_path / "all")
+    merged = Dataset(tmp_path / "all")
+    sources = [(Dataset(shards[0]), 0), (Dataset(shards[0]), 1), (Dataset(shards[1]), 0), (Dataset(shards[2]), 0)]
+    assert merged.num_episodes == 4
+    for index, (dataset, number) in enumerate(sources):
+        for key, values in dataset.episode(number).arrays.items():
+            np.testing.assert_array_equal(merged.episode(index).arrays[key], values)
+        assert row_ids(merged.root, index) == row_ids(dataset.root, number)
+    assert merged.info["features"][TOUCH]["tactile"]["pads"] == ["tip"]
+    assert merged.info["features"]["observation.state"]["unit"] == ["rad", "m"]
+    assert merged.video_problems() == []
+
+
+def test_merging_one_dataset_copies_it(shards: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    merge([shards[1]], tmp_path / "one")
+    files = {p.relative_to(shards[1]): p.read_bytes() for p in shards[1].rglob("*") if p.is_file()}
+    assert {
+        p.relative_to(tmp_path / "one"): p.read_bytes() for p in (tmp_path / "one").rglob("*") if p.is_file()
+    } == files
+
+
+def test_datasets_with_other_features_do_not_merge(spec: DatasetSpec, shards: list[Path], tmp_path: Path) -> None:
+    wider = dataclasses.replace(
+        spec, features={**spec.features, "action": dataclasses.replace(spec.features["action"], shape=(3,), names=("a", "b", "c"), unit="rad")}
+    )  # fmt: skip
+    episode = made_up(spec, 9)
+    arrays = {**episode.arrays, "action": np.zeros((9, 3), np.float32)}
+    write_episodes([dataclasses.replace(episode, spec=wider, arrays=arrays)], tmp_path / "wide")
+    with pytest.raises(DatasetError, match="do not merge"):
+        merge([shards[1], tmp_path / "wide"], tmp_path / "all")
+
+
+def test_a_merge_that_loses_frames_is_an_error(
+    shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Dataset, "video_problems", lambda self: ["front: one is missing"])
+    with pytest.raises(DatasetError, match="after merging, first: front: one is missing"):
+        merge(shards[1:], tmp_path / "all")
+
+
+@pytest.mark.parametrize("name", ["Anna's data", "ünï 😀 #1", "a%d", "[x] {y}"])
+def test_folders_with_odd_names_merge(shards: list[Path], tmp_path: Path, name: str) -> None:
+    import shutil
+
+    folder = tmp_path / name
+    for shard in shards[1:]:
+        shutil.copytree(shard, folder / shard.name)
+    merge([folder / "b", folder / "c"], folder / "all")
+    assert row_ids(folder / "all", 1) == list(range(300, 334))
+
+
+def test_an_episode_of_one_row_is_written(spec: DatasetSpec, tmp_path: Path) -> None:
+    write_episodes([made_up(spec, 1)], tmp_path / "ds")
+    assert row_ids(tmp_path / "ds") == [0]
