@@ -99,6 +99,8 @@ def _ingest(config: IngestConfig) -> int:
 
 def _check_out(config: IngestConfig, inputs: list[Path]) -> None:
     """What is certain to be in the way is told before an hour of work, not after it."""
+    from taccorl.data.lerobot_format import check_path
+
     out, whole = config.out, config.out.resolve()
     if out.name in ("", ".."):
         raise DatasetError(f"--out={out} has no name of its own: give a folder's name")
@@ -110,6 +112,8 @@ def _check_out(config: IngestConfig, inputs: list[Path]) -> None:
     store = config.store.resolve()
     if whole.is_relative_to(store) or store.is_relative_to(whole):
         raise DatasetError(f"--out={out} and --store={config.store} lie in one another: choose another")
+    for place in (whole, store):
+        check_path(place)
     for place in (whole.parent, store):
         folder = next(p for p in (place, *place.parents) if p.exists())
         if not folder.is_dir():

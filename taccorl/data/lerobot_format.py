@@ -30,6 +30,8 @@ LARGE_FEATURE = 256
 """Features with at least this many elements get exact quantiles in blocks, instead of LeRobot's 5000-bin histogram for each
 element: 80 kB an element, 123 MB for the taxels of a row and 1.2 GB for their window."""
 PRIORITY_ROWS = 16
+UNSAFE_IN_PATHS = "'*?[]"
+"""LeRobot 0.6.1 reads these as patterns (of parquet files) or quotes (in the list of videos to join)."""
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 ENCODERS: dict[str, dict[str, Any]] = {
     # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
@@ -71,6 +73,18 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
     return features
 
 
+def check_path(path: Path) -> None:
+    """
+    Raises:
+        DatasetError: LeRobot would misread this place, or worse, read another.
+    """
+    odd = sorted(set(str(path.resolve())) & set(UNSAFE_IN_PATHS))
+    if odd:
+        raise DatasetError(
+            f"{path.resolve()}: LeRobot cannot work in a folder with {' '.join(odd)} in its path; use another"
+        )
+
+
 def write_episodes(
     episodes: Sequence[Episode], root: Path, *, progress: Callable[[int], None] | None = None, streaming: bool = True
 ) -> None:
@@ -84,6 +98,7 @@ def write_episodes(
         DatasetError: even the slow way's videos do not hold one frame a row.
         RecordingError: a picture is broken; nothing is left at ``root``.
     """
+    check_path(root)
     if root.exists():
         raise DatasetError(f"{root} exists already; nothing was touched: give another folder")
     try:
@@ -201,10 +216,15 @@ def exact_stats(values: np.ndarray, block: int = 128) -> dict[str, np.ndarray]:
         values: (T, size).
         block: elements at a time, so that memory stays small.
     """
+
+    def quantiles(x: np.ndarray) -> np.ndarray:
+        # as LeRobot counts: the smallest value that a share q of them does not exceed, nothing in between
+        return np.quantile(x, QUANTILES, axis=0, method="inverted_cdf")
+
     parts = []
     for start in range(0, values.shape[1], block):
         x = values[:, start : start + block].astype(np.float64)
-        parts.append(np.concatenate([[x.min(0), x.max(0), x.mean(0), x.std(0)], np.quantile(x, QUANTILES, axis=0)]))
+        parts.append(np.concatenate([[x.min(0), x.max(0), x.mean(0), x.std(0)], quantiles(x)]))
     names = ["min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES)]
     stats = dict(zip(names, np.concatenate(parts, axis=1), strict=True))
     return stats | {"count": np.array([len(values)])}
@@ -225,6 +245,8 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
     Raises:
         DatasetError: they differ in features, fps or robot, or the merged videos do not hold one frame a row.
     """
+    for path in (*roots, destination):
+        check_path(path)
     if len(roots) == 1:
         shutil.copytree(roots[0], destination, dirs_exist_ok=True)
     else:

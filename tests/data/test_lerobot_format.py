@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -31,7 +32,8 @@ video_codec: h264
 features:
   observation.state: {{dtype: float32, shape: [2], names: [a, b], unit: [rad, m], frame: joint, rate_hz: 30, range: [-9, 9]}}
   action: {{dtype: float32, shape: [2], names: [a, b], unit: [rad, m], frame: joint, rate_hz: 30, range: [-9, 9]}}
-  observation.images.front: {{dtype: video, shape: [{SIZE[0]}, {SIZE[1]}, 3], unit: rgb8, frame: cam, rate_hz: 30, range: [0, 255]}}
+  observation.images.front:
+    {{dtype: video, shape: [{SIZE[0]}, {SIZE[1]}, 3], unit: rgb8, frame: cam, rate_hz: 30, range: [0, 255]}}
   observation.tactile: {{dtype: int16, shape: [384], unit: adc_count, frame: pad, rate_hz: 100, range: [-255, 255],
     sensor: {data_specs_folder()}/sensors/flexitac_v2.yaml, pads: [tip]}}
 """
@@ -217,14 +219,12 @@ def test_exact_statistics_are_lerobots_within_one_histogram_bin() -> None:
         assert ours[name].shape == theirs[name].shape, name
     for name in ("min", "max", "mean", "std", "count"):
         np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-6, atol=1e-6, err_msg=name)
+    bins = (values.max(axis=0) - values.min(axis=0)) / 5000  # LeRobot's histogram
     for q in QUANTILES:
         name = f"q{round(100 * q):02d}"
-        # LeRobot's histogram has 5000 bins over (max − min); integers sit apart by up to a few of them at these ranks
-        gap = np.abs(ours[name] - theirs[name])
-        assert gap.max() <= 510 / 200 * 3, (name, gap.max())
-    # by hand: 0 … 199 has its median at 99.5, its 1 % quantile at 1.99
-    assert ours["q50"][8] == pytest.approx(99.5)
-    assert ours["q01"][8] == pytest.approx(1.99)
+        assert (np.abs(ours[name] - theirs[name]) <= bins + 1e-4).all(), name  # its edges are float32
+    # by hand: of 0 … 199, half do not exceed 99 (the 100th), and 1 % (two of them) do not exceed 1
+    assert (ours["q50"][8], ours["q01"][8], ours["q99"][8]) == (99, 1, 197)
     assert (ours["std"][7], ours["q99"][7]) == (0.0, 4.0)
 
 
@@ -238,7 +238,9 @@ def test_written_statistics_of_touch_are_the_exact_ones(spec: DatasetSpec, tmp_p
     touch = episode.arrays[TOUCH]
     np.testing.assert_allclose(stats[TOUCH]["max"], touch.max(axis=0))
     np.testing.assert_allclose(stats[TOUCH]["mean"], touch.mean(axis=0), rtol=1e-6)
-    np.testing.assert_allclose(stats[TOUCH]["q90"], np.quantile(touch, 0.9, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(
+        stats[TOUCH]["q90"], np.sort(touch, axis=0)[29]
+    )  # of 33, ⌈0.9 · 33⌉ = 30 do not exceed it
     np.testing.assert_allclose(stats["observation.state"]["max"], [32, 32 / 7], rtol=1e-6)
 
 
@@ -301,9 +303,8 @@ def test_merging_one_dataset_copies_it(shards: list[Path], tmp_path: Path) -> No
 
 
 def test_datasets_with_other_features_do_not_merge(spec: DatasetSpec, shards: list[Path], tmp_path: Path) -> None:
-    wider = dataclasses.replace(
-        spec, features={**spec.features, "action": dataclasses.replace(spec.features["action"], shape=(3,), names=("a", "b", "c"), unit="rad")}
-    )  # fmt: skip
+    three = dataclasses.replace(spec.features["action"], shape=(3,), names=("a", "b", "c"), unit="rad")
+    wider = dataclasses.replace(spec, features={**spec.features, "action": three})
     episode = made_up(spec, 9)
     arrays = {**episode.arrays, "action": np.zeros((9, 3), np.float32)}
     write_episodes([dataclasses.replace(episode, spec=wider, arrays=arrays)], tmp_path / "wide")
@@ -319,15 +320,24 @@ def test_a_merge_that_loses_frames_is_an_error(
         merge(shards[1:], tmp_path / "all")
 
 
-@pytest.mark.parametrize("name", ["Anna's data", "ünï 😀 #1", "a%d", "[x] {y}"])
+@pytest.mark.parametrize("name", ["ünï 😀 #1", "a%d {y}", "a&b;$c", ".hidden"])
 def test_folders_with_odd_names_merge(shards: list[Path], tmp_path: Path, name: str) -> None:
-    import shutil
-
     folder = tmp_path / name
     for shard in shards[1:]:
         shutil.copytree(shard, folder / shard.name)
     merge([folder / "b", folder / "c"], folder / "all")
     assert row_ids(folder / "all", 1) == list(range(300, 334))
+
+
+@pytest.mark.parametrize("name", ["Anna's data", "run [3]", "a*", "what?"])
+def test_folders_that_lerobot_would_misread_are_refused(
+    spec: DatasetSpec, shards: list[Path], tmp_path: Path, name: str
+) -> None:
+    with pytest.raises(DatasetError, match="LeRobot cannot work in a folder with"):
+        write_episodes([made_up(spec, 5)], tmp_path / name)
+    with pytest.raises(DatasetError, match="LeRobot cannot work in a folder with"):
+        merge(shards[1:], tmp_path / name / "all")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_episode_of_one_row_is_written(spec: DatasetSpec, tmp_path: Path) -> None:

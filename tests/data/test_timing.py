@@ -32,6 +32,16 @@ def test_grid_begins_at_the_start_and_ends_at_or_before_the_end():
     assert make_grid(5, 4, 30).tolist() == []
 
 
+@pytest.mark.parametrize("fps", [7, 24, 30, 50, 60, 90, 100])
+def test_grid_has_every_row_that_fits_and_no_other(fps):
+    """Row k is at k / fps rounded to the nanosecond; an end on, just before and just after every one of them."""
+    rows = [round(k * S / fps) for k in range(12)]
+    for k, row in enumerate(rows[:-1]):
+        assert make_grid(0, row, fps).tolist() == rows[: k + 1]
+        assert make_grid(0, row + 1, fps).tolist() == rows[: k + 1]
+        assert make_grid(0, row - 1, fps).tolist() == rows[:k]
+
+
 def test_grid_does_not_drift_over_ten_hours():
     grid = make_grid(NOW, NOW + 36_000 * S, 30)
     assert len(grid) == 36_000 * 30 + 1
@@ -73,6 +83,8 @@ def test_interpolate_weighs_by_time_and_needs_both_neighbours_fresh():
     assert m.weight is not None
     assert m.weight[[1, 2, 3, 7, 8]].tolist() == [0.0, 0.25, 0.0, 0.5, 0.0]
     assert m.index[:, 0].tolist() == [-1, 0, 0, 1, 1, 1, 1, 2, 3, 3]
+    edge = match(ns(10, 20), ns(0, 30), "interpolate", max_age_s=0.02)  # 10 ms old and 20 ms ahead; 20 ms old, 10 ahead
+    assert edge.fresh.tolist() == [True, True]
     assert m.age_s[0] == np.inf
     assert m.age_s[[1, 2, 7]].tolist() == [0.0, -0.0075, -0.005]  # the look-ahead is told
 
@@ -253,6 +265,7 @@ def test_latency_moves_samples_back_to_the_event():
     assert pad.time_ns.tolist() == ns(0, 10, 20).tolist()
     m = match(ns(10), pad.time_ns, "asof", max_age_s=0.04)
     assert pad.order[m.index[0, 0]] == 1
+    assert pad.skew_s == 0.0
     ahead = read_clock(ns(10), ns(10), clock="header", latency_s=-0.38)
     assert ahead.time_ns.tolist() == ns(390).tolist()
 

@@ -108,7 +108,11 @@ FROM_CONFIG: dict[str, tuple[dict[str, Any], str, tuple[str, ...]]] = {
     "degrees": ({"joints_in_degrees": True}, "quarantined", ("degrees?", "left_joint")),
     "swapped_arms": ({"swap_arms": True}, "quarantined", ("arm",)),
     "sim_time": ({"sim_time_stamps": True}, "refused", ("simulation time",)),
-    "swapped_pads": ({"swap_pads": ("left_robot_left_finger", "right_robot_left_finger")}, "quarantined", ("left_a", "right_a")),
+    "swapped_pads": (
+        {"swap_pads": ("left_robot_left_finger", "right_robot_left_finger")},
+        "quarantined",
+        ("left_a", "right_a"),
+    ),
     "clock_offset": (
         {"clock_offset_s": {"/camera_f/color/image_raw/compressed": 0.6}},
         "refused",
