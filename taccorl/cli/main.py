@@ -23,19 +23,14 @@ def main(argv: list[str] | None = None) -> int:
         argv = sys.argv[1:]
     words = argv
     known = [verb for group in VERBS.values() for verb in group]
-    if not words or words[0] in ("-h", "--help"):
-        print("usage: taccorl <verb> [what] [--option=value …]      taccorl <verb> --help\n")
-        for group, verbs in VERBS.items():
-            print(group)
-            for verb, line in verbs.items():
-                print(f"  {verb:9s}{line}")
-        print("\ntraining and scoring are LeRobot's own commands: lerobot-train, lerobot-eval")
-        return 0
-    if words[0] not in known:
+    listing = not words or words[0] in ("-h", "--help")
+    if not listing and words[0] not in known:
         print(f"taccorl: no verb {words[0]!r}; {nearest(words[0], known)}", file=sys.stderr)
         return 2
     try:
-        return importlib.import_module(f"taccorl.cli.{words[0]}").main(words[1:])
+        code = _list_verbs() if listing else importlib.import_module(f"taccorl.cli.{words[0]}").main(words[1:])
+        sys.stdout.flush()  # a closed pipe shows here at the latest
+        return code
     except TaccorlError as error:
         print(f"taccorl {words[0]}: {error}", file=sys.stderr)
         return 2
@@ -49,6 +44,16 @@ def main(argv: list[str] | None = None) -> int:
         place = f" ({error.filename})" if error.filename else ""
         print(f"taccorl {words[0]}: {error.strerror or error}{place}", file=sys.stderr)
         return 2
+
+
+def _list_verbs() -> int:
+    print("usage: taccorl <verb> [what] [--option=value …]      taccorl <verb> --help\n")
+    for group, verbs in VERBS.items():
+        print(group)
+        for verb, line in verbs.items():
+            print(f"  {verb:9s}{line}")
+    print("\ntraining and scoring are LeRobot's own commands: lerobot-train, lerobot-eval")
+    return 0
 
 
 if __name__ == "__main__":

@@ -17,10 +17,15 @@ COLORS = {"written": "green", "split": "yellow", "quarantined": "red", "refused"
 SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError  # for main() to end on; rich would exit with 1, which means something else here
+
+
 def console() -> Console:
     """The terminal at its own width; anything else wide enough not to fold a topic's name."""
-    found = Console()
-    return found if found.is_terminal else Console(width=WIDE)
+    found = _Console()
+    return found if found.is_terminal else _Console(width=WIDE)
 
 
 class Bars:

@@ -13,7 +13,7 @@ import numpy as np
 
 from taccorl.data import decode, timing
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
-from taccorl.data.recording import Recording, find_sources, opened
+from taccorl.data.recording import Recording, find_sources, opened, release
 from taccorl.data.spec import FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
@@ -393,15 +393,16 @@ class Cutter:
                 following = np.asarray(values[order[np.minimum(index + 1, len(order) - 1)]])
                 part = part + m.weight[rows, None, None] * (following - part)
             parts.append(part)
+            release(values)
         joined = np.concatenate(parts, axis=2)
         if key in self.baselines:
-            joined = joined.astype(np.int64) - self.baselines[key]
+            joined = np.subtract(joined, self.baselines[key], dtype=np.int16, casting="unsafe")  # max_count fits int16
         out = joined.reshape(len(joined), -1)
         if out.shape[1] != feature.size:
             raise RecordingError(
                 f"{key}: channels {', '.join(matches)} give {out.shape[1]} values, the dataset spec says {feature.size}"
             )
-        return out.astype(feature.dtype)
+        return out.astype(feature.dtype, copy=False)
 
     def _pictures(self, sources: dict[str, tuple[str, np.ndarray]], num_rows: int) -> Iterator[Pictures]:
         """Rows' pictures, decoded once each, in one pass over the file."""

@@ -57,7 +57,7 @@ class PictureWatch:
     def see(self, pictures: Pictures) -> None:
         """The next row's pictures."""
         for key, thumbs in self._thumbs.items():
-            thumbs.append(thumbnail(pictures[key]))
+            thumbs.append(thumbnail(pictures[key]).astype(np.float16))  # exact to 1/16 of a level
 
     def findings(self) -> list[Finding]:
         """Frozen cameras, once all rows were seen."""

@@ -6,6 +6,7 @@ that memory does not grow with the recording.
 """
 
 import contextlib
+import mmap
 import tempfile
 from abc import ABC, abstractmethod
 from array import array
@@ -232,6 +233,13 @@ class Spool:
         if self._rows == 0 or self._dtype is None:
             return np.empty((0, 0))
         return np.memmap(self._path, dtype=self._dtype, mode="r", shape=(self._rows, self._size))
+
+
+def release(values: np.ndarray) -> None:
+    """Give the memory of a memory-mapped array back; it is read from disk again when it is next used."""
+    mapped = getattr(values, "_mmap", None)
+    if mapped is not None and hasattr(mapped, "madvise"):
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def load_recording(

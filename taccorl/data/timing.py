@@ -107,9 +107,8 @@ def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
     """(T,) row times from ``start_ns`` at ``fps``, the last one at or before ``end_ns``. No drift: each is rounded alone."""
     if end_ns < start_ns:
         return np.empty(0, dtype=np.int64)
-    half = (
-        fps // 2
-    )  # row k is at k / fps rounded to the nearest ns, so the last row may lie up to half a ns before k / fps
+    # Row k is at k / fps rounded to a nanosecond: it may lie up to half a nanosecond before k / fps.
+    half = fps // 2
     num_rows = ((end_ns - start_ns + 1) * fps - half - 1) // NS_PER_S + 1
     return start_ns + (np.arange(num_rows, dtype=np.int64) * NS_PER_S + half) // fps
 

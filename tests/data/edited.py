@@ -14,7 +14,6 @@ from taccorl.demos.stand_in import EPISODE_TOPIC, START_UNIX_NS
 
 SIZE = (96, 128)  # rows, columns of pictures: as small as a frame id allows to be quick
 NATIVE = ("[224, 224, 3]", f"[{SIZE[0]}, {SIZE[1]}, 3]")
-H264 = ("video_codec: libsvtav1", "video_codec: h264")
 STAMPED = ("JointState", "CompressedImage")
 
 

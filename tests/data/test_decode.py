@@ -274,6 +274,7 @@ def test_counts_that_the_adc_cannot_send_are_refused():
         (None, "no list of counts"),
         ("not base64!", "text that is not base64"),
         ("é", "text that is not base64"),
+        ("AAEC!/w==", "text that is not base64"),  # lenient readers would drop the mark and go on
     ],
 )
 def test_what_is_no_frame_of_counts_is_refused(frame, reason):
@@ -417,10 +418,13 @@ def test_letterbox_leaves_a_picture_of_the_right_size_alone():
     assert decode.letterbox(image, 224, 224) is image
 
 
-def test_letterbox_averages_when_it_shrinks_and_fills_when_it_grows():
-    image = np.zeros((4, 4, 3), np.uint8)
-    image[::2, ::2] = 200  # one pixel of every 2 × 2 block: mean 50
-    assert (decode.letterbox(image, 2, 2) == 50).all()
+def test_letterbox_averages_when_it_shrinks_and_blends_when_it_grows():
+    image = np.zeros((6, 6, 3), np.uint8)
+    image[::3, ::3] = 180  # one pixel of every 3 × 3 block, off its centre: mean 20
+    assert (decode.letterbox(image, 2, 2) == 20).all()
+    step = np.zeros((2, 2, 3), np.uint8)
+    step[:, 1] = 200
+    assert decode.letterbox(step, 4, 4)[0, :, 0].tolist() == [0, 50, 150, 200]
     assert decode.letterbox(np.full((2, 4, 3), 9, np.uint8), 8, 8)[2:6].min() == 9
 
 

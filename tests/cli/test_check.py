@@ -1,0 +1,200 @@
+"""``taccorl check`` on recordings and datasets: its words and its exit codes."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from taccorl.cli.main import main
+from taccorl.demos.stand_in import CAMERA_TOPICS, StandInConfig, write_mcap
+
+SPEC = "--spec=piper_flexitac_mcap"
+FRONT = CAMERA_TOPICS["front"]
+
+
+def record(path: Path, **config: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_mcap(path, StandInConfig(**({"duration_s": 2.5, "camera_size": (96, 128)} | config)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("good") / "good.mcap")
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Any:
+    def run(*words: Any) -> tuple[int, str]:
+        code = main(["check", *map(str, words)])
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, shown.out + shown.err
+
+    return run
+
+
+# ---- recordings ----
+
+
+def test_a_sound_recording_is_ok(good: Path, said: Any) -> None:
+    code, text = said(good, SPEC)
+    assert code == 0
+    assert text.count("ok  ") == 2, "the recording and its one episode"
+    assert "76 rows, 'insert the test tube into the rack'" in text  # 2.3 s, both ends on a row
+    assert "warning" not in text and "error" not in text
+
+
+def test_wrong_units_are_an_error_that_says_so(tmp_path: Path, said: Any) -> None:
+    code, text = said(record(tmp_path / "degrees.mcap", joints_in_degrees=True), SPEC, "--pictures=false")
+    assert code == 1
+    assert "error" in text and "degrees?" in text
+
+
+def test_a_frozen_camera_is_found_only_when_pictures_are_looked_at(tmp_path: Path, said: Any) -> None:
+    path = record(tmp_path / "frozen.mcap", duration_s=4.0, frozen_camera="front")
+    code, text = said(path, SPEC)
+    assert (code, "frozen_picture" in text) == (1, True)
+    code, text = said(path, SPEC, "--pictures=false")
+    assert (code, "frozen_picture" in text) == (0, False)
+
+
+def test_what_is_lost_is_a_warning(tmp_path: Path, said: Any) -> None:
+    path = record(tmp_path / "gap.mcap", duration_s=4.0, gap=(FRONT, 1.8, 2.3))
+    code, text = said(path, SPEC, "--pictures=false")
+    assert code == 1
+    assert "lost: " in text and "no fresh sample of front" in text
+    assert "part 0: " in text and "part 1: " in text
+
+
+def test_an_episode_that_the_operator_discarded_is_no_warning(tmp_path: Path, said: Any) -> None:
+    path = record(tmp_path / "two.mcap", duration_s=4.0, episodes=2, outcomes=("discard", "success"))
+    code, text = said(path, SPEC, "--pictures=false")
+    assert code == 0
+    assert "discarded by the operator" in text
+
+
+def test_pictures_that_do_not_decode_are_named_and_the_rest_is_checked(good: Path, tmp_path: Path, said: Any) -> None:
+    seen = 0
+    with good.open("rb") as source, (tmp_path / "broken.mcap").open("wb") as sink:
+        writer = Writer(sink)
+        writer.start(profile="ros2")
+        ids: dict[str, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            assert schema is not None
+            if channel.topic not in ids:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                ids[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            seen += channel.topic == FRONT
+            broken = channel.topic == FRONT and seen == 40
+            data = message.data.replace(b"\xff\xd8\xff", b"\0\0\0") if broken else message.data
+            writer.add_message(ids[channel.topic], message.log_time, data, message.publish_time)
+        writer.finish()
+    code, text = said(tmp_path / "broken.mcap", SPEC)
+    assert code == 1
+    assert "broken_picture: front: 1 pictures do not decode, first at 1.3" in text
+    assert "76 rows" in text
+
+
+def test_a_bad_file_in_a_folder_does_not_hide_the_others(good: Path, tmp_path: Path, said: Any) -> None:
+    shutil.copy(good, tmp_path / "b.mcap")
+    (tmp_path / "a.mcap").write_bytes(b"not a recording")
+    code, text = said(tmp_path, SPEC, "--pictures=false")
+    assert code == 1
+    assert "unreadable" in text and "is not an MCAP file" in text
+    assert "76 rows" in text
+
+
+# ---- datasets ----
+
+
+def test_a_sound_dataset_is_checked_by_the_spec_it_carries(dataset: Path, said: Any) -> None:
+    code, text = said(dataset)
+    assert "episode 0: " in text and "episode 1: " in text
+    assert code == int("warning" in text)
+    assert "error" not in text
+
+
+def test_a_cut_video_is_an_error_and_the_other_episodes_are_still_checked(
+    dataset: Path, tmp_path: Path, said: Any
+) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    video = next(copy.rglob("videos/observation.images.front/**/*.mp4"))
+    os.truncate(video, video.stat().st_size // 2)
+    code, text = said(copy)
+    assert code == 1
+    assert "video_count" in text and "observation.images.front" in text
+    assert "episode 0: " in text and "episode 1: " in text
+
+
+def test_an_incomplete_dataset_is_one_clear_line(dataset: Path, tmp_path: Path, said: Any) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    next((copy / "data").rglob("*.parquet")).unlink()
+    code, text = said(copy)
+    assert code == 2
+    assert "data files are missing" in text
+
+
+# ---- what is no recording ----
+
+
+def odd_things(folder: Path) -> dict[str, Path]:
+    (folder / "empty").mkdir()
+    (folder / "dir.mcap").mkdir()
+    os.mkfifo(folder / "pipe.mcap")
+    (folder / "dangling.mcap").symlink_to(folder / "nowhere.mcap")
+    (folder / "text.txt").write_text("hello")
+    names = ["empty", "dir.mcap", "pipe.mcap", "dangling.mcap", "text.txt", "missing.mcap"]
+    return {name: folder / name for name in names}
+
+
+@pytest.mark.parametrize("name", ["empty", "dir.mcap", "pipe.mcap", "dangling.mcap", "text.txt", "missing.mcap"])
+@pytest.mark.parametrize("with_spec", [True, False])
+def test_no_recording_is_one_clear_line_that_names_it(name: str, with_spec: bool, tmp_path: Path, said: Any) -> None:
+    path = odd_things(tmp_path)[name]
+    if name == "text.txt" and with_spec:
+        code, text = said(path, SPEC)  # the spec names the reader, and the reader says what is wrong with the file
+        assert code == 1 and "is not an MCAP file" in text
+        return
+    code, text = said(path, *([SPEC] if with_spec else []))
+    assert code == 2
+    assert text.startswith("taccorl check: ") and str(path) in text
+    assert len(text.strip().splitlines()) == 1
+    if name in ("missing.mcap", "dangling.mcap"):
+        assert "no such file" in text
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("piper_flexitac_mcpa", ("did you mean 'piper_flexitac_mcap'",)),
+        ("taccorl_bimanual", ("taccorl_bimanual.yaml:", "unknown key 'name'")),
+        ("flexitac_v2", ("flexitac_v2.yaml:", "unknown key")),
+        ("broken.yaml", ("broken.yaml:3:", "rate_hz")),
+    ],
+)
+def test_a_spec_that_cannot_be_obeyed_is_named_with_its_line(
+    spec: str, words: tuple[str, ...], good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("broken.yaml").write_text("spec_version: 1\nchannels:\n  a: {topic: /a, rate_hz: fast}\n")
+    code, text = said(good, f"--spec={spec}")
+    assert code == 2
+    for word in words:
+        assert word in text
+
+
+def test_check_starts_without_torch_or_lerobot(good: Path) -> None:
+    code = (
+        "import sys; from taccorl.cli.main import main\n"
+        f"main(['check', {str(good)!r}, {SPEC!r}, '--pictures=false'])\n"
+        "print({'torch', 'lerobot', 'h5py', 'rosbags'} & set(sys.modules) or 'light')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "light"

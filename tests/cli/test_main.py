@@ -1,0 +1,116 @@
+"""The program as a whole: its list of verbs, its help, its exit codes."""
+
+import dataclasses
+import importlib
+import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taccorl.cli.check import CheckConfig
+from taccorl.cli.ingest import IngestConfig, InspectConfig
+from taccorl.cli.lineage import ExplainConfig, PruneConfig
+from taccorl.cli.main import VERBS, main
+from taccorl.cli.view import ViewConfig
+from taccorl.errors import TaccorlError
+
+HELP = {
+    ("ingest",): IngestConfig,
+    ("ingest", "inspect"): InspectConfig,
+    ("check",): CheckConfig,
+    ("view",): ViewConfig,
+    ("lineage", "explain"): ExplainConfig,
+    ("lineage", "prune"): PruneConfig,
+}
+TACCORL = [sys.executable, "-m", "taccorl.cli.main"]
+
+
+def test_the_list_names_every_verb_and_needs_no_library() -> None:
+    heavy = "{'numpy', 'torch', 'lerobot', 'draccus', 'rich', 'yaml'}"
+    code = f"import sys; from taccorl.cli.main import main; main([]); print({heavy} & set(sys.modules) or 'light')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *listing, loaded = done.stdout.splitlines()
+    assert loaded == "light"
+    for group, verbs in VERBS.items():
+        assert group in listing
+        for verb, line in verbs.items():
+            assert f"  {verb:9s}{line}" in listing
+            assert callable(importlib.import_module(f"taccorl.cli.{verb}").main)
+
+
+@pytest.mark.parametrize("words", [["-h"], ["--help"], []])
+def test_the_list_is_no_error(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 0
+    assert "usage: taccorl <verb>" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("typo", "meant"), [("ingst", "ingest"), ("chekc", "check"), ("veiw", "view")])
+def test_an_unknown_verb_names_the_nearest(typo: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([typo, "x"]) == 2
+    assert capsys.readouterr().err == f"taccorl: no verb {typo!r}; did you mean {meant!r}?\n"
+
+
+@pytest.mark.parametrize("words", HELP, ids=" ".join)
+def test_help_of_every_verb_shows_what_each_option_is(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*words, "--help"])
+    assert stop.value.code == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    source = inspect.getsource(HELP[words])
+    for field in dataclasses.fields(HELP[words]):
+        assert f"--{field.name}" in shown
+        # the sentence below the field in the source
+        said = source.split(f"\n    {field.name}: ", 1)[1].split('"""', 2)[1]
+        assert " ".join(said.split())[:30] in shown, field.name
+
+
+def test_help_comes_first_whatever_else_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["ingest", "some", "words", "--help"])
+    assert stop.value.code == 0
+    assert "--dry_run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "words"),
+    [
+        (TaccorlError("front: no such topic"), 2, "taccorl check: front: no such topic"),
+        (FileNotFoundError(2, "No such file or directory", "x.mcap"), 2, "No such file or directory (x.mcap)"),
+        (OSError("odd"), 2, "taccorl check: odd"),
+        (KeyboardInterrupt(), 130, "run again to go on"),
+    ],
+)
+def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
+    raised: BaseException,
+    code: int,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(argv: Any) -> int:
+        raise raised
+
+    monkeypatch.setattr("taccorl.cli.check.main", fail)
+    assert main(["check", "x"]) == code
+    shown = capsys.readouterr().err
+    assert words in shown and "Traceback" not in shown
+    assert len(shown.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("words", [(), ("lineage", "--help"), ("ingest", "inspect", "{recording}")])
+def test_a_reader_that_goes_away_is_no_error_message(words: tuple[str, ...], tmp_path: Path) -> None:
+    from taccorl.demos.stand_in import StandInConfig, write_mcap
+
+    write_mcap(tmp_path / "a.mcap", StandInConfig(duration_s=2.0, camera_size=(96, 128)))
+    read_end, write_end = os.pipe()
+    os.close(read_end)  # as `taccorl … | head -0` does
+    given = [w.format(recording=tmp_path / "a.mcap") for w in words]
+    done = subprocess.run([*TACCORL, *given], stdout=write_end, stderr=subprocess.PIPE, text=True)
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (141, "")

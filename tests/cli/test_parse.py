@@ -1,0 +1,179 @@
+"""Command lines into configs: what is typed is what is meant, and a slip is named."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+import pytest
+
+from taccorl.cli.parse import parse
+from taccorl.errors import TaccorlError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motor(draccus.ChoiceRegistry):
+    """Something that turns."""
+
+
+@Motor.register_subclass("small")
+@dataclass(frozen=True, kw_only=True)
+class SmallMotor(Motor):
+    """The default."""
+
+    poles: int = 2
+
+
+@Motor.register_subclass("big")
+@dataclass(frozen=True, kw_only=True)
+class BigMotor(Motor):
+    """Needs a voltage."""
+
+    voltage_v: float
+
+
+@dataclass(kw_only=True)
+class Robot:
+    """For these tests."""
+
+    paths: list[Path]
+    """Files."""
+    name: str
+    """Its name."""
+    home: Path | None = None
+    """Its home."""
+    joints: int = 6
+    """How many."""
+    reach_m: float | None = None
+    """How far."""
+    quick: bool = False
+    """Or not."""
+    motor: Motor = field(default_factory=SmallMotor)
+    """Which one."""
+
+
+def robot(*words: str) -> Robot:
+    return parse(Robot, list(words), positional="paths")
+
+
+def test_bare_words_and_options_in_any_order() -> None:
+    found = robot("a.mcap", "--name=arm", "b.mcap", "--joints=7", "--quick=true", "--reach_m=0.8")
+    expected = Robot(paths=[Path("a.mcap"), Path("b.mcap")], name="arm", joints=7, quick=True, reach_m=0.8)
+    assert found == expected
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        "run #3.mcap", "123", "1e3", "true", "null", "~", "2024-01-01", "a: b", "[x]y", "{a", "./- a", "it's", '"quoted"',
+        "includes/x", "include", "a=b", "*.mcap", "&anchor", "!tag", "über 測試 😀", "b\udc80d", "  spaced  ", "%d", "a,b", "@x",
+    ],
+)  # fmt: skip
+def test_paths_and_texts_are_taken_as_typed(odd: str) -> None:
+    assert robot(odd, "--name=x").paths == [Path(odd)]
+    if odd != "~":
+        assert robot("x", f"--name={odd}").name == odd
+    if odd != "null":
+        assert robot("x", "--name=x", f"--home={odd}").home == Path(odd)
+
+
+def test_a_list_may_be_given_by_repeating_or_as_yaml() -> None:
+    assert robot("--paths=a", "--paths=b", "--name=x").paths == [Path("a"), Path("b")]
+    assert robot("--paths=[a, b]", "--name=x").paths == [Path("a"), Path("b")]
+
+
+def test_null_takes_back_an_optional_value(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("name: x\npaths: [a]\nhome: /home/me\n")
+    assert robot(f"--config_path={tmp_path / 'c.yaml'}").home == Path("/home/me")
+    assert robot(f"--config_path={tmp_path / 'c.yaml'}", "--home=null").home is None
+
+
+def test_a_tilde_is_the_home_folder_not_a_folder_named_tilde(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/someone")
+    assert robot("x", "--name=x", "--home=~/data").home == Path("/home/someone/data")
+
+
+def test_options_go_before_the_config_file(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("name: from file\njoints: 5\npaths: [a]\nmotor: {type: big, voltage_v: 24}\n")
+    found = robot(f"--config_path={tmp_path / 'c.yaml'}", "--joints=4", "b")
+    assert found == Robot(paths=[Path("b")], name="from file", joints=4, motor=BigMotor(voltage_v=24.0))
+
+
+def test_a_nested_option_means_the_default_kind() -> None:
+    assert robot("x", "--name=x", "--motor.poles=8").motor == SmallMotor(poles=8)
+    assert robot("x", "--name=x", "--motor.type=big", "--motor.voltage_v=12").motor == BigMotor(voltage_v=12.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("x", "--nme=a"), ("unknown option '--nme=a'", "did you mean 'name'")),
+        (("x", "--name=a", "-joints=3"), ("unknown option '-joints=3'", "did you mean 'joints'")),
+        (("x", "--name=a", "--motor.pole=3"), ("unknown option", "did you mean 'motor.poles'")),
+        (("x", "--name=a", "--motor.type=bigg"), ("'bigg'", "small", "big")),
+        (("x", "--name=a", "--motor.type=big"), ("voltage_v",)),
+        (("x", "--name=a", "--motor.type=big", "--motor.poles=3"), ("poles",)),
+        (("x", "--name", "a"), ("option '--name' needs a value: --name=…",)),
+        (("x", "--name="), ("option '--name=' needs a value",)),
+        (("x", "--name=a", "--quick"), ("option '--quick' needs a value",)),
+        (("--name=a",), ("missing --paths=", "--help")),
+        (("x",), ("missing --name=",)),
+        ((), ("missing --paths=, --name=",)),
+        (("x", "--name=a", "--joints=six"), ("joints", "'six'", "int")),
+        (("x", "--name=a", "--joints=1.5"), ("joints", "1.5")),
+        (("x", "--name=a", "--quick=maybe"), ("quick", "'maybe'", "bool")),
+        (("x", "--name=a", "--reach_m=[1"), ("[1",)),
+        (("x", "--name=a", "--paths=b"), ("'x' and --paths=…", "one way")),
+        (("", "--name=a"), ("paths is empty",)),
+        (("--name=a", "--config_path=odd.yaml"), ("odd.yaml", "found list")),
+        (("--name=a", "--config_path=bad.yaml"), ("bad.yaml", "is not YAML")),
+        (("--name=a", "--config_path=typo.yaml"), ("pathz",)),
+    ],
+)
+def test_a_slip_is_named_with_the_way_out(
+    words: tuple[str, ...], said: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("odd.yaml").write_text("- 1\n")
+    Path("bad.yaml").write_text("paths: [a\n")
+    Path("typo.yaml").write_text("pathz: [a]\n")
+    with pytest.raises(TaccorlError) as error:
+        robot(*words)
+    for word in said:
+        assert word in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_one_word_fills_a_single_field_and_no_more() -> None:
+    @dataclass(kw_only=True)
+    class One:
+        """For this test."""
+
+        path: Path
+        """Where."""
+
+    assert parse(One, ["2024-01-01"], positional="path") == One(path=Path("2024-01-01"))
+    with pytest.raises(TaccorlError, match="one path at a time, found a b"):
+        parse(One, ["a", "b"], positional="path")
+    with pytest.raises(TaccorlError, match="did not expect 'a'; options: --path="):
+        parse(One, ["a"])
+
+
+def test_every_field_of_every_verb_survives_the_way_through(tmp_path: Path) -> None:
+    """No config of ours has a field that this parser would lose."""
+    from taccorl.cli.ingest import IngestConfig
+    from taccorl.lineage.engines import LocalEngine, SlurmEngine
+
+    words = ["a", "--spec=s", "--out=o", "--store=t", "--dry_run=true", "--replace=true", "--engine.workers=3"]
+    expected: Any = IngestConfig(
+        paths=[Path("a")],
+        spec="s",
+        out=Path("o"),
+        store=Path("t"),
+        dry_run=True,
+        replace=True,
+        engine=LocalEngine(workers=3),
+    )
+    assert parse(IngestConfig, words, positional="paths") == expected
+    words[-1:] = ["--engine.type=slurm", "--engine.partition=gpu", "--engine.time=01:00:00"]
+    assert parse(IngestConfig, words, positional="paths").engine == SlurmEngine(partition="gpu", time="01:00:00")

@@ -1,0 +1,533 @@
+"""Recordings into one dataset: every input has one outcome, a second run does only what is new, and nothing is damaged."""
+
+import contextlib
+import json
+import os
+import resource
+import shlex
+import shutil
+import subprocess
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from edited import NATIVE, SIZE, Raw, changed_specs, rewrite
+
+from taccorl.cli.main import main
+from taccorl.data import ingest as ingest_module
+from taccorl.data import lerobot_format
+from taccorl.data.cutting import Cutter, open_episodes
+from taccorl.data.dataset import Dataset
+from taccorl.demos.stand_in import CAMERA_TOPICS, StandInConfig, read_frame_id, write_mcap
+from taccorl.errors import DatasetError
+
+pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")  # its other threads only wait
+FRONT = CAMERA_TOPICS["front"]
+GAP = (CAMERA_TOPICS["left_wrist"], 1.8, 2.3)
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped spec with small pictures, so that writing is quick and frame ids can be read."""
+    return changed_specs(tmp_path_factory.mktemp("specs"), NATIVE)
+
+
+def record(path: Path, **config: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_mcap(path, StandInConfig(**({"duration_s": 2.5, "camera_size": SIZE} | config)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sound recordings."""
+    folder = tmp_path_factory.mktemp("good")
+    record(folder / "a.mcap", seed=1)
+    record(folder / "b.mcap", seed=2)
+    return folder
+
+
+class Ingests:
+    """The real command in this process, on one store, with a note of every recording that was really written."""
+
+    def __init__(self, folder: Path, spec: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder, self.spec = folder, spec
+        self.out, self.store, self.log = folder / "out", folder / "store", folder / "written.log"
+        original = lerobot_format.write_episodes
+
+        def noted(episodes: Sequence[Any], root: Path, **options: Any) -> None:
+            with self.log.open("a") as log:
+                log.write(f"{len(episodes)}\n")
+            original(episodes, root, **options)
+
+        monkeypatch.setattr(lerobot_format, "write_episodes", noted)
+
+    def words(self, *paths: Path | str, **options: Any) -> list[str]:
+        given = {"spec": self.spec, "out": self.out, "store": self.store} | options
+        return ["ingest", *map(str, paths), *(f"--{k.replace('__', '.')}={v}" for k, v in given.items())]
+
+    def run(self, *paths: Path | str, **options: Any) -> int:
+        return main(self.words(*paths, **options))
+
+    def report(self) -> dict[str, Any]:
+        return json.loads(self.out.with_name(f"{self.out.name}.ingest_report.json").read_text())
+
+    def written(self) -> int:
+        """Recordings written since last asked."""
+        count = len(self.log.read_text().split()) if self.log.exists() else 0
+        self.log.unlink(missing_ok=True)
+        return count
+
+
+@pytest.fixture
+def ingests(tmp_path: Path, spec: Path, monkeypatch: pytest.MonkeyPatch) -> Ingests:
+    return Ingests(tmp_path, spec, monkeypatch)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Every file but the manifest, which says when it was made."""
+    files = [p for p in folder.rglob("*") if p.is_file() and p.name != "manifest.json"]
+    return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+
+def in_fork(work: Callable[[], int]) -> int:
+    """Start ``work`` in a copy of this process; its process id."""
+    pid = os.fork()
+    if pid:
+        return pid
+    code = 99
+    try:
+        code = work()
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def exit_code(pid: int) -> int:
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+# ---- one outcome each, and a report that adds up ----
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory, spec: Path) -> dict[str, Any]:
+    """Four recordings of four outcomes in one command."""
+    folder = tmp_path_factory.mktemp("mixed")
+    record(folder / "in/1_good.mcap", duration_s=5.0, episodes=2, outcomes=("success", "failure"), seed=3)
+    record(folder / "in/2_gap.mcap", duration_s=4.0, gap=GAP, seed=4)
+    record(folder / "in/3_degrees.mcap", duration_s=3.0, joints_in_degrees=True)
+    (folder / "in/4_empty.mcap").touch()
+    words = ["ingest", str(folder / "in"), f"--spec={spec}", f"--out={folder / 'out'}", f"--store={folder / 'store'}"]
+    code = main(words)
+    report = json.loads((folder / "out.ingest_report.json").read_text())
+    return {"folder": folder, "code": code, "report": report, "dataset": Dataset(folder / "out")}
+
+
+def test_every_recording_has_exactly_one_outcome(mixed: dict[str, Any]) -> None:
+    report = mixed["report"]
+    assert mixed["code"] == 1
+    assert [(Path(r["recording"]).stem, r["outcome"]) for r in report["recordings"]] == [
+        ("1_good", "written"),
+        ("2_gap", "split"),
+        ("3_degrees", "quarantined"),
+        ("4_empty", "refused"),
+    ]
+    assert report["outcomes"] == {"written": 1, "split": 1, "quarantined": 1, "refused": 1}
+    for r in report["recordings"]:
+        assert (r["reason"] == "") == (r["outcome"] == "written")
+        assert {"spec", "spec_digest", "part", "command", "episodes", "losses", "damage", "findings"} <= set(r)
+        assert "traceback" not in r and "artefact" not in r
+
+
+def test_counts_in_the_report_are_those_of_the_dataset(mixed: dict[str, Any]) -> None:
+    report, dataset = mixed["report"], mixed["dataset"]
+    episodes = [e for r in report["recordings"] for e in r["episodes"] if e["outcome"] == "written"]
+    assert [e["index_in_dataset"] for e in episodes] == list(range(4))
+    assert report["episodes"] == dataset.num_episodes == 4
+    assert report["rows"] == sum(e["rows"] for e in episodes) == dataset.info["total_frames"]
+    assert [dataset.num_rows(e["index_in_dataset"]) for e in episodes] == [e["rows"] for e in episodes]
+    assert [e["success"] for e in episodes] == [True, False, True, True]
+    assert all("index_in_dataset" not in e for e in report["recordings"][2]["episodes"])
+    messages = report["recordings"][0]["messages"]
+    assert messages["/joint_states_left"] == 1000  # 5 s at 200 Hz
+
+
+def test_times_in_the_report_count_from_the_recordings_first_sample(mixed: dict[str, Any]) -> None:
+    first, second = mixed["report"]["recordings"][0]["episodes"]
+    assert first["start_s"] == pytest.approx(
+        0.1, abs=0.01
+    )  # the stand-in's start markers: 0.1 s into each slot of 2.5 s
+    assert second["start_s"] == pytest.approx(2.6, abs=0.01)
+    before, after = mixed["report"]["recordings"][1]["episodes"]
+    [loss] = mixed["report"]["recordings"][1]["losses"]
+    assert before["end_s"] < loss["start_s"] <= loss["end_s"] < after["start_s"]
+    assert loss["start_s"] - before["end_s"] == pytest.approx(1 / 30, abs=0.002)
+
+
+def test_the_dataset_holds_what_cutting_gives(mixed: dict[str, Any], spec: Path) -> None:
+    dataset, index = mixed["dataset"], 0
+    for name in ("1_good", "2_gap"):
+        with open_episodes(mixed["folder"] / f"in/{name}.mcap", spec) as episodes:
+            for episode in episodes:
+                stored = dataset.episode(index)
+                for key, values in episode.arrays.items():
+                    np.testing.assert_array_equal(stored.arrays[key], values)
+                ids = [read_frame_id(shown["observation.images.front"]) for shown in episode.pictures()]
+                assert [read_frame_id(f) for f in dataset.frames(index, "observation.images.front")] == ids
+                assert (stored.instruction, stored.success) == (episode.instruction, episode.success)
+                assert stored.start_ns == episode.start_ns
+                index += 1
+    assert index == dataset.num_episodes
+    assert dataset.video_problems() == []
+
+
+def test_provenance_travels_in_the_dataset(mixed: dict[str, Any]) -> None:
+    meta = mixed["dataset"].root / "meta/taccorl"
+    assert json.loads((meta / "ingest_report.json").read_text()) == mixed["report"]
+    records = json.loads((meta / "episodes.json").read_text())
+    assert [Path(r["recording"]).stem for r in records] == ["1_good", "1_good", "2_gap", "2_gap"]
+    assert all(len(r["source_digest"]) == 64 for r in records)
+    assert mixed["dataset"].episode(0).origin == "surrogate stand-in, not a robot"
+
+
+def test_the_named_commands_show_what_is_wrong(mixed: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    commands = {Path(r["recording"]).stem: shlex.split(r["command"]) for r in mixed["report"]["recordings"]}
+    assert commands["4_empty"][:3] == ["taccorl", "ingest", "inspect"]
+    assert main(commands["4_empty"][1:]) == 1
+    assert "is empty (0 bytes)" in capsys.readouterr().out
+    # view needs a screen; what it would open is there
+    _, verb, path, spec_option = commands["3_degrees"]
+    assert verb == "view"
+    with open_episodes(Path(path), spec_option.removeprefix("--spec=")) as episodes:
+        assert np.abs(episodes[0].arrays["observation.state"]).max() > 10
+
+
+def test_an_unfit_recording_without_episodes_is_not_sent_to_the_viewer(ingests: Ingests, tmp_path: Path) -> None:
+    record(tmp_path / "in.mcap", gap=("/left_robot_left_finger", 0.2, 9.0))
+    assert ingests.run(tmp_path / "in.mcap", dry_run="true") == 1
+    with contextlib.suppress(FileNotFoundError):
+        ingests.report()
+    job = ingest_module.find_jobs([tmp_path / "in.mcap"], _loaded(ingests.spec), "spec", tmp_path / "store", True)
+    [entry] = ingest_module.ingest(job, tmp_path / "out", None)["recordings"]
+    assert (entry["outcome"], entry["episodes"]) == ("quarantined", [])
+    assert "baseline needs 30" in entry["reason"]
+    assert entry["command"].startswith("taccorl ingest inspect ")
+
+
+def _loaded(spec: Path) -> Any:
+    from taccorl.data.spec import load_recording_spec
+
+    return load_recording_spec(spec)
+
+
+# ---- pictures, watched while they are written ----
+
+
+def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_is_kept(
+    ingests: Ingests, tmp_path: Path
+) -> None:
+    # frozen after a third of 6 s; two episodes of 3 s: of the first 1 s is frozen, all of the second
+    record(tmp_path / "in.mcap", duration_s=6.0, episodes=2, frozen_camera="right_wrist", seed=2)
+    assert ingests.run(tmp_path / "in.mcap") == 1
+    [entry] = ingests.report()["recordings"]
+    assert [e["outcome"] for e in entry["episodes"]] == ["written", "quarantined"]
+    assert entry["outcome"] == "quarantined"
+    assert "1 of 2 episodes" in entry["reason"] and "right_wrist" in json.dumps(entry["episodes"][1]["findings"])
+    assert Dataset(ingests.out).num_episodes == 1
+
+
+def test_a_recording_whose_only_episode_is_frozen_gives_nothing(ingests: Ingests, tmp_path: Path) -> None:
+    record(tmp_path / "in.mcap", duration_s=4.0, frozen_camera="front")
+    assert ingests.run(tmp_path / "in.mcap") == 1
+    [entry] = ingests.report()["recordings"]
+    assert entry["outcome"] == "quarantined"
+    assert "unchanged pictures" in entry["reason"]
+    assert not ingests.out.exists()
+    assert not [p for p in ingests.store.rglob("*") if p.name == "dataset"]
+
+
+def test_pictures_that_do_not_decode_cost_only_themselves(ingests: Ingests, tmp_path: Path) -> None:
+    def garble(messages: list[Raw]) -> Iterator[Raw]:
+        front = 0
+        for m in messages:
+            front += m.topic == FRONT
+            broken = m.topic == FRONT and front in (31, 41)
+            yield Raw(m.topic, m.type, m.log_ns, m.data.replace(b"\xff\xd8\xff", b"\0\0\0")) if broken else m
+
+    rewrite(record(tmp_path / "whole.mcap"), tmp_path / "in.mcap", garble)
+    assert ingests.run(tmp_path / "in.mcap") == 0
+    [entry] = ingests.report()["recordings"]
+    assert entry["outcome"] == "split"
+    assert "2 of front" in entry["reason"]
+    assert entry["broken_pictures_s"]["front"] == [pytest.approx(1.03, abs=0.06), pytest.approx(1.36, abs=0.06)]
+    assert entry["losses"] == [], "each row has an older picture of under 80 ms"
+    ids = [read_frame_id(f) for f in Dataset(ingests.out).frames(0, "observation.images.front")]
+    assert not {30, 40} & set(ids)
+    assert {29, 31, 39, 41} <= set(ids)
+
+
+def test_a_fault_of_ours_is_told_without_a_traceback_on_the_screen(
+    ingests: Ingests, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    original = Cutter.cut
+
+    def faulty(self: Cutter) -> Any:
+        return 1 // 0 if self.recording.source.name.endswith("a.mcap") else original(self)
+
+    monkeypatch.setattr(Cutter, "cut", faulty)
+    assert ingests.run(good) == 1
+    bad, other = ingests.report()["recordings"]
+    assert bad["outcome"] == "refused" and "a fault in taccorl, please report it: ZeroDivisionError" in bad["reason"]
+    assert "in faulty" in bad["traceback"]
+    assert other["outcome"] == "written", "its neighbour does not suffer"
+    shown = capsys.readouterr()
+    assert "Traceback" not in shown.out + shown.err
+
+
+# ---- a second run ----
+
+
+def test_a_second_run_does_nothing_again(ingests: Ingests, good: Path) -> None:
+    assert ingests.run(good) == 0
+    assert ingests.written() == 2
+    before = {p: p.stat().st_mtime_ns for p in (*ingests.store.rglob("*"), *ingests.out.rglob("*")) if p.is_file()}
+    report = ingests.report()
+    assert ingests.run(good) == 0
+    assert ingests.written() == 0
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+    assert ingests.report() == report
+
+
+def test_a_new_recording_is_the_only_one_written(ingests: Ingests, good: Path, tmp_path: Path) -> None:
+    inputs = Path(shutil.copytree(good, tmp_path / "in"))
+    assert ingests.run(inputs) == 0
+    assert ingests.written() == 2
+    record(inputs / "c.mcap", seed=3)
+    assert ingests.run(inputs) == 2, "another dataset is in the way"
+    assert ingests.written() == 1
+    assert ingests.run(inputs, replace="true") == 0
+    assert ingests.written() == 0
+    assert Dataset(ingests.out).num_episodes == 3
+    assert Dataset(tmp_path / "out.old-1").num_episodes == 2
+
+
+def test_a_changed_spec_writes_all_again(ingests: Ingests, good: Path, tmp_path: Path, spec: Path) -> None:
+    assert ingests.run(good) == 0
+    assert ingests.written() == 2
+    shutil.copytree(spec.parents[1], tmp_path / "specs")
+    other = tmp_path / "specs/recordings" / spec.name
+    other.write_text("# a comment decides nothing\n" + other.read_text())
+    assert ingests.run(good, spec=other) == 0
+    assert ingests.written() == 0
+    other.write_text(other.read_text().replace("min_s: 1.0", "min_s: 0.5"))
+    assert ingests.run(good, spec=other, out=tmp_path / "out2") == 0
+    assert ingests.written() == 2
+
+
+def test_the_same_content_under_another_name_is_known(ingests: Ingests, good: Path, tmp_path: Path) -> None:
+    assert ingests.run(good / "a.mcap") == 0
+    assert ingests.written() == 1
+    shutil.copy(good / "a.mcap", tmp_path / "renamed.mcap")
+    assert ingests.run(tmp_path / "renamed.mcap", out=tmp_path / "out2") == 0
+    assert ingests.written() == 0
+    assert Path(Dataset(tmp_path / "out2").told(0)["provenance"]["recording"]).name == "renamed.mcap"
+    assert content(tmp_path / "out2/data") == content(ingests.out / "data")
+
+
+def test_one_file_by_several_names_is_one_input(
+    ingests: Ingests, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(good)
+    (tmp_path / "link.mcap").symlink_to(good / "a.mcap")
+    assert ingests.run("a.mcap", good / "a.mcap", "./a.mcap", f"../{good.name}/a.mcap", tmp_path / "link.mcap") == 0
+    assert [r["recording"] for r in ingests.report()["recordings"]] == ["a.mcap"]
+    assert Dataset(ingests.out).num_episodes == 1
+
+
+def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(
+    ingests: Ingests, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ["2024-01-01.mcap", "[bold]it's #1 [].mcap", "über 測試 😀.mcap"]
+    folder = tmp_path / "a: b [/c] 'd'"
+    folder.mkdir(parents=True)
+    for name in names:
+        shutil.copy(good / "a.mcap", folder / name)
+    monkeypatch.chdir(folder)
+    assert ingests.run(*names, out=tmp_path / "my data/ünï") == 0
+    report = json.loads((tmp_path / "my data/ünï.ingest_report.json").read_text())
+    assert [r["recording"] for r in report["recordings"]] == names
+    shown = capsys.readouterr().out
+    for name in names:
+        assert name in shown
+    for r, name in zip(report["recordings"], names, strict=True):
+        assert shlex.split(r["command"])[2] == name
+
+
+# ---- what is in the way ----
+
+
+def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(
+    ingests: Ingests, good: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ingests.out.mkdir()
+    (ingests.out / "thesis.txt").write_text("do not touch")
+    assert ingests.run(good) == 2
+    assert "--replace=true" in capsys.readouterr().err
+    assert ingests.written() == 0
+    assert content(ingests.out) == {"thesis.txt": b"do not touch"}
+    assert ingests.run(good / "a.mcap", replace="true") == 0
+    aside = ingests.out.with_name("out.old-1")
+    assert str(aside) in capsys.readouterr().out
+    assert content(aside) == {"thesis.txt": b"do not touch"}
+
+
+def test_another_dataset_is_left_alone_and_the_way_out_is_named(
+    ingests: Ingests, good: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ingests.run(good / "a.mcap") == 0
+    before = content(ingests.out)
+    assert ingests.run(good / "b.mcap") == 2
+    said = capsys.readouterr().err
+    assert "is in the way" in said and "--replace=true" in said
+    assert content(ingests.out) == before
+
+
+def test_a_replacement_that_fails_puts_back_what_was_there(
+    ingests: Ingests, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ingests.run(good / "a.mcap") == 0
+    before = content(ingests.out)
+
+    def fail(roots: Any, destination: Path) -> None:
+        raise DatasetError("3 problems after merging")
+
+    monkeypatch.setattr(lerobot_format, "merge", fail)
+    assert ingests.run(good / "b.mcap", replace="true") == 2
+    assert "3 problems after merging" in capsys.readouterr().err
+    assert content(ingests.out) == before
+    assert sorted(p.name for p in ingests.folder.iterdir() if p.name.startswith("out")) == [
+        "out",
+        "out.ingest_report.json",
+    ]
+
+
+def test_replacing_a_dataset_by_itself_moves_nothing(ingests: Ingests, good: Path) -> None:
+    assert ingests.run(good / "a.mcap") == 0
+    assert ingests.run(good / "a.mcap", replace="true") == 0
+    assert not ingests.out.with_name("out.old-1").exists()
+
+
+# ---- dry runs ----
+
+
+def test_a_dry_run_writes_nothing_at_all(
+    ingests: Ingests, mixed: dict[str, Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = ingests.folder / "here"
+    scratch = ingests.folder / "scratch"
+    place.mkdir()
+    scratch.mkdir()
+    monkeypatch.chdir(place)
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    assert main(["ingest", str(mixed["folder"] / "in"), f"--spec={ingests.spec}", "--dry_run=true"]) == 1
+    assert list(place.iterdir()) == list(scratch.iterdir()) == []
+    shown = capsys.readouterr().out
+    assert "1 written, 1 split, 1 quarantined, 1 refused" in shown
+    assert "nothing was written" in shown
+
+
+# ---- the machine fails ----
+
+
+def _no_damage(ingests: Ingests) -> None:
+    assert not ingests.out.exists()
+    assert not [p for p in ingests.folder.rglob(".*") if p.is_dir() and "taccorl" in p.name]
+    assert not list(ingests.store.glob("recording/.*")), "half an artefact"
+
+
+@pytest.mark.parametrize("limit_bytes", [20_000, 120_000])
+def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(
+    ingests: Ingests, good: Path, limit_bytes: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As a full disk would: some write fails, in LeRobot's encoder threads or elsewhere."""
+    import lerobot.datasets.lerobot_dataset  # noqa: F401  (before the limit: importing writes files, too)
+
+    def limited() -> int:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
+        return ingests.run(good)
+
+    assert exit_code(in_fork(limited)) == 2
+    shown = capfd.readouterr()
+    assert "Traceback" not in shown.out + shown.err
+    last = shown.err.strip().splitlines()[-1]
+    assert last.startswith("taccorl ingest: ") and "larger than this user may write" in last
+    assert "run the same command again" in last
+    _no_damage(ingests)
+    assert ingests.run(good) == 0, "with room again, it goes on"
+
+
+@pytest.mark.parametrize("size", ["200k", "900k"])
+def test_a_full_disk_stops_the_run_with_one_clear_line(
+    tmp_path: Path,
+    spec: Path,
+    good: Path,
+    size: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(disk)], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("mounting a small disk takes root")
+    try:
+        ingests = Ingests(disk, spec, monkeypatch)
+        ingests.log = tmp_path / "written.log"
+        assert ingests.run(good) == 2
+        shown = capfd.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        last = shown.err.strip().splitlines()[-1]
+        assert last.startswith("taccorl ingest: no space left")
+        _no_damage(ingests)
+        subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
+        assert ingests.run(good) == 0
+        assert Dataset(ingests.out).num_episodes == 2
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_store_that_is_read_only_is_told_at_once(
+    tmp_path: Path, spec: Path, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ingests = Ingests(tmp_path, spec, monkeypatch)
+    assert ingests.run(good, out="/proc/nothing/out") == 2
+    assert ingests.run(good, store="/proc/nothing/store") == 2
+    assert ingests.written() <= 2
+    assert capsys.readouterr().err.count("taccorl ingest: ") == 2
+
+
+# ---- many at once ----
+
+
+def test_two_workers_write_the_same_bytes_as_one(ingests: Ingests, good: Path, tmp_path: Path) -> None:
+    assert ingests.run(good) == 0
+    assert ingests.run(good, out=tmp_path / "out2", store=tmp_path / "store2", engine__workers=2) == 0
+    assert content(tmp_path / "out2") == content(ingests.out)
+    assert json.loads((tmp_path / "out2.ingest_report.json").read_text()) == ingests.report()
+
+
+def test_two_commands_at_once_share_the_work_and_agree(ingests: Ingests, good: Path) -> None:
+    import lerobot.datasets.lerobot_dataset  # noqa: F401
+
+    pids = [in_fork(lambda: ingests.run(good)) for _ in range(2)]
+    assert [exit_code(pid) for pid in pids] == [0, 0]
+    assert ingests.written() == 2, "each recording was written once"
+    assert Dataset(ingests.out).num_episodes == 2
+    assert Dataset(ingests.out).video_problems() == []
+    _ = ingests.report()
