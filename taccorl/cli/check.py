@@ -45,10 +45,13 @@ def main(argv: list[str]) -> int:
 
 
 def _check_dataset(config: CheckConfig) -> int:
+    import av.logging
+
     from taccorl.cli.tables import findings_table
     from taccorl.data.checks import Finding, check_episode, check_recording_episodes
     from taccorl.data.dataset import Dataset
 
+    av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
     dataset = Dataset(config.path)
     findings = [Finding("video_count", "error", "video", text) for text in dataset.video_problems()]
     findings += [Finding("skipped_feature", "note", key, f"{key}: {why}") for key, why in dataset.skipped.items()]
@@ -56,9 +59,12 @@ def _check_dataset(config: CheckConfig) -> int:
     findings += check_recording_episodes(episodes) if len(episodes) > 1 else []
     findings_table(str(config.path), findings)
     worst = _worst(findings)
-    for episode in episodes:
-        found = check_episode(episode, pictures=config.pictures)
-        findings_table(f"  episode {episodes.index(episode)}: {episode.num_rows} rows", found)
+    for number, episode in enumerate(episodes):
+        try:
+            found = check_episode(episode, pictures=config.pictures)
+        except TaccorlError as error:  # a video that does not hold its rows: the other episodes may be sound
+            found = [Finding("unreadable", "error", "video", str(error))]
+        findings_table(f"  episode {number}: {episode.num_rows} rows", found)
         worst = max(worst, _worst(found))
     return worst
 

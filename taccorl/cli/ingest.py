@@ -146,8 +146,9 @@ def _inspect(config: InspectConfig) -> int:
     from taccorl.data.inspection import draft_spec, inspect_source
     from taccorl.data.recording import find_sources
 
-    if config.draft is not None and config.draft.exists():
-        raise TaccorlError(f"{config.draft} exists; give another --draft, it would be overwritten")
+    draft = config.draft
+    if draft is not None and os.path.lexists(draft):
+        raise TaccorlError(f"{draft} exists; give another --draft, it would be overwritten")
     failed, found = 0, []
     for path in config.paths:
         try:
@@ -166,13 +167,13 @@ def _inspect(config: InspectConfig) -> int:
                 failed += 1
                 continue
             inventory_table(inventory)
-            text = draft_spec(inventory, config.draft.parent if config.draft else None)
-            if config.draft is not None:
-                config.draft.write_text(text, encoding="utf-8")
-                print(f"draft spec: {config.draft}")
-                config.draft = None
+            if draft is not None:
+                with draft.open("x", encoding="utf-8") as file:
+                    file.write(draft_spec(inventory, draft.parent))
+                print(f"draft spec: {draft}")
+                draft = None
             elif inventory.fits:
                 print(f"fits the shipped spec: taccorl ingest {shlex.quote(str(path))} --spec={inventory.fits[0]}\n")
             else:
-                print("draft spec (--draft=FILE writes it):\n\n" + text)
+                print("draft spec (--draft=FILE writes it):\n\n" + draft_spec(inventory))
     return 1 if failed else 0

@@ -204,7 +204,7 @@ def _channel_names(topics: list[TopicSummary]) -> dict[str, str]:
         short = [w for w in words if w not in ("image_raw", "compressed", "color")]
         name = "_".join(short) or "channel"
         name = "_".join(words) if name in names.values() else name
-        name = name if name[0].isalpha() else f"channel_{name}"
+        name = name if name[0].isalpha() and name.lower() not in YAML_WORDS else f"channel_{name}"
         numbered = (f"{name}_{k}" for k in itertools.count(2))
         names[t.topic] = name if name not in names.values() else next(n for n in numbered if n not in names.values())
     return names
@@ -233,4 +233,4 @@ def _channel(t: TopicSummary, clock: str, rate_known: bool) -> str:
 def _yaml(text: str) -> str:
     """A text as YAML reads it back; quoted unless it is plainly a name or path."""
     plain = re.fullmatch(r"/?[A-Za-z_][A-Za-z0-9_/.-]*", text)
-    return text if plain and text.lower() not in YAML_WORDS else json.dumps(text)
+    return text if plain and text.lower() not in YAML_WORDS else json.dumps(text, ensure_ascii=False)

@@ -140,6 +140,7 @@ class McapFile:
 
     def find(self, start: int, stop: int, opcodes: Collection[int], channels: Collection[int] = ()) -> int | None:
         """Offset of the first whole record of one of ``opcodes`` in [start, stop); messages only of these channel ids."""
+        wanted = np.isin(np.arange(256), list(opcodes))
         for offset in range(start, stop, BLOCK_BYTES):
             self.file.seek(offset)
             block = np.frombuffer(self.file.read(min(BLOCK_BYTES, stop - offset) + HEADER_BYTES - 1), np.uint8)
@@ -147,7 +148,7 @@ class McapFile:
                 return None
             heads = block[: len(block) - HEADER_BYTES + 1]
             small = (block[6:-2] == 0) & (block[7:-1] == 0) & (block[8:] == 0)  # lengths below 2⁴⁰ bytes
-            for at in np.flatnonzero(np.isin(heads, list(opcodes)) & small):
+            for at in np.flatnonzero(wanted[heads] & small):
                 record = self.record(offset + int(at))
                 if record is not None and self._is_sure(record, channels):
                     return record.offset
@@ -274,11 +275,15 @@ def chunk_records(chunk: Chunk) -> Iterator[Any]:
             yield parse(opcode, bytes(data[start:offset]))
 
 
+def check_size(num_bytes: int) -> None:
+    if num_bytes > MAX_CHUNK_BYTES:
+        raise ValueError(f"it claims {num_bytes:,} bytes, at most {MAX_CHUNK_BYTES:,} are opened")
+
+
 def _contents(chunk: Chunk) -> bytes | bytearray:
     """Uncompressed, and never more than the chunk claims."""
     claims = chunk.uncompressed_size
-    if claims > MAX_CHUNK_BYTES:
-        raise ValueError(f"it claims {claims:,} bytes uncompressed, at most {MAX_CHUNK_BYTES:,} are opened")
+    check_size(claims)
     if chunk.compression == "":
         return chunk.data
     if chunk.compression not in ("zstd", "lz4"):

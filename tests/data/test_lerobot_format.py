@@ -1,6 +1,7 @@
 """Made-up episodes through LeRobot's own writer: every row keeps its own picture, or somebody hears of it."""
 
 import dataclasses
+import json
 import logging
 import shutil
 import threading
@@ -343,3 +344,22 @@ def test_folders_that_lerobot_would_misread_are_refused(
 def test_an_episode_of_one_row_is_written(spec: DatasetSpec, tmp_path: Path) -> None:
     write_episodes([made_up(spec, 1)], tmp_path / "ds")
     assert row_ids(tmp_path / "ds") == [0]
+
+
+def test_data_files_are_those_of_lerobots_writer_left_alone(
+    spec: DatasetSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import contextlib
+
+    import pyarrow.parquet as pq
+
+    episodes = [made_up(spec, 300), made_up(spec, 41, 300, seed=1)]
+    write_episodes(episodes, tmp_path / "ours")
+    monkeypatch.setattr(lerobot_format, "_large_features_in_blocks", lambda writer: contextlib.nullcontext())
+    write_episodes(episodes, tmp_path / "theirs")
+    ours, theirs = (pq.read_table(next((tmp_path / name / "data").rglob("*.parquet"))) for name in ("ours", "theirs"))
+    assert ours.schema.equals(theirs.schema)
+    assert ours.equals(theirs)
+    said = [json.loads(table.schema.metadata[b"huggingface"])["info"] for table in (ours, theirs)]
+    assert said[0] == said[1]
+    assert (tmp_path / "ours/meta/info.json").read_text() == (tmp_path / "theirs/meta/info.json").read_text()

@@ -247,6 +247,7 @@ class _File:
             return [], True
         chunk = None
         try:
+            mcap_records.check_size(record.length)
             chunk = mcap_records.parse(CHUNK, mcap.body(record))
             found = list(mcap_records.chunk_records(chunk))
         except Exception as error:  # CRC, decompression, struct: whatever it is, only this chunk is lost

@@ -747,6 +747,26 @@ def bounded_memory():
     return bounded
 
 
+def test_a_chunk_larger_than_memory_is_not_read(tmp_path, bounded_memory):
+    """300 MiB of nothing (a hole in the file) in one uncompressed chunk, then a good one."""
+    size = 300 << 20
+    data = mcap_with_chunk(Chunk("", b"", T0_NS, T0_NS, 1, size))
+    at = data.index(struct.pack("<Q", size))
+    start, body = at - 25, at + 8 + 4 + 4 + 8  # CRC, empty compression name, length of the data
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        file.write(
+            data[:start] + struct.pack("<BQ", 0x06, 40 + size) + data[start + 9 : body - 8] + struct.pack("<Q", size)
+        )
+        file.seek(size, 1)
+        file.write(data[body:])
+    reader = reader_of(path)
+    with bounded_memory(megabytes=20):
+        assert [m.log_ns for m in reader.messages(("/lone",))] == [T0_NS, T0_NS + 1]
+    assert (reader.damage[0].byte_start, reader.damage[0].byte_end) == (start, body + size)
+    assert "314,572,840 bytes, at most 268,435,456 are opened" in reader.damage[0].reason
+
+
 def test_a_record_length_of_exabytes_is_not_believed(tmp_path, bounded_memory):
     start, _ = place_of("zstd", 0x06, 1)
     data = bytearray(FILES["zstd"])

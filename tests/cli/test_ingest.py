@@ -1,0 +1,219 @@
+"""``taccorl ingest`` and ``ingest inspect`` as typed: words, files and exit codes."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taccorl.cli.main import main
+from taccorl.demos.stand_in import PAD_TOPICS, StandInConfig, write_cobot_magic_hdf5, write_mcap
+
+SPEC = "--spec=piper_flexitac_mcap"
+BAGS = Path("/work/shared/data/bags")
+SMALL: dict[str, Any] = {"duration_s": 2.5, "camera_size": (96, 128)}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("good") / "good.mcap"
+    write_mcap(path, StandInConfig(**SMALL))
+    return path
+
+
+@pytest.fixture
+def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs ``taccorl ingest …`` in an empty folder; (exit code, all that was said)."""
+    place = tmp_path / "here"
+    place.mkdir()
+    monkeypatch.chdir(place)
+
+    def run(*words: Any) -> tuple[int, str]:
+        code = main(["ingest", *map(str, words)])
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, shown.out + shown.err
+
+    return run
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+# ---- ingest ----
+
+
+def test_the_command_of_the_readme_says_where_everything_is(good: Path, said: Any) -> None:
+    before = good.read_bytes()
+    code, text = said(good, SPEC, "--out=outputs/my dataset")
+    assert code == 0
+    assert "1 recordings: 1 written, 0 split, 0 quarantined, 0 refused" in text
+    assert "report: outputs/my dataset.ingest_report.json" in text
+    assert "(1 episodes, 70 rows)" in text
+    report = json.loads(Path("outputs/my dataset.ingest_report.json").read_text())
+    assert report["rows"] == 70
+    assert (Path("outputs/my dataset") / "meta/info.json").is_file()
+    assert (Path("outputs/store") / "taccorl-store.txt").is_file()
+    assert good.read_bytes() == before
+    # and again, from elsewhere in words but not in place
+    assert said(good, SPEC, "--out=./outputs/../outputs/my dataset")[0] == 0
+
+
+def test_a_dry_run_in_an_empty_folder_leaves_it_empty(good: Path, said: Any) -> None:
+    code, text = said(good, SPEC, "--dry_run=true")
+    assert code == 0
+    assert "70" in text and "nothing was written" in text
+    assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.parametrize("dry_run", ["true", "false"])
+def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run: str, tmp_path: Path, said: Any) -> None:
+    write_mcap(tmp_path / "degrees.mcap", StandInConfig(**SMALL, joints_in_degrees=True))
+    (tmp_path / "empty.mcap").touch()
+    code, text = said(tmp_path, SPEC, "--out=out", f"--dry_run={dry_run}")
+    assert code == 1
+    assert "1 quarantined, 1 refused" in text
+    assert "look: taccorl view" in text and "look: taccorl ingest inspect" in text
+    assert not Path("out").exists()
+    assert Path("out.ingest_report.json").exists() == (dry_run == "false")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--out=.",), "has no name of its own"),
+        (("--out=..",), "has no name of its own"),
+        (("--out=store/x", "--store=store"), "lie in one another"),
+        (("--out=x", "--store=x/store"), "lie in one another"),
+        (("--out=file/x",), "file is no folder"),
+        (("--store=file/x",), "file is no folder"),
+        (("--out=Anna's data",), "LeRobot cannot work in a folder with '"),
+        (("--out=x", "--store=store [1]"), "LeRobot cannot work in a folder with [ ]"),
+        (("--out=file",), "is no dataset of taccorl"),
+        (("--out=full",), "is no dataset of taccorl"),
+        (("--store=full",), "is not a taccorl store"),
+        (("--out=in",), "is read, and lies in --out=in"),
+        (("--out=in", "--replace=true"), "is read, and lies in --out=in"),
+        (("--engine.workers=two",), "engine.workers"),
+        (("--egnine.workers=2",), "did you mean 'engine.workers'"),
+        (("--spec=nope",), "no spec 'nope'"),
+        (("nowhere.mcap",), "nowhere.mcap: no such file or folder"),
+    ],
+)
+def test_what_cannot_work_is_told_before_any_work(
+    words: tuple[str, ...], expected: str, good: Path, said: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("file").write_text("x")
+    Path("full").mkdir()
+    Path("full/mine.txt").write_text("x")
+    Path("in").mkdir()
+    shutil.copy(good, "in/good.mcap")
+    before = tree(Path.cwd())
+    monkeypatch.setattr("taccorl.data.ingest.ingest_one", lambda *_: pytest.fail("work was begun"))
+    spec = () if any(w.startswith("--spec") for w in words) else (SPEC,)
+    code, text = said("in", *spec, *words)
+    assert code == 2
+    assert expected in text
+    assert len(text.strip().splitlines()) == 1
+    assert tree(Path.cwd()) == before
+
+
+# ---- inspect ----
+
+
+def test_inspect_shows_channels_and_names_the_spec_that_fits(good: Path, said: Any) -> None:
+    code, text = said("inspect", good)
+    assert code == 0
+    for topic in PAD_TOPICS.values():
+        assert topic in text
+    assert f"fits the shipped spec: taccorl ingest {good} {SPEC}" in text
+    assert "surrogate stand-in" in text
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_inspect_goes_on_after_what_it_cannot_read(good: Path, tmp_path: Path, said: Any) -> None:
+    write_cobot_magic_hdf5(tmp_path / "episode_0.hdf5", StandInConfig(**SMALL))
+    (tmp_path / "bad.mcap").write_bytes(b"\0" * 100)
+    code, text = said("inspect", tmp_path / "missing.mcap", tmp_path / "bad.mcap", good, tmp_path / "episode_0.hdf5")
+    assert code == 1
+    assert "missing.mcap: no such file" in text
+    assert "bad.mcap: is not an MCAP file" in text
+    assert "piper_flexitac_mcap" in text and "cobot_magic_hdf5" in text
+
+
+def test_inspect_reads_a_dataset_too(dataset: Path, said: Any) -> None:
+    code, text = said("inspect", dataset)
+    assert code == 0
+    assert "observation.tactile/left_a" in text
+    assert "taccorl_lerobot" in text
+
+
+def test_names_that_look_like_markup_are_shown_as_they_are(good: Path, tmp_path: Path, said: Any) -> None:
+    path = tmp_path / "[red]a[" / "bold].mcap"  # rich would read "[/bold]" as a closing tag
+    path.parent.mkdir()
+    shutil.copy(good, path)
+    code, text = said("inspect", path)
+    assert code == 0 and str(path) in text
+    code, text = said(path, SPEC, "--dry_run=true")
+    assert code == 0 and "[/bold].mcap" in text
+
+
+@pytest.mark.skipif(not BAGS.is_dir(), reason="other people's bags are not here")
+def test_inspect_describes_other_peoples_bags_in_a_few_lines(said: Any) -> None:
+    for path in sorted(BAGS.rglob("*.mcap")) + sorted(BAGS.rglob("*.db3")):
+        code, text = said("inspect", path)
+        assert code == 0, text
+        assert max(map(len, text.splitlines())) < 1000, "no page of settings in one line"
+    code, text = said("inspect", BAGS / "rosbag2_wbag_split", "--split_bag=true")
+    assert code == 0 and "(5 files)" in text
+
+
+# ---- the draft ----
+
+
+def test_a_draft_never_overwrites(good: Path, said: Any) -> None:
+    Path("mine.yaml").write_text("my work")
+    code, text = said("inspect", good, "--draft=mine.yaml")
+    assert code == 2
+    assert "mine.yaml exists" in text
+    assert Path("mine.yaml").read_text() == "my work"
+    Path("dangling.yaml").symlink_to("elsewhere.yaml")
+    code, text = said("inspect", good, "--draft=dangling.yaml")
+    assert code == 2 and not Path("elsewhere.yaml").exists()
+
+
+def test_a_draft_into_a_missing_folder_is_one_clear_line(good: Path, said: Any) -> None:
+    code, text = said("inspect", good, "--draft=nowhere/mine.yaml")
+    assert code == 2
+    assert "nowhere" in text.strip().splitlines()[-1]
+
+
+def test_a_draft_with_its_todos_replaced_ingests(good: Path, said: Any) -> None:
+    code, text = said("inspect", good, "--draft=mine.yaml")
+    assert code == 0 and "draft spec: mine.yaml" in text
+    code, text = said(good, "--spec=mine.yaml", "--dry_run=true")
+    assert code == 2 and "mine.yaml:" in text and "TODO" in text
+    draft = Path("mine.yaml").read_text()
+    pads = ", ".join(topic.strip("/") for topic in PAD_TOPICS.values())
+    for line, filled in (
+        ("text: TODO", "text: insert the tube"),
+        ("pick: [TODO]", "pick: [joint1, joint2, joint3, joint4, joint5, joint6, gripper]"),
+        (
+            "observation.state: {channels: [TODO]",
+            "observation.state: {channels: [joint_states_left, joint_states_right]",
+        ),
+        ("action: {channels: [TODO]", "action: {channels: [joint_states_ctrl_left, joint_states_ctrl_right]"),
+        ("front: {channels: [TODO]", "front: {channels: [camera_f]"),
+        ("left_wrist: {channels: [TODO]", "left_wrist: {channels: [camera_l]"),
+        ("right_wrist: {channels: [TODO]", "right_wrist: {channels: [camera_r]"),
+        ("tactile: {channels: [TODO, TODO, TODO, TODO]", f"tactile: {{channels: [{pads}]"),
+    ):
+        assert line in draft
+        draft = draft.replace(line, filled)
+    Path("mine.yaml").write_text(draft)
+    code, text = said(good, "--spec=mine.yaml", "--out=out")
+    assert code == 0, text
+    assert "1 written" in text
+    assert Path("out/data").is_dir()

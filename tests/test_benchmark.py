@@ -1,0 +1,185 @@
+"""Benchmarks: arithmetic of a row, goals, the page, and what a partial run keeps."""
+
+import dataclasses
+import datetime
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from taccorl import benchmark as module
+from taccorl.benchmark import BENCHMARKS, Row, benchmark, cpu_s, machine, meets, render, run, spread
+from taccorl.errors import TaccorlError
+
+
+@pytest.fixture
+def only_mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """No registered benchmarks but the test's own; files go to an empty folder."""
+    monkeypatch.setattr(module, "BENCHMARKS", {})
+    monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(module, "JSON_PATH", tmp_path / "bench.json")
+    monkeypatch.setattr(module, "PAGE_PATH", tmp_path / "docs" / "benchmarks.md")
+    monkeypatch.setattr(module.pkgutil, "iter_modules", lambda path: iter(()))
+    return tmp_path
+
+
+def stored(folder: Path) -> dict[str, dict]:
+    return {row["name"]: row for row in json.loads((folder / "bench.json").read_text())}
+
+
+# ---- arithmetic ----
+
+
+def test_spread_is_half_the_range() -> None:
+    assert spread([2.0, 5.0, 3.0]) == 1.5
+    assert spread([7.0]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("value", "goal", "met"),
+    [
+        (4.0, "≥ 4", True),
+        (3.999, "≥ 4", False),
+        (1.5, "< 1.5", False),
+        (1.499, "< 1.5", True),
+        (5.0, "≤ 5", True),
+        (5.1, "> 5", True),
+        (3.0, "= 3", True),
+        (999.0, "< 1,000", True),
+        (0.0, "≥ 0 of 20", True),
+        (1.0, "", None),
+    ],
+)
+def test_goals_are_read_as_written(value: float, goal: str, met: bool | None) -> None:
+    assert meets(value, goal) is met
+
+
+@pytest.mark.parametrize("goal", ["4", "at least 4", "≥4", ">= 4", "≥ four", "≥"])
+def test_a_goal_that_cannot_be_read_is_an_error_that_shows_one(goal: str) -> None:
+    with pytest.raises(TaccorlError, match="≥ 4"):
+        meets(1.0, goal)
+
+
+def test_a_value_that_is_no_number_meets_nothing() -> None:
+    assert meets(float("nan"), "≥ 4") is False
+
+
+def test_cpu_seconds_count_this_process_and_its_ended_children() -> None:
+    before, with_children = cpu_s(), cpu_s(children=True)
+    sum(range(3_000_000))
+    subprocess.run([sys.executable, "-c", "sum(range(10_000_000))"], check=True)
+    own = cpu_s() - before
+    assert 0 < own < cpu_s(children=True) - with_children
+
+
+def test_the_machine_is_described_without_its_name() -> None:
+    import platform
+
+    assert "cores" in machine()
+    assert platform.node() not in machine()
+
+
+# ---- a run ----
+
+
+def test_a_row_is_completed_stored_and_rendered(only_mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    @benchmark("reading")
+    def _() -> Iterator[Row]:
+        yield Row(name="rows", value=4.5, unit="×", goal="≥ 4", rival="default", rival_value=2.0, n=3, spread=0.25)
+        yield Row(name="time", value=1.6, unit="CPU-s", goal="< 1.5", n=5, spread=0.1)
+        yield Row(name="size", value=12345.678, unit="MB", n=1, spread=0.0)
+
+    rows = run()
+    assert [r.met for r in rows] == [True, False, None]
+    assert list(stored(only_mine)) == ["reading: rows", "reading: time", "reading: size"]
+    first = stored(only_mine)["reading: rows"]
+    assert first["date"] == datetime.date.today().isoformat()
+    assert first["command"] == "make bench ONLY=reading"
+    assert first == dataclasses.asdict(rows[0])
+    page = (only_mine / "docs/benchmarks.md").read_text()
+    assert "| reading: rows | 4.5 ± 0.25 | × | ≥ 4 | yes | default: 2 | 3 | `make bench ONLY=reading` |" in page
+    assert "| reading: time | 1.6 ± 0.1 | CPU-s | < 1.5 | **no** |  | 5 |" in page
+    assert "| reading: size | 1.235e+04 ± 0 | MB |  |  |  | 1 |" in page
+    shown = capsys.readouterr().out
+    assert "NOT MET" in shown and "bench.json and docs/benchmarks.md written" in shown
+
+
+def test_a_partial_run_keeps_the_rows_of_the_others_and_replaces_its_own(only_mine: Path) -> None:
+    value = [1.0]
+
+    @benchmark("b")
+    def _() -> Iterator[Row]:
+        yield Row(name="old name" if value[0] == 1.0 else "new name", value=value[0], unit="s", n=1, spread=0.0)
+
+    @benchmark("a")
+    def _() -> Iterator[Row]:
+        yield Row(name="x: y", value=7.0, unit="s", n=1, spread=0.0)
+
+    run()
+    assert list(stored(only_mine)) == ["a: x: y", "b: old name"]
+    a_before = stored(only_mine)["a: x: y"]
+    value[0] = 2.0
+    run("b")
+    assert list(stored(only_mine)) == ["a: x: y", "b: new name"]
+    assert stored(only_mine)["a: x: y"] == a_before
+    assert "old name" not in (only_mine / "docs/benchmarks.md").read_text()
+
+
+def test_a_benchmark_that_fails_does_not_cost_the_figures_of_the_others(only_mine: Path) -> None:
+    @benchmark("first")
+    def _() -> Iterator[Row]:
+        yield Row(name="x", value=1.0, unit="s", n=1, spread=0.0)
+
+    @benchmark("second")
+    def _() -> Iterator[Row]:
+        raise RuntimeError("the rival crashed")
+        yield
+
+    with pytest.raises(RuntimeError, match="the rival crashed"):
+        run()
+    assert list(stored(only_mine)) == ["first: x"]
+
+
+def test_cells_cannot_break_the_table() -> None:
+    row = Row(name="a | b", value=1.0, unit="s", rival="x|y", n=1, spread=0.0, machine="2 cores")
+    line = render([dataclasses.asdict(row)]).splitlines()[-1]
+    assert line.replace("\\|", "").count("|") == 11  # ten cells
+
+
+def test_an_unknown_name_is_told_with_the_nearest(only_mine: Path) -> None:
+    @benchmark("ingest")
+    def _() -> Iterator[Row]:
+        yield Row(name="x", value=1.0, unit="s", n=1, spread=0.0)
+
+    with pytest.raises(TaccorlError, match="no benchmark 'ingst'; did you mean 'ingest'"):
+        run("ingst")
+    assert not (only_mine / "bench.json").exists()
+
+
+def test_the_command_finds_registered_benchmarks_and_names_the_nearest() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "taccorl.benchmark", "--only=corupton"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr == "no benchmark 'corupton'; did you mean 'corruption'?\n"
+    done = subprocess.run(
+        [sys.executable, "-m", "taccorl.benchmark", "ingest"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2, "a bare word would run everything"
+    assert "--only=" in done.stderr
+
+
+def test_every_registered_goal_can_be_read() -> None:
+    import re
+
+    import taccorl.demos.benchmarks  # noqa: F401
+
+    assert {"ingest", "memory", "corruption", "kill", "start_up"} <= set(BENCHMARKS)
+    source = Path(taccorl.demos.benchmarks.__file__ or "").read_text()
+    goals = re.findall(r'goal="([^"]*)"', source) + re.findall(r'"(< [0-9.]+)"', source)
+    assert len(goals) >= 7
+    for goal in goals:
+        assert meets(0.0, goal) in (True, False)
