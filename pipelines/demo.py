@@ -43,6 +43,9 @@ def main() -> None:
     print(f"report         {OUT / 'dataset.ingest_report.json'}")
     print(f"Rerun          {OUT / 'episode.rrd'}   (.venv/bin/rerun {OUT / 'episode.rrd'})")
     print(f"contact sheet  {OUT / 'contact_sheet.png'}")
+    print("\ntry next (after `source .venv/bin/activate`):")
+    print(f"  taccorl view {dataset} --serve=true")
+    print(f"  taccorl ingest YOUR_RECORDINGS/ --spec={SPEC} --out=outputs/mine --dry_run=true")
 
 
 if __name__ == "__main__":

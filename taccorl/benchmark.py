@@ -81,8 +81,13 @@ def meets(value: float, goal: str) -> bool | None:
     if not goal:
         return None
     sign, _, bound = goal.partition(" ")
-    limit = float(bound.split()[0].replace(",", ""))
-    return {"≥": value >= limit, "≤": value <= limit, "<": value < limit, ">": value > limit, "=": value == limit}[sign]
+    try:
+        limit = float(bound.split()[0].replace(",", ""))
+        return {"≥": value >= limit, "≤": value <= limit, "<": value < limit, ">": value > limit, "=": value == limit}[
+            sign
+        ]
+    except (KeyError, ValueError, IndexError) as error:
+        raise TaccorlError(f"goal {goal!r} cannot be read; write it like '≥ 4' or '< 1.5'") from error
 
 
 def machine() -> str:
@@ -98,16 +103,17 @@ def machine() -> str:
 
 
 def run(only: str | None = None) -> list[Row]:
-    """Run all benchmarks, or the one named ``only``, and store their rows."""
+    """Run all benchmarks, or the one named ``only``, and store their rows, those of each as soon as it is done."""
     for package in pkgutil.iter_modules(taccorl.__path__):
         name = f"taccorl.{package.name}.benchmarks"
         if package.ispkg and importlib.util.find_spec(name):
             importlib.import_module(name)
     if only is not None and only not in BENCHMARKS:
         raise TaccorlError(f"no benchmark {only!r}; {nearest(only, BENCHMARKS)}")
-    rows = []
+    rows: list[Row] = []
     for name in [only] if only else list(BENCHMARKS):
         print(f"bench {name} …", flush=True)
+        first = len(rows)
         for row in BENCHMARKS[name]():
             full = dataclasses.replace(
                 row,
@@ -119,7 +125,8 @@ def run(only: str | None = None) -> list[Row]:
             )
             print(f"  {_line(full)}", flush=True)
             rows.append(full)
-    _store(rows)
+        _store(rows[first:])
+    print(f"{JSON_PATH.name} and {PAGE_PATH.relative_to(ROOT)} written")
     return rows
 
 
@@ -140,7 +147,6 @@ def _store(rows: list[Row]) -> None:
     JSON_PATH.write_text(json.dumps(merged, indent=1, ensure_ascii=False) + "\n")
     PAGE_PATH.parent.mkdir(exist_ok=True)
     PAGE_PATH.write_text(render(merged))
-    print(f"{JSON_PATH.name} and {PAGE_PATH.relative_to(ROOT)} written")
 
 
 def render(rows: list[dict[str, Any]]) -> str:
@@ -170,13 +176,17 @@ def render(rows: list[dict[str, Any]]) -> str:
             r["machine"],
             r["date"],
         ]
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def main() -> int:
     """``python -m taccorl.benchmark [--only=name]``"""
-    only = [a.removeprefix("--only=") for a in sys.argv[1:] if a.startswith("--only=")]
+    words = sys.argv[1:]
+    only = [a.removeprefix("--only=") for a in words if a.startswith("--only=")]
+    if len(only) != len(words) or len(words) > 1:
+        print(f"unknown {' '.join(words)!r}; usage: python -m taccorl.benchmark [--only=name]", file=sys.stderr)
+        return 2
     try:
         # The module run as __main__ is another one than taccorl.benchmark, where the packages register.
         rows = importlib.import_module("taccorl.benchmark").run(only[0] if only else None)

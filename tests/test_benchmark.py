@@ -175,7 +175,7 @@ def test_the_command_finds_registered_benchmarks_and_names_the_nearest() -> None
 def test_every_registered_goal_can_be_read() -> None:
     import re
 
-    import taccorl.demos.benchmarks  # noqa: F401
+    import taccorl.demos.benchmarks
 
     assert {"ingest", "memory", "corruption", "kill", "start_up"} <= set(BENCHMARKS)
     source = Path(taccorl.demos.benchmarks.__file__ or "").read_text()

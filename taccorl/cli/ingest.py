@@ -10,11 +10,14 @@ import os
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
+
+if TYPE_CHECKING:
+    from taccorl.data.ingest import Job
 
 
 @dataclass(kw_only=True)
@@ -80,7 +83,7 @@ def _ingest(config: IngestConfig) -> int:
 
     spec = load_recording_spec(config.spec)
     jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run)
-    _check_out(config, [file for job in jobs for file in job.source.files])
+    _check_out(config, jobs)
     store = None if config.dry_run else Store(config.store)
     moved: list[Path] = []
     replace = moved.append if config.replace else None
@@ -89,22 +92,24 @@ def _ingest(config: IngestConfig) -> int:
             report = ingest(jobs, config.out, store, engine=config.engine, progress=bars.update, replace=replace)
         except InTheWayError as error:
             raise InTheWayError(f"{error} --replace=true moves it aside.") from error
+    path = _write_report(report, config)
     ingest_table(report)
     for aside in moved:
         print(f"what was at {config.out} is now at {aside}")
-    _write_report(report, config)
-    wrong = report["outcomes"]["quarantined"] + report["outcomes"]["refused"]
-    return 1 if wrong else 0
+    _say_where(report, config, path)
+    return (
+        1 if report["episodes_quarantined"] + report["outcomes"]["quarantined"] + report["outcomes"]["refused"] else 0
+    )
 
 
-def _check_out(config: IngestConfig, inputs: list[Path]) -> None:
+def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
     """What is certain to be in the way is told before an hour of work, not after it."""
     from taccorl.data.lerobot_format import check_path
 
     out, whole = config.out, config.out.resolve()
     if out.name in ("", ".."):
         raise DatasetError(f"--out={out} has no name of its own: give a folder's name")
-    inside = [path for path in inputs if path.resolve().is_relative_to(whole)]
+    inside = [file for job in jobs for file in job.source.files if file.resolve().is_relative_to(whole)]
     if inside:
         raise DatasetError(f"{inside[0]} is read, and lies in --out={out}: give another --out")
     if config.dry_run:
@@ -120,25 +125,48 @@ def _check_out(config: IngestConfig, inputs: list[Path]) -> None:
             raise DatasetError(f"{place}: {folder} is no folder")
         if not os.access(folder, os.W_OK | os.X_OK):
             raise DatasetError(f"{place}: nothing may be written in {folder}")
-    if out.exists() and not config.replace and not (out / "meta/taccorl/manifest.json").is_file():
+    if out.exists() and not config.replace:
+        _check_same(out, jobs)
+
+
+def _check_same(out: Path, jobs: "list[Job]") -> None:
+    """``out`` exists: it must be what these recordings and this spec gave before."""
+    way_out = "give another --out, or --replace=true to move it aside"
+    manifest = out / "meta/taccorl/manifest.json"
+    try:
+        made_by = json.loads(manifest.read_text())["config"]
+        there = {(name, part) for name, part, _ in made_by["recordings"]}
+        same_spec = made_by["spec"] == jobs[0].spec.digest
+    except (OSError, ValueError, KeyError, TypeError):
+        raise DatasetError(f"{out} exists and is no dataset of taccorl: {way_out}") from None
+    wanted = {(job.source.path.name, job.source.part) for job in jobs}
+    if there != wanted or not same_spec:
+        new, gone = len(wanted - there), len(there - wanted)
+        why = f"{new} recordings are new, {gone} are missing" if new or gone else "it was made with another spec"
         raise DatasetError(
-            f"{out} exists and is no dataset of taccorl: give another --out, or --replace=true to move it aside"
+            f"{out} exists and holds another dataset ({why}): {way_out}. Finished recordings are not done again"
         )
 
 
-def _write_report(report: dict[str, Any], config: IngestConfig) -> None:
+def _write_report(report: dict[str, Any], config: IngestConfig) -> Path:
+    """Beside the dataset, before anything is printed: a closed pipe must not cost it."""
     path = config.out.with_name(f"{config.out.name}.ingest_report.json")
+    if not config.dry_run:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temp = path.with_name(f".{path.name}.{os.getpid()}")
+        temp.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        temp.replace(path)
+    return path
+
+
+def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None:
     if config.dry_run:
         print("dry run: nothing was written")
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temp = path.with_name(f".{path.name}.{os.getpid()}")
-    temp.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    temp.replace(path)
-    print(f"report: {path}")
+    print(f"report:  {path}")
     if report["episodes"]:
         print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows)")
-        print(f"look:    taccorl view {config.out} --episode=0")
+        print(f"look:    taccorl view {shlex.quote(str(config.out))} --episode=0")
 
 
 def _inspect(config: InspectConfig) -> int:

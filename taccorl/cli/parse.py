@@ -129,11 +129,15 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
     import yaml
     from draccus.utils import DraccusException
 
+    given = []
     for option in options:
-        if option.startswith("--config_path="):
-            _check_config_file(Path(option.partition("=")[2]))
+        name, _, value = option.partition("=")
+        if name == "--config_path":
+            _check_config_file(_path(value))
+            option = f"{name}={json.dumps(str(_path(value)), ensure_ascii=False)}"
+        given.append(option)
     try:
-        return draccus.parse(config_class, args=options, exit_on_error=False)
+        return draccus.parse(config_class, args=given, exit_on_error=False)
     except (DraccusException, argparse.ArgumentError, yaml.YAMLError) as error:
         raise TaccorlError(" ".join(str(error).split())) from error
     except SystemExit as stop:

@@ -22,6 +22,12 @@ class _Console(Console):
         raise BrokenPipeError  # for main() to end on; rich would exit with 1, which means something else here
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """`taccorl … | head`: for ``cli.main`` to handle, not an exit code that means something else."""
+        raise BrokenPipeError
+
+
 def console() -> Console:
     """The terminal at its own width; anything else wide enough not to fold a topic's name."""
     found = _Console()
@@ -56,9 +62,8 @@ def ingest_table(report: dict[str, Any]) -> None:
     table = Table("recording", "outcome", "episodes", "rows", "why", box=None, pad_edge=False)
     for r in report["recordings"]:
         written = [e for e in r["episodes"] if e["outcome"] == "written"]
-        name = r["recording"] + (f"#{r['part']}" if r["part"] else "")
         rows = str(sum(e["rows"] for e in written))
-        cells = (Text(_shorten(name)), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows)
+        cells = (Text(_name(r)), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows)
         table.add_row(*cells, Text(r["reason"]))
     out = console()
     out.print(table)
@@ -69,9 +74,14 @@ def ingest_table(report: dict[str, Any]) -> None:
             for f in e["findings"]:
                 if f["severity"] != "note":
                     label = Text(f"  {f['severity']}: ", SEVERITY[f["severity"]])
-                    out.print(label + Text(f"{_shorten(r['recording'])} {e['name']}: {f['text']}"), soft_wrap=True)
+                    where = " ".join(w for w in (_name(r), e["name"]) if w)
+                    out.print(label + Text(f"{where}: {f['feature']}: {f['text']}"), soft_wrap=True)
     counts = ", ".join(f"{n} {o}" for o, n in report["outcomes"].items())
-    out.print(f"{len(report['recordings'])} recordings: {counts}", highlight=False)
+    out.print(f"recordings: {counts}", highlight=False)
+
+
+def _name(r: dict[str, Any]) -> str:
+    return _shorten(r["recording"] + (f"#{r['part']}" if r["part"] else ""))
 
 
 def findings_table(name: str, findings: list[Any]) -> None:

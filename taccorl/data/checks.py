@@ -4,7 +4,8 @@ An **error** says that the data is wrong: ingest quarantines the episode. A **wa
 worth knowing; what could not be judged is a note too, never a pass in silence.
 
     error    not_finite, joint_limit, out_of_range, swapped_arms, swapped_pads, noise_only,
-             action_lag (command after state), frozen_picture (half of the episode or more)
+             action_lag (command after state), frozen_picture (half of the episode or more),
+             touch_lag (too early on one arm and too late on the other)
     warning  low_rate, gaps, old_samples, jump, idle, frozen_state, frozen_picture, action_lag (too long, or unlike the
              other arm or the other episodes), dead_taxel, stuck_taxel, saturated, noisy_pad, frozen_touch, silent_pad,
              touch_lag, pad_lag, baseline_drift, baseline_offset
@@ -110,7 +111,7 @@ def _check_touch(episode: Episode, key: str, joints_fit: bool) -> list[Finding]:
 def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
     """How one channel's samples met the rows."""
     duration_s = episode.num_rows / episode.spec.fps
-    promised_hz = episode.spec.features[timing.feature].rate_hz
+    promised_hz = timing.nominal_hz or episode.spec.features[timing.feature].rate_hz
     samples = max(timing.rate_hz * duration_s, 1.0)
     findings: list[Finding] = []
 

@@ -379,6 +379,7 @@ class Cutter:
             duplicates=clock.duplicates,
             out_of_order=clock.out_of_order,
             zero_stamps=clock.zero_stamps,
+            nominal_hz=self.spec.channels[channel].rate_hz,
         )
 
     def _array(self, key: str, feature: FeatureSpec, matches: dict[str, timing.Matched], rows: slice) -> np.ndarray:

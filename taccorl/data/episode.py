@@ -43,6 +43,8 @@ class ChannelTiming:
     duplicates: int = 0
     out_of_order: int = 0
     zero_stamps: int = 0
+    nominal_hz: float = 0.0
+    """Rate that the recording spec states for the channel; 0 if nobody says."""
 
 
 @dataclass(frozen=True)

@@ -264,13 +264,20 @@ def _check_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[
     if not odd:
         return []
     each = ", ".join(f"{name} {lag_text(lag)}" for name, lag in odd.items())
+    # One clock that is off moves all pads the same way. Both ways at once: each feels the other gripper's part.
+    exchanged = min(odd.values()) < low and max(odd.values()) > high
+    advice = (
+        "some too early and some too late: left and right pads (or the arms' joint topics) exchanged? Mend the topics in the spec"
+        if exchanged
+        else "their clock is off by about that; set `clock` or `latency_s` on these pads' channels"
+    )
     return [
         Finding(
             "touch_lag",
-            "warning",
+            "error" if exchanged else "warning",
             key,
             f"pads first feel the part at odd times from the gripper's stop on it: {each} (plausible {low:.2f} to "
-            f"{high:.2f} s): their clock is off by about that; set `clock` or `latency_s` on these pads' channels",
+            f"{high:.2f} s): {advice}",
         )
     ]
 
@@ -292,7 +299,7 @@ def _check_pad_lag(key: str, pads: list[Pad], fps: int) -> list[Finding]:
                     "warning",
                     key,
                     f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name}, though both hold the same "
-                    f"part (limit {PAD_LAG_S:g} s): one of them is on another clock; set `latency_s` on its channel",
+                    f"part (limit {PAD_LAG_S:g} s): one is on another clock, or exchanged with the other gripper's",
                 )
             )
     return findings

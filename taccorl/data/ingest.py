@@ -1,8 +1,8 @@
 """Recordings into one LeRobot dataset: each recording a stage of its own in the store, then merged and published whole.
 
-Every input ends as exactly one of: ``written``; ``split`` (written in part: something was silent, damaged or cut off, and
-what was lost is listed); ``quarantined`` (readable, but its data is wrong); ``refused`` (cannot be read or does not fit the
-spec). Originals are only ever read.
+Every input ends as exactly one of: ``written``; ``split`` (written in part: something was silent, damaged, cut off, or some
+of its episodes were quarantined, and what is missing is listed); ``quarantined`` (readable, but its data is wrong: none of it
+is in the dataset); ``refused`` (cannot be read or does not fit the spec). Originals are only ever read.
 """
 
 import contextlib
@@ -108,6 +108,7 @@ def ingest(
             name=lambda job: job.source.name,
             on_done=lambda job, _: progress(job.source.name, next(done), len(jobs)) if progress else None,
         )
+    _leave_out_twins(entries)
     report = _report(jobs, entries)
     shards = [(entry, Path(entry["artefact"])) for entry in entries if entry.get("artefact")]
     for entry in entries:
@@ -141,6 +142,23 @@ def ingest(
     return report
 
 
+def _leave_out_twins(entries: list[dict[str, Any]]) -> None:
+    """The same content twice would put the same episodes into training and test: the second is refused."""
+    first: dict[tuple[Any, ...], str] = {}
+    for entry in entries:
+        if not entry.get("artefact"):
+            continue
+        content = (tuple(entry["source_digests"]), entry["part"])
+        if content in first:
+            digest = entry["source_digests"][0][:12]
+            entry |= _entry(
+                "refused", f"the same content as {first[content]} (sha256 {digest}…): its episodes are in already"
+            )
+            del entry["artefact"]
+        else:
+            first[content] = entry["recording"]
+
+
 @contextlib.contextmanager
 def _moved_aside(out: Path) -> Iterator[Path]:
     """What is at ``out`` lies under another name; it comes back if the work fails."""
@@ -158,8 +176,9 @@ def _moved_aside(out: Path) -> Iterator[Path]:
 
 def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
     """One recording to a shard in the store. Never raises for a fault of the recording: the entry says what happened."""
+    digests: list[str] = []
     try:
-        entry = _dry(job) if job.dry_run else _stored(job, progress)
+        entry = _dry(job, progress) if job.dry_run else _stored(job, progress, digests)
     except NothingToWrite as nothing:
         entry = nothing.entry
     except Unfit as error:
@@ -176,7 +195,7 @@ def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
         else:  # our fault, not the user's: no traceback on the screen, but the whole of it in the report
             entry = _entry("refused", f"a fault in taccorl, please report it: {type(error).__name__}: {error}")
             entry["traceback"] = traceback.format_exc()
-    return _named(entry, job)
+    return _named({**entry, "source_digests": digests}, job)
 
 
 def _machine_fault(error: Exception) -> str | None:
@@ -192,65 +211,86 @@ def _stopped(fault: str, place: Path) -> TaccorlError:
     )
 
 
-def _stored(job: Job, progress: Progress | None) -> dict[str, Any]:
+def _stored(job: Job, progress: Progress | None, digests: list[str]) -> dict[str, Any]:
     store = Store(job.store)
     stage = Stage("recording", lambda config, inputs, folder: _build(job, folder, progress), RECORDING_STAGE_VERSION)
     inputs = [store.source(path) for path in job.source.files]
+    digests += [artefact.digest for artefact in inputs]
     artefact = store.run(stage, {"spec": job.spec.digest, "part": job.source.part}, inputs)
-    entry = json.loads((artefact.path / "entry.json").read_text())
-    return {**entry, "artefact": str(artefact.path), "source_digests": [a.digest for a in inputs]}
-
-
-def _dry(job: Job) -> dict[str, Any]:
-    with opened(job.source, job.spec) as recording:
-        cut = Cutter(recording).cut()
-        _, entry = _judge(recording, cut, {})
-    return entry
+    return {**json.loads((artefact.path / "entry.json").read_text()), "artefact": str(artefact.path)}
 
 
 def _build(job: Job, folder: Path, progress: Progress | None) -> None:
     """Stage ``recording``: dataset/, entry.json and episodes.json of one recording."""
+    from taccorl.data.lerobot_format import write_episodes
+
+    def write(episodes: list[Episode]) -> None:
+        rows = sum(e.num_rows for e in episodes)
+        report = None if progress is None else lambda done: progress(job.source.name, done, rows)
+        shutil.rmtree(folder / "dataset", ignore_errors=True)
+        write_episodes(episodes, folder / "dataset", progress=report)
+
     with opened(job.source, job.spec) as recording:
-        cutter = Cutter(recording)
-        try:
-            good, entry = _write(cutter, {}, job, folder, progress)
-        except BrokenPicture:
-            cutter.drop_broken_pictures()
-            good, entry = _write(cutter, {}, job, folder, progress)
-            entry["broken_pictures_s"] = cutter.broken_pictures_s
-            if entry["outcome"] == "written":
-                broken = ", ".join(f"{len(times)} of {channel}" for channel, times in cutter.broken_pictures_s.items())
-                reason = f"pictures that do not decode: {broken}; their rows show the one before"
-                entry |= {"outcome": "split", "reason": reason}
+        good, entry = _settle(Cutter(recording), write)
         records = [episode_record(e, "") for e in good]
     _dump(folder / "entry.json", entry)
     _dump(folder / "episodes.json", records)
 
 
-def _write(
-    cutter: Cutter, seen: dict[str, list[Finding]], job: Job, folder: Path, progress: Progress | None
+def _dry(job: Job, progress: Progress | None) -> dict[str, Any]:
+    """What ``_build`` would say: everything is read, pictures too, and nothing written."""
+
+    def look(episodes: list[Episode]) -> None:
+        rows, done = sum(e.num_rows for e in episodes), 0
+        for episode in episodes:
+            for _ in episode.pictures():
+                done += 1
+                if progress is not None:
+                    progress(job.source.name, done, rows)
+
+    with opened(job.source, job.spec) as recording:
+        return _settle(Cutter(recording), look)[1]
+
+
+def _settle(cutter: Cutter, consume: Callable[[list[Episode]], None]) -> tuple[list[Episode], dict[str, Any]]:
+    """The good episodes, consumed, and the report entry. What only the pictures show may take a second try.
+
+    Raises:
+        NothingToWrite: no good episode.
+    """
+    try:
+        return _consume(cutter, {}, consume)
+    except BrokenPicture:
+        cutter.drop_broken_pictures()
+    good, entry = _consume(cutter, {}, consume)
+    entry["broken_pictures_s"] = cutter.broken_pictures_s
+    if entry["outcome"] == "written":
+        broken = ", ".join(f"{len(times)} of {channel}" for channel, times in cutter.broken_pictures_s.items())
+        entry |= {
+            "outcome": "split",
+            "reason": f"pictures that do not decode: {broken}; their rows show the one before",
+        }
+    return good, entry
+
+
+def _consume(
+    cutter: Cutter, seen: dict[str, list[Finding]], consume: Callable[[list[Episode]], None]
 ) -> tuple[list[Episode], dict[str, Any]]:
-    """Judge and write; what only the pictures show is known afterwards, and may make it necessary to write again.
+    """Judge and consume, watching the pictures go by.
 
     Args:
-        seen: episode name → findings from its pictures, of an earlier attempt.
+        seen: episode name → findings from its pictures, of an earlier try.
     """
-    from taccorl.data.lerobot_format import write_episodes
-
     good, entry = _judge(cutter.recording, cutter.cut(), seen)
     if not good:
         raise NothingToWrite(entry)
     watches = [PictureWatch(e) for e in good]
-    rows = sum(e.num_rows for e in good)
-    report = None if progress is None else lambda done: progress(job.source.name, done, rows)
-    watched = [dataclasses.replace(e, pictures=_watched(e, w)) for e, w in zip(good, watches, strict=True)]
-    write_episodes(watched, folder / "dataset", progress=report)
+    consume([dataclasses.replace(e, pictures=_watched(e, w)) for e, w in zip(good, watches, strict=True)])
     found = {e.name: w.findings() for e, w in zip(good, watches, strict=True)}
     if seen or not any(f.severity != "note" for findings in found.values() for f in findings):
         return good, entry
     if any(f.severity == "error" for findings in found.values() for f in findings):
-        shutil.rmtree(folder / "dataset")
-        return _write(cutter, found, job, folder, progress)
+        return _consume(cutter, found, consume)
     return good, _judge(cutter.recording, cutter.cut(), found)[1]
 
 
@@ -275,7 +315,7 @@ def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tu
         episodes.append(
             {
                 "name": e.name.removeprefix(recording.source.name).strip(),
-                "outcome": "written" if e in good else "quarantined",
+                "outcome": "quarantined" if any(f.severity == "error" for f in found) else "written",
                 "start_s": round(start_s, 3),
                 "end_s": round(start_s + (e.num_rows - 1) / e.spec.fps, 3),
                 "rows": e.num_rows,
@@ -297,19 +337,32 @@ def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tu
 
 
 def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damage]) -> tuple[Outcome, str]:
-    errors = [f for found in findings for f in found if f.severity == "error"]
-    lost = [loss for loss in cut.losses if loss.wanted]
-    if errors:
-        wrong = sum(any(f.severity == "error" for f in found) for found in findings)
-        return "quarantined", f"{wrong} of {len(findings)} episodes: {errors[0].text}"
-    if not cut.episodes:
-        return "quarantined", "; ".join(_describe(loss) for loss in cut.losses[:3]) or "no rows"
-    gone = [d for d in damage if d.lost]
-    if lost or gone:
-        reasons = [str(d) for d in gone[:1]] + [_describe(loss) for loss in lost[:1]]
-        more = len(lost) + len(gone) - len(reasons)
-        return "split", "; ".join(reasons) + (f"; {more} more in the report" if more > 0 else "")
-    return "written", f"nothing lost; {damage[0]}" if damage else ""
+    """A recording's outcome and the reason, most telling part first."""
+    errors = [next((f for f in found if f.severity == "error"), None) for found in findings]
+    wrong = [f"{f.feature}: {f.text}" for f in errors if f is not None]
+    gone = [str(d) for d in damage if d.lost]
+    lost = [_describe(loss) for loss in cut.losses if loss.wanted]
+    left_out = [_describe(loss) for loss in cut.losses if not loss.wanted]
+    if wrong:
+        wrong[0] = (
+            f"{len(wrong)} of {len(findings)} episodes quarantined: {wrong[0]}" if len(findings) > 1 else wrong[0]
+        )
+    if len(wrong) == len(findings):
+        return "quarantined", _first_of([wrong[:1], gone, lost, left_out]) or "no rows"
+    if wrong or lost or gone:
+        return "split", _first_of([wrong[:1], gone, lost])
+    failures = sum(e.success is False for e in cut.episodes)
+    notes = [f"{len(left_out)} discarded by the operator"] if left_out else []
+    notes += [f"{failures} marked as failure (success: false)"] if failures else []
+    notes += [f"nothing lost; {d}" for d in damage[:1]]
+    return "written", "; ".join(notes)
+
+
+def _first_of(kinds: list[list[str]]) -> str:
+    """The first reason of each kind, and how many there are besides."""
+    told = [reasons[0] for reasons in kinds if reasons][:2]
+    more = sum(map(len, kinds)) - len(told)
+    return "; ".join(told) + (f"; {more} more in the report" if more > 0 else "")
 
 
 def _describe(loss: Loss) -> str:
@@ -325,7 +378,7 @@ def _entry(outcome: Outcome, reason: str) -> dict[str, Any]:
 def _named(entry: dict[str, Any], job: Job) -> dict[str, Any]:
     """The entry with what depends on where the recording lies: kept out of the store, which knows contents only."""
     path, spec = shlex.quote(str(job.source.path)), shlex.quote(job.spec_name)
-    command = f"taccorl view {path} --spec={spec}" if entry["episodes"] else f"taccorl ingest inspect {path}"
+    command = f"taccorl check {path} --spec={spec}"
     head = {
         "recording": str(job.source.path),
         "part": job.source.part,
@@ -349,6 +402,7 @@ def _report(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> dict[str, Any
         "dataset_spec": jobs[0].spec.target.name,
         "outcomes": outcomes,
         "episodes": len(written),
+        "episodes_quarantined": sum(e["outcome"] == "quarantined" for entry in entries for e in entry["episodes"]),
         "rows": sum(e["rows"] for e in written),
         "recordings": entries,
     }

@@ -99,6 +99,12 @@ def test_options_go_before_the_config_file(tmp_path: Path) -> None:
     assert found == Robot(paths=[Path("b")], name="from file", joints=4, motor=BigMotor(voltage_v=24.0))
 
 
+def test_a_config_file_may_have_any_name(tmp_path: Path) -> None:
+    path = tmp_path / "run #3: ünï.yaml"
+    path.write_text("name: x\npaths: [a]\n")
+    assert robot(f"--config_path={path}").name == "x"
+
+
 def test_a_nested_option_means_the_default_kind() -> None:
     assert robot("x", "--name=x", "--motor.poles=8").motor == SmallMotor(poles=8)
     assert robot("x", "--name=x", "--motor.type=big", "--motor.voltage_v=12").motor == BigMotor(voltage_v=12.0)
