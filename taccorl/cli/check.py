@@ -79,7 +79,11 @@ def _check_recordings(config: CheckConfig) -> int:
     assert config.spec is not None
     spec = load_recording_spec(config.spec)
     worst = 0
-    for _, source in find_sources(config.path, reader=spec.reader, split_bag=spec.split_bag):
+    skipped: list[str] = []
+    sources = find_sources(config.path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped)
+    for line in skipped:
+        print(f"not read: {line}")
+    for _, source in sources:
         try:
             with opened(source, spec) as recording:
                 cutter = Cutter(recording)

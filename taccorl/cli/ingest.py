@@ -18,6 +18,8 @@ from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
     from taccorl.data.ingest import Job
+    from taccorl.data.inspection import Inventory
+    from taccorl.data.recording import Source
 
 
 @dataclass(kw_only=True)
@@ -51,13 +53,14 @@ class InspectConfig:
     split_bag: bool = False
     """Files x_0, x_1, … of a folder are one recording."""
     draft: Path | None = None
-    """Write the draft spec here instead of printing it; an existing file is left alone."""
+    """Write the draft spec here, and the draft of its dataset spec beside it (…_dataset.yaml), instead of printing them;
+    existing files are left alone."""
 
 
 def main(argv: list[str]) -> int:
     """0: all written or split; 1: something was quarantined or refused."""
     if argv and argv[0] == "inspect":
-        return _inspect(parse(InspectConfig, argv[1:], positional="paths"))
+        return _inspect(parse(InspectConfig, argv[1:], positional="paths", prog="taccorl ingest inspect"))
     return _ingest(parse(IngestConfig, argv, positional="paths"))
 
 
@@ -82,7 +85,10 @@ def _ingest(config: IngestConfig) -> int:
     from taccorl.lineage.store import Store
 
     spec = load_recording_spec(config.spec)
-    jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run)
+    skipped: list[str] = []
+    jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped)
+    for line in skipped:
+        print(f"not read: {line}")
     _check_out(config, jobs)
     store = None if config.dry_run else Store(config.store)
     moved: list[Path] = []
@@ -171,37 +177,77 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
 
 def _inspect(config: InspectConfig) -> int:
     from taccorl.cli.tables import inventory_table
-    from taccorl.data.inspection import draft_spec, inspect_source
-    from taccorl.data.recording import find_sources
+    from taccorl.data.draft import dataset_path
+    from taccorl.data.inspection import inspect_source
+    from taccorl.data.recording import without_place
 
     draft = config.draft
-    if draft is not None and os.path.lexists(draft):
-        raise TaccorlError(f"{draft} exists; give another --draft, it would be overwritten")
-    failed, found = 0, []
-    for path in config.paths:
+    for path in (draft, dataset_path(draft)) if draft is not None else ():
+        if os.path.lexists(path):
+            raise TaccorlError(f"{path} exists; give another --draft, it would be overwritten")
+    found, failed = _find_all(config)
+    for path, name, source in found:
         try:
-            found.append((path, find_sources(path, reader=config.reader, split_bag=config.split_bag)))
+            inventory = inspect_source(name, source)
+        except TaccorlError as error:
+            print(f"{source.name}: {without_place(str(error), source.name)}")
+            failed += 1
+            continue
+        inventory_table(inventory)
+        _say_fit(inventory, path)
+        if draft is not None:
+            _write_drafts(inventory, draft)
+            draft = None
+        elif config.draft is None and not inventory.fits:
+            _print_drafts(inventory)
+    return 1 if failed else 0
+
+
+def _find_all(config: InspectConfig) -> tuple[list[tuple[Path, str, "Source"]], int]:
+    """(path as given, reader, recording) of all that is there, and how many entries were not read."""
+    from taccorl.data.recording import find_sources
+
+    found, failed = [], 0
+    for path in config.paths:
+        skipped: list[str] = []
+        try:
+            sources = find_sources(path, reader=config.reader, split_bag=config.split_bag, skipped=skipped)
         except TaccorlError as error:
             if len(config.paths) == 1:
                 raise
             print(error)
             failed += 1
-    for path, sources in found:
-        for name, source in sources:
-            try:
-                inventory = inspect_source(name, source)
-            except TaccorlError as error:
-                print(f"{source.name}: {error}")
-                failed += 1
-                continue
-            inventory_table(inventory)
-            if draft is not None:
-                with draft.open("x", encoding="utf-8") as file:
-                    file.write(draft_spec(inventory, draft.parent))
-                print(f"draft spec: {draft}")
-                draft = None
-            elif inventory.fits:
-                print(f"fits the shipped spec: taccorl ingest {shlex.quote(str(path))} --spec={inventory.fits[0]}\n")
-            else:
-                print("draft spec (--draft=FILE writes it):\n\n" + draft_spec(inventory))
-    return 1 if failed else 0
+            continue
+        for entry in skipped:
+            print(f"{path}: not read: {entry}")
+        failed += len(skipped)
+        found += [(path, name, source) for name, source in sources]
+    return found, failed
+
+
+def _say_fit(inventory: "Inventory", path: Path) -> None:
+    for fit in inventory.fits[:1]:
+        if inventory.faults:
+            print(f"has the topics of the shipped spec {fit}, but {'; '.join(inventory.faults)}\n")
+        else:
+            print(f"fits the shipped spec: taccorl ingest {shlex.quote(str(path))} --spec={fit}\n")
+
+
+def _write_drafts(inventory: "Inventory", path: Path) -> None:
+    from taccorl.data.draft import dataset_path, draft_specs
+
+    drafts = draft_specs(inventory, path)
+    for place, text in ((path, drafts.recording), (dataset_path(path), drafts.dataset)):
+        with place.open("x", encoding="utf-8") as file:
+            file.write(text)
+    print(f"draft spec: {path}\nand of its dataset: {dataset_path(path)}\nreplace the TODOs in both\n")
+
+
+def _print_drafts(inventory: "Inventory") -> None:
+    from taccorl.data.draft import dataset_path, draft_specs
+
+    path = Path("draft.yaml")
+    drafts = draft_specs(inventory, path)
+    print(f"no shipped spec fits; drafts of two specs (--draft={path} writes them):\n")
+    print(f"# ---- {path}: how it is read ----\n{drafts.recording}")
+    print(f"# ---- {dataset_path(path)}: what its dataset holds ----\n{drafts.dataset}")

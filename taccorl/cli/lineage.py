@@ -2,7 +2,8 @@
 taccorl lineage prune [--store=outputs/store] [--keep=DATASET ...] [--yes=true]
 
 explain  what a dataset or artefact was made from, down to the raw recordings, and what changed since (then it exits 1)
-prune    what the kept datasets were not made from; deletes it only with --yes=true
+prune    what no dataset was made from; deletes it only with --yes=true. Datasets that lie where they were written
+         count by themselves; name moved or copied ones with --keep
 """
 
 import json
@@ -13,6 +14,7 @@ from pathlib import Path
 from taccorl.errors import TaccorlError, nearest
 
 DEFAULT_STORE = Path("outputs/store")
+SHOWN_GONE = 10
 
 
 @dataclass(kw_only=True)
@@ -32,7 +34,7 @@ class PruneConfig:
     store: Path = DEFAULT_STORE
     """The store to free."""
     keep: list[Path] = field(default_factory=list)
-    """Datasets whose whole lineage stays. Repeat --keep=DATASET for each; with none, every artefact may go."""
+    """Further datasets whose whole lineage stays: moved or copied ones. Repeat --keep=DATASET for each."""
     yes: bool = False
     """Delete. Without it, only list what would be freed."""
 
@@ -53,7 +55,7 @@ def _explain(argv: list[str]) -> int:
     from taccorl.lineage.explain import render, trace
     from taccorl.lineage.prune import open_store
 
-    config = parse(ExplainConfig, argv, positional="path")
+    config = parse(ExplainConfig, argv, positional="path", prog="taccorl lineage explain")
     if config.store.exists() or config.store != DEFAULT_STORE:
         store = open_store(config.store)
     else:
@@ -67,21 +69,28 @@ def _prune(argv: list[str]) -> int:
     from taccorl.cli.parse import parse
     from taccorl.lineage.prune import delete, open_store, unneeded
 
-    config = parse(PruneConfig, join_repeated(argv, "keep"))
+    config = parse(PruneConfig, join_repeated(argv, "keep"), prog="taccorl lineage prune")
     store = open_store(config.store)
     folders = unneeded(store, config.keep)
     for folder in folders:
         note = "  (left by a run that died)" if folder.is_leftover else ""
         print(f"{_megabytes(folder.size_bytes)}  {folder.path}{note}")
     total = _megabytes(sum(folder.size_bytes for folder in folders)).strip()
-    kept = f"needed for {len(config.keep)} kept datasets" if config.keep else "kept, as no --keep=DATASET was given"
-    print(f"{len(folders)} of {len(store.folders())} folders in {store.root} are not {kept}: {total}")
+    num_kept = len({path.resolve() for path in (*store.destinations.present(), *config.keep)})
+    print(
+        f"{len(folders)} of {_count(len(store.folders()), 'folder')} in {store.root} not needed for "
+        f"{_count(num_kept, 'dataset')}: {total}"
+    )
+    if gone := store.destinations.gone():
+        print(f"{_count(len(gone), 'dataset')} gone or moved; name moved ones with --keep=DATASET:")
+        for path in gone[:SHOWN_GONE]:
+            print(f"  {path}")
     if not folders or not config.yes:
         if folders:
             print("Nothing was deleted; add --yes=true to delete them.")
         return 0
     busy = delete(store, folders)
-    print(f"Deleted {len(folders) - len(busy)} folders.")
+    print(f"Deleted {_count(len(folders) - len(busy), 'folder')}.")
     for folder in busy:
         print(f"Left alone, as a run is using it now: {folder.path}", file=sys.stderr)
     return 0
@@ -94,6 +103,10 @@ def join_repeated(argv: list[str], name: str) -> list[str]:
     if not values or values[0].startswith("["):
         return argv
     return [word for word in argv if not word.startswith(prefix)] + [prefix + json.dumps(values)]
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def _megabytes(size_bytes: int) -> str:

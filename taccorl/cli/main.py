@@ -22,6 +22,11 @@ def main(argv: list[str] | None = None) -> int:
         os.environ["TACCORL_PROGRAM"] = "1"
         argv = sys.argv[1:]
     words = argv
+    if words == ["--version"]:
+        from taccorl import __version__
+
+        print(f"taccorl {__version__}")
+        return 0
     known = [verb for group in VERBS.values() for verb in group]
     listing = not words or words[0] in ("-h", "--help")
     if not listing and words[0] not in known:

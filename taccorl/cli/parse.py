@@ -18,11 +18,14 @@ from taccorl.errors import TaccorlError, nearest
 HELP = ("-h", "--help")
 
 
-def parse[ConfigT](config_class: type[ConfigT], argv: Sequence[str], *, positional: str | None = None) -> ConfigT:
+def parse[ConfigT](
+    config_class: type[ConfigT], argv: Sequence[str], *, positional: str | None = None, prog: str | None = None
+) -> ConfigT:
     """``argv`` as ``config_class``. Paths and texts are taken as they are typed; other values are YAML, as in LeRobot.
 
     Args:
         positional: field that bare words fill; a list field takes all of them.
+        prog: what was typed before ``argv``, for the help; ``taccorl`` and the name of the config's module if not given.
 
     Raises:
         TaccorlError: unknown option, value of the wrong type, missing or surplus word.
@@ -31,7 +34,8 @@ def parse[ConfigT](config_class: type[ConfigT], argv: Sequence[str], *, position
     options = [a for a in argv if a.startswith("-")]
     hints = typing.get_type_hints(config_class)
     if any(option in HELP for option in options):
-        return _draccus(config_class, options)
+        _print_help(config_class, hints, positional, prog)
+        sys.exit(0)
     for option in options:
         _check_option(option, hints)
     if words:
@@ -47,17 +51,49 @@ def parse[ConfigT](config_class: type[ConfigT], argv: Sequence[str], *, position
     texts, rest = _take_texts(options, hints)
     given = {o.lstrip("-").partition("=")[0] for o in options}
     fields = {f.name: f for f in dataclasses.fields(config_class)}  # pyright: ignore[reportArgumentType]
-    required = [
-        n
-        for n, f in fields.items()
-        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and n not in given
-    ]
-    if required and "config_path" not in given:
-        raise TaccorlError(f"missing {', '.join(f'--{n}=' for n in required)}; --help says more")
+    missing = [n for n in _required(config_class) if n not in given]
+    if missing and "config_path" not in given:
+        place = " (give a file or folder)" if positional and Path in _kinds(hints[positional]) else ""
+        named = [f"--{n}={place if n == positional else ''}" for n in missing]
+        raise TaccorlError(f"missing {', '.join(named)}; --help says more")
     rest += _implied_types(rest, fields)
     # YAML would read a path 2024-01-01 as a date, and cut "run #3" at the number sign.
     rest += [f"--{name}={json.dumps(['x'] if isinstance(value, list) else 'x')}" for name, value in texts.items()]
     return dataclasses.replace(_draccus(config_class, rest), **texts)  # pyright: ignore[reportArgumentType]
+
+
+def _required(config_class: type) -> list[str]:
+    """Fields without a default."""
+    nothing = dataclasses.MISSING
+    fields = dataclasses.fields(config_class)
+    return [f.name for f in fields if f.default is nothing and f.default_factory is nothing]
+
+
+def _kinds(hint: Any) -> tuple[Any, ...]:
+    """The kind itself, or those that a list or union is of."""
+    return typing.get_args(hint) or (hint,)
+
+
+def _print_help(config_class: type, hints: dict[str, Any], positional: str | None, prog: str | None) -> None:
+    """The verb's own words, then draccus's list of options."""
+    from draccus.argparsing import ArgumentParser
+
+    module, required = sys.modules[config_class.__module__], _required(config_class)
+    words = []
+    if positional is not None:
+        word = positional.upper() + " …" * (_text_kind(hints[positional]) == "list")
+        words = [word if positional in required else f"[{word}]"]
+    words += [f"--{name}=…" for name in required if name != positional]
+    prog = prog or f"taccorl {module.__name__.rpartition('.')[2]}"
+    said = (module.__doc__ or "").strip().replace("``", "")
+    options = ArgumentParser(config_class, usage=" ".join([prog, *words, "[options]"]), description=said).parser
+    for action in options._actions:
+        if action.dest in required:
+            action.help = f"{action.help} (required)"
+        if action.dest in required or action.default is None:
+            action.default = argparse.SUPPRESS  # it would read (default: None)
+    options.print_help()
+    sys.stdout.flush()
 
 
 def _check_option(option: str, hints: dict[str, Any]) -> None:
@@ -140,10 +176,6 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
         return draccus.parse(config_class, args=given, exit_on_error=False)
     except (DraccusException, argparse.ArgumentError, yaml.YAMLError) as error:
         raise TaccorlError(" ".join(str(error).split())) from error
-    except SystemExit as stop:
-        if stop.code in (0, None):
-            sys.stdout.flush()
-        raise
 
 
 def _check_config_file(path: Path) -> None:

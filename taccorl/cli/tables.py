@@ -19,11 +19,6 @@ SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        raise BrokenPipeError  # for main() to end on; rich would exit with 1, which means something else here
-
-
-class _Console(Console):
-    def on_broken_pipe(self) -> None:
         """`taccorl … | head`: for ``cli.main`` to handle, not an exit code that means something else."""
         raise BrokenPipeError
 
@@ -100,18 +95,23 @@ def inventory_table(inventory: Inventory) -> None:
     """Channels, rates, gaps, clock skew and damage of one recording."""
     out = console()
     files = f" ({len(inventory.source.files)} files)" if len(inventory.source.files) > 1 else ""
-    about = f"{files}  {inventory.reader}, {inventory.duration_s:.2f} s"
+    duration = f"{inventory.duration_s:.2f}" if inventory.times_known else "–"
+    about = f"{files}  {inventory.reader}, {duration} s"
     out.print(Text(inventory.source.name, "bold") + Text(about), soft_wrap=True)
     table = Table(box=None, pad_edge=False)
     for column in ("topic", "type", "messages", "rate [Hz]", "gaps", "longest gap [s]", "clock"):
         table.add_column(column, justify="left" if column in ("topic", "type", "clock") else "right", overflow="fold")
     for t in inventory.topics:
-        rate, gap = (f"{t.rate_hz:.1f}", f"{t.longest_gap_s:.3f}") if t.rate_hz else ("–", "–")
-        numbers = (str(t.num_messages), rate, str(t.num_gaps), gap)
-        table.add_row(Text(t.topic), Text(t.type.name), *numbers, _clock(t))
+        timed = bool(t.rate_hz) and inventory.times_known
+        rate, gaps, gap = (f"{t.rate_hz:.1f}", str(t.num_gaps), f"{t.longest_gap_s:.3f}") if timed else ("–",) * 3
+        clock = _clock(t) if inventory.times_known else "–"
+        table.add_row(Text(t.topic), Text(t.type.name), str(t.num_messages), rate, gaps, gap, clock)
     out.print(table)
     for t in inventory.topics:
-        if t.type.undecodable:
+        if t.names:
+            out.print(Text(f"  names of {t.topic}: {', '.join(t.names)}"), soft_wrap=True)
+    for t in inventory.topics:
+        if t.problem:
             out.print(Text("  not decodable ", "yellow") + Text(t.problem), soft_wrap=True)
     for name, record in inventory.metadata.items():
         text = str(record)

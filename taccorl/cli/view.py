@@ -9,6 +9,7 @@ PATH is a LeRobot dataset's folder, or a recording with the spec that reads it. 
 """
 
 import contextlib
+import shlex
 import signal
 import sys
 import tempfile
@@ -122,7 +123,8 @@ def _write(config: ViewConfig, episode: "Episode") -> bool:
         from taccorl.views.episode import save_episode
 
         save_episode(episode, config.save, native=True)
-        print(f"wrote {config.save}: look at it with {Path(sys.executable).with_name('rerun')} {config.save}")
+        command = shlex.join([str(Path(sys.executable).with_name("rerun")), str(config.save)])
+        print(f"wrote {config.save}: look at it with {command}")
     if config.screenshot is not None:
         from taccorl.views.screenshot import screenshot
 

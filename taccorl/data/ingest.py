@@ -67,15 +67,25 @@ class NothingToWrite(RecordingError):
         self.entry = entry
 
 
-def find_jobs(paths: Sequence[Path], spec: RecordingSpec, spec_name: str, store: Path, dry_run: bool) -> list[Job]:
+def find_jobs(
+    paths: Sequence[Path],
+    spec: RecordingSpec,
+    spec_name: str,
+    store: Path,
+    dry_run: bool,
+    skipped: list[str] | None = None,
+) -> list[Job]:
     """One job per recording under ``paths``, in the order given, folders in natural order; a file twice is one input.
+
+    Args:
+        skipped: is told what else lies there and why it is not read.
 
     Raises:
         RecordingError: a path holds no recording.
     """
     jobs: dict[tuple[Path, str | None], Job] = {}
     for path in paths:
-        for _, source in find_sources(path, reader=spec.reader, split_bag=spec.split_bag):
+        for _, source in find_sources(path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped):
             jobs.setdefault((source.path.resolve(), source.part), Job(source, spec, spec_name, store, dry_run))
     return list(jobs.values())
 

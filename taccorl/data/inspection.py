@@ -1,23 +1,22 @@
-"""What a recording holds: channels, rates, gaps, clock skew, damage; and a draft spec to start from."""
+"""What a recording holds: channels, rates, gaps, clock skew, names of joints, damage, and which shipped spec fits it."""
 
-import itertools
-import json
-import re
-from dataclasses import dataclass, field
-from pathlib import Path
+import contextlib
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from taccorl.data import decode
-from taccorl.data.recording import Damage, Source, TopicType, readers
-from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec, load_recording_spec
+from taccorl.data.recording import Damage, Reader, Source, TopicType, readers
+from taccorl.data.spec import ChannelSpec, SensorSpec, data_specs_folder, load_sensor_spec, shipped_recording_specs
 from taccorl.data.timing import NS_PER_S, SIM_TIME_S
-from taccorl.errors import SpecError
+from taccorl.errors import RecordingError
 
 PICTURES = ("CompressedImage", "Image")
-VECTORS = ("JointState", "MultiArray", "Imu", "Pose", "Twist", "Wrench")
+JOINTS = ("JointState",)
+ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
-YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 
 
 @dataclass(frozen=True)
@@ -42,17 +41,29 @@ class TopicSummary:
     """Messages with the stamp of an earlier one."""
     zero_stamps: int
     """Messages stamped 0, where others have a time."""
+    names: tuple[str, ...] = ()
+    """Of its values, from the ``name`` list of its first message."""
+    num_values: int | None = None
+    """Numbers in a message of joints or of an array; None where it holds no list of numbers."""
+    sensor: str | None = None
+    """Shipped sensor whose pad frames fit it."""
+    misfit: str = ""
+    """Why its first message cannot be used: a picture in an encoding that is not read, names without values."""
 
     @property
     def problem(self) -> str:
         """Why its values cannot be decoded, with its name; empty where they can."""
-        why = self.type.undecodable or ""
+        why = self.type.undecodable or self.misfit
         return why if not why or why.startswith(self.topic) else f"{self.topic}: {why}"
 
     @property
     def sim_time(self) -> bool:
         """The header counts from a simulation's start (or from boot), not from 1970."""
         return self.stamped and abs(self.skew_s) > SIM_TIME_S
+
+    def holds(self, kinds: tuple[str, ...]) -> bool:
+        """Its type's name ends as one of ``kinds`` does, whatever the package is called."""
+        return any(kind in decode.type_key(self.type.name).rsplit("/", 1)[-1] for kind in kinds)
 
 
 @dataclass(frozen=True)
@@ -68,13 +79,29 @@ class Inventory:
     """Shipped recording specs whose topics are all here."""
 
     @property
+    def times_known(self) -> bool:
+        """False: the file names neither times nor a rate, and the reader had to make times up."""
+        return "rate" not in self.metadata.get("time", {})
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What keeps even a spec that fits from reading all of it."""
+        simulated = [t.topic for t in self.topics if t.sim_time]
+        found = [f"{len(simulated)} topics are stamped in simulation time, first {simulated[0]}"] if simulated else []
+        lost = [d for d in self.damage if d.lost]
+        return (
+            *found,
+            *([f"it is damaged: {lost[0]}" + f" (and {len(lost) - 1} more)" * (len(lost) > 1)] if lost else []),
+        )
+
+    @property
     def duration_s(self) -> float:
         spans = [(t.first_ns, t.last_ns) for t in self.topics if t.num_messages]
         return (max(b for _, b in spans) - min(a for a, _ in spans)) / NS_PER_S if spans else 0.0
 
 
 def inspect_source(reader_name: str, source: Source) -> Inventory:
-    """Read every message's times, decode nothing.
+    """Read every message's times; decode one message of each topic of joints, arrays and pictures.
 
     Raises:
         RecordingError: not of that format, or empty.
@@ -87,6 +114,8 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
         stamp.append(m.stamp_ns)
     types = reader.topics()
     summaries = [_summary(topic, types[topic], *times.get(topic, ([], []))) for topic in sorted(types)]
+    sensors = {p.stem: load_sensor_spec(p) for p in sorted((data_specs_folder() / "sensors").glob("*.yaml"))}
+    summaries = [replace(t, **_first_message(reader, t, sensors)) for t in summaries]
     with_messages = {t.topic: t.type.name for t in summaries if t.num_messages}
     return Inventory(
         source,
@@ -124,113 +153,58 @@ def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | Non
     )
 
 
+def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
+    """What only a decoded message tells: names, number of values, pad or not."""
+    shape = t.type.shape
+    if t.type.undecodable or not t.num_messages:
+        return {}
+    if shape is not None:
+        sizes = [name for name, s in sensors.items() if t.type.name == s.wire.dtype and shape in _frames(s)]
+        return {"num_values": math.prod(shape) if len(shape) <= 1 else None, "sensor": next(iter(sizes), None)}
+    if not t.holds((*JOINTS, *ARRAYS, *PICTURES)):
+        return {}
+    try:
+        # by its time, for readers that can go there; the file is let go at the first message
+        first = next(iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)), None)
+        return _content(t, first.value, sensors) if first is not None else {}
+    except RecordingError as error:
+        return {"misfit": str(error)}
+
+
+def _frames(sensor: SensorSpec) -> tuple[tuple[int, ...], ...]:
+    """Shapes in which a stored pad frame may come."""
+    return ((sensor.wire.rows * sensor.wire.columns,), (sensor.wire.rows, sensor.wire.columns))
+
+
+def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
+    """
+    Raises:
+        RecordingError: a spec could not use it either.
+    """
+    channel = ChannelSpec(topic=t.topic, rate_hz=1.0, field="position" if t.holds(JOINTS) else "data")
+    if t.holds(PICTURES):
+        decode.picture(value, replace(channel, field=None))
+        return {}
+    if t.holds(JOINTS):
+        names = tuple(str(n) for n in decode.get(value, "name"))
+        size = decode.vector_extractor(replace(channel, pick=names))(value).size
+        return {"names": names, "num_values": size}
+    for name, sensor in sensors.items():
+        if sensor.wire.dtype in t.type.name.lower():
+            with contextlib.suppress(RecordingError):
+                return {"sensor": name, "num_values": decode.pad_extractor(channel, sensor)(value).size}
+    return {"num_values": decode.vector_extractor(channel)(value).size}
+
+
 def _fitting(reader_name: str, topics: dict[str, str]) -> tuple[str, ...]:
     """Shipped specs whose topics are all there, with their types."""
     names = []
-    for path in sorted((data_specs_folder() / "recordings").glob("*.yaml")):
-        try:
-            spec = load_recording_spec(path)
-        except SpecError:
-            continue
+    for name, spec in shipped_recording_specs().items():
         texts = {t for t in (spec.episodes.topic, spec.instruction.topic) if t}
         there = all(
             c.topic in topics and (c.type is None or decode.type_key(c.type) == decode.type_key(topics[c.topic]))
             for c in spec.channels.values()
         )
         if spec.reader == reader_name and there and texts <= set(topics):
-            names.append(path.stem)
+            names.append(name)
     return tuple(names)
-
-
-def draft_spec(inventory: Inventory, folder: Path | None = None) -> str:
-    """A recording spec to start from, as YAML text: the channels as measured, the features left to fill in.
-
-    Args:
-        folder: where the draft will lie; ``data_specs/recordings`` if not given.
-    """
-    useful = [t for t in inventory.topics if t.num_messages and t.type.undecodable is None]
-    vectors = [t for t in useful if _is(t, VECTORS) or (t.type.shape is not None and len(t.type.shape) <= 1)]
-    pictures = [t for t in useful if _is(t, PICTURES) or (t.type.shape is not None and len(t.type.shape) == 3)]
-    texts = [t for t in useful if _is(t, TEXTS)]
-    stamped = [t for t in vectors + pictures if t.stamped]
-    clock = "header" if stamped and not any(t.sim_time for t in stamped) else "log"
-    names = _channel_names(vectors + pictures)
-    rate_known = "rate" not in inventory.metadata.get("time", {})  # how the HDF5 reader says that it had to guess
-    dataset_path = data_specs_folder() / "taccorl_bimanual.yaml"
-    away = folder is not None and folder.resolve() != (data_specs_folder() / "recordings").resolve()
-    dataset = _yaml(str(dataset_path)) if away else f"../{dataset_path.name}"
-    lines = [
-        f"# Draft from {' '.join(inventory.source.name.split())}: replace every TODO and check every line;",
-        "# `taccorl ingest … --dry_run=true` tells what is still wrong.",
-        "spec_version: 1",
-        f"dataset: {dataset}   # what the dataset shall hold; cobot_magic.yaml beside it is the same without touch",
-        f"reader: {inventory.reader}",
-        f"clock: {clock}",
-        "episodes: {by: whole_file, min_s: 1.0}"
-        + (f"   # or {{by: markers, topic: {texts[0].topic}, min_s: 1.0}}" if texts else ""),
-        "instruction: {from: spec, text: TODO}",
-        "channels:   # keep what a feature below uses, remove the rest",
-    ]
-    lines += [f"  {names[t.topic]}: {_channel(t, clock, rate_known)}" for t in vectors + pictures]
-    skipped = [t for t in inventory.topics if t not in vectors and t not in pictures and t not in texts]
-    lines += [f"  # not used: {' '.join((t.problem or f'{t.topic} ({t.type.name})').split())}" for t in skipped]
-    lines.append("features:   # several channels are joined in the order of the list")
-    lines += _features(load_dataset_spec(dataset_path), [names[t.topic] for t in pictures])
-    return "\n".join(lines) + "\n"
-
-
-def _features(dataset: DatasetSpec, pictures: list[str]) -> list[str]:
-    lines = []
-    for key, feature in dataset.features.items():
-        todo, hint = ["TODO"], f"{feature.size} values: {' … '.join(feature.names[:: max(1, feature.size - 1)])}"
-        if feature.dtype == "video":
-            hint = f"one of {', '.join(pictures)}" if pictures else "no pictures were found"
-        elif feature.pads:
-            todo, hint = ["TODO"] * len(feature.pads), f"pads {', '.join(feature.pads)}"
-        if not feature.optional:
-            lines.append(f"  {key}: {{channels: [{', '.join(todo)}], align: asof}}   # {hint}")
-    return lines
-
-
-def _is(t: TopicSummary, words: tuple[str, ...]) -> bool:
-    return any(word in decode.type_key(t.type.name).rsplit("/", 1)[-1] for word in words)
-
-
-def _channel_names(topics: list[TopicSummary]) -> dict[str, str]:
-    """Topic → a short name of its own."""
-    names: dict[str, str] = {}
-    for t in topics:
-        words = re.sub(r"[^A-Za-z0-9/]+", "_", t.topic).strip("/_").split("/")
-        short = [w for w in words if w not in ("image_raw", "compressed", "color")]
-        name = "_".join(short) or "channel"
-        name = "_".join(words) if name in names.values() else name
-        name = name if name[0].isalpha() and name.lower() not in YAML_WORDS else f"channel_{name}"
-        numbered = (f"{name}_{k}" for k in itertools.count(2))
-        names[t.topic] = name if name not in names.values() else next(n for n in numbered if n not in names.values())
-    return names
-
-
-def _channel(t: TopicSummary, clock: str, rate_known: bool) -> str:
-    rate = float(f"{t.rate_hz:.3g}") if t.rate_hz else 1.0
-    parts = [f"topic: {_yaml(t.topic)}"]
-    if t.type.name and t.type.name != "no schema" and t.type.shape is None:
-        parts.append(f"type: {_yaml(t.type.name)}")
-    if _is(t, ("JointState",)):
-        parts += ["field: position", "pick: [TODO]"]
-    elif _is(t, ("MultiArray",)):
-        parts.append("field: data")
-    if clock == "header" and not t.stamped:
-        parts.append("clock: log")
-    if clock == "header" and t.zero_stamps:
-        parts.append("drop_zero_stamp: true")
-    if rate_known:
-        parts += [f"rate_hz: {rate:g}", f"max_age_s: {max(0.03, round(2.4 / rate, 3)):g}"]
-    else:
-        parts += ["rate_hz: TODO", "max_age_s: TODO"]
-    return "{" + ", ".join(parts) + "}"
-
-
-def _yaml(text: str) -> str:
-    """A text as YAML reads it back; quoted unless it is plainly a name or path."""
-    plain = re.fullmatch(r"/?[A-Za-z_][A-Za-z0-9_/.-]*", text)
-    return text if plain and text.lower() not in YAML_WORDS else json.dumps(text, ensure_ascii=False)

@@ -28,6 +28,7 @@ BLOCK_BYTES = 1 << 20
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
 MESSAGE_BYTES = 22  # channel (2), sequence (4), log time (8), publish time (8); the rest is the payload
+DATA_END_BYTES = HEADER_BYTES + 4  # the whole record
 
 # Bodies: a number of fixed bytes; "short", "long": a part behind its own length in 4 or 8 bytes.
 _LAYOUTS: dict[int, tuple[int | str, ...]] = {

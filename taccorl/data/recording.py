@@ -18,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from taccorl.data import decode
-from taccorl.data.spec import ChannelSpec, RecordingSpec
+from taccorl.data.spec import ChannelSpec, RecordingSpec, shipped_recording_specs
 from taccorl.errors import RecordingError, nearest
 from taccorl.plugins import Registry
 
@@ -126,8 +126,28 @@ class Reader(ABC):
 readers: Registry[type[Reader]] = Registry("reader", "taccorl.data.readers")
 
 
-def find_sources(path: Path, *, reader: str | None = None, split_bag: bool = False) -> list[tuple[str, Source]]:
+MAGICS = (
+    (b"\x89HDF\r\n\x1a\n", "an HDF5 file", "hdf5"),
+    (b"SQLite format 3\0", "an SQLite bag", "db3"),
+    (b"\x89MCAP0\r\n", "an MCAP file", "mcap"),
+    (b"\xff\xd8\xff", "a JPEG picture", None),
+    (b"\x89PNG\r\n", "a PNG picture", None),
+)
+"""How files begin, what they are, and the reader that opens them."""
+MOST_NAMED = 5
+"""Entries of a folder to name in an error."""
+DEEPEST = 4
+"""Levels of folders to look through for recordings that lie deeper than they are read."""
+
+
+def find_sources(
+    path: Path, *, reader: str | None = None, split_bag: bool = False, skipped: list[str] | None = None
+) -> list[tuple[str, Source]]:
     """(reader name, source) of every recording that ``path`` holds: a file, a bag folder, a dataset, or a folder of those.
+
+    Args:
+        skipped: if given, what a folder holds besides and why it is not read is added here, and no entry of a folder
+            keeps the others from being read.
 
     Raises:
         RecordingError: nothing there, or nothing that a reader opens.
@@ -138,18 +158,20 @@ def find_sources(path: Path, *, reader: str | None = None, split_bag: bool = Fal
         raise RecordingError(f"{path}: no such file or folder; {nearest(path.name, siblings)}")
     names = [reader] if reader else list(readers)
     found = _sources_at(path, names, split_bag)
-    if found is None and path.is_dir():
-        children = sorted(path.iterdir(), key=lambda p: decode.natural_key(p.name))
-        nested = [_sources_at(child, names, split_bag) or [] for child in children]
-        found = [item for items in nested for item in items]
-    if found is None and path.is_file() and reader is not None:
-        found = [(reader, Source(path, (path,)))]  # an odd ending: the named reader will say what is wrong with it
-    if not found:
-        endings = sorted({s for name in names for s in readers.get(name).suffixes})
-        raise RecordingError(
-            f"{path}: no recording here; readers {names} open {', '.join(endings)} and LeRobot datasets"
-        )
-    return found
+    if found is not None:
+        return found
+    if path.is_dir():
+        found, left = _sources_below(path, names, split_bag, stop=skipped is None)
+        if not found:
+            raise RecordingError(f"{path}: {_why_nothing(path, names, split_bag, left)}")
+        if skipped is not None:
+            skipped += left
+        return found
+    _, opens = sniff(path)
+    if opens in names or (reader is not None and _other_kind(path, names, split_bag) is None):
+        # an odd ending: the reader will say what is wrong with it
+        return [(opens if opens in names else names[0], Source(path, (path,)))]
+    raise RecordingError(f"{path}: {_why_nothing(path, names, split_bag, [])}")
 
 
 def _sources_at(path: Path, names: list[str], split_bag: bool) -> list[tuple[str, Source]] | None:
@@ -157,6 +179,121 @@ def _sources_at(path: Path, names: list[str], split_bag: bool) -> list[tuple[str
         sources = readers.get(name).sources(path, split_bag=split_bag)
         if sources is not None:
             return [(name, source) for source in sources]
+    return None
+
+
+def _sources_below(
+    folder: Path, names: list[str], split_bag: bool, *, stop: bool
+) -> tuple[list[tuple[str, Source]], list[str]]:
+    """Recordings directly in a folder, and what else lies there.
+
+    Args:
+        stop: raise the error of an entry that a reader knows and cannot open, instead of listing it.
+    """
+    found: list[tuple[str, Source]] = []
+    left: list[str] = []
+    for child in sorted(folder.iterdir(), key=lambda p: decode.natural_key(p.name)):
+        try:
+            sources, why = _sources_at(child, names, split_bag), None
+        except (RecordingError, OSError) as error:
+            if stop:
+                raise
+            sources, why = None, without_place(str(error), child)
+        if sources is not None:
+            found += sources
+        elif not child.name.startswith("."):
+            left.append(f"{child.name} ({why or _why_not(child, names, split_bag)})")
+    return found, left
+
+
+def _why_not(path: Path, names: list[str], split_bag: bool) -> str:
+    """Why an entry of a folder is not read."""
+    other = _other_kind(path, names, split_bag)
+    if other is not None:
+        return other
+    if path.is_dir():
+        deeper = _nearest_folder(path, names, split_bag)
+        return (
+            "a folder without recordings" if deeper is None else f"there are recordings in {deeper}: give that folder"
+        )
+    kind, _ = sniff(path)
+    return "no recording" if kind is None else f"{kind} with another ending: give the file itself"
+
+
+def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
+    """What ``path`` is, where that is known and none of the readers ``names`` opens it."""
+    others = [name for name in readers if name not in names]
+    reads = f"; this spec reads {', '.join(names)}" if others else ""
+    kind, opens = sniff(path)
+    if kind is None:
+        try:
+            found = _sources_at(path, others, split_bag)
+        except RecordingError as error:
+            return without_place(str(error), path) + reads
+        if not found:
+            return None
+        opens = found[0][0]
+        kind = "a LeRobot dataset" if opens == "lerobot" else opens
+    if opens is None:
+        return f"{kind}, no recording"
+    return None if opens in names else kind + reads
+
+
+def sniff(path: Path) -> tuple[str, str | None] | tuple[None, None]:
+    """What a file is by its first bytes, and the reader that opens it; None where nobody knows."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(max(len(magic) for magic, _, _ in MAGICS))
+    except OSError:
+        return None, None
+    return next(((kind, opens) for magic, kind, opens in MAGICS if head.startswith(magic)), (None, None))
+
+
+def without_place(text: str, path: Path | str) -> str:
+    """An error's text for where its file has been named already."""
+    return text.removeprefix(f"{path}: ")
+
+
+def _why_nothing(path: Path, names: list[str], split_bag: bool, left: list[str]) -> str:
+    """Why no recording was found at ``path``, and the way to one."""
+    other = _other_kind(path, names, split_bag)
+    if other is not None:
+        _, opens = sniff(path)
+        fitting = [name for name, spec in shipped_recording_specs().items() if spec.reader == opens]
+        return other + (f" ({', '.join(fitting)} reads {opens})" if fitting and len(names) == 1 else "")
+    deeper = _nearest_folder(path, names, split_bag) if path.is_dir() else None
+    if deeper is not None:
+        return f"no recording here, but there are some in {deeper}: give that folder"
+    opened = [", ".join(sorted({s for name in names for s in readers.get(name).suffixes}))]
+    opened += ["LeRobot datasets"] * ("lerobot" in names)
+    who = f"the reader {names[0]} opens" if len(names) == 1 else f"readers {', '.join(names)} open"
+    more = f" and {len(left) - MOST_NAMED} more" if len(left) > MOST_NAMED else ""
+    listed = f"; not read: {', '.join(left[:MOST_NAMED])}{more}" if left else ""
+    return f"no recording here; {who} {' and '.join(text for text in opened if text)}{listed}"
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+    except OSError:  # somebody else's
+        return []
+
+
+def _reads(path: Path, names: list[str], split_bag: bool) -> bool:
+    try:
+        return bool(_sources_at(path, names, split_bag))
+    except (RecordingError, OSError):
+        return False
+
+
+def _nearest_folder(path: Path, names: list[str], split_bag: bool) -> Path | None:
+    """The first folder below ``path`` that holds recordings, level by level."""
+    level = [path]
+    for _ in range(DEEPEST):
+        level = [p for folder in level for p in _entries(folder) if p.is_dir()]
+        for folder in level:
+            if any(_reads(child, names, split_bag) for child in _entries(folder)):
+                return folder
     return None
 
 

@@ -3,6 +3,7 @@
 Every feature states dtype, shape, unit, frame, rate and valid range. The files live in ``data_specs/``.
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -20,6 +21,27 @@ from taccorl.errors import SpecError, nearest
 
 Align = Literal["hold", "asof", "interpolate", "window"]
 SPEC_VERSION = 1
+UNITS = (
+    *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz"),
+    *("N", "Nm", "Pa", "kg", "A", "V", "W", "K", "s", "Hz", "1"),
+    *("adc_count", "rgb8", "unknown"),
+)
+"""Units of features and sensors: SI; wxyz: a unit quaternion; 1: a number without unit; unknown: of others' datasets."""
+OTHER_UNITS = {
+    **dict.fromkeys(("deg", "degs", "degree", "degrees", "°"), ("rad", "0.0174533")),
+    **dict.fromkeys(("deg/s", "degrees/s", "°/s", "dps"), ("rad/s", "0.0174533")),
+    **dict.fromkeys(("mm", "millimetre", "millimeter"), ("m", "0.001")),
+    **dict.fromkeys(("cm", "centimetre", "centimeter"), ("m", "0.01")),
+    "mm/s": ("m/s", "0.001"),
+    "rpm": ("rad/s", "0.104720"),
+    "Ncm": ("Nm", "0.01"),
+    "mA": ("A", "0.001"),
+    "mV": ("V", "0.001"),
+    "ms": ("s", "0.001"),
+    "kPa": ("Pa", "1000"),
+    "%": ("1", "0.01"),
+}
+"""What drivers send instead: the unit to have and the factor to it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,6 +272,20 @@ def find_spec(name: str | Path) -> Path:
     raise SpecError(f"no spec {str(name)!r}: neither a file nor a shipped spec; {nearest(path.stem, shipped)}")
 
 
+def shipped_recording_specs() -> dict[str, RecordingSpec]:
+    """Name → recording spec of every shipped one that loads."""
+    return _recording_specs(data_specs_folder() / "recordings")
+
+
+@functools.cache
+def _recording_specs(folder: Path) -> dict[str, RecordingSpec]:
+    found = {}
+    for path in sorted(folder.glob("*.yaml")):
+        with contextlib.suppress(SpecError):  # somebody is writing it
+            found[path.stem] = load_recording_spec(path)
+    return found
+
+
 def load_sensor_spec(path: Path) -> SensorSpec:
     """A sensor file of ``data_specs/sensors``."""
     document = Document(SensorSpec, path)
@@ -266,6 +302,7 @@ def load_sensor_spec(path: Path) -> SensorSpec:
         raise document.error(
             "wire", f"{wire[0]}×{wire[1]} with transpose: {spec.wire.transpose} is not the pad's {pad[0]}×{pad[1]}"
         )
+    _check_unit(document, "unit", spec.unit)
     if spec.max_count > np.iinfo(spec.wire.dtype).max:
         raise document.error("wire/dtype", f"{spec.max_count} counts do not fit the wire's {spec.wire.dtype}")
     if spec.max_count > np.iinfo(np.int16).max:
@@ -300,11 +337,26 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
     return dataclasses.replace(spec, sensors=sensors)
 
 
+def _check_unit(document: Document[Any], where: str, unit: str) -> None:
+    if unit in UNITS:
+        return
+    if unit in OTHER_UNITS:
+        other, factor = OTHER_UNITS[unit]
+        raise document.error(
+            where,
+            f"{unit!r}: datasets hold {other}; convert with `scale: [{factor}]` on the channel (one factor for each value "
+            f"that it picks) and write {other} here",
+        )
+    raise document.error(where, f"{unit!r} is no unit that datasets have; {nearest(unit, UNITS)}")
+
+
 def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, sensor: SensorSpec | None) -> None:
     if any(n <= 0 for n in feature.shape) or not feature.shape:
         raise document.error(f"{where}/shape", f"{list(feature.shape)} holds nothing")
     if feature.rate_hz <= 0:
         raise document.error(f"{where}/rate_hz", f"{feature.rate_hz:g} is not a rate")
+    for unit in (feature.unit,) if isinstance(feature.unit, str) else feature.unit:
+        _check_unit(document, f"{where}/unit", unit)
     if feature.dtype == "video":
         if len(feature.shape) != 3 or feature.shape[2] != 3 or feature.shape[0] % 2 or feature.shape[1] % 2:
             raise document.error(

@@ -1,19 +1,21 @@
 """What an artefact was made from, down to the raw recordings, and whether anything changed since: a tree as text.
 
-``✗`` marks what no longer matches its record: a changed, missing or added file, or an input that is gone.
+``✗`` marks what no longer matches its record: a changed, missing or added file, or a raw source that is gone. An
+artefact that left the store is no fault: the dataset carries its record.
 """
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from taccorl.lineage.canonical import flatten, show
+from taccorl.lineage.canonical import flatten
 from taccorl.lineage.digest import DigestCache, digest_file, digest_files
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import digests_now, read_manifest
 from taccorl.lineage.store import Store
 
-SHOWN = 12  # hex digits of a digest; settings in one line; changed files by name
+SHOWN = 12  # hex digits of a digest; changed files by name
+SHOWN_ITEMS = 4  # of a list in a config
 
 
 @dataclass
@@ -71,14 +73,14 @@ class _Tracer:
     def __init__(self, store: Store | None) -> None:
         self.store = store
         self.cache: DigestCache | None = store.digests if store else None
-        self.said: set[Path] = set()
+        self.said: set[Path | str] = set()
         self.software: dict[str, str] = {}
+        self.carried: dict[str, dict[str, Any]] = {}
+        self.listed: set[str] = set()  # digests of the sources that the datasets above name
 
     def artefact(self, folder: Path, recorded: str | None = None) -> Origin:
         manifest = read_manifest(folder)
-        title = (
-            f"{manifest['stage']} v{manifest['stage_version']}  key {manifest['key']}  {_digest(manifest['digest'])}"
-        )
+        title = _title(manifest)
         if folder in self.said:
             return Origin(f"{title}  (see above)")
         self.said.add(folder)
@@ -86,8 +88,18 @@ class _Tracer:
         origin = Origin(title, self.lines(folder, manifest), _changes(manifest["files"], now))
         if recorded not in (None, manifest["digest"], digest_files(now)):
             origin.problems.append(f"holds something else now: {_digest(str(recorded))} went into the step above")
-        origin.inputs = [self.input(entry) for entry in manifest["inputs"]]
+        origin.inputs = self.inputs(manifest)
         return origin
+
+    def inputs(self, manifest: dict[str, Any]) -> list[Origin]:
+        """The sources that the manifest itself names, then what it was made from."""
+        self.carried |= manifest.get("ancestors", {})
+        sources, above = manifest.get("sources", []), self.listed
+        self.listed = above | {source["digest"] for source in sources}
+        origins = [self.source(Path(source["path"]), source["digest"]) for source in sources]
+        origins += [self.input(entry) for entry in manifest["inputs"]]
+        self.listed = above
+        return origins
 
     def lines(self, folder: Path, manifest: dict[str, Any]) -> list[str]:
         made = f"made {manifest['created']} in {manifest['seconds']} s"
@@ -97,15 +109,35 @@ class _Tracer:
         return [f"at {folder}: {len(manifest['files'])} files", made, f"config: {_config(manifest)}"]
 
     def input(self, entry: dict[str, Any]) -> Origin:
-        path, recorded = Path(entry["path"]), entry["digest"]
-        if not path.exists() and entry["key"] and self.store and (moved := self.store.find_key(entry["key"])):
+        path, recorded, key = Path(entry["path"]), entry["digest"], entry["key"]
+        if key is None and recorded in self.listed:  # equal content was read before, perhaps from elsewhere
+            return Origin(f"source  {_digest(recorded)}  first read from {path}")
+        if not path.exists() and key and self.store and (moved := self.store.find_key(key)):
             path = moved
-        if not path.exists():
-            kind = f"artefact of key {entry['key']}" if entry["key"] else "source"
-            return Origin(
-                f"{kind}  {path}  {_digest(recorded)}", problems=["missing: there is nothing at this path now"]
-            )
-        return self.artefact(path, recorded) if read_manifest(path) else self.raw(path, recorded)
+        if path.exists() and read_manifest(path):
+            return self.artefact(path, recorded)
+        if not path.exists() and key in self.carried:
+            return self.gone(path, self.carried[key])
+        if not path.exists() and key:
+            title = f"artefact of key {key}  {path}  {_digest(recorded)}"
+            return Origin(title, problems=["missing: there is nothing at this path now"])
+        return self.source(path, recorded)
+
+    def gone(self, path: Path, manifest: dict[str, Any]) -> Origin:
+        """An artefact of which only the record is left, in the dataset that was made from it."""
+        key = manifest["key"]
+        if key in self.said:
+            return Origin(f"{_title(manifest)}  (see above)")
+        self.said.add(key)
+        where = f"not in the store any more: {path}" if path.name == key else f"not there any more: {path}"
+        origin = Origin(_title(manifest), [where, f"made {manifest['created']}", f"config: {_config(manifest)}"])
+        origin.inputs = self.inputs(manifest)
+        return origin
+
+    def source(self, path: Path, recorded: str) -> Origin:
+        if path.exists():
+            return self.raw(path, recorded)
+        return Origin(f"source  {path}  {_digest(recorded)}", problems=["missing: there is nothing at this path now"])
 
     def raw(self, path: Path, recorded: str | None) -> Origin:
         now = _content(path, self.cache)
@@ -119,13 +151,30 @@ def _content(path: Path, cache: DigestCache | None) -> str:
     return digest_files(digests_now(path, cache)) if path.is_dir() else digest_file(path, cache)
 
 
+def _title(manifest: dict[str, Any]) -> str:
+    return f"{manifest['stage']} v{manifest['stage_version']}  key {manifest['key']}  {_digest(manifest['digest'])}"
+
+
 def _config(manifest: dict[str, Any]) -> str:
     changed = manifest["config_not_default"]
-    settings = flatten(manifest["config"]) if changed is None else changed
-    text = ", ".join(f"{name or 'value'}={show(value)}" for name, value in settings.items())
-    if changed is None:
-        return text
-    return f"{text} (all else at its default)" if text else "all at its default"
+    if changed is not None:
+        text = ", ".join(f"{name}={_readable(value)}" for name, value in changed.items())
+        return f"{text} (all else at its default)" if text else "all at its default"
+    settings = {name: value for name, value in flatten(manifest["config"]).items() if value is not None}
+    return ", ".join(f"{name or 'value'}={_readable(value)}" for name, value in settings.items()) or "none"
+
+
+def _readable(value: Any) -> str:
+    """A setting for the eye: text as it is, nothing for what is not set, the first few of a long list."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{name}: {_readable(v)}" for name, v in value.items() if v is not None) + "}"
+    if isinstance(value, list):
+        shown = [_readable(item) for item in value if item is not None]
+        more = [f"… {len(shown) - SHOWN_ITEMS} more"] if len(shown) > SHOWN_ITEMS else []
+        return f"[{', '.join(shown[:SHOWN_ITEMS] + more)}]"
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    return str(value)
 
 
 def _changes(then: dict[str, str], now: dict[str, str]) -> list[str]:

@@ -1,5 +1,7 @@
-"""Free the store of artefacts that no kept dataset was made from, and of what dead runs left behind.
+"""Free the store of artefacts that no dataset was made from, and of what dead runs left behind.
 
+What the store published is kept for as long as it lies where it was published; further datasets (moved, copied) are
+kept if they are named.
 Only folders that the store itself made are ever considered: ``<stage>/<key>`` and their temporary forms. Do not prune
 while a pipeline runs: it may be about to read an artefact that no dataset refers to yet.
 """
@@ -14,6 +16,7 @@ from pathlib import Path
 from filelock import Timeout
 
 from taccorl.errors import DatasetError
+from taccorl.lineage.ancestors import Manifest, manifest_of
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.store import KEY, MARKER, Store, is_store
@@ -43,8 +46,8 @@ def open_store(root: Path) -> Store:
     return Store(root)
 
 
-def unneeded(store: Store, keep: Sequence[Path]) -> list[Unneeded]:
-    """Artefacts that none of the ``keep`` datasets was made from, and leftovers of dead runs; deletes nothing.
+def unneeded(store: Store, keep: Sequence[Path] = ()) -> list[Unneeded]:
+    """Artefacts that no published dataset and none of ``keep`` was made from, and leftovers; deletes nothing.
 
     Raises:
         DatasetError: a dataset to keep does not exist or has no manifest, so what it needs is unknown.
@@ -73,23 +76,23 @@ def delete(store: Store, folders: Sequence[Unneeded]) -> list[Unneeded]:
 
 
 def _needed_keys(store: Store, keep: Sequence[Path]) -> set[str]:
-    """The keys of the ``keep`` datasets and of everything they were made from."""
-    in_store = {path.name: path for path in store.artefacts()}
-    todo = []
+    """The keys of the datasets and of everything they were made from."""
+    todo: list[Manifest] = []
     for path in keep:
         if not (manifest := read_manifest(path)):
             problem = "has no taccorl manifest" if Path(path).exists() else "does not exist"
             raise DatasetError(f"--keep={path} {problem}: what it was made from is unknown. Nothing was deleted.")
         todo.append(manifest)
+    todo += [read_manifest(path) for path in store.destinations.present()]
     needed: set[str] = set()
+    carried: dict[str, Manifest] = {}
     while todo:
         manifest = todo.pop()
-        if manifest["key"] in needed:
+        if not manifest or manifest["key"] in needed:
             continue
         needed.add(manifest["key"])
-        for entry in manifest["inputs"]:  # an input outside the store, itself a dataset, has inputs in it all the same
-            todo.append(read_manifest(in_store.get(entry["key"], Path(entry["path"]))))
-        todo = [manifest for manifest in todo if manifest]
+        carried |= manifest.get("ancestors", {})
+        todo += [manifest_of(entry, store.find_key, carried) for entry in manifest["inputs"]]
     return needed
 
 

@@ -19,7 +19,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,9 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from taccorl.errors import DatasetError, InTheWayError
+from taccorl.lineage.ancestors import ancestors
 from taccorl.lineage.canonical import canonical, canonical_text, differences, not_default
+from taccorl.lineage.destinations import Destinations
 from taccorl.lineage.digest import (
     DigestCache,
     digest_bytes,
@@ -57,6 +59,7 @@ class Store:
         self.root = Path(root).resolve()
         _mark(self.root)
         self.digests = DigestCache(self.root / ".digests")
+        self.destinations = Destinations(self.root / ".destinations")
 
     def source(self, path: Path) -> Artefact:
         """A raw file or folder (or an earlier artefact, wherever it lies), addressed by its content as it is now."""
@@ -82,7 +85,9 @@ class Store:
 
     def find_key(self, key: str) -> Path | None:
         """The folder of the artefact with this key, whatever its stage."""
-        return next((path for path in self.artefacts() if path.name == key), None)
+        if not KEY.fullmatch(key):
+            return None
+        return next((path for path in self.root.glob(f"[!.]*/{key}") if _is_own(path) and _is_own(path.parent)), None)
 
     def artefacts(self) -> list[Path]:
         """The folders of all artefacts."""
@@ -94,7 +99,13 @@ class Store:
         return [path for stage in stages for path in sorted(stage.iterdir()) if _is_own(path)]
 
     def run(
-        self, stage: Stage, config: Any, inputs: Sequence[Artefact], *, destination: Path | None = None
+        self,
+        stage: Stage,
+        config: Any,
+        inputs: Sequence[Artefact],
+        *,
+        destination: Path | None = None,
+        sources: Sequence[Artefact] = (),
     ) -> Artefact:
         """The artefact of ``stage``; made now if it is not there yet.
 
@@ -103,12 +114,16 @@ class Store:
             config: a dataclass or plain JSON data; handed to the stage as it is.
             inputs: handed to the stage as paths, in this order.
             destination: publish the artefact there, outside the store, instead of under its key.
+            sources: with a destination, the raw sources of this very run. A recording's artefact only knows the path
+                where its content was first read; these are the paths that the destination's manifest names.
 
         Raises:
             DatasetError: ``destination`` holds anything else; nothing of it is touched.
         """
-        job = self._job(stage, config, list(inputs), destination)
+        job = self._job(stage, config, list(inputs), destination, list(sources))
         if (found := self._existing(job)) is not None:
+            if job.is_published:  # a store that was made anew knows it from now on
+                self.destinations.remember(job.final, job.key)
             return found
         with self.lock(job.lock_name):
             for leftover in job.leftovers():
@@ -116,9 +131,13 @@ class Store:
             found = self._existing(job)
             return found if found is not None else self._make(job)
 
-    def _job(self, stage: Stage, config: Any, inputs: list[Artefact], destination: Path | None) -> "_Job":
+    def _job(
+        self, stage: Stage, config: Any, inputs: list[Artefact], destination: Path | None, sources: list[Artefact]
+    ) -> "_Job":
         key = self.key(stage, config, inputs)
         if destination is None:
+            if sources:
+                raise LineageError(f"stage {stage.name}: sources are for a destination's manifest, and it has none.")
             return _Job(stage, config, inputs, key, self._place(stage, key), lock_name=key, temp_prefix=f".{key}.")
         final = Path(destination).absolute()
         final = final.parent.resolve() / final.name
@@ -127,7 +146,7 @@ class Store:
         lock_name = f"destination-{digest_bytes(str(final).encode())[:KEY_DIGITS]}"
         # Beside the user's folder: named after this store, whose lock alone tells if a temporary folder's maker lives.
         temp_prefix = f".{final.name}.taccorl-{digest_bytes(str(self.root).encode())[:8]}-"
-        return _Job(stage, config, inputs, key, final, lock_name, temp_prefix)
+        return _Job(stage, config, inputs, key, final, lock_name, temp_prefix, is_published=True, sources=sources)
 
     def _make(self, job: "_Job") -> Artefact:
         for artefact in job.inputs:
@@ -140,7 +159,9 @@ class Store:
         try:
             start_s = time.perf_counter()
             job.stage.fn(job.config, [artefact.path for artefact in job.inputs], temp)
-            digest = _seal(temp, job, seconds=time.perf_counter() - start_s)
+            digest = _seal(temp, job, time.perf_counter() - start_s, self._origins(job) if job.is_published else {})
+            if job.is_published:  # before it is there, so that it is never there unknown to prune
+                self.destinations.remember(job.final, job.key)
             try:
                 temp.rename(job.final)
             except OSError:  # something came to lie there meanwhile: the same artefact is as good as ours
@@ -153,6 +174,14 @@ class Store:
         except BaseException:
             shutil.rmtree(temp, ignore_errors=True)
             raise
+
+    def _origins(self, job: "_Job") -> dict[str, Any]:
+        """What a published manifest says more than one in the store: its sources, and what its inputs were made from."""
+        sources = [{"path": str(source.path.absolute()), "digest": source.digest} for source in job.sources]
+        return {
+            "sources": sources,
+            "ancestors": ancestors([_entry(artefact) for artefact in job.inputs], self.find_key),
+        }
 
     def _existing(self, job: "_Job") -> Artefact | None:
         found = _with_key(job.final, job.key)
@@ -198,6 +227,8 @@ class _Job:
     final: Path
     lock_name: str
     temp_prefix: str
+    is_published: bool = False
+    sources: list[Artefact] = field(default_factory=list)
 
     def leftovers(self) -> list[Path]:
         """Temporary folders of runs that died, if the lock is ours."""
@@ -232,7 +263,7 @@ def _with_key(folder: Path, key: str) -> Artefact | None:
     return Artefact(folder, manifest["digest"]) if manifest and manifest["key"] == key else None
 
 
-def _seal(temp: Path, job: _Job, seconds: float) -> str:
+def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> str:
     """Digest what the stage wrote, bring it to the disk, write the manifest; returns the artefact's digest."""
     stage = job.stage
     files = digest_each(temp, hidden=True) if temp.is_dir() else {}
@@ -252,9 +283,8 @@ def _seal(temp: Path, job: _Job, seconds: float) -> str:
         "seconds": round(seconds, 3),
         "config": canonical(job.config),
         "config_not_default": not_default(job.config),
-        "inputs": [
-            {"path": str(artefact.path), "digest": artefact.digest, "key": _key_of(artefact)} for artefact in job.inputs
-        ],
+        "inputs": [_entry(artefact) for artefact in job.inputs],
+        **origins,
         "software": software(),
         "files": files,
     }
@@ -264,10 +294,11 @@ def _seal(temp: Path, job: _Job, seconds: float) -> str:
     return digest
 
 
-def _key_of(artefact: Artefact) -> str | None:
-    """The key of an input, unless it is raw or was changed since it was made."""
+def _entry(artefact: Artefact) -> dict[str, Any]:
+    """An input as a manifest names it; with its key, unless it is raw or was changed since it was made."""
     manifest = artefact.manifest
-    return manifest["key"] if manifest and manifest["digest"] == artefact.digest else None
+    key = manifest["key"] if manifest and manifest["digest"] == artefact.digest else None
+    return {"path": str(artefact.path), "digest": artefact.digest, "key": key}
 
 
 def _in_the_way(job: _Job) -> str:

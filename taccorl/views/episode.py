@@ -25,14 +25,15 @@ from taccorl.views.blueprint import episode_blueprint, heatmap_places
 from taccorl.views.colors import CONTACT_COLOR, HEATMAP, LINE_COLORS, NOISE_COLOR, PAD_COLORS
 from taccorl.views.figure import log_figure
 from taccorl.views.groups import groups_of, short_name, vector_keys
-from taccorl.views.outputs import APPLICATION, check_free, replacing
+from taccorl.views.outputs import check_free, replacing
 from taccorl.views.provenance import provenance
+from taccorl.views.rrd import recording_to
 from taccorl.views.touch import Pad, contact_gate, pads_of
 from taccorl.views.video import Clip, cut
 from taccorl.views.viewer import can_decode
 
 JPEG_QUALITY = 90
-PICTURES_AT_ONCE = 64  # rows; keeps memory flat however long the episode is
+PICTURES_AT_ONCE = 64  # rows; more would only hold more decoded pictures
 EVENT_COLORS = (0x2563EBFF, 0x0D9488FF, 0xCA8A04FF, 0x9333EAFF, 0xDB2777FF, 0x65A30DFF)
 
 
@@ -69,13 +70,11 @@ def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, nati
     """The episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as above.
 
     Raises:
-        OutputError: ``rrd`` is somebody else's file.
+        OutputError: ``rrd`` is somebody else's file, or the disk is full.
     """
     check_free(rrd)
-    with replacing(rrd) as part, rr.RecordingStream(APPLICATION) as rec:
-        rec.save(part, default_blueprint=episode_blueprint(episode, at_s=at_s))
+    with replacing(rrd) as part, recording_to(part, episode_blueprint(episode, at_s=at_s)) as rec:
         log_episode(rec, episode, native=native)
-        rec.disconnect()
 
 
 def time_columns(episode: Episode, rows: Sequence[int] | None = None) -> list[rr.TimeColumn]:

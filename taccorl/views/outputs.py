@@ -1,7 +1,9 @@
 """Files that views write: each says where it is from, and none lands on somebody else's file."""
 
 import contextlib
+import errno
 import os
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,10 +19,11 @@ APPLICATION = "taccorl_episode"
 RRD_MAGIC = b"RRF2"
 HEAD_BYTES = 1024
 """An .rrd names its application in its first message."""
+DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 class OutputError(TaccorlError):
-    """A file that is in the way."""
+    """A file that is in the way, or for which the disk has no room."""
 
 
 def check_free(path: Path) -> None:
@@ -30,7 +33,7 @@ def check_free(path: Path) -> None:
         OutputError: something else is there, or there is no such folder.
     """
     if not path.parent.is_dir():
-        raise OutputError(f"{path.parent}: no such folder; make it first: mkdir -p {path.parent}")
+        raise OutputError(f"{path.parent}: no such folder; make it first: mkdir -p {shlex.quote(str(path.parent))}")
     if path.exists() and not _is_ours(path):
         raise OutputError(f"{path}: is there already and not from `{SOFTWARE}`; give another name, or remove it")
 
@@ -51,11 +54,21 @@ def _is_ours(path: Path) -> bool:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A name beside ``path`` to write to; at the end it takes ``path``'s place at once, or goes if there was an error."""
+    """A name beside ``path`` to write to; at the end it takes ``path``'s place at once, or goes if there was an error.
+
+    Raises:
+        OutputError: the disk is full, or a file may not be so large.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield part
         part.replace(path)
+    except OSError as error:
+        if error.errno not in DISK_FAULTS:
+            raise
+        place = path if error.filename in (None, str(part)) else error.filename
+        kept = "; the earlier file is as it was" if path.exists() else ""
+        raise OutputError(f"{place}: not written: {error.strerror}{kept}. Make room, or give another place") from error
     finally:
         part.unlink(missing_ok=True)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+import taccorl
 from taccorl.cli.check import CheckConfig
 from taccorl.cli.ingest import IngestConfig, InspectConfig
 from taccorl.cli.lineage import ExplainConfig, PruneConfig
@@ -46,6 +47,11 @@ def test_the_list_names_every_verb_and_needs_no_library() -> None:
 def test_the_list_is_no_error(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 0
     assert "usage: taccorl <verb>" in capsys.readouterr().out
+
+
+def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"taccorl {taccorl.__version__}\n"
 
 
 @pytest.mark.parametrize(("typo", "meant"), [("ingst", "ingest"), ("chekc", "check"), ("veiw", "view")])

@@ -122,9 +122,9 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("x", "--name", "a"), ("option '--name' needs a value: --name=…",)),
         (("x", "--name="), ("option '--name=' needs a value",)),
         (("x", "--name=a", "--quick"), ("option '--quick' needs a value",)),
-        (("--name=a",), ("missing --paths=", "--help")),
+        (("--name=a",), ("missing --paths= (give a file or folder); --help says more",)),
         (("x",), ("missing --name=",)),
-        ((), ("missing --paths=, --name=",)),
+        ((), ("missing --paths= (give a file or folder), --name=",)),
         (("x", "--name=a", "--joints=six"), ("joints", "'six'", "int")),
         (("x", "--name=a", "--joints=1.5"), ("joints", "1.5")),
         (("x", "--name=a", "--quick=maybe"), ("quick", "'maybe'", "bool")),
@@ -148,6 +148,20 @@ def test_a_slip_is_named_with_the_way_out(
     for word in said:
         assert word in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_help_names_the_verb_then_says_what_the_module_says(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        parse(Robot, ["x", "--help"], positional="paths", prog="taccorl move")
+    assert stop.value.code == 0
+    usage, empty, said, *rest = capsys.readouterr().out.splitlines()
+    assert usage == "usage: taccorl move PATHS … --name=… [options]"
+    assert (empty, said) == ("", "Command lines into configs: what is typed is what is meant, and a slip is named.")
+    options = " ".join(" ".join(rest).split())
+    assert "Files. (required)" in options and "Its name. (required)" in options
+    assert "How many. (default: 6)" in options
+    assert "Its home. --joints" in options, "nothing to say about a default of nothing"
+    assert "None" not in options
 
 
 def test_one_word_fills_a_single_field_and_no_more() -> None:

@@ -396,8 +396,9 @@ def test_a_folder_holds_its_recordings_in_natural_order(tmp_path):
 
 
 def test_a_folder_without_recordings_says_what_would_be_one(tmp_path):
-    with pytest.raises(RecordingError, match=r"no recording here; readers .*mcap.* open .*\.mcap"):
-        find_sources(tmp_path)
+    for split_bag in (False, True):
+        with pytest.raises(RecordingError, match=r"no recording here; readers .*mcap.* open .*\.mcap"):
+            find_sources(tmp_path, split_bag=split_bag)
     (tmp_path / "a.txt").touch()
     with pytest.raises(RecordingError, match="no recording here"):
         find_sources(tmp_path / "a.txt")

@@ -235,6 +235,7 @@ OTHER_WORDS = [
     "topic",
     "/other",
     "other",
+    "unknown",
 ]
 
 
@@ -297,6 +298,7 @@ TACTILE, WINDOW = ("features", "observation.tactile"), ("features", "observation
         (("wire_shift_bits",), 10, "wire_shift_bits", "10 of 10 bits leave no count"),
         (("adc_bits",), 10**9, "wire_shift_bits", "leave no count"),  # and no memory is taken to find that out
         (("spec_version",), 2, "spec_version", "2; this taccorl reads version 1"),
+        (("unit",), "counts", "unit", "'counts' is no unit that datasets have; did you mean 'adc_count'?"),
         (("wire", "dtype"), "float32", "wire → dtype", "'float32' is none of 'uint8', 'uint16'"),
     ],
 )
@@ -329,6 +331,12 @@ def test_counts_must_fit_the_dataset(tmp_path):
         ((*STATE, "shape"), [3], "observation.state → names", "2 names for 3 values"),
         ((*STATE, "names"), ["joint", "joint"], "observation.state → names", "a name stands twice"),
         ((*STATE, "unit"), ["rad"], "observation.state → unit", "1 units for 2 values"),
+        ((*STATE, "unit"), ["rad", "furlong"], "state → unit", "'furlong' is no unit that datasets have; known: 1, A, Hz"),
+        ((*STATE, "unit"), ["radian", "m"], "observation.state → unit", "did you mean 'rad'?"),
+        ((*STATE, "unit"), ["deg", "m"], "state → unit", "'deg': datasets hold rad; convert with `scale: [0.0174533]`"),
+        ((*STATE, "unit"), ["rad", "mm"], "observation.state → unit", "'mm': datasets hold m; convert with `scale: [0.001]`"),
+        (("features", "action", "unit"), "TODO", "features → action → unit", "'TODO' is no unit that datasets have"),
+        ((*FRONT, "unit"), "rgb", "images.front → unit", "did you mean 'rgb8'?"),
         ((*STATE, "rate_hz"), -1, "observation.state → rate_hz", "-1 is not a rate"),
         ((*STATE, "range", "gripper"), [0.1, 0.1], "observation.state → range", "a lower bound is not below its upper bound"),
         ((*STATE, "range", "gripper"), REMOVE, "observation.state → range", "no range for gripper"),

@@ -34,7 +34,7 @@ class HastyStore(Store):
     def _make(self, job: Any) -> Artefact:
         job.final.mkdir(parents=True)
         (job.final / "one").write_text("early")
-        digest = _seal(job.final, job, seconds=0.0)
+        digest = _seal(job.final, job, seconds=0.0, origins={})
         job.stage.fn(job.config, [], job.final)
         return Artefact(job.final, digest)
 
@@ -46,7 +46,7 @@ def wrong(store: Store) -> list[Path]:
 
 def temporary(folder: Path) -> list[Path]:
     """Temporary folders anywhere below."""
-    return [p for p in folder.rglob(".*") if p.is_dir() and p.name not in (".locks", ".digests")]
+    return [p for p in folder.rglob(".*") if p.is_dir() and p.name not in (".locks", ".digests", ".destinations")]
 
 
 def survives(kill_at: int, work: Callable[[], Any]) -> bool:

@@ -101,8 +101,77 @@ def test_input_replaced_by_another_artefact_is_reported(world, tmp_path):
 
 def test_store_that_was_moved_is_found_by_key(world, tmp_path):
     (tmp_path / "store").rename(tmp_path / "elsewhere")
-    assert [problem.split(":")[0] for problem in problems(world.dataset, None)] == ["missing", "missing"]
-    assert problems(world.dataset, Store(tmp_path / "elsewhere")) == []
+    moved = Store(tmp_path / "elsewhere")
+    assert "not in the store any more" in explain(world.dataset, None)
+    assert "not in the store any more" not in explain(world.dataset, moved)
+    (moved.find_key(world.episodes[1].path.name) / "data" / "3.bin").write_text("edited")  # found, so judged
+    assert [problem.partition(",")[0] for problem in problems(world.dataset, moved)] == ["changed since: data/3.bin"]
+
+
+def test_dataset_whose_store_is_gone_still_tells_its_lineage_down_to_the_raw_files(world, tmp_path):
+    again = Store(tmp_path / "other").run(
+        Stage("copy", _write), None, [world.store.source(world.dataset)], destination=tmp_path / "derived"
+    )
+    merge_key = world.made.manifest["key"]
+    for gone in (world.store.root, tmp_path / "other", world.dataset):
+        shutil.rmtree(gone)
+    lines = explain(again.path, None).splitlines()
+    assert lines[4] == f"└─ merge v1  key {merge_key}  digest {world.made.digest[:12]}"
+    assert lines[5].endswith(f"not there any more: {world.dataset}")
+    shown = "\n".join(lines)
+    for episode, source in zip(world.episodes, world.sources, strict=True):
+        assert f"ingest v1  key {episode.path.name}  digest {episode.digest[:12]}" in shown
+        assert f"not in the store any more: {episode.path}" in shown
+        assert f"source  {source.path}  digest {source.digest[:12]}" in shown
+    assert shown.count("config: rate_hz=20.0 (all else at its default)") == 2
+    assert lines[-1] == GOOD
+    (world.raw / "demo_0.raw").write_text("edited")  # the raw files are judged all the same
+    (world.raw / "demo_1.raw").unlink()
+    assert [problem.split(":")[0] for problem in problems(again.path)] == ["changed since", "missing"]
+
+
+def test_manifest_without_its_inputs_records_says_that_they_are_missing(world):
+    """As written before manifests carried them, and as any artefact in a store is."""
+    merged = world.store.run(MERGE_DATASET, IngestConfig(), world.episodes)
+    shutil.rmtree(world.episodes[0].path)
+    assert problems(merged.path) == ["missing: there is nothing at this path now"]
+
+
+# The paths of this very run.
+
+
+@pytest.fixture
+def mine(world, tmp_path):
+    """A dataset of the user's copy of a file whose equal was read before, from another path."""
+    copy = tmp_path / "my recording.raw"
+    shutil.copy(world.raw / "demo_0.raw", copy)
+    source = world.store.source(copy)
+    episode = world.store.run(INGEST, IngestConfig(rate_hz=20.0), [source])
+    assert episode == world.episodes[0]
+    world.store.run(MERGE_DATASET, IngestConfig(), [episode], destination=tmp_path / "mine", sources=[source])
+    return tmp_path / "mine"
+
+
+def test_the_users_own_file_is_named_and_the_path_of_its_equal_is_only_mentioned(mine, world, tmp_path):
+    lines = explain(mine, world.store).splitlines()
+    digest = world.sources[0].digest[:12]
+    assert lines[4] == f"├─ source  {tmp_path}/my recording.raw  digest {digest}"
+    assert lines[5].startswith("└─ ingest v1")
+    assert lines[9] == f"   └─ source  digest {digest}  first read from {world.raw}/demo_0.raw"
+    assert lines[10:] == [GOOD]
+
+
+@pytest.mark.parametrize("store_is_there", [True, False])
+def test_change_of_the_users_own_file_is_reported_and_that_of_its_equal_is_not(mine, world, tmp_path, store_is_there):
+    store = world.store if store_is_there else None
+    if not store_is_there:
+        shutil.rmtree(world.store.root)
+    (world.raw / "demo_0.raw").unlink()
+    assert problems(mine, store) == []
+    (tmp_path / "my recording.raw").write_text("edited")
+    assert [problem.split(":")[0] for problem in problems(mine, store)] == ["changed since"]
+    (tmp_path / "my recording.raw").unlink()
+    assert [problem.split(":")[0] for problem in problems(mine, store)] == ["missing"]
 
 
 def test_input_used_twice_is_explained_once(world, tmp_path):
@@ -116,6 +185,16 @@ def test_plain_config_is_shown_whole_as_it_declares_no_defaults(tmp_path):
     store = Store(tmp_path / "store")
     artefact = store.run(Stage("one", _write), {"noise": {"std_m": 0.01}, "name": "cup"}, [])
     assert "config: name=cup, noise.std_m=0.01" in explain(artefact.path, store)
+
+
+def test_config_is_shown_to_be_read_not_parsed(tmp_path):
+    store = Store(tmp_path / "store")
+    named = [[f"réc {i}.mcap", None, "written"] for i in range(100)]
+    config = {"recordings": named, "part": None, "fit": True, "pads": []}
+    text = explain(store.run(Stage("one", _write), config, []).path, store)
+    shown = ", ".join(f"[réc {i}.mcap, written]" for i in range(4))
+    assert f"config: fit=true, pads=[], recordings=[{shown}, … 96 more]\n" in text
+    assert "config: none\n" in explain(store.run(Stage("one", _write), None, []).path, store)
 
 
 def _write(config, inputs, out_dir):

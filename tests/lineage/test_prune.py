@@ -1,5 +1,6 @@
 """Prune: keeps what kept datasets were made from, frees the rest and the leftovers, and touches nothing else."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,7 @@ import pytest
 
 from taccorl.cli.lineage import join_repeated, main
 from taccorl.errors import DatasetError, TaccorlError
-from taccorl.lineage.explain import trace
+from taccorl.lineage.explain import explain, trace
 from taccorl.lineage.prune import delete, open_store, unneeded
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
@@ -52,6 +53,52 @@ def test_keeps_what_the_dataset_was_made_from_however_deep_and_frees_the_rest(wo
     assert unneeded(store, [world / "dataset"]) == []
 
 
+def test_what_a_published_dataset_was_made_from_stays_without_being_named(world):
+    store = Store(world / "store")
+    assert [folder.path.parent.name for folder in unneeded(store)] == ["ingest", "ingest"]
+    assert unneeded(store) == unneeded(store, [world / "dataset"])
+    delete(store, unneeded(store))
+    assert trace(world / "dataset", store).num_problems() == 0
+    assert "any more" not in explain(world / "dataset", store)
+
+
+@pytest.mark.parametrize("fate", ["removed", "moved", "replaced"])
+def test_dataset_that_is_no_longer_there_keeps_nothing_unless_its_new_place_is_named(world, fate):
+    store, dataset, moved = Store(world / "store"), world / "dataset", world / "moved"
+    dataset.rename(moved)
+    if fate == "removed":
+        shutil.rmtree(moved)
+    elif fate == "replaced":
+        other = store.run(INGEST, IngestConfig(rate_hz=20.0), [store.source(world / "raw" / "demo_0.raw")])
+        shutil.copytree(other.path, dataset)
+    assert store.destinations.gone() == [dataset]
+    assert len(unneeded(store)) == 5
+    if fate != "removed":
+        assert len(unneeded(store, [moved])) == 2
+        delete(store, unneeded(store))  # and even if it is not named, its lineage reaches the raw files
+        text = explain(moved, store)
+        assert text.count("not in the store any more") == 3
+        assert all(f"{world}/raw/demo_{i}.raw" in text for i in range(2))
+        assert trace(moved, store).num_problems() == 0
+
+
+def test_store_that_was_made_anew_learns_of_a_dataset_when_its_run_is_repeated(world):
+    store, raw = Store(world / "other"), world / "raw"
+    episodes = [store.run(INGEST, IngestConfig(), [store.source(raw / f"demo_{i}.raw")]) for i in range(2)]
+    merged = store.run(MERGE, IngestConfig(), episodes)
+    assert len(unneeded(store)) == 3
+    store.run(Stage("finish", _finish), None, [merged], destination=world / "dataset")
+    assert unneeded(store) == []
+
+
+def test_what_lies_behind_an_artefact_that_is_gone_is_kept_all_the_same(world):
+    store = Store(world / "store")
+    [merged] = (store.root / "merge").iterdir()
+    shutil.rmtree(merged)
+    assert len(store.artefacts()) == 4
+    assert len(unneeded(store)) == 2  # the two episodes stay: the dataset's own manifest tells of them
+
+
 def test_lineage_through_another_dataset_outside_the_store_is_followed(world):
     store = Store(world / "store")
     derived = store.run(Stage("copy", _copy), None, [store.source(world / "dataset")], destination=world / "derived")
@@ -69,11 +116,13 @@ def test_folders_that_the_store_did_not_make_are_left_alone(world):
         folder.mkdir()
         (folder / "thesis.txt").write_text("mine")
     (store.root / "ingest" / "0123456789abcdef").symlink_to(outside)
-    delete(store, unneeded(store, []))
+    shutil.copytree(world / "dataset", world / "copy")
+    shutil.rmtree(world / "dataset")  # so that every artefact may go
+    delete(store, unneeded(store))
     assert (mine / "thesis.txt").exists()
     assert (outside / "thesis.txt").exists()
     assert store.artefacts() == []
-    assert (world / "dataset" / "all.bin").exists()
+    assert (world / "copy" / "all.bin").exists()
     assert len(list((world / "raw").iterdir())) == 3
 
 
@@ -103,8 +152,8 @@ def test_what_a_run_is_building_now_is_neither_listed_nor_deleted(world):
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "building\n"
-        listed = unneeded(store, [])
-        assert len(listed) == 5
+        listed = unneeded(store)
+        assert len(listed) == 2
         assert not any("wait" in str(folder.path) for folder in listed)
         assert delete(store, listed) == []
         made, _ = process.communicate("\n", timeout=20)
@@ -115,15 +164,31 @@ def test_what_a_run_is_building_now_is_neither_listed_nor_deleted(world):
 
 
 def test_command_lists_first_and_deletes_only_with_yes(world, capsys):
-    words = ["prune", f"--store={world / 'store'}", f"--keep={world / 'dataset'}"]
-    assert main(words) == 0
+    words = ["prune", f"--store={world / 'store'}"]
+    assert main([*words, f"--keep={world / 'dataset'}"]) == 0
     out = capsys.readouterr().out
-    assert "2 of 5 folders" in out
+    assert f"2 of 5 folders in {world / 'store'} not needed for 1 dataset: 0.0 MB" in out
     assert "Nothing was deleted" in out
     assert len(Store(world / "store").artefacts()) == 5
     assert main([*words, "--yes=true"]) == 0
-    assert "Deleted 2 folders" in capsys.readouterr().out
+    assert "Deleted 2 folders." in capsys.readouterr().out
     assert len(Store(world / "store").artefacts()) == 3
+    run_and_die(world / "store")
+    assert main([*words, "--yes=true"]) == 0
+    assert "Deleted 1 folder." in capsys.readouterr().out
+    (world / "dataset").rename(world / "moved")
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "3 of 3 folders" in out
+    assert f"1 dataset gone or moved; name moved ones with --keep=DATASET:\n  {world / 'dataset'}\n" in out
+
+
+@pytest.mark.parametrize("verb", ["explain", "prune"])
+def test_help_names_the_verb_as_it_is_typed(verb, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([verb, "--help"])
+    assert stop.value.code == 0
+    assert f"usage: taccorl lineage {verb} " in capsys.readouterr().out
 
 
 def test_command_explains_and_its_status_tells_if_anything_changed(world, capsys):

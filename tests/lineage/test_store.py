@@ -204,6 +204,22 @@ def test_destination_holds_the_dataset_and_a_second_run_leaves_it_untouched(stor
     assert temporary(tmp_path / "datasets") == []
 
 
+def test_manifest_of_a_destination_names_its_sources_and_carries_the_records_of_its_inputs(store, raw, tmp_path):
+    sources = [store.source(path) for path in sorted(raw.iterdir())]
+    episodes = [store.run(INGEST, IngestConfig(), [source]) for source in sources]
+    merged = store.run(MERGE_DATASET, IngestConfig(), episodes)
+    made = store.run(ONE, "x", [merged, merged], destination=tmp_path / "d", sources=sources)
+    assert made.manifest["sources"] == [{"path": str(source.path), "digest": source.digest} for source in sources]
+    carried = made.manifest["ancestors"]
+    assert set(carried) == {artefact.path.name for artefact in (*episodes, merged)}
+    for artefact in (*episodes, merged):
+        record = carried[artefact.path.name]
+        assert record == {name: artefact.manifest[name] for name in record}
+        assert set(artefact.manifest) - set(record) == {"taccorl_manifest", "place", "seconds", "software", "files"}
+    with pytest.raises(LineageError, match="sources are for a destination"):
+        store.run(ONE, "x", [merged], sources=sources)
+
+
 def test_destination_with_another_config_is_refused_with_both_named(store, raw, tmp_path):
     source = store.source(raw / "demo_0.raw")
     made = store.run(

@@ -1,6 +1,8 @@
 """``taccorl view`` on a real dataset and a real recording of the stand-in, as a user types it."""
 
 import os
+import resource
+import shlex
 import signal
 import socket
 import subprocess
@@ -15,6 +17,8 @@ from PIL import Image
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
+from taccorl.views.video import codec_of
+from taccorl.views.viewer import can_decode
 
 from .readback import read_rrd
 
@@ -31,7 +35,13 @@ def test_dataset_becomes_an_rrd_with_its_own_numbers_and_videos(dataset: Path, t
     assert main(["view", str(dataset), "--episode=1", f"--save={out}"]) == 0
     assert f"wrote {out}" in capsys.readouterr().out
     found, episode = read_rrd(out), Dataset(dataset).episode(1)
-    frames = found["/observation/images/front"]["VideoFrameReference:timestamp"]
+    # A video that the Rerun program here could not decode is saved as pictures, as the command's note says.
+    shown_as = (
+        "VideoFrameReference:timestamp"
+        if can_decode(codec_of(episode.videos["observation.images.front"]))
+        else "EncodedImage:blob"
+    )
+    frames = found["/observation/images/front"][shown_as]
     assert frames.frame_index == list(range(episode.num_rows))
     shown = np.array([v[0] for v in found["/observation/tactile/left_a"]["DepthImage:buffer"].values], dtype=np.uint8)
     pad = episode.pads("observation.tactile")["left_a"]
@@ -89,6 +99,41 @@ def test_what_cannot_be_done_says_why_and_what_to_do(
     assert message in error
     assert len(error.splitlines()) == 1
     assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("option", ["save=x.rrd", "sheet=x.png"])
+@pytest.mark.parametrize("is_there", [False, True])
+def test_on_a_full_disk_one_line_says_so_and_an_earlier_file_is_kept(
+    option: str, is_there: bool, dataset: Path, tmp_path: Path, capfd, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    out, limits = Path(option.partition("=")[2]), resource.getrlimit(resource.RLIMIT_FSIZE)
+    if is_there:
+        assert main(["view", str(dataset), f"--{option}"]) == 0
+        assert out.stat().st_size > 20_000  # so the limit below falls in the middle
+    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
+    capfd.readouterr()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # the kernel refuses to write more, as when full
+    try:
+        assert main(["view", str(dataset), f"--{option}"]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said, error = capfd.readouterr()  # of the whole process: Rerun's own log, too
+    assert "wrote" not in said
+    kept = "; the earlier file is as it was" if is_there else ""
+    assert error == f"taccorl view: {out}: not written: File too large{kept}. Make room, or give another place\n"
+    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_printed_commands_can_be_pasted_whatever_the_path(dataset: Path, tmp_path: Path, capsys):
+    folder = tmp_path / "Anna's données"
+    assert main(["view", str(dataset), f"--save={folder}/x y.rrd"]) == 2
+    assert shlex.split(capsys.readouterr().err.partition("make it first: ")[2]) == ["mkdir", "-p", str(folder)]
+    folder.mkdir()
+    assert main(["view", str(dataset), f"--save={folder}/x y.rrd"]) == 0
+    program, path = shlex.split(capsys.readouterr().out.partition("look at it with ")[2])
+    assert Path(program).name == "rerun"
+    assert Path(path).read_bytes().startswith(b"RRF2")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

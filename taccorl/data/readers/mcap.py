@@ -21,6 +21,7 @@ from taccorl.data.mcap_records import (
     CHANNEL,
     CHUNK,
     DATA_END,
+    DATA_END_BYTES,
     MAGIC,
     MESSAGE,
     METADATA,
@@ -187,7 +188,7 @@ class _File:
             raise RecordingError(
                 f"{self.path}: is not an MCAP file: begins with {head!r}, not {MAGIC!r}, and holds no chunk"
             )
-        self._damaged(0, start, "not the beginning of an MCAP file")
+        self._damaged(0, start, "not the beginning of an MCAP file", lost=start != len(MAGIC))
         return start
 
     def _walk(self, mcap: McapFile) -> Iterator[Record]:
@@ -198,8 +199,9 @@ class _File:
             if record is None:
                 following = self._resume(mcap, sure, offset)
                 if following is None:
-                    cut = "the file ends without a footer (cut by a crash?)"
-                    self._damaged(offset, mcap.end, cut if mcap.summary.end is None else "a damaged record")
+                    cut = mcap.summary.end is None
+                    reason = "the file ends without a footer (cut by a crash?)" if cut else "a damaged end of the data"
+                    self._damaged(offset, mcap.end, reason, lost=cut or mcap.end - offset > DATA_END_BYTES)
                     return
                 start = offset if offset < following else sure
                 self._damaged(start, following, "a record header that makes no sense")
@@ -278,7 +280,8 @@ class _File:
         if mcap.summary.problem or self.data_end.end != mcap.end:
             problem = mcap.summary.problem or "it begins elsewhere"
             reason = f"no index behind the data ({problem}): nothing there was read"
-            self.damage.append(Damage(str(self.path), self.data_end.end, mcap.size, reason, lost=False))
+            another = mcap.find(self.data_end.end, mcap.end, {CHUNK, DATA_END})  # no index holds these: joined files
+            self._damaged(self.data_end.end, mcap.size, reason, lost=another is not None)
 
     def _convert(self, found: list[Any], proven: bool, place: Record) -> Iterator[Message]:
         for r in found:
@@ -330,9 +333,8 @@ class _File:
         if table.get(number) != definition:
             if (kind, number) in self.known.proven and not proven:
                 if place is not None:
-                    self._damaged(
-                        place.offset, place.end, f"a damaged {kind.__name__.lower()}; the index's copy is used"
-                    )
+                    reason = f"a damaged {kind.__name__.lower()}; the index's copy is used"
+                    self._damaged(place.offset, place.end, reason, lost=False)
                 return
             table[number] = definition
             for channel in self.known.channels.values():
@@ -356,6 +358,6 @@ class _File:
             type_name(self.known.schema(channel)), channel.message_encoding, problem
         )
 
-    def _damaged(self, start: int, end: int, reason: str, chunk: Chunk | None = None) -> None:
+    def _damaged(self, start: int, end: int, reason: str, chunk: Chunk | None = None, *, lost: bool = True) -> None:
         times = (chunk.message_start_time, chunk.message_end_time) if chunk is not None else (None, None)
-        self.damage.append(Damage(str(self.path), start, end, reason, *times))
+        self.damage.append(Damage(str(self.path), start, end, reason, *times, lost=lost))

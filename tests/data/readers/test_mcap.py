@@ -437,7 +437,7 @@ def check_salvage(path: Path, layout: str, first: int, last: int, *, shifted: bo
                 p,
                 reader.damage,
             )
-    assert not lost or reader.damage
+    assert not lost or any(d.lost for d in reader.damage)
     assert len(list(reader.messages(None))) >= len(found) - len(altered)  # looking at times only survives it too
     return reader
 
@@ -564,13 +564,13 @@ def test_a_wrong_byte_in_a_message_outside_chunks_is_noticed_by_the_data_crc(tmp
 def test_unprotected_messages_that_do_not_decode_are_damage_but_a_wrong_schema_is_an_error(tmp_path):
     data = bytearray(FILES["unchunked"])
     pads = [p for log, p in PLACES["unchunked"].items() if (log - T0_NS) // STEP_NS % 4 == 2]
-    for p in pads[:3]:
+    assert len(pads) == 12
+    for p in pads[:10]:
         data[p.end - 1] = ord("!")
     reader = reader_of(write(tmp_path, bytes(data)))
-    assert delivered(reader) == [m for m in EXPECTED if PLACES["unchunked"][m[1]] not in pads[:3]]
-    assert [(d.byte_start, d.byte_end) for d in reader.damage] == [(p.start, p.end) for p in pads[:3]]
-    for p in pads:
-        data[p.end - 1] = ord("!")
+    assert delivered(reader) == [m for m in EXPECTED if PLACES["unchunked"][m[1]] not in pads[:10]]
+    assert [(d.byte_start, d.byte_end) for d in reader.damage] == [(p.start, p.end) for p in pads[:10]]
+    data[pads[10].end - 1] = ord("!")  # the eleventh
     with pytest.raises(RecordingError, match=r"/pad: .* does not fit its schema Pad"):
         delivered(reader_of(write(tmp_path, bytes(data))))
 
@@ -593,7 +593,16 @@ def test_a_zeroed_page_at_the_beginning_is_survived(tmp_path, layout):
 def test_a_wrong_magic_alone_costs_nothing(tmp_path, layout):
     reader = check_salvage(write(tmp_path, b"\0" + FILES[layout][1:]), layout, 0, 1)
     assert delivered(reader) == EXPECTED
-    assert (reader.damage[0].byte_start, reader.damage[0].byte_end) == (0, 8)
+    assert (reader.damage[0].byte_start, reader.damage[0].byte_end, reader.damage[0].lost) == (0, 8, False)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_broken_end_of_the_data_costs_nothing(tmp_path, layout):
+    at, end = place_of(layout, 0x0F)
+    reader = check_salvage(write(tmp_path, flip(layout, at)), layout, at, at + 1)
+    assert delivered(reader) == EXPECTED
+    (damage,) = reader.damage
+    assert (damage.byte_start, damage.byte_end, damage.lost) == (at, end, False)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -603,15 +612,18 @@ def test_garbage_behind_the_file_costs_nothing_and_is_told(tmp_path, layout):
     assert delivered(reader) == EXPECTED
     (damage,) = reader.damage
     assert damage.byte_end == size + 700
+    assert not damage.lost
     assert "nothing there was read" in damage.reason
 
 
-def test_a_second_recording_behind_the_first_is_not_lost_in_silence(tmp_path):
-    reader = reader_of(write(tmp_path, FILES["zstd"] * 2))
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_second_recording_behind_the_first_is_told_as_lost(tmp_path, layout):
+    reader = reader_of(write(tmp_path, FILES[layout] * 2))
     assert delivered(reader) == EXPECTED
     (damage,) = reader.damage
-    assert damage.byte_end == 2 * len(FILES["zstd"])
-    assert damage.byte_start <= len(FILES["zstd"])
+    assert damage.byte_end == 2 * len(FILES[layout])
+    assert damage.byte_start <= len(FILES[layout])
+    assert damage.lost
 
 
 def test_garbage_before_the_file_costs_nothing_where_there_are_chunks(tmp_path):
@@ -673,17 +685,29 @@ def test_a_chunk_is_found_again_beside_what_only_looks_like_one(tmp_path):
     ]
 
 
+def with_bytes_before(at: int, more: bytes) -> bytes:
+    """The zstd file with ``more`` put in at ``at``, behind all that its index points to, and the index made right again."""
+    data, (_, summary), (footer, _) = FILES["zstd"], place_of("zstd", 0x0F), place_of("zstd", 0x02)
+    moved = data[summary:footer] + struct.pack("<BQQQ", 0x02, 20, summary + len(more), 0)
+    crc = struct.pack("<I", zlib.crc32(moved))
+    return data[:at] + more + data[at:summary] + moved + crc + mcap_records.MAGIC
+
+
 def test_an_applications_own_record_is_passed_over(tmp_path):
-    """The MCAP specification leaves kinds 0x80 and above to applications. Here one stands before the end-of-data record."""
-    data, (at, summary) = FILES["zstd"], place_of("zstd", 0x0F)
+    """The MCAP specification leaves kinds 0x80 and above to applications."""
     private = struct.pack("<BQ", 0x90, 50) + bytes(50)
-    moved, footer = data[summary : place_of("zstd", 0x02)[0]], struct.pack("<BQQQ", 0x02, 20, summary + len(private), 0)
-    crc = struct.pack("<I", zlib.crc32(moved + footer))
-    reader = reader_of(
-        write(tmp_path, data[:at] + private + data[at:summary] + moved + footer + crc + mcap_records.MAGIC)
-    )
+    reader = reader_of(write(tmp_path, with_bytes_before(place_of("zstd", 0x0F)[0], private)))
     assert delivered(reader) == EXPECTED
     assert reader.damage == []
+
+
+def test_bytes_between_the_data_and_its_index_are_told(tmp_path):
+    end = place_of("zstd", 0x0F)[1]
+    reader = reader_of(write(tmp_path, with_bytes_before(end, b"x" * 77)))
+    assert delivered(reader) == EXPECTED
+    (damage,) = reader.damage
+    assert damage.byte_start == end
+    assert not damage.lost
 
 
 # --- bombs
@@ -745,6 +769,30 @@ def bounded_memory():
             tracemalloc.stop()
 
     return bounded
+
+
+@pytest.mark.parametrize(
+    ("compression", "beyond", "claim", "reason"),
+    [
+        ("br", 0, 0, "compression 'br' is not read"),
+        ("", 5, 0, "a record reaches beyond its end"),
+        ("", 0, 3, "bytes uncompressed, it claims"),
+        ("zstd", 0, 0, "chunk lost (ZstdError"),
+        ("lz4", 0, 0, "chunk lost (RuntimeError"),
+    ],
+)
+def test_a_chunk_without_crc_must_at_least_hold_together(tmp_path, compression, beyond, claim, reason):
+    """One message in it, whose length reaches ``beyond`` the chunk; the chunk claims ``claim`` bytes too many."""
+    data = struct.pack("<BQHIQQ", 0x05, 22 + 4 + beyond, 1, 0, T0_NS + 5, 0) + b"1234"
+    reader = reader_of(write(tmp_path, mcap_with_chunk(Chunk(compression, data, T0_NS, T0_NS, 0, len(data) + claim))))
+    assert [m.log_ns for m in reader.messages(("/lone",))] == [T0_NS, T0_NS + 1]
+    assert reason in reader.damage[0].reason
+
+
+def test_a_chunk_without_crc_that_holds_together_is_read(tmp_path):
+    data = struct.pack("<BQHIQQ", 0x05, 22 + 4, 1, 0, T0_NS + 5, 0) + b"1234"
+    reader = reader_of(write(tmp_path, mcap_with_chunk(Chunk("", data, T0_NS, T0_NS, 0, len(data)))))
+    assert [m.value for m in reader.messages(("/lone",))] == [1, 1234, 1]
 
 
 def test_a_chunk_larger_than_memory_is_not_read(tmp_path, bounded_memory):

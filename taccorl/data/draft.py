@@ -1,0 +1,287 @@
+"""Two specs to start from, drafted after a look at a recording: how it is read, and what its dataset holds.
+
+What the recording tells is filled in: topics, types, names of joints, rates, shapes. What it cannot tell (units, valid ranges,
+the instruction) is ``TODO`` with a comment that says what to write there.
+"""
+
+import itertools
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from taccorl.data.inspection import JOINTS, PICTURES, TEXTS, Inventory, TopicSummary
+from taccorl.data.spec import UNITS, data_specs_folder, load_sensor_spec
+
+COMMAND_WORDS = ("command", "cmd", "ctrl", "target", "action", "master", "leader", "desired", "goal")
+STATE_WORDS = ("qpos", "state", "position", "joint")
+YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
+PICTURE_SHAPE = (224, 224, 3)
+"""What π0.5 looks at; pictures are letterboxed to it."""
+FPS = 30
+"""Rows a second where no camera says what would be natural."""
+STALE_PERIODS = 2.4
+"""A sample may be late by this many periods before a row counts as stale."""
+
+
+class Drafts(NamedTuple):
+    """Two YAML texts."""
+
+    recording: str
+    dataset: str
+
+
+def dataset_path(path: Path) -> Path:
+    """Where the dataset spec lies that goes with a recording spec at ``path``."""
+    return path.with_name(f"{path.stem}_dataset.yaml")
+
+
+def draft_specs(inventory: Inventory, path: Path = Path("draft.yaml")) -> Drafts:
+    """A recording spec to lie at ``path``, and the dataset spec beside it that it names."""
+    roles = _roles(inventory)
+    return Drafts(_recording(inventory, roles, path), _dataset(inventory, roles, path))
+
+
+# ---- which topic is what ----
+
+
+@dataclass(frozen=True)
+class _Roles:
+    states: list[TopicSummary]
+    commands: list[TopicSummary]
+    """Empty: no topic is named as a command."""
+    pictures: list[TopicSummary]
+    pads: list[TopicSummary]
+    """Of one sensor."""
+    spare: list[TopicSummary]
+    """Other topics with numbers: any of them may be what the user wants."""
+    names: dict[str, str]
+    """Topic → channel."""
+
+    @property
+    def used(self) -> list[TopicSummary]:
+        return [*self.states, *self.commands, *self.pictures, *self.pads]
+
+
+def _roles(inventory: Inventory) -> _Roles:
+    useful = [t for t in inventory.topics if t.num_messages and not t.problem]
+    topics = {t.topic for t in useful}
+    pictures = [t for t in useful if t.holds(PICTURES) or (t.type.shape is not None and len(t.type.shape) == 3)]
+    pictures = [t for t in pictures if "depth" not in t.topic.lower() and f"{t.topic}/compressed" not in topics]
+    pads = [t for t in useful if t.sensor]
+    pads = [t for t in pads if t.sensor == pads[0].sensor]
+    numbers = [t for t in useful if t.num_values and not t.sensor]
+    commands = [t for t in numbers if _says(t, COMMAND_WORDS)]
+    commands = [t for t in commands if t.names] or commands
+    measured = [t for t in numbers if not _says(t, COMMAND_WORDS)]
+    states = [t for t in measured if t.names] or [t for t in measured if _says(t, STATE_WORDS)]
+    states = _one_of_each(states) or (measured if len(measured) == 1 else [])
+    # a mobile base has commands of its own: one topic that alone commands all of the state is enough
+    commands = next(([t] for t in commands if t.num_values == sum(s.num_values or 0 for s in states)), commands)
+    spare = [t for t in numbers if t not in commands and t not in states]
+    return _Roles(states, commands, pictures, pads, spare, _channel_names(useful))
+
+
+def _one_of_each(topics: list[TopicSummary]) -> list[TopicSummary]:
+    """Of several topics with the same joints of the same arm, the one that is named most as a state."""
+    best: dict[Any, TopicSummary] = {}
+    for t in sorted(topics, key=lambda t: (not _says(t, STATE_WORDS), len(t.topic))):
+        best.setdefault((t.names or t.topic, _side(t)), t)
+    return [t for t in topics if t in best.values()]
+
+
+def _side(t: TopicSummary) -> str:
+    words = re.split(r"[^a-z]+", t.topic.lower())
+    return next((w for w in words if w in ("left", "right")), "")
+
+
+def _says(t: TopicSummary, hints: tuple[str, ...]) -> bool:
+    """One of the words of its topic is, or begins with, one of ``hints``."""
+    return any(word.startswith(hints) for word in re.split(r"[^a-z]+", t.topic.lower()))
+
+
+def _channel_names(topics: list[TopicSummary]) -> dict[str, str]:
+    """Topic → a short name of its own."""
+    names: dict[str, str] = {}
+    for t in topics:
+        words = re.sub(r"[^A-Za-z0-9/]+", "_", t.topic).strip("/_").split("/")
+        short = [w for w in words if w not in ("image_raw", "compressed", "color")]
+        name = re.sub(r"^observations?_(images_)?", "", "_".join(short)) or "channel"
+        name = "_".join(words) if name in names.values() else name
+        name = name if name[0].isalpha() and name.lower() not in YAML_WORDS else f"channel_{name}"
+        numbered = (f"{name}_{k}" for k in itertools.count(2))
+        names[t.topic] = name if name not in names.values() else next(n for n in numbered if n not in names.values())
+    return names
+
+
+# ---- the recording spec ----
+
+
+def _recording(inventory: Inventory, roles: _Roles, path: Path) -> str:
+    stamped = [t for t in roles.used if t.stamped]
+    clock = "header" if stamped and not any(t.sim_time for t in stamped) else "log"
+    texts = [t for t in inventory.topics if t.num_messages and t.holds(TEXTS)]
+    known = inventory.times_known
+    rate = "" if known else f"; rate_hz: the recorder's rows a second, max_age_s: {STALE_PERIODS} / rate_hz"
+    unused = [t for t in inventory.topics if t not in roles.used and t not in roles.spare and t not in texts]
+    lines = [
+        *_head(inventory),
+        f"dataset: {_yaml(dataset_path(path).name)}   # what the dataset shall hold, drafted beside this file",
+        f"reader: {inventory.reader}",
+        f"clock: {clock}",
+        "episodes: {by: whole_file, min_s: 1.0}"
+        + (f"   # or {{by: markers, topic: {_yaml(texts[0].topic)}, min_s: 1.0}}" if texts else ""),
+        "instruction: {from: topic, topic: task}"
+        if inventory.reader == "lerobot"
+        else "instruction: {from: spec, text: TODO}   # the sentence that the policy reads: pick up the cup",
+        f"channels:   # each must be used by a feature below{rate}",
+        *(f"  {roles.names[t.topic]}: {_channel(t, clock, known)}" for t in roles.used),
+        *(f"  # {roles.names[t.topic]}: {_channel(t, clock, known)}" for t in roles.spare),
+        *(f"  # not used: {' '.join((t.problem or f'{t.topic} ({t.type.name})').split())}" for t in unused),
+        "features:   # several channels are joined in the order of the list",
+        *_mappings(roles),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _head(inventory: Inventory) -> list[str]:
+    return [
+        f"# Draft from {' '.join(inventory.source.name.split())}: replace every TODO as the comment behind it says,",
+        "# check every line; `taccorl ingest … --dry_run=true` tells what is still wrong.",
+        "spec_version: 1",
+    ]
+
+
+def _mappings(roles: _Roles) -> list[str]:
+    def line(key: str, topics: list[TopicSummary]) -> str:
+        return f"  {key}: {{channels: [{', '.join(roles.names[t.topic] for t in topics)}], align: asof}}"
+
+    found = [line("observation.state", roles.states)] if roles.states else []
+    if roles.commands:
+        found.append(line("action", roles.commands))
+    elif roles.states:
+        states = ", ".join(roles.names[t.topic] for t in roles.states)
+        spare = " or ".join(roles.names[t.topic] for t in roles.spare)
+        other = f"{spare} (uncomment it above), or " if spare else ""
+        found.append(
+            f"  action: {{channels: [TODO], align: asof}}   # no topic is named as a command: {other}{states}, as measured"
+        )
+    found += [line(f"observation.images.{roles.names[t.topic]}", [t]) for t in roles.pictures]
+    return found + ([line("observation.tactile", roles.pads)] if roles.pads else [])
+
+
+def _channel(t: TopicSummary, clock: str, rate_known: bool) -> str:
+    parts = [f"topic: {_yaml(t.topic)}"]
+    if t.type.name and t.type.name != "no schema" and t.type.shape is None:
+        parts.append(f"type: {_yaml(t.type.name)}")
+    if t.holds(JOINTS):
+        parts += ["field: position", f"pick: [{', '.join(_yaml(n) for n in t.names)}]"]
+    elif t.num_values and t.type.shape is None:
+        parts.append("field: data")
+    if clock == "header" and not t.stamped:
+        parts.append("clock: log")
+    if clock == "header" and t.zero_stamps:
+        parts.append("drop_zero_stamp: true")
+    if rate_known:
+        rate_hz = _rate_hz([t])
+        parts += [f"rate_hz: {rate_hz:g}", f"max_age_s: {max(0.03, round(STALE_PERIODS / rate_hz, 3)):g}"]
+    else:
+        parts += ["rate_hz: TODO", "max_age_s: TODO"]
+    return "{" + ", ".join(parts) + "}"
+
+
+# ---- the dataset spec ----
+
+
+def _dataset(inventory: Inventory, roles: _Roles, path: Path) -> str:
+    known = inventory.times_known
+    pace = [t for t in roles.pictures or roles.states if t.rate_hz]
+    fps = max(1, round(min(FPS, _rate_hz(pace)))) if pace else FPS
+    unknown = "TODO   # the recorder's rows a second, as rate_hz below"
+    lines = [
+        *_head(inventory),
+        "# Two PiPER arms with FlexiTac pads? Then name data_specs/taccorl_bimanual.yaml and its features instead.",
+        f"name: {_yaml(re.sub(r'[^A-Za-z0-9_]+', '_', path.stem))}",
+        "robot_type: my_robot   # any name, the same for all datasets of this robot",
+        f"fps: {fps if known else unknown}",
+        "features:",
+    ]
+    elements = _elements(roles.states, roles)
+    if roles.states:
+        lines += _numbers("observation.state", roles.states, elements, known)
+    else:
+        lines.append("  # no observation.state: no topic here is named or shaped like joint positions")
+    if roles.commands:
+        own = _elements(roles.commands, roles)
+        # one order of the same joints keeps one set of names, whatever the topics are called
+        same = [t.names for t in roles.commands] == [t.names for t in roles.states]
+        lines += _numbers("action", roles.commands, elements if same else own, known)
+    elif roles.states:
+        lines += ["  # as observation.state; another number of values if the channels of `action` have another"]
+        lines += _numbers("action", roles.states, elements, known)
+    for t in roles.pictures:
+        name, rate = roles.names[t.topic], f"{_rate_hz([t]):g}" if known else "TODO"
+        lines += [
+            f"  observation.images.{name}:",
+            f"    {{dtype: video, shape: {list(PICTURE_SHAPE)}, unit: rgb8, frame: {name}_optical, rate_hz: {rate}, "
+            "range: [0, 255]}",
+        ]
+    return "\n".join(lines + (_touch(roles, known) if roles.pads else [])) + "\n"
+
+
+def _elements(topics: list[TopicSummary], roles: _Roles) -> list[str]:
+    """A name for each value, with its arm's in front where there are several; none where messages name nothing."""
+    if not all(t.names for t in topics):
+        return []
+    found: list[str] = []
+    for t in topics:
+        prefix = f"{_side(t) or roles.names[t.topic]}_" if len(topics) > 1 else ""
+        for name in t.names:
+            plain = re.sub(r"[^A-Za-z0-9_.]+", "_", name).strip("_") or "joint"
+            full = plain if plain.startswith(prefix) else f"{prefix}{plain}"
+            full = full if full.endswith(".pos") else f"{full}.pos"
+            found.append(full if full not in found else f"{len(found)}_{full}")
+    return found
+
+
+def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: bool) -> list[str]:
+    size = sum(t.num_values or 0 for t in topics)
+    each = elements[0] if elements else ""
+    units = ", ".join(u for u in UNITS if u not in ("adc_count", "rgb8", "unknown"))
+    return [
+        f"  {key}:",
+        "    dtype: float32",
+        f"    shape: [{size}]",
+        *([f"    names: [{', '.join(_yaml(n) for n in elements)}]"] if elements else []),
+        f"    unit: TODO   # one for all, rad, or a list of {size}, [rad, …, m]; known: {units}",
+        "    frame: joint",
+        f"    rate_hz: {f'{_rate_hz(topics):g}' if known else 'TODO'}",
+        "    range: TODO   # lowest and highest valid value for all, [-3.14, 3.14]"
+        + (f", or for each: {{{each}: [-2.6, 2.6], …}}" if each else ""),
+    ]
+
+
+def _touch(roles: _Roles, known: bool) -> list[str]:
+    sensor_path = data_specs_folder() / "sensors" / f"{roles.pads[0].sensor}.yaml"
+    sensor = load_sensor_spec(sensor_path)
+    pads = [roles.names[t.topic] for t in roles.pads]
+    rate, size = f"{_rate_hz(roles.pads):g}" if known else "TODO", len(pads) * sensor.rows * sensor.columns
+    return [
+        "  observation.tactile:",
+        f"    {{dtype: int16, shape: [{size}], unit: {sensor.unit}, frame: pad, rate_hz: {rate}, "
+        f"range: [{-sensor.max_count}, {sensor.max_count}],",
+        f"     sensor: {_yaml(str(sensor_path))}, pads: [{', '.join(pads)}]}}",
+    ]
+
+
+def _rate_hz(topics: list[TopicSummary]) -> float:
+    """The slowest one's, to three digits; a whole number if it is that within 1 %."""
+    rate_hz = min(t.rate_hz or 1.0 for t in topics)
+    return float(f"{rate_hz:.3g}") if abs(round(rate_hz) - rate_hz) > 0.01 * rate_hz else float(round(rate_hz))
+
+
+def _yaml(text: str) -> str:
+    """A text as YAML reads it back; quoted unless it is plainly a name or path."""
+    plain = re.fullmatch(r"/?[A-Za-z_][A-Za-z0-9_/.-]*", text)
+    return text if plain and text.lower() not in YAML_WORDS else json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,40 @@
+"""What an artefact's inputs were made from, and theirs: a published manifest carries it, for the store may be emptied."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from taccorl.lineage.manifest import read_manifest
+
+CARRIED = ("stage", "stage_version", "key", "digest", "created", "config", "config_not_default", "inputs")
+
+Manifest = dict[str, Any]
+Entry = dict[str, Any]
+"""An input in a manifest: path, digest, and key if a stage made it."""
+
+
+def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> dict[str, Manifest]:
+    """``{key: the manifest in short}`` of everything above ``inputs`` that a stage made, as far as it can be found."""
+    found: dict[str, Manifest] = {}
+    carried: dict[str, Manifest] = {}
+    todo = list(inputs)
+    while todo:
+        entry = todo.pop()
+        manifest = manifest_of(entry, find_key, carried)
+        if not manifest or manifest["key"] in found:
+            continue
+        found[manifest["key"]] = {name: manifest[name] for name in CARRIED}
+        carried |= manifest.get("ancestors", {})
+        todo += manifest["inputs"]
+    return dict(sorted(found.items()))
+
+
+def manifest_of(entry: Entry, find_key: Callable[[str], Path | None], carried: dict[str, Manifest]) -> Manifest:
+    """What made this input: as it says itself, where it lies or in the store, else as is ``carried``; empty if raw."""
+    key = entry["key"]
+    if key is None:
+        return {}
+    if (manifest := read_manifest(Path(entry["path"]))).get("key") == key:
+        return manifest
+    in_store = find_key(key)
+    return (read_manifest(in_store) if in_store else {}) or carried.get(key, {})

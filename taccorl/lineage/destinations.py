@@ -1,0 +1,41 @@
+"""Where a store published what: one small file per destination, so that `prune` knows what the datasets need."""
+
+import json
+import os
+from pathlib import Path
+
+from taccorl.lineage.digest import digest_bytes
+from taccorl.lineage.manifest import read_manifest
+
+
+class Destinations:
+    """The paths outside a store that it published to, each with the key of what it put there last."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def remember(self, path: Path, key: str) -> None:
+        """Note that the artefact of ``key`` is, or is about to be, at ``path``; one rename, so never half a note."""
+        note = self.folder / f"{digest_bytes(os.fsencode(path))[:32]}.json"
+        content = json.dumps({"path": str(path), "key": key}) + "\n"
+        if note.is_file() and note.read_text(encoding="ascii") == content:
+            return
+        self.folder.mkdir(exist_ok=True)
+        temp = note.with_name(f"{note.name}.{os.getpid()}-{os.urandom(4).hex()}")
+        with temp.open("w", encoding="ascii") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temp.replace(note)
+
+    def present(self) -> list[Path]:
+        """Those that still hold what was published there."""
+        return [path for path, key in self._notes() if read_manifest(path).get("key") == key]
+
+    def gone(self) -> list[Path]:
+        """Those that were removed, moved or replaced."""
+        return [path for path, key in self._notes() if read_manifest(path).get("key") != key]
+
+    def _notes(self) -> list[tuple[Path, str]]:
+        notes = [json.loads(note.read_bytes()) for note in self.folder.glob("*.json")]
+        return sorted((Path(note["path"]), note["key"]) for note in notes)

@@ -1,0 +1,56 @@
+"""``taccorl ingest inspect`` over folders, and over files of other people's kinds."""
+
+from pathlib import Path
+
+import pytest
+
+from taccorl.cli.main import main
+from taccorl.demos.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
+
+SMALL = StandInConfig(duration_s=2.0, camera_size=(96, 128))
+
+
+def test_one_bad_entry_of_a_folder_does_not_hide_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_mcap(tmp_path / "good.mcap", SMALL)
+    (tmp_path / "v21/meta").mkdir(parents=True)
+    (tmp_path / "v21/meta/info.json").write_text('{"codebase_version": "v2.1"}')
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "zero.mcap").touch()
+    assert main(["ingest", "inspect", str(tmp_path)]) == 1
+    printed = capsys.readouterr().out
+    assert "piper_flexitac_mcap" in printed
+    assert f"{tmp_path}: not read: notes.txt (no recording)" in printed
+    assert f"{tmp_path}: not read: v21 (is a LeRobot v2.1 dataset" in printed
+    assert f"{tmp_path / 'zero.mcap'}: is empty (0 bytes)" in printed
+    assert printed.count("zero.mcap") == 1
+
+
+def test_times_that_the_reader_made_up_are_not_shown_as_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_cobot_magic_hdf5(tmp_path / "a.hdf5", SMALL)
+    assert main(["ingest", "inspect", str(tmp_path / "a.hdf5")]) == 0
+    printed = capsys.readouterr().out
+    assert "hdf5, – s" in printed
+    [row] = [line for line in printed.splitlines() if line.startswith("/observations/qpos")]
+    assert row.split() == ["/observations/qpos", "float32", "60", "–", "–", "–", "–"]
+
+
+def test_what_is_wrong_comes_instead_of_a_spec_that_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.mcap"
+    write_mcap(path, StandInConfig(duration_s=2.0, camera_size=(96, 128), sim_time_stamps=True))
+    main(["ingest", "inspect", str(path)])
+    printed = capsys.readouterr().out
+    assert "fits the shipped spec" not in printed
+    assert "has the topics of the shipped spec piper_flexitac_mcap, but" in printed
+    assert "stamped in simulation time" in printed
+
+
+def test_without_a_spec_that_fits_both_drafts_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.mcap"
+    write_mcap(path, StandInConfig(duration_s=2.0, camera_size=(96, 128), encoding="json"))
+    assert main(["ingest", "inspect", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert "no shipped spec fits" in printed
+    assert "dataset: draft_dataset.yaml" in printed and "draft_dataset.yaml: what its dataset holds" in printed
+    assert list(tmp_path.iterdir()) == [path]

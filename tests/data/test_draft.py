@@ -1,0 +1,235 @@
+"""Drafts are specs once their TODOs are replaced as the comments say: a recording of any robot goes through the real command."""
+
+import base64
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from mcap.writer import Writer
+from mcap_ros2.writer import Writer as Ros2Writer
+
+from taccorl.cli.main import main
+from taccorl.data.dataset import Dataset
+from taccorl.data.draft import Drafts, draft_specs
+from taccorl.data.inspection import inspect_source
+from taccorl.data.recording import find_sources
+from taccorl.data.spec import load_recording_spec
+from taccorl.demos.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
+from taccorl.errors import RecordingError, SpecError
+
+BAGS = Path("/work/shared/data/bags")
+START_NS = 1_780_000_000 * 10**9
+JOINTS = [f"panda_joint{k}" for k in range(1, 8)]
+PIXEL = base64.b64encode(cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes()).decode()
+HEADER = """
+===
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+===
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+JOINT_STATE = "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort" + HEADER
+PICTURE = "std_msgs/Header header\nstring format\nuint8[] data" + HEADER
+
+
+def drafted(path: Path, name: str = "mine.yaml") -> Drafts:
+    return draft_specs(inspect_source(*find_sources(path)[0]), Path(name))
+
+
+def one_arm(path: Path, command: str = "/arm/joint_command", duration_s: float = 4.0) -> Path:
+    """A seven-joint arm with one camera, as its ROS 2 drivers would write it: joints at 100 Hz, JPEG at 15 Hz."""
+    with path.open("wb") as file:
+        writer = Ros2Writer(file)
+        joints = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+        pictures = writer.register_msgdef("sensor_msgs/msg/CompressedImage", PICTURE)
+        for k in range(round(duration_s * 100)):
+            time_ns = START_NS + k * 10**7
+            header = {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}, "frame_id": ""}
+            for topic, lag in (("/arm/joint_states", 0.1), (command, 0.0)):
+                position = [0.3 * np.sin(k / 100 + j - lag) for j in range(7)]
+                message = {"header": header, "name": JOINTS, "position": position, "velocity": [], "effort": []}
+                writer.write_message(topic, joints, message, time_ns + 10**6, time_ns)
+            if k % 7 == 0:
+                image = np.random.default_rng(k).integers(0, 255, (12, 16, 3), np.uint8).repeat(10, 0).repeat(10, 1)
+                data = cv2.imencode(".jpg", image)[1].tobytes()
+                message = {"header": header, "format": "jpeg", "data": data}
+                writer.write_message("/wrist/image_raw/compressed", pictures, message, time_ns + 10**6, time_ns)
+        writer.finish()
+    return path
+
+
+def fill_in(folder: Path, **values: str) -> None:
+    """The first thing that the comment behind each TODO proposes, no other line touched."""
+    written = {"text": "pick up the cup", "unit": "rad", "range": "[-3.14, 3.14]", **values}
+    for path in folder.glob("mine*.yaml"):
+        text = re.sub(r"(\w+): (\[?)TODO(?=\b)", lambda m: f"{m[1]}: {m[2]}{written[m[1]]}", path.read_text())
+        path.write_text(text)
+        assert "TODO" not in "".join(line.split("#")[0] for line in text.splitlines())
+
+
+def inspect_and_ingest(recording: Path, folder: Path, **values: str) -> Dataset:
+    assert main(["ingest", "inspect", str(recording), f"--draft={folder / 'mine.yaml'}"]) == 0
+    fill_in(folder, **values)
+    words = [str(recording), f"--spec={folder / 'mine.yaml'}", f"--out={folder / 'out'}", f"--store={folder / 'store'}"]
+    assert main(["ingest", *words]) == 0
+    return Dataset(folder / "out")
+
+
+def test_a_robot_with_one_arm_and_one_camera_is_ingested_by_its_drafts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = inspect_and_ingest(one_arm(tmp_path / "a.mcap"), tmp_path)
+    printed = capsys.readouterr().out
+    assert f"names of /arm/joint_states: {', '.join(JOINTS)}" in printed
+    assert f"and of its dataset: {tmp_path / 'mine_dataset.yaml'}" in printed
+    assert set(dataset.spec.features) == {"observation.state", "action", "observation.images.wrist"}
+    assert dataset.spec.features["action"].names == tuple(f"{name}.pos" for name in JOINTS)
+    assert dataset.spec.features["observation.images.wrist"].shape == (224, 224, 3)
+    assert dataset.spec.fps == 14  # 100 / 7 pictures a second
+    episode = dataset.episode(0)
+    at_s = (episode.start_ns - START_NS) * 1e-9 + np.arange(episode.num_rows) / 14
+    assert episode.num_rows > 50
+    for key, lag in (("observation.state", 0.1), ("action", 0.0)):
+        expected = 0.3 * np.sin(at_s[:, None] + np.arange(7) - lag)
+        # the newest sample may be 10 ms old, and 0.3 rad/s is the fastest
+        assert np.abs(episode.arrays[key] - expected).max() < 0.3 * 0.011
+
+
+@pytest.mark.parametrize("chosen", ["teach_values", "arm_joint_states"])
+def test_without_a_topic_named_as_a_command_the_user_chooses(chosen: str, tmp_path: Path) -> None:
+    path = one_arm(tmp_path / "a.mcap", command="/teach/values", duration_s=0.5)
+    assert main(["ingest", "inspect", str(path), f"--draft={tmp_path / 'mine.yaml'}"]) == 0
+    text = (tmp_path / "mine.yaml").read_text()
+    [action] = [line for line in text.splitlines() if line.startswith("  action:")]
+    assert action.endswith(
+        "# no topic is named as a command: teach_values (uncomment it above), or arm_joint_states, as measured"
+    )
+    if chosen == "teach_values":
+        text = text.replace("  # teach_values: ", "  teach_values: ")
+    (tmp_path / "mine.yaml").write_text(text)
+    fill_in(tmp_path, channels=chosen)
+    spec = load_recording_spec(tmp_path / "mine.yaml")
+    assert spec.features["action"].channels == (chosen,)
+    assert spec.features["observation.state"].channels == ("arm_joint_states",)
+
+
+@pytest.mark.parametrize("encoding", ["ros2", "json", "protobuf"])
+def test_two_arms_with_pads_are_drafted_with_touch_in_any_encoding(encoding: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_mcap(path, StandInConfig(duration_s=2.0, camera_size=(96, 128), encoding=encoding))
+    drafts = drafted(path)
+    (tmp_path / "mine.yaml").write_text(drafts.recording)
+    (tmp_path / "mine_dataset.yaml").write_text(drafts.dataset)
+    fill_in(tmp_path)
+    spec = load_recording_spec(tmp_path / "mine.yaml")
+    names = spec.target.features["observation.state"].names
+    assert (names[0], names[13], len(names)) == ("left_joint1.pos", "right_gripper.pos", 14)
+    assert spec.target.features["action"].names == names
+    assert spec.target.features["observation.tactile"].size == 4 * 32 * 12
+    assert spec.target.sensors["observation.tactile"].name == "flexitac_v2"
+    assert spec.channels["joint_states_ctrl_left"].pick[-1] == "gripper"
+    assert spec.clock == "header" and spec.clock_of("left_robot_left_finger") == "log"
+
+
+def test_a_touching_draft_of_the_stand_in_ingests(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_mcap(path, StandInConfig(duration_s=2.5, camera_size=(96, 128)))
+    dataset = inspect_and_ingest(path, tmp_path)
+    assert dataset.num_rows(0) > 60
+    assert np.abs(dataset.episode(0).arrays["observation.tactile"]).max() > 30
+
+
+def test_a_file_that_names_no_rate_leaves_it_to_the_user(tmp_path: Path) -> None:
+    path = tmp_path / "a.hdf5"
+    write_cobot_magic_hdf5(path, StandInConfig(duration_s=2.0, camera_size=(96, 128)))
+    drafts = drafted(path)
+    assert "qpos: {topic: /observations/qpos, rate_hz: TODO, max_age_s: TODO}" in drafts.recording
+    dataset = inspect_and_ingest(path, tmp_path, rate_hz="30", max_age_s="0.08", fps="30")
+    assert {k: f.size for k, f in dataset.spec.features.items() if f.dtype != "video"} == {
+        "observation.state": 14,
+        "action": 14,  # not with the mobile base's
+    }
+    assert "observation.images.cam_high" in dataset.spec.features
+
+
+def test_drafts_are_no_spec_before_their_todos_are_replaced(tmp_path: Path) -> None:
+    path = one_arm(tmp_path / "a.mcap", duration_s=0.5)
+    drafts = drafted(path)
+    (tmp_path / "mine.yaml").write_text(drafts.recording)
+    (tmp_path / "mine_dataset.yaml").write_text(drafts.dataset)
+    with pytest.raises(SpecError, match=r"mine_dataset.yaml:\d+: .*'TODO'"):
+        load_recording_spec(tmp_path / "mine.yaml")
+    fill_in(tmp_path, unit="TODO".lower())
+    with pytest.raises(SpecError, match=r"unit: 'todo' is no unit"):
+        load_recording_spec(tmp_path / "mine.yaml")
+
+
+def test_neither_file_of_the_pair_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = one_arm(tmp_path / "a.mcap", duration_s=0.5)
+    (tmp_path / "mine_dataset.yaml").write_text("my work")
+    assert main(["ingest", "inspect", str(path), f"--draft={tmp_path / 'mine.yaml'}"]) == 2
+    assert "mine_dataset.yaml exists" in capsys.readouterr().err
+    assert (tmp_path / "mine_dataset.yaml").read_text() == "my work"
+    assert not (tmp_path / "mine.yaml").exists()
+
+
+def _bag(path: Path, topics: dict[str, str]) -> Path:
+    """JSON topics of these types, three messages each."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for name, kind in topics.items():
+            schema = writer.register_schema(kind, "jsonschema", b'{"type": "object"}')
+            channel = writer.register_channel(name, "json", schema)
+            data = PIXEL if "Image" in kind else [1.0]
+            for k in range(3):
+                writer.add_message(channel, 10**18 + k * 10**7, json.dumps({"data": data}).encode(), publish_time=0)
+        writer.finish()
+    return path
+
+
+def test_topics_with_like_or_odd_names_get_channel_names_of_their_own(tmp_path: Path) -> None:
+    names = {
+        "/cam/image_raw": "sensor_msgs/Image",
+        "/cam/color/image_raw/compressed": "sensor_msgs/CompressedImage",
+        "/cam/compressed": "sensor_msgs/CompressedImage",
+        "/cam-1": "sensor_msgs/Image",
+        "/cam.1": "sensor_msgs/Image",
+        "/a, b: {c} #d": "std_msgs/Float64MultiArray",
+        "123": "std_msgs/Float64MultiArray",
+        "true": "std_msgs/Float64MultiArray",
+        "/": "std_msgs/Float64MultiArray",
+        "/tätig/😀": "std_msgs/Float64MultiArray",
+    }
+    drafts = drafted(_bag(tmp_path / "a.mcap", names))
+    text = re.sub(r"^  # (?!not used)", "  ", drafts.recording, flags=re.MULTILINE)  # those that are spare as well
+    draft = yaml.safe_load(text)
+    channels = draft["channels"]
+    assert {c["topic"] for c in channels.values()} == set(names)
+    assert len(channels) == len(names)
+    assert all(isinstance(name, str) and name[0].isalpha() for name in channels)
+    assert {c["type"] for c in channels.values()} == set(names.values())
+
+
+@pytest.mark.skipif(not BAGS.is_dir(), reason="other people's bags are not here")
+def test_every_draft_of_other_peoples_bags_is_yaml() -> None:
+    drafts = 0
+    for folder in (p for p in sorted(BAGS.rglob("*")) if p.is_dir()):
+        try:
+            sources = find_sources(folder)
+        except RecordingError:
+            continue  # a folder of folders
+        for name, source in sources:
+            pair = draft_specs(inspect_source(name, source))
+            assert {"dataset", "reader", "channels", "features"} <= set(yaml.safe_load(pair.recording))
+            assert {"name", "fps", "features"} <= set(yaml.safe_load(pair.dataset))
+            drafts += 1
+    assert drafts >= 8
