@@ -78,8 +78,8 @@ def _prune(argv: list[str]) -> int:
     total = _megabytes(sum(folder.size_bytes for folder in folders)).strip()
     num_kept = len({path.resolve() for path in (*store.destinations.present(), *config.keep)})
     print(
-        f"{len(folders)} of {_count(len(store.folders()), 'folder')} in {store.root} not needed for "
-        f"{_count(num_kept, 'dataset')}: {total}"
+        f"not needed for {_count(num_kept, 'dataset')}: {len(folders)} of {_count(len(store.folders()), 'folder')} "
+        f"in {store.root}, {total}"
     )
     if gone := store.destinations.gone():
         print(f"{_count(len(gone), 'dataset')} gone or moved; name moved ones with --keep=DATASET:")

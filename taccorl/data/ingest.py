@@ -236,9 +236,9 @@ def _build(job: Job, folder: Path, progress: Progress | None) -> None:
 
     def write(episodes: list[Episode]) -> None:
         rows = sum(e.num_rows for e in episodes)
-        report = None if progress is None else lambda done: progress(job.source.name, done, rows)
         shutil.rmtree(folder / "dataset", ignore_errors=True)
-        write_episodes(episodes, folder / "dataset", progress=report)
+        tell = progress or (lambda name, done, total: None)
+        write_episodes(episodes, folder / "dataset", progress=lambda done: tell(job.source.name, done, rows))
 
     with opened(job.source, job.spec) as recording:
         good, entry = _settle(Cutter(recording), write)

@@ -177,7 +177,8 @@ class Store:
 
     def _origins(self, job: "_Job") -> dict[str, Any]:
         """What a published manifest says more than one in the store: its sources, and what its inputs were made from."""
-        sources = [{"path": str(source.path.absolute()), "digest": source.digest} for source in job.sources]
+        each = dict.fromkeys(job.sources)  # a file of several recordings is named once
+        sources = [{"path": str(source.path.absolute()), "digest": source.digest} for source in each]
         return {
             "sources": sources,
             "ancestors": ancestors([_entry(artefact) for artefact in job.inputs], self.find_key),

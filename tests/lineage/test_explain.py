@@ -104,7 +104,7 @@ def test_store_that_was_moved_is_found_by_key(world, tmp_path):
     moved = Store(tmp_path / "elsewhere")
     assert "not in the store any more" in explain(world.dataset, None)
     assert "not in the store any more" not in explain(world.dataset, moved)
-    (moved.find_key(world.episodes[1].path.name) / "data" / "3.bin").write_text("edited")  # found, so judged
+    (moved.root / "ingest" / world.episodes[1].path.name / "data" / "3.bin").write_text("edited")  # found, so judged
     assert [problem.partition(",")[0] for problem in problems(world.dataset, moved)] == ["changed since: data/3.bin"]
 
 

@@ -167,7 +167,7 @@ def test_command_lists_first_and_deletes_only_with_yes(world, capsys):
     words = ["prune", f"--store={world / 'store'}"]
     assert main([*words, f"--keep={world / 'dataset'}"]) == 0
     out = capsys.readouterr().out
-    assert f"2 of 5 folders in {world / 'store'} not needed for 1 dataset: 0.0 MB" in out
+    assert f"not needed for 1 dataset: 2 of 5 folders in {world / 'store'}, 0.0 MB" in out
     assert "Nothing was deleted" in out
     assert len(Store(world / "store").artefacts()) == 5
     assert main([*words, "--yes=true"]) == 0

@@ -208,7 +208,7 @@ def test_manifest_of_a_destination_names_its_sources_and_carries_the_records_of_
     sources = [store.source(path) for path in sorted(raw.iterdir())]
     episodes = [store.run(INGEST, IngestConfig(), [source]) for source in sources]
     merged = store.run(MERGE_DATASET, IngestConfig(), episodes)
-    made = store.run(ONE, "x", [merged, merged], destination=tmp_path / "d", sources=sources)
+    made = store.run(ONE, "x", [merged, merged], destination=tmp_path / "d", sources=[*sources, *sources])
     assert made.manifest["sources"] == [{"path": str(source.path), "digest": source.digest} for source in sources]
     carried = made.manifest["ancestors"]
     assert set(carried) == {artefact.path.name for artefact in (*episodes, merged)}
