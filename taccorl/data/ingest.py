@@ -121,6 +121,12 @@ def ingest(
     _leave_out_twins(entries)
     report = _report(jobs, entries)
     shards = [(entry, Path(entry["artefact"])) for entry in entries if entry.get("artefact")]
+    sources = [
+        Artefact(path, digest)
+        for job, entry in zip(jobs, entries, strict=True)
+        if entry.get("artefact")
+        for path, digest in zip(job.source.files, entry["source_digests"], strict=True)
+    ]
     for entry in entries:
         entry.pop("artefact", None)
     if not shards or store is None or any(job.dry_run for job in jobs):
@@ -138,12 +144,12 @@ def ingest(
     inputs = [Artefact(path, json.loads((path / "manifest.json").read_text())["digest"]) for _, path in shards]
     try:
         try:
-            store.run(stage, config, inputs, destination=out)
+            store.run(stage, config, inputs, destination=out, sources=sources)
         except InTheWayError:
             if replace is None:
                 raise
             with _moved_aside(out) as aside:
-                store.run(stage, config, inputs, destination=out)
+                store.run(stage, config, inputs, destination=out, sources=sources)
             replace(aside)
     except Exception as error:
         if (fault := _machine_fault(error)) is not None:

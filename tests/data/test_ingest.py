@@ -140,7 +140,9 @@ def test_every_recording_has_exactly_one_outcome(mixed: dict[str, Any]) -> None:
     ]
     assert report["outcomes"] == {"written": 1, "split": 1, "quarantined": 1, "refused": 1}
     for r in report["recordings"]:
-        assert r["reason"] == ("1 marked as failure (success: false)" if r["outcome"] == "written" else r["reason"]) != ""
+        assert (
+            r["reason"] == ("1 marked as failure (success: false)" if r["outcome"] == "written" else r["reason"]) != ""
+        )
         assert {"spec", "spec_digest", "part", "command", "episodes", "losses", "damage", "findings"} <= set(r)
         assert "traceback" not in r and "artefact" not in r
 
@@ -243,7 +245,9 @@ def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_i
     assert [e["outcome"] for e in entry["episodes"]] == ["written", "quarantined"]
     assert entry["outcome"] == "split"
     assert ingests.report()["episodes_quarantined"] == 1
-    assert "1 of 2 episodes quarantined" in entry["reason"] and "right_wrist" in json.dumps(entry["episodes"][1]["findings"])
+    assert "1 of 2 episodes quarantined" in entry["reason"] and "right_wrist" in json.dumps(
+        entry["episodes"][1]["findings"]
+    )
     assert Dataset(ingests.out).num_episodes == 1
 
 
