@@ -156,6 +156,8 @@ def find_sources(
     if not path.exists():
         siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
         raise RecordingError(f"{path}: no such file or folder; {nearest(path.name, siblings)}")
+    if not (path.is_file() or path.is_dir()):  # a pipe would wait for ever
+        raise RecordingError(f"{path}: no recording here: neither a file nor a folder")
     names = [reader] if reader else list(readers)
     found = _sources_at(path, names, split_bag)
     if found is not None:
@@ -241,6 +243,8 @@ def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
 
 def sniff(path: Path) -> tuple[str, str | None] | tuple[None, None]:
     """What a file is by its first bytes, and the reader that opens it; None where nobody knows."""
+    if not path.is_file():  # a pipe would wait for ever
+        return None, None
     try:
         with path.open("rb") as file:
             head = file.read(max(len(magic) for magic, _, _ in MAGICS))
