@@ -33,7 +33,12 @@ class Bars:
     """Progress over recordings: rows of the one at work, or recordings done when several are at work."""
 
     def __init__(self, num_recordings: int) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+        )
         self._progress = Progress(*columns, transient=True, console=Console(stderr=True))
         self._num = num_recordings
         self._task: Any = None
