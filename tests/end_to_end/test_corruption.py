@@ -101,7 +101,11 @@ FROM_BYTES: dict[str, tuple[Callable[[Path], bytes], str, tuple[str, ...]]] = {
     "wrong_schema": (wrong_schema, "refused", ("/joint_states_left", "PoseStamped", "JointState")),
     "empty": (lambda p: b"", "refused", ("empty",)),
     "only_magic": (lambda p: p.read_bytes()[:8], "refused", ("/joint_states_left",)),
-    "wrong_first_byte": (lambda p: b"X" + p.read_bytes()[1:], "split", ("not the beginning of an MCAP file",)),
+    "wrong_first_byte": (
+        lambda p: b"X" + p.read_bytes()[1:],
+        "written",
+        ("nothing lost", "not the beginning of an MCAP file"),
+    ),
     "garbage": (lambda p: random.Random(0).randbytes(50_000), "refused", ("not an MCAP",)),
 }
 FROM_CONFIG: dict[str, tuple[dict[str, Any], str, tuple[str, ...]]] = {

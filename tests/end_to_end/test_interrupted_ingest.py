@@ -89,7 +89,7 @@ def leftovers(folder: Path) -> list[str]:
     return [
         str(p)
         for p in folder.rglob("*")
-        if p.is_dir() and p.name.startswith(".") and p.name not in (".locks", ".digests")
+        if p.is_dir() and p.name.startswith(".") and p.name not in (".locks", ".digests", ".destinations")
     ]
 
 
