@@ -69,11 +69,10 @@ def ingest_speed() -> Iterator[Row]:
         folder = Path(name)
         recording = _stand_in(folder / "recording.mcap", RECORDING_S)
         native = _native_spec(folder / "data_specs")
-        for label, spec_path in (
-            ("480×640 kept", native),
-            ("224×224, as shipped", "piper_flexitac_mcap"),
-        ):
-            yield from _ingest_rows(label, recording, load_recording_spec(spec_path), folder)
+        yield from _ingest_rows("480×640 kept", recording, load_recording_spec(native), folder, goal="≥ 4")
+        # No goal against the rival here: it is handed pictures already scaled down, and we decode them at 480 × 640.
+        shipped = load_recording_spec("piper_flexitac_mcap")
+        yield from _ingest_rows("224×224, as shipped", recording, shipped, folder, goal="")
 
 
 def _ingest_rows(label: str, path: Path, spec: Any, folder: Path, goal: str) -> Iterator[Row]:
