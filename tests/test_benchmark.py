@@ -179,7 +179,7 @@ def test_every_registered_goal_can_be_read() -> None:
 
     assert {"ingest", "memory", "corruption", "kill", "start_up"} <= set(BENCHMARKS)
     source = Path(taccorl.demos.benchmarks.__file__ or "").read_text()
-    goals = re.findall(r'goal="([^"]*)"', source) + re.findall(r'"(< [0-9.]+)"', source)
+    goals = re.findall(r'goal="([^"]+)"', source) + re.findall(r'"(< [0-9.]+)"', source)
     assert len(goals) >= 7
     for goal in goals:
         assert meets(0.0, goal) in (True, False)
