@@ -29,7 +29,7 @@ BROWSER_ARGUMENTS = (
     "--ignore-gpu-blocklist",
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",  # the page may talk to nobody but us
 )
-SETTLE_S = 12.0
+SETTLE_S = 8.0
 """A web viewer that loads slowly looks finished, and the same twice, before its first picture is decoded."""
 CALM_LEVELS = 0.2
 """Mean difference of two shots (of 255) below which the page has come to rest."""
