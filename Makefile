@@ -3,10 +3,10 @@ PYTHON ?= python3.12
 BIN := .venv/bin
 export HF_HUB_OFFLINE := 1
 
-.PHONY: demo test test-slow lint bench lock clean
+.PHONY: demo test test-slow lint bench pictures lock clean
 
 demo: .venv/.ready
-	@echo "demo: a stand-in recording → dataset → checks → Rerun. Nothing here comes from a robot."
+	@echo "demo: the twin demonstrates → recordings → dataset → checks → Rerun. Nothing here comes from a robot."
 	$(BIN)/python -m pipelines.demo
 
 test: .venv/.ready
@@ -25,6 +25,10 @@ lint: .venv/.ready
 # make bench ONLY=ingest: one of the registered benchmarks. Rows go to bench.json and docs/benchmarks.md.
 bench: .venv/.ready
 	$(BIN)/python -m taccorl.benchmark $(if $(ONLY),--only=$(ONLY))
+
+# The pictures of the README: docs/task_*.png.
+pictures: .venv/.ready
+	$(BIN)/python -m pipelines.task_pictures
 
 # Names and versions only: no addresses, no hashes.
 lock: .venv/.ready

@@ -1,0 +1,1 @@
+"""The MuJoCo twin of the bench: robot, touch, tasks, effects, environments."""

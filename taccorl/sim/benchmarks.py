@@ -1,0 +1,226 @@
+"""Figures of the twin: physics, touch, pictures, gripping. ``make bench ONLY=twin_speed`` and the others."""
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator
+from statistics import median
+
+import mujoco
+import numpy as np
+
+from taccorl.benchmark import Row, benchmark, cpu_s, spread
+from taccorl.errors import TaccorlError
+from taccorl.sim.grip_rig import gripped, in_hand_m, rest, shake
+from taccorl.sim.pad import OneSim, PadArray
+from taccorl.sim.rendering import Renderer
+from taccorl.sim.robot import PADS, RobotConfig
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks import tasks
+from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+NUM_SIMS = 128
+REPEATS = 7
+
+
+def _cpu_s(work: Callable[[], object], repeats: int = REPEATS) -> list[float]:
+    work()
+    times = []
+    for _ in range(repeats):
+        before = cpu_s()
+        work()
+        times.append(cpu_s() - before)
+    return times
+
+
+def _in_turns(*works: Callable[[], object], repeats: int = REPEATS) -> list[list[float]]:
+    """CPU-seconds of each, measured in turns, because a scene's cost drifts and so does a shared machine."""
+    times = [[_cpu_s(work, 1)[0] for work in works] for _ in range(repeats)]
+    return [list(column) for column in zip(*times, strict=True)]
+
+
+def holding(num_sims: int = NUM_SIMS) -> tuple[Simulation, np.ndarray]:
+    """Simulations of Assembly #1 in which both hands hold their part on the table, and the targets that keep them there."""
+    sim = Simulation(tasks.get("assembly_1")(), num_sims=num_sims)
+    sim.reset(np.arange(num_sims))
+    qpos = sim.arrays["qpos"]
+    goal = sim.targets.copy()
+    for arm, part, width_m in (("left", "socket", 0.030), ("right", "plug", 0.020)):
+        a = 0 if arm == "left" else 7
+        joint = sim.model.joint(part).qposadr[0]
+        task_part = getattr(sim.task, part)
+        grasp = next(iter(task_part.grasps.values())).part_from_tcp
+        pose = sim.tcp(arm) @ np.linalg.inv(grasp)
+        for i in range(num_sims):
+            qpos[i, joint : joint + 3] = pose[i, :3, 3]
+            mujoco.mju_mat2Quat(qpos[i, joint + 3 : joint + 7], np.ascontiguousarray(pose[i, :3, :3]).ravel())
+        for finger in "ab":
+            qpos[:, sim.model.joint(f"{arm}_finger_{finger}").qposadr[0]] = width_m / 2 + 0.0001
+        goal[:, a + 6] = width_m - 0.02
+    sim.batch.forward()
+    for _ in range(15):
+        sim.step(goal)
+    for part in sim.task.parts:
+        if sim.pads_touching(part).sum(1).min() < 2:
+            raise TaccorlError(f"benchmark: {part} is not held in every simulation")
+    return sim, goal
+
+
+@benchmark("twin_speed")
+def twin_speed() -> Iterator[Row]:
+    """Control steps, touch and the share of Python, both hands holding."""
+    sim, goal = holding()
+    step_ms = sim.config.physics.timestep_s * 1e3
+    steps = sim.config.physics.steps_per_control_step
+    full, bare = _in_turns(lambda: sim.step(goal), lambda: sim.batch.step(nstep=steps))
+    rates = [NUM_SIMS / t for t in full]
+    # 600 a CPU-second at 2 ms, 300 at 1 ms: in proportion to the step.
+    yield Row(
+        name=f"control steps, 128 sims, both hands holding, step {step_ms:.2f} ms, one thread",
+        value=median(rates),
+        unit="env steps/CPU-s",
+        goal=f"≥ {300 * step_ms:.0f}",
+        n=len(rates),
+        spread=spread(rates),
+    )
+    shares = [b / f for f, b in zip(full, bare, strict=True)]
+    yield Row(
+        name="share of a bare Batch.step loop's speed",
+        value=median(shares),
+        unit="1",
+        goal="≥ 0.9",
+        rival="Batch.step, env steps/CPU-s",
+        rival_value=NUM_SIMS / median(bare),
+        n=len(shares),
+        spread=spread(shares),
+    )
+    touch = [t / NUM_SIMS * 1e6 for t in _cpu_s(lambda: sim.pads.touch(sim.batch))]
+    yield Row(
+        name="touch, depth and rate of 4 × 384 taxels",
+        value=median(touch),
+        unit="µs/env",
+        goal="≤ 90",
+        n=len(touch),
+        spread=spread(touch),
+    )
+    share = [100 * t / (median(full) / NUM_SIMS * 1e6) for t in touch]
+    yield Row(
+        name="touch", value=median(share), unit="% of a control step", goal="≤ 10", n=len(share), spread=spread(share)
+    )
+    env = TaccorlVectorEnv("assembly_1", num_envs=NUM_SIMS, num_threads=1)
+    env.reset(seed=0)
+    env.sim.restore(sim.snapshot())
+    actions = goal.astype(np.float32)
+    # What the environment adds: its own Python, without MuJoCo and without touch.
+    stepped, bare, felt = _in_turns(
+        lambda: env.step(actions), lambda: env.sim.batch.step(nstep=steps), lambda: env.sim.touch()
+    )
+    added = [100 * (t - b - f) / t for t, b, f in zip(stepped, bare, felt, strict=True)]
+    yield Row(
+        name="vector env: Python outside of MuJoCo and touch",
+        value=median(added),
+        unit="% of a control step",
+        goal="≤ 20",
+        n=len(added),
+        spread=spread(added),
+    )
+
+
+@benchmark("grip")
+def grip() -> Iterator[Row]:
+    """How a part stays in the hand, and what its mass does to the pads' reading."""
+    model, data = gripped(0.04, 10.0)
+    creeps = []
+    for _ in range(3):
+        before = in_hand_m(data)
+        rest(model, data, 2.0)
+        creeps.append(float(np.linalg.norm(in_hand_m(data) - before)) / 2.0 * 1e3)
+    yield Row(
+        name="creep of a 40 g part at 10 N",
+        value=median(creeps),
+        unit="mm/s",
+        goal="≤ 0.02",
+        n=len(creeps),
+        spread=spread(creeps),
+    )
+    slips = []
+    for mass_kg in (0.04, 0.07, 0.1):
+        slips.append(shake(*gripped(mass_kg, 10.0)) * 1e3)
+    yield Row(
+        name="slip in a 3 s shake at 10 N; 40 g (n: 40, 70, 100 g)",
+        value=slips[0],
+        unit="mm",
+        goal="≤ 1",
+        n=len(slips),
+        spread=spread(slips),
+    )
+    hard = [shake(*gripped(mass_kg, 10.0), swing_rad=0.2) * 1e3 for mass_kg in (0.04, 0.07, 0.1)]
+    yield Row(
+        name="slip in a shake of 0.2 rad, centripetal drift (no goal)",
+        value=hard[0],
+        unit="mm",
+        n=len(hard),
+        spread=spread(hard),
+    )
+    for pads, goal in (("sprung", "≤ 5"), ("rigid", "")):
+        peaks = [_peak_reading(mass_kg, pads) for mass_kg in (0.04, 0.1, 0.3)]
+        differs = 100 * (max(peaks) - min(peaks)) / min(peaks)
+        yield Row(
+            name=f"reading at 10 N, 40 → 300 g, {pads} pads: largest over smallest",
+            value=differs,
+            unit="%",
+            goal=goal,
+            n=len(peaks),
+            spread=0.0,
+        )
+
+
+def _peak_reading(mass_kg: float, pads: str) -> float:
+    config = TwinConfig(robot=RobotConfig(pads=pads))  # pyright: ignore[reportArgumentType]
+    model, data = gripped(mass_kg, 10.0, config)
+    array = PadArray(model, PADS)
+    sensor = config.sensor.build(PADS)
+    reading = sensor.reading(*array.touch(OneSim(data)), None)
+    return float(reading[0, 2:].max())
+
+
+@benchmark("pictures")
+def pictures() -> Iterator[Row]:
+    """Rendering of the three cameras."""
+    sim = Simulation(tasks.get("test_tube")())
+    sim.reset([0])
+    names = [camera.name for camera in sim.config.cameras]
+    for size, goal in ((224, "≤ 6"), (96, "")):
+        with Renderer(sim.model, names, size, size) as renderer:
+            times = [t * 1e3 for t in _cpu_s(lambda r=renderer: r.render_batch(sim.batch), 30)]
+            driver = renderer.driver
+        yield Row(
+            name=f"three {size}² pictures of a task with {sim.model.ngeom} geoms, {driver.split('(')[0].strip()}",
+            value=median(times),
+            unit="ms CPU",
+            goal=goal,
+            n=len(times),
+            spread=spread(times),
+        )
+
+
+@benchmark("physics_step")
+def physics_step() -> Iterator[Row]:
+    """What the choice of the physics step costs; penetration is measured in ``make bench ONLY=experts``."""
+    for steps in (20, 40):
+        config = TwinConfig()
+        config.physics = dataclasses.replace(config.physics, steps_per_control_step=steps)
+        sim = Simulation(tasks.get("assembly_1")(), config, num_sims=NUM_SIMS)
+        sim.reset(np.arange(NUM_SIMS))
+        goal = sim.targets.copy()
+        rates = [NUM_SIMS / t for t in _cpu_s(lambda sim=sim, goal=goal: sim.step(goal))]
+        yield Row(
+            name=f"control steps, hands empty, step {1e3 / CONTROL_HZ / steps:.2f} ms",
+            value=median(rates),
+            unit="env steps/CPU-s",
+            n=len(rates),
+            spread=spread(rates),
+        )
+
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -1,0 +1,119 @@
+"""The effects that have been added to one twin, acting together: their order, their memory, what they may not do at once."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects.effect import LAYERS, Effect, Memory
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+
+class AddedEffects:
+    """Effects of N simulations. Absent ones are left out; what is left acts in the order of ``LAYERS``, then by name.
+
+    A sensor takes it as one of its transforms. Looking at the pads is one thing, their passing time another: only ``scan``,
+    which ``Simulation.advance`` calls at its end, moves their memory on.
+
+    Args:
+        time_s: (N,) the simulations' clocks, live.
+    """
+
+    def __init__(self, effects: Sequence[Effect], time_s: np.ndarray) -> None:
+        self.present = present(effects)
+        self._time_s = time_s
+        self._scanned_s = np.array(time_s)
+        self._start = [effect.memory(len(time_s)) for effect in self.present]
+        self._memory: list[Memory] = [{k: v.copy() for k, v in rows.items()} for rows in self._start]
+        touch = [k for k, effect in enumerate(self.present) if effect.layer != "robot"]
+        self.remember_touch = any(self._start[k] for k in touch)
+        """Whether a reading depends on earlier ones: then each step must scan the pads, whether somebody looks or not."""
+
+    def command(self, targets: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        """What reaches the controllers of targets (N, 14) that stand for ``dt_s`` (N,)."""
+        for effect, memory in zip(self.present, self._memory, strict=True):
+            targets = effect.command(targets, memory, dt_s)
+        return targets
+
+    def encoder(self, values: np.ndarray) -> np.ndarray:
+        """What is reported of joints and grippers (N, 14)."""
+        for effect in self.present:
+            values = effect.encoder(values)
+        return values
+
+    def __call__(self, reading: np.ndarray) -> np.ndarray:
+        """What the pads read now where ideal ones would read ``reading`` (N, 4, 32, 12). Looking changes nothing."""
+        return self._read(reading, [{k: v.copy() for k, v in rows.items()} for rows in self._memory])
+
+    def scan(self, reading: np.ndarray) -> None:
+        """Remember ``reading`` (N, 4, 32, 12), what ideal pads would read now, as what there has been since the last scan."""
+        self._read(reading, self._memory)
+        self._scanned_s[:] = self._time_s
+
+    def _read(self, reading: np.ndarray, memories: list[Memory]) -> np.ndarray:
+        now = np.array(self._time_s)
+        for effect, memory in zip(self.present, memories, strict=True):
+            reading = effect.reading(reading, memory, now, now - self._scanned_s)
+        return reading
+
+    def reset(self, ids: np.ndarray, targets: np.ndarray) -> None:
+        """Forget what ``ids`` have been through; of the ``targets`` (N, 14) theirs have stood for ever."""
+        for memory, start in zip(self._memory, self._start, strict=True):
+            for name, values in memory.items():
+                values[ids] = start[name][ids]
+        self.command(targets, np.zeros(len(targets)))
+        self._scanned_s[ids] = self._time_s[ids]
+
+    def snapshot(self, ids: np.ndarray) -> Memory:
+        """Rows of ``ids``: ``"0/taxel_creep/crept"`` and the like, and when the pads were scanned last."""
+        return {key: values[ids].copy() for key, values in self._named().items()}
+
+    def restore(self, rows: Memory, ids: np.ndarray) -> None:
+        """Put rows of ``snapshot`` back into ``ids``; other rows are passed over.
+
+        Raises:
+            TaccorlError: they are of a twin with other effects.
+        """
+        kept, named = {key for key in rows if "/" in key}, self._named()
+        if kept != named.keys():
+            raise TaccorlError(
+                f"restore: the state remembers {', '.join(sorted(kept)) or 'nothing'}, this twin's effects keep "
+                f"{', '.join(sorted(named)) or 'nothing'}; it is another twin's"
+            )
+        for key, values in named.items():
+            values[ids] = rows[key]
+
+    def _named(self) -> Memory:
+        named = {
+            f"{k}/{effect.name}/{name}": values
+            for k, (effect, memory) in enumerate(zip(self.present, self._memory, strict=True))
+            for name, values in memory.items()
+        }
+        return named | {"pads/scanned_s": self._scanned_s}
+
+
+def present(effects: Sequence[Effect]) -> list[Effect]:
+    """Those that are not absent, in the order in which they act.
+
+    Raises:
+        TaccorlError: two entries of one effect act on the same thing.
+    """
+    taken: dict[tuple[str, str], int] = {}
+    for k, effect in enumerate(effects):
+        for thing in effect.acts_on():
+            if (first := taken.setdefault((effect.name, thing), k)) != k:
+                raise TaccorlError(
+                    f"effects: {effect.name} acts on {thing} twice, as entries {first + 1} and {k + 1}; make one of them"
+                )
+    here = [effect for effect in effects if not effect.is_absent]
+    return sorted(here, key=lambda effect: (LAYERS.index(effect.layer), effect.name, effect.acts_on()))
+
+
+def edit_model(spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+    """Build the effects of ``config`` into a model that is otherwise complete."""
+    for effect in present(config.effects):
+        effect.edit(spec, config)

@@ -1,0 +1,36 @@
+"""Baseline drift: what a taxel reads without contact wanders off with time."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
+
+
+@effects.register("baseline_drift")
+@dataclass(kw_only=True)
+class BaselineDrift(TouchEffect):
+    """r = f + b t, with t since the reset, when the baseline was taken.
+
+    A reading of 1 is 75 counts; what sinks below the converter's 0 is cut off.
+    """
+
+    name: ClassVar = "baseline_drift"
+    layer: ClassVar = "baseline"
+    rate_per_min: float = parameter(
+        unit="1/min",
+        symbol="b",
+        absent=0.0,
+        low=-2.0,
+        high=2.0,
+        typical=0.1,
+        source="a choice: 7.5 counts a minute, half of the no-contact threshold in two",
+    )
+
+    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        reading = reading.copy()
+        drift = self.rate_per_min / 60.0 * time_s
+        reading[:, self.slots] += drift[:, None, None, None].astype(reading.dtype)
+        return reading

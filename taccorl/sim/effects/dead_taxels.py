@@ -1,0 +1,40 @@
+"""Dead taxels: some never read anything."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import BoardEffect, Memory, parameter
+from taccorl.sim.robot import PAD_TAXELS, PADS
+
+
+@effects.register("dead_taxels")
+@dataclass(kw_only=True)
+class DeadTaxels(BoardEffect):
+    """r = 0 for a share of each pad's taxels, drawn once from ``seed``. A greater share adds to the taxels of a smaller one."""
+
+    name: ClassVar = "dead_taxels"
+    layer: ClassVar = "taxel"
+    share: float = parameter(
+        unit="1",
+        symbol="s",
+        absent=0.0,
+        low=0.0,
+        high=1.0,
+        typical=0.05,
+        source="a choice",
+    )
+
+    def dead(self) -> np.ndarray:
+        """(4, 32, 12) bool; round(s · 384) on each pad, chosen or not."""
+        num_taxels = math.prod(PAD_TAXELS)
+        rank = np.random.default_rng(self.seed).permuted(np.tile(np.arange(num_taxels), (len(PADS), 1)), axis=1)
+        return (rank < round(self.share * num_taxels)).reshape(-1, *PAD_TAXELS)
+
+    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        reading = reading.copy()
+        reading[:, self.slots] *= ~self.dead()[self.slots]
+        return reading

@@ -1,0 +1,255 @@
+"""What an effect is: a physical mechanism with parameters, each with unit, bounds and the value at which nothing happens.
+
+An effect acts through as few of five hooks as it needs:
+
+==========  ==================================================  =======================================================
+``edit``    MuJoCo's model, before it is compiled               friction, armature, delays: MuJoCo does the work
+``command`` targets on their way to the controller (N, 14)      each time they are sent, 150 Hz in ``Simulation.step``
+``encoder`` angles and openings as reported (N, 14)             whenever they are read
+``reading`` the pads' reading (N, 4, 32, 12)                    between the sensor's law and its gain
+``memory``  arrays (N, …) that hooks keep between calls         part of ``Simulation.snapshot``, so runs go on bit-exactly
+==========  ==================================================  =======================================================
+
+An effect all of whose parameters stand at their absent values is not built at all: no joint, no buffer, no hook. That makes
+the twin with it bit-identical to the twin without it. What remains to be shown is that the absent value is where the effect
+fades out, and ``tests/sim/effects/test_every_effect.py`` shows both for every registered class, outside packages' included.
+
+Two entries of one effect may not act on the same joint or pad. Entries act in the order of ``LAYERS``, then by name: how the
+file lists them does not matter.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import mujoco
+import numpy as np
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.robot import ARMS, JOINTS, PADS
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+CHANNELS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in (*JOINTS, "gripper"))
+"""What the 14 columns of targets and reported values belong to: the order of actions."""
+Memory = dict[str, np.ndarray]
+"""Name → array (N, …), changed in place."""
+LAYERS = ("robot", "material", "spread", "taxel", "baseline")
+"""From the mechanics outwards; a pad's rubber comes before its wiring, and the wiring before the zero that is taken off."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """One number of an effect."""
+
+    name: str
+    """With its unit as suffix, as the field of the effect."""
+    unit: str
+    symbol: str
+    """In the effect's equation."""
+    absent: float | None
+    """At this value the effect is not there. None: it only shapes the effect and means nothing while that is absent."""
+    low: float
+    high: float
+    """Bounds for fitting; other values are refused."""
+    typical: float
+    """Of a robot like this one: where a search starts."""
+    source: str
+
+
+def parameter(
+    *,
+    unit: str,
+    symbol: str,
+    low: float,
+    high: float,
+    typical: float,
+    absent: float | None,
+    source: str,
+) -> float:
+    """A dataclass field that holds a ``Parameter``; its default is the absent value, or else the typical one."""
+    meta = {"unit": unit, "symbol": symbol, "absent": absent, "low": low, "high": high, "typical": typical}
+    return field(default=typical if absent is None else absent, metadata={"parameter": meta | {"source": source}})
+
+
+@dataclass(kw_only=True)
+class Effect:
+    """Base of all effects: a dataclass of parameters, with what is known about them."""
+
+    name: ClassVar[str]
+    """As registered."""
+    layer: ClassVar[Literal["robot", "material", "spread", "taxel", "baseline"]]
+
+    interval: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Parameter → 95 % interval of its estimate, in the parameter's unit."""
+    evidence: str = ""
+    """Why it is believed to be there: measurements, error before and after."""
+
+    def __post_init__(self) -> None:
+        if "__dataclass_fields__" not in type(self).__dict__:
+            raise TaccorlError(f"effect {self.name}: class {type(self).__name__} lacks its @dataclass(kw_only=True)")
+        known = {p.name: p for p in self.parameters()}
+        if all(p.absent is None for p in known.values()):
+            raise TaccorlError(f"effect {self.name}: none of its parameters has an absent value; one must")
+        for p in known.values():
+            setattr(self, p.name, self._checked(p, getattr(self, p.name)))
+        for name, ends in self.interval.items():
+            if name not in known:
+                raise TaccorlError(f"effect {self.name}: interval of {name!r}, which it lacks; {nearest(name, known)}")
+            if len(ends) != 2 or not all(map(math.isfinite, ends)) or ends[0] > ends[1]:
+                raise TaccorlError(f"effect {self.name}: interval of {name} is {ends}; give two numbers, low and high")
+        self.interval = {name: (float(low), float(high)) for name, (low, high) in self.interval.items()}
+
+    def _checked(self, p: Parameter, value: float) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            raise TaccorlError(f"effect {self.name}: {p.name} is {value!r}; give a number in {p.unit}")
+        if value != p.absent and not p.low <= value <= p.high:
+            raise TaccorlError(
+                f"effect {self.name}: {p.name} is {value:g} {p.unit}, outside of {p.low:g} … {p.high:g} {p.unit}"
+            )
+        return float(value)
+
+    @classmethod
+    def parameters(cls) -> tuple[Parameter, ...]:
+        """In the order of the class's fields."""
+        fields = [f for f in dataclasses.fields(cls) if "parameter" in f.metadata]
+        return tuple(Parameter(name=f.name, **f.metadata["parameter"]) for f in fields)
+
+    @classmethod
+    def settings(cls) -> list[str]:
+        """Names of all that can be set: parameters, selectors, what is known about them."""
+        return [f.name for f in dataclasses.fields(cls)]
+
+    @property
+    def is_absent(self) -> bool:
+        """Whether every parameter that has an absent value stands at it."""
+        return all(getattr(self, p.name) == p.absent for p in self.parameters() if p.absent is not None)
+
+    def acts_on(self) -> list[str]:
+        """Joints, arms or pads."""
+        raise NotImplementedError
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        """Change the twin's model. ``spec`` is complete: arms, parts, sensors."""
+
+    def memory(self, num_sims: int) -> Memory:
+        """Arrays (N, …) as they are after a reset, before ``command`` is told the targets at rest."""
+        return {}
+
+    def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+        """What arrives at the controllers of the targets (N, 14) that are now sent.
+
+        Args:
+            targets: joint angles [rad] and openings [m] in the order of actions.
+            dt_s: (N,) for how long they will stand. 0 for simulations that do not advance now, whose memory is to stay; and
+                after a reset, when the targets are those at rest.
+        """
+        return targets
+
+    def encoder(self, values: np.ndarray) -> np.ndarray:
+        """What is reported where the joints say ``values`` (N, 14) [rad, m]."""
+        return values
+
+    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        """What the pads read where ideal ones would read ``reading`` (N, 4, 32, 12): as the sensor's law gives it, 0 without
+        contact, before gain, noise and rounding. To be returned as a new array of the same float type.
+
+        What is written into ``memory`` lasts from one scan to the next, and a scan is at the end of every
+        ``Simulation.advance``: a control step, or what a replay holds a command for. Who only looks gets a copy of it. With
+        ``dt_s`` = 0 the reading of the scan must come out again.
+
+        Args:
+            time_s: (N,) since the reset.
+            dt_s: (N,) since the last scan.
+        """
+        return reading
+
+
+@dataclass(kw_only=True)
+class ArmEffect(Effect):
+    """An effect of a whole arm."""
+
+    layer: ClassVar = "robot"
+    arm: Literal["left", "right", "both"] = "both"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.arm not in (*ARMS, "both"):
+            raise TaccorlError(f"effect {self.name}: no arm {self.arm!r}; {nearest(self.arm, (*ARMS, 'both'))}")
+
+    def arms(self) -> list[str]:
+        return [arm for arm in ARMS if self.arm in (arm, "both")]
+
+    def acts_on(self) -> list[str]:
+        return self.arms()
+
+
+@dataclass(kw_only=True)
+class JointEffect(ArmEffect):
+    """An effect of single joints: the same numbers for all that are chosen. Joints that differ get an entry each."""
+
+    possible: ClassVar[tuple[str, ...]] = JOINTS
+    """What ``joints`` may name."""
+    joints: list[str] = field(default_factory=lambda: list(JOINTS))
+    """``joint1`` … ``joint6``, which the paper calls J0 … J5; for some effects ``gripper``, too."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_chosen(self.name, "joint", self.joints, self.possible)
+
+    def acts_on(self) -> list[str]:
+        return [f"{arm}_{joint}" for arm in self.arms() for joint in self.joints]
+
+    @property
+    def columns(self) -> list[int]:
+        """Where the chosen joints stand in targets and reported values."""
+        return [CHANNELS.index(name) for name in self.acts_on()]
+
+    def chosen(self, spec: mujoco.MjSpec) -> Iterator[mujoco.MjsJoint]:
+        """The joints' own entries of the model."""
+        for name in self.acts_on():
+            yield spec.joint(name)
+
+
+@dataclass(kw_only=True)
+class TouchEffect(Effect):
+    """An effect of pads or of their taxels."""
+
+    pads: list[str] = field(default_factory=lambda: list(PADS))
+    """``left_a`` … ``right_b``."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_chosen(self.name, "pad", self.pads, PADS)
+
+    def acts_on(self) -> list[str]:
+        return list(self.pads)
+
+    @property
+    def slots(self) -> list[int]:
+        """Where the chosen pads stand in the reading."""
+        return [PADS.index(pad) for pad in self.pads]
+
+
+@dataclass(kw_only=True)
+class BoardEffect(TouchEffect):
+    """An effect that is drawn once for each board."""
+
+    seed: int = 0
+    """Of these boards: another one is another set of taxels."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise TaccorlError(f"effect {self.name}: seed is {self.seed!r}; give a whole number of 0 or more")
+
+
+def _check_chosen(effect: str, kind: str, chosen: list[str], possible: tuple[str, ...]) -> None:
+    for name in chosen:
+        if name not in possible:
+            raise TaccorlError(f"effect {effect}: {kind}s: no {kind} {name!r}; {nearest(name, possible)}")
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise TaccorlError(f"effect {effect}: {kind}s are {chosen}; name at least one, each once")

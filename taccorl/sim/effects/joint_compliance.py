@@ -1,0 +1,49 @@
+"""Joint compliance: the gear between motor and link gives way like a spring."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import JointEffect, parameter
+from taccorl.sim.effects.transmission import add_transmission_joint
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+
+@effects.register("joint_compliance")
+@dataclass(kw_only=True)
+class JointCompliance(JointEffect):
+    """The link turns by c τ against the motor under the torque τ that the gear carries, the arm's weight included.
+
+    Controller and encoder see the motor. Built as a second, sprung hinge between the motor's joint and the link, so the model has
+    one joint more: ``left_joint5_compliance``. Its damping is κ / c.
+    """
+
+    name: ClassVar = "joint_compliance"
+    compliance_rad_per_nm: float = parameter(
+        unit="rad/(N·m)",
+        symbol="c",
+        absent=0.0,
+        low=0.0,
+        high=0.05,
+        typical=0.001,
+        source="a choice: 1e3 N·m/rad",
+    )
+    damping_s: float = parameter(
+        unit="s",
+        symbol="κ",
+        absent=None,
+        low=0.0,
+        high=0.05,
+        typical=0.002,
+        source="a choice: lightly damped",
+    )
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        for motor in self.chosen(spec):
+            spring = add_transmission_joint(motor, "compliance")
+            spring.stiffness[0] = 1.0 / self.compliance_rad_per_nm
+            spring.damping[0] = self.damping_s / self.compliance_rad_per_nm

@@ -1,0 +1,43 @@
+"""Pad compliance: the pads are softer or harder than configured."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import TouchEffect, parameter
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+
+@effects.register("pad_compliance")
+@dataclass(kw_only=True)
+class PadCompliance(TouchEffect):
+    """A pad's stiffness is k times ``robot.pad_stiffness_n_per_m``: the same force presses it in by 1 / k of the depth.
+
+    A sensor's gain does the same to readings; only how far the fingers close tells them apart.
+    """
+
+    name: ClassVar = "pad_compliance"
+    layer: ClassVar = "robot"
+    stiffness_factor: float = parameter(
+        unit="1",
+        symbol="k",
+        absent=1.0,
+        low=0.05,
+        high=20.0,
+        typical=0.5,
+        source="a choice, as the nominal stiffness is",
+    )
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        if config.robot.pads != "sprung":
+            raise TaccorlError(
+                f"effect pad_compliance: the twin's pads are {config.robot.pads} and have no stiffness; set robot.pads to sprung"
+            )
+        for pad in self.pads:
+            for joint in spec.joint(f"{pad}_spring").parent.joints:
+                joint.stiffness[0] *= self.stiffness_factor

@@ -1,0 +1,69 @@
+"""Payload: a mass on the hand that the controller does not know of."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import ArmEffect, parameter
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+_RADIUS_M = 0.02  # of the ball, for its inertia
+
+
+@effects.register("payload")
+@dataclass(kw_only=True)
+class Payload(ArmEffect):
+    """A ball of mass m fixed to link 6 at c: torque m g × lever arm on every joint, and its inertia.
+
+    It has no shape that could touch anything.
+    """
+
+    name: ClassVar = "payload"
+    mass_kg: float = parameter(
+        unit="kg",
+        symbol="m",
+        absent=0.0,
+        low=0.0,
+        high=1.5,
+        typical=0.2,
+        source="a choice; the rated payload is 1.5 kg (PiPER manual)",
+    )
+    x_link6_m: float = parameter(
+        unit="m",
+        symbol="c_x",
+        absent=None,
+        low=-0.15,
+        high=0.15,
+        typical=0.0,
+        source="a choice: middle of the hand",
+    )
+    y_link6_m: float = parameter(
+        unit="m",
+        symbol="c_y",
+        absent=None,
+        low=-0.15,
+        high=0.15,
+        typical=0.0,
+        source="a choice: middle of the hand",
+    )
+    z_link6_m: float = parameter(
+        unit="m",
+        symbol="c_z",
+        absent=None,
+        low=-0.05,
+        high=0.25,
+        typical=0.1,
+        source="a choice: between flange and pads (TCP at 0.168)",
+    )
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        inertia = 0.4 * self.mass_kg * _RADIUS_M**2
+        for arm in self.arms():
+            ball = spec.body(f"{arm}_link6").add_body(name=f"{arm}_payload")
+            ball.mass, ball.explicitinertial = self.mass_kg, True
+            ball.ipos = [self.x_link6_m, self.y_link6_m, self.z_link6_m]
+            ball.inertia = [inertia] * 3

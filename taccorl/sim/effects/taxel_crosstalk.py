@@ -1,0 +1,43 @@
+"""Crosstalk: a taxel passes a part of its reading to its neighbours."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
+
+
+@effects.register("taxel_crosstalk")
+@dataclass(kw_only=True)
+class TaxelCrosstalk(TouchEffect):
+    """r = f + c/4 Σ (f_neighbour − f) over the neighbours in its row and column: a taxel keeps 1 − c and gives c/4 to each.
+
+    At the edge it keeps the share of neighbours that it lacks, so the sum over a pad stays.
+    """
+
+    name: ClassVar = "taxel_crosstalk"
+    layer: ClassVar = "spread"
+    share: float = parameter(
+        unit="1",
+        symbol="c",
+        absent=0.0,
+        low=0.0,
+        high=0.8,
+        typical=0.1,
+        source="a choice; covers carry load sideways, taxels share wires",
+    )
+
+    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        own = reading[:, self.slots]
+        spread = own.copy()
+        for axis in (2, 3):
+            flow = 0.25 * self.share * np.diff(own, axis=axis)  # from each taxel's next one into it
+            head, tail = [slice(None)] * 4, [slice(None)] * 4
+            head[axis], tail[axis] = slice(None, -1), slice(1, None)
+            spread[tuple(head)] += flow
+            spread[tuple(tail)] -= flow
+        reading = reading.copy()
+        reading[:, self.slots] = spread
+        return reading

@@ -1,0 +1,34 @@
+"""Gain spread: no two taxels read the same under the same load."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import BoardEffect, Memory, parameter
+from taccorl.sim.robot import PAD_TAXELS, PADS
+
+
+@effects.register("taxel_gain_spread")
+@dataclass(kw_only=True)
+class TaxelGainSpread(BoardEffect):
+    """r_i = g_i f_i with ln g_i normal, of mean 0 and standard deviation s: drawn once, from ``seed``."""
+
+    name: ClassVar = "taxel_gain_spread"
+    layer: ClassVar = "taxel"
+    log_std: float = parameter(
+        unit="1",
+        symbol="s",
+        absent=0.0,
+        low=0.0,
+        high=0.7,
+        typical=0.15,
+        source="a choice",
+    )
+
+    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        log_gain = np.random.default_rng(self.seed).standard_normal((len(PADS), *PAD_TAXELS))[self.slots]
+        reading = reading.copy()
+        reading[:, self.slots] *= np.exp(self.log_std * log_gain).astype(reading.dtype)
+        return reading

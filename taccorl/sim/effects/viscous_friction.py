@@ -1,0 +1,36 @@
+"""Viscous friction: a torque against the motion in proportion to its speed."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import JointEffect, parameter
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+
+@effects.register("viscous_friction")
+@dataclass(kw_only=True)
+class ViscousFriction(JointEffect):
+    """τ = −b q̇. Of a joint that follows fixed targets b adds to K_d and nothing else: no position tells them apart.
+
+    To see b, change the gains between recordings, or record torques.
+    """
+
+    name: ClassVar = "viscous_friction"
+    damping_nms_per_rad: float = parameter(
+        unit="N·m·s/rad",
+        symbol="b",
+        absent=0.0,
+        low=0.0,
+        high=50.0,
+        typical=1.0,
+        source="a choice; 0.15 on a Unitree Go2, research/discrepancy.md §4.6",
+    )
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        for joint in self.chosen(spec):
+            joint.damping[0] += self.damping_nms_per_rad

@@ -1,0 +1,118 @@
+"""One twin as a gymnasium environment: ``gymnasium.make("taccorl.sim.env:taccorl/Assembly1-v0")``.
+
+Importing this registers every task as ``taccorl/<Task>-v0``; ``gymnasium.make_vec`` gives the native vector environment.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.spaces import Observation
+from taccorl.sim.tasks import tasks
+from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
+
+
+class TaccorlEnv(gymnasium.Env):
+    """``task`` in the twin, one simulation; ``TaccorlVectorEnv`` with N = 1, so equal to it bit for bit.
+
+    Reward is 1 at the step that completes the task, else 0. Terminates with success or failure, truncates when time is up;
+    after that the episode stands still until ``reset``. ``reset(seed=s)`` gives the scene of seed s; without a seed the stream
+    ``episode_seed(s, 0, k)`` goes on. ``info``: as in ``TaccorlVectorEnv``, one value each.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        difficulty: str = "train",
+        twin: TwinConfig | str | Path | None = None,
+        images: bool = True,
+        randomization: float = 1.0,
+        seed: int | None = None,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Arguments and errors: ``TaccorlVectorEnv``."""
+        self._envs = TaccorlVectorEnv(
+            task,
+            difficulty=difficulty,
+            twin=twin,
+            images="always" if images else "never",
+            randomization=randomization,
+            seed=seed,
+            num_threads=1,
+            autoreset=AutoresetMode.DISABLED,
+            max_episode_steps=max_episode_steps,
+            render_mode=render_mode,
+        )
+        self.task, self.task_description, self.render_mode = task, self._envs.task_description, render_mode
+        self.observation_space = self._envs.single_observation_space
+        self.action_space = self._envs.single_action_space
+
+    @property
+    def sim(self) -> Simulation:
+        """The simulation, for snapshots and privileged state."""
+        return self._envs.sim
+
+    @property
+    def _max_episode_steps(self) -> int:
+        """LeRobot's evaluation asks for it by this name."""
+        return self.sim.judge.limit_steps
+
+    def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; ``options={"state": snapshot}`` begins it from ``sim.snapshot()``, bit-exactly."""
+        super().reset(seed=seed)
+        observation, _ = self._envs.reset(seed=None if seed is None else [seed], options=options)
+        return _only(observation), _only(self._envs.facts())
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One control step (1/30 s) with targets (14,) [rad, m].
+
+        Raises:
+            TaccorlError: wrong shape, a value that is no number or far beyond the limits.
+        """
+        observation, reward, terminated, truncated, _ = self._envs.step(shaped(action)[None])
+        facts = _only(self._envs.facts())
+        return _only(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), facts
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The front camera's picture (224, 224, 3) uint8."""
+        pictures = self._envs.render()
+        return None if pictures is None else pictures[0].copy()
+
+
+def _only(batch: dict[str, Any]) -> dict[str, Any]:
+    """The one row of each array; single values as Python's own."""
+    rows = {name: _only(values) if isinstance(values, dict) else values[0] for name, values in batch.items()}
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in rows.items()}
+
+
+def env_id(task: str) -> str:
+    """Gymnasium's name of a task: ``test_tube`` → ``taccorl/TestTube-v0``."""
+    return f"taccorl/{''.join(word.capitalize() for word in task.split('_'))}-v0"
+
+
+def register_envs() -> None:
+    """Register every task with gymnasium; again is harmless."""
+    for name in tasks:
+        if env_id(name) not in gymnasium.registry:
+            gymnasium.register(
+                id=env_id(name),
+                entry_point="taccorl.sim.env:TaccorlEnv",
+                vector_entry_point="taccorl.sim.vector_env:TaccorlVectorEnv",
+                max_episode_steps=round(tasks.get(name).time_limit_s * CONTROL_HZ),
+                kwargs={"task": name},
+            )
+
+
+register_envs()

@@ -1,0 +1,68 @@
+"""The twin's environments under the names that LeRobot's ``preprocess_observation`` reads (lerobot/envs/utils.py, 0.6.1).
+
+LeRobot turns ``pixels/<camera>`` into ``observation.images.<camera>``, ``agent_pos`` into ``observation.state``, and puts
+``observation.`` before any other name. Here, not in ``lerobot_plugin``, so that worker processes start without torch.
+"""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from taccorl.sim.env import TaccorlEnv
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+
+def raw_names(observation: Observation) -> dict[str, Any]:
+    """An observation with pictures, or a batch of them, renamed. Counts become float32, as LeRobot's recorder wants them."""
+    return {
+        "pixels": {name: observation[IMAGE_KEYS[name]] for name in CAMERAS},
+        "agent_pos": observation[STATE_KEY],
+        "tactile": observation[TACTILE_KEY].astype(np.float32),
+    }
+
+
+def _raw_space(space: gymnasium.Space) -> gymnasium.spaces.Dict:
+    assert isinstance(space, gymnasium.spaces.Dict)
+    counts = space[TACTILE_KEY]
+    assert isinstance(counts, gymnasium.spaces.Box)
+    tactile = gymnasium.spaces.Box(counts.low.astype(np.float32), counts.high.astype(np.float32))
+    pixels = gymnasium.spaces.Dict({name: space[IMAGE_KEYS[name]] for name in CAMERAS})
+    return gymnasium.spaces.Dict({"pixels": pixels, "agent_pos": space[STATE_KEY], "tactile": tactile})
+
+
+class LeRobotEnv(TaccorlEnv):
+    """``TaccorlEnv`` with LeRobot's raw names; always with pictures."""
+
+    def __init__(self, task: str, **settings: Any) -> None:
+        super().__init__(task, images=True, **settings)
+        self.observation_space = _raw_space(self.observation_space)
+
+    def reset(self, **arguments: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        observation, info = super().reset(**arguments)
+        return raw_names(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return raw_names(observation), reward, terminated, truncated, info
+
+
+class LeRobotVectorEnv(TaccorlVectorEnv):
+    """``TaccorlVectorEnv`` with LeRobot's raw names; always with pictures.
+
+    An episode that is over stands still: LeRobot's rollout steps until the last one is, and ignores what follows the first end.
+    """
+
+    def __init__(self, task: str, num_envs: int, **settings: Any) -> None:
+        super().__init__(task, num_envs, images="always", autoreset=gymnasium.vector.AutoresetMode.DISABLED, **settings)
+        self.single_observation_space = _raw_space(self.single_observation_space)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+
+    def reset(self, **arguments: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        observation, info = super().reset(**arguments)
+        return raw_names(observation), info
+
+    def step(self, actions: np.ndarray) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(actions)
+        return raw_names(observation), reward, terminated, truncated, info

@@ -1,0 +1,92 @@
+"""From what predicates see at one instant to what became of an episode: held for half a second, failed, or out of time."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from taccorl.sim.robot import ARMS
+from taccorl.sim.tasks.task import HOLD_S, Task, Verdict
+
+if TYPE_CHECKING:
+    from taccorl.sim.simulation import Simulation
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of each of N episodes so far."""
+
+    success: np.ndarray
+    """(N,) bool: the goal has held for 0.5 s after release, and nothing had failed before."""
+    failure: np.ndarray
+    """(N,) object: '' or the category: the task's own, ``timeout`` or ``diverged``."""
+    partial: np.ndarray
+    """(N,) int, newest."""
+
+    @property
+    def over(self) -> np.ndarray:
+        """(N,) bool."""
+        return self.success | (self.failure != "")
+
+
+class Judge:
+    """Counters over control steps, one row a simulation."""
+
+    def __init__(self, task: Task, num_sims: int, control_hz: int) -> None:
+        self.task, self.control_hz = task, control_hz
+        self.hold_steps = round(HOLD_S * control_hz)
+        self.limit_steps = round(task.time_limit_s * control_hz)
+        self.held = np.zeros(num_sims, dtype=np.int64)
+        self.steps = np.zeros(num_sims, dtype=np.int64)
+        self.success = np.zeros(num_sims, dtype=bool)
+        self.failure = np.full(num_sims, "", dtype=object)
+        self.lasted = np.zeros((num_sims, len(task.failures)), dtype=np.int64)
+        """(N, categories) control steps for which each failure has been seen without a break."""
+        self._limits = np.array([max(1, round(seconds * control_hz)) for seconds in task.failures.values()])
+        self.subtask = np.zeros((num_sims, len(ARMS)), dtype=np.int64)
+        """(N, 2) index of each arm's current subtask; one past the last when all are done."""
+        self.verdict: Verdict | None = None
+        self._subtasks = task.subtasks()
+
+    @property
+    def outcome(self) -> Outcome:
+        assert self.verdict is not None, "reset the simulation first"
+        return Outcome(self.success.copy(), self.failure.copy(), self.verdict.partial)
+
+    def reset(self, ids: np.ndarray, scene: "Simulation") -> None:
+        self.held[ids] = self.steps[ids] = 0
+        self.success[ids], self.failure[ids] = False, ""
+        self.subtask[ids] = self.lasted[ids] = 0
+        self.verdict = self.task.look(scene)
+
+    def update(self, scene: "Simulation") -> None:
+        """After each control step. An episode that is over keeps its outcome."""
+        verdict = self.verdict = self.task.look(scene)
+        running = ~self.success & (self.failure == "")
+        self.steps[running] += 1
+        self.held = np.where(verdict.goal & ~scene.diverged, self.held + 1, 0)
+        self.success |= running & (self.held >= self.hold_steps)
+        running &= ~self.success
+        seen = np.array([verdict.failures[name] for name in self.task.failures], bool).reshape(-1, len(self.held)).T
+        self.lasted = np.where(seen, self.lasted + 1, 0)
+        failed = np.column_stack([self.lasted >= self._limits, np.ones(len(self.held), bool)])
+        failure = np.array([*self.task.failures, ""], dtype=object)[failed.argmax(1)]  # the first, or none
+        failure[(failure == "") & (self.steps >= self.limit_steps)] = "timeout"
+        failure[scene.diverged] = "diverged"
+        self.failure[running] = failure[running]
+        # Only the current subtask may end, and one a step at most: an edge before its turn does not count.
+        before = self.subtask.copy()
+        for a, arm in enumerate(ARMS):
+            for k, subtask in enumerate(self._subtasks[arm]):
+                self.subtask[(before[:, a] == k) & subtask.done(scene), a] = k + 1
+
+    def snapshot(self, ids: np.ndarray) -> dict[str, np.ndarray]:
+        return {
+            name: getattr(self, name)[ids].copy()
+            for name in ("held", "lasted", "steps", "success", "failure", "subtask")
+        }
+
+    def restore(self, rows: dict[str, np.ndarray], ids: np.ndarray, scene: "Simulation") -> None:
+        for name, values in rows.items():
+            getattr(self, name)[ids] = values
+        self.verdict = self.task.look(scene)

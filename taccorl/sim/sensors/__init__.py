@@ -1,0 +1,148 @@
+"""Sensors of the twin, one file each: register a ``SensorConfig`` with ``@sensors.register("name")`` and it takes part.
+
+What every sensor does, in this order (``Sensor.sense``):
+
+1. law: depth and rate of the taxels → reading, a number per taxel, 0 where nothing touches;
+2. transforms: effects of the sensor's material and wiring, reading → reading, one after the other;
+3. gain, resting counts, noise, analogue-digital converter → counts on the wire.
+
+Effects (a law that is no straight line, creep, crosstalk, dead taxels, drift) are transforms and nothing else.
+
+Letters in shapes: N sims, P pads, K taxels = R rows · C columns.
+"""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from taccorl.data.spec import SensorSpec
+from taccorl.errors import TaccorlError, nearest
+from taccorl.plugins import Registry
+
+type Noise = np.random.Generator | Sequence[np.random.Generator] | None
+"""One generator for all sims; or one each, so that a sim's noise is the same alone and in a batch; or no noise."""
+
+
+class Transform(Protocol):
+    """One effect between law and gain."""
+
+    def __call__(self, reading: np.ndarray, /) -> np.ndarray:
+        """(N, P, R, C) reading → the same shape. One with a memory keeps it per sim and is called once a scan."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class TactileFrames:
+    """What all pads send at one instant."""
+
+    counts: np.ndarray
+    """(N, P, R, C) uint8 or uint16 counts on the wire, in the pads' own layout."""
+    baseline: np.ndarray
+    """(P, R, C) counts at rest, without noise: what ingest finds as the median of a recording's first frames, but for noise."""
+    pads: tuple[str, ...]
+    spec: SensorSpec
+
+    @property
+    def counts_above_baseline(self) -> np.ndarray:
+        """(N, P · K) int16: ``observation.tactile`` of the dataset, pad after pad, row after row."""
+        above = np.subtract(self.counts, self.baseline, dtype=np.int16, casting="unsafe")
+        return above.reshape(len(above), -1)
+
+    def wire_frame(self, pad: str) -> np.ndarray:
+        """(N, wire rows, wire columns) as the board of ``pad`` sends them, row after row.
+
+        Raises:
+            TaccorlError: there is no such pad; names the nearest.
+        """
+        if pad not in self.pads:
+            raise TaccorlError(f"no pad {pad!r}; {nearest(pad, self.pads)}")
+        return np.ascontiguousarray(as_wire(self.counts[:, self.pads.index(pad)], self.spec))
+
+
+def as_wire(frames: np.ndarray, spec: SensorSpec) -> np.ndarray:
+    """(..., R, C) in the pad's layout → (..., wire rows, wire columns); a view."""
+    return frames.swapaxes(-1, -2) if spec.wire.transpose else frames
+
+
+class Sensor(abc.ABC):
+    """Pads of one kind. Holds what is built into this one: resting counts, transforms."""
+
+    def __init__(
+        self, spec: SensorSpec, pads: Sequence[str], baseline: np.ndarray, transforms: Sequence[Transform]
+    ) -> None:
+        self.spec, self.pads, self.baseline = spec, tuple(pads), baseline
+        self.transforms = list(transforms)
+        """Applied in this order; with none of them a reading goes on untouched, bit for bit."""
+
+    @abc.abstractmethod
+    def reading(self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, time_s: np.ndarray | None) -> np.ndarray:
+        """Law: depth and rate (N, P, K), or (S, N, P, K) at times (S,) before the stamp, → reading (N, P, R, C)."""
+
+    @abc.abstractmethod
+    def clean_counts(self, reading: np.ndarray) -> np.ndarray:
+        """Counts above rest, without noise, rounding and limits: what a driver model of its own starts from. Same shape."""
+
+    @abc.abstractmethod
+    def digitise(self, reading: np.ndarray, noise: Noise) -> np.ndarray:
+        """Gain, resting counts, noise and converter: reading (N, P, R, C) → counts on the wire, same shape."""
+
+    def sense(
+        self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, noise: Noise, time_s: np.ndarray | None = None
+    ) -> TactileFrames:
+        """What the pads send for depth [m] and rate [m/s] of their taxels (N, P, K).
+
+        Given as a history (S, N, P, K) with ``time_s`` (S,), rising, of which 0 is the stamp (the end of the scan), each row
+        of the wire reads at its own instant of the scan. Without ``time_s`` the whole pad reads at once.
+
+        Raises:
+            TaccorlError: shapes do not fit, a history does not cover the scan, a transform changes the shape.
+        """
+        shape = (len(self.pads), self.spec.rows * self.spec.columns)
+        if (
+            depth_m.shape != depth_rate_mps.shape
+            or depth_m.ndim != (3 if time_s is None else 4)
+            or depth_m.shape[-2:] != shape
+        ):
+            raise TaccorlError(
+                f"sensor {self.spec.name}: depth {depth_m.shape} and rate {depth_rate_mps.shape}; give both as (sims, "
+                f"{shape[0]}, {shape[1]}), or as (samples, sims, {shape[0]}, {shape[1]}) with time_s of the samples"
+            )
+        reading = self.reading(depth_m, depth_rate_mps, time_s)
+        for transform in self.transforms:
+            before, reading = reading.shape, transform(reading)
+            if reading.shape != before:
+                raise TaccorlError(f"sensor {self.spec.name}: {transform} made {reading.shape} of a reading {before}")
+        return TactileFrames(self.digitise(reading, noise), self.baseline, self.pads, self.spec)
+
+
+@dataclass(kw_only=True)
+class SensorConfig(abc.ABC):
+    """Settings of one kind of sensor."""
+
+    seed: int = 0
+    """Of this unit: what differs from board to board (resting counts) is drawn from it."""
+
+    @abc.abstractmethod
+    def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> Sensor:
+        """The sensor on these pads, in their order, with effects between law and gain, in theirs."""
+
+
+sensors: Registry[type[SensorConfig]] = Registry("sensor", "taccorl.sim.sensors")
+
+
+def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Normal numbers (N, ...) float32, sim after sim; None without noise.
+
+    Raises:
+        TaccorlError: another number of generators than sims.
+    """
+    if noise is None:
+        return None
+    if isinstance(noise, np.random.Generator):
+        return noise.standard_normal(shape, dtype=np.float32)
+    if len(noise) != shape[0]:
+        raise TaccorlError(f"noise: {len(noise)} generators for {shape[0]} sims; give one each, or one for all")
+    return np.stack([rng.standard_normal(shape[1:], dtype=np.float32) for rng in noise])

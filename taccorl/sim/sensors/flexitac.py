@@ -1,0 +1,128 @@
+"""FlexiTac-V2: 32 × 12 taxels a pad, normal channel only, one byte a taxel, about 100 scans a second.
+
+Law (paper eq. 10): f = [k_n δ + k_d δ̇]₊ where δ > 0. The reading f has the unit of the policy's normalised reading: with the
+default gain 1 is 75 counts, since the data spec's gain is 1/75 a count, and contact is f > λ_f = 0.4, 30 counts.
+
+k_n and the gain are a choice, not a measurement: 10 N on a whole sprung pad (2e4 N/m: 0.5 mm) read f = 0.8 at the deepest
+taxel, 60 counts; 30 N read 180, and at 40 N a taxel with a high resting count saturates. No force calibration of these boards
+is known to us; alignment fits both on a robot.
+
+Board and wire: data_specs/sensors/flexitac_v2.yaml. Letters in shapes: as in ``taccorl.sim.sensors``, S samples.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.data.spec import SensorSpec, find_spec, load_sensor_spec
+from taccorl.errors import TaccorlError
+from taccorl.sim.sensors import Noise, Sensor, SensorConfig, Transform, as_wire, sensors, standard_normal
+
+
+def normal_reading(
+    depth_m: np.ndarray, depth_rate_mps: np.ndarray, stiffness_per_m: float, damping_s_per_m: float
+) -> np.ndarray:
+    """Spring-damper taxel reading, paper eq. 10: [k_n δ + k_d δ̇]₊, and 0 where δ is. Never pulls."""
+    reading = stiffness_per_m * depth_m + damping_s_per_m * depth_rate_mps
+    return np.maximum(reading, 0) * (depth_m > 0)
+
+
+def scan_instants_s(spec: SensorSpec) -> np.ndarray:
+    """(wire rows,) when each row of the wire is read, before the stamp: the middles of equal shares of the scan."""
+    share = (np.arange(spec.wire.rows) + 0.5) / spec.wire.rows
+    return (share - 1) * spec.scan_time_s
+
+
+def at_scan_instants(samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec) -> np.ndarray:
+    """Samples (S, ..., R, C) at times (S,) → (..., R, C), each row of the wire at its instant, by linear interpolation.
+
+    Raises:
+        TaccorlError: times do not rise, or leave out an instant of the scan.
+    """
+    instants_s = scan_instants_s(spec)
+    times = np.asarray(time_s, float)
+    if (
+        times.shape != samples.shape[:1]
+        or (np.diff(times) <= 0).any()
+        or times[0] > instants_s[0]
+        or times[-1] < instants_s[-1]
+    ):
+        raise TaccorlError(
+            f"sensor {spec.name}: {len(samples)} samples at {times.tolist()} s; times must rise and cover the scan, "
+            f"{instants_s[0]:.4f} to {instants_s[-1]:.4f} s before the stamp"
+        )
+    after = np.clip(np.searchsorted(times, instants_s, side="right"), 1, len(times) - 1)
+    weight = ((instants_s - times[after - 1]) / (times[after] - times[after - 1])).astype(samples.dtype)
+    on_wire = as_wire(samples, spec)
+    row = np.arange(spec.wire.rows)
+    # Both picks stand first: (wire rows, ..., wire columns)
+    earlier, later = on_wire[after - 1, ..., row, :], on_wire[after, ..., row, :]
+    weight = weight.reshape(-1, *[1] * (earlier.ndim - 1))
+    return as_wire(np.moveaxis(earlier + weight * (later - earlier), 0, -2), spec)
+
+
+class FlexiTac(Sensor):
+    """Pads as ``FlexiTacConfig`` describes them. Stateless but for transforms with a memory."""
+
+    def __init__(
+        self, config: "FlexiTacConfig", spec: SensorSpec, pads: Sequence[str], transforms: Sequence[Transform]
+    ) -> None:
+        shape = (len(pads), spec.rows, spec.columns)
+        low, high = config.resting_count
+        # In the middle of a step of the converter, so that a reading of ± ½ count does not show.
+        self._resting = np.random.default_rng(config.seed).integers(low, high + 1, shape) + 0.5
+        super().__init__(spec, pads, np.floor(self._resting).astype(np.int64), transforms)
+        self._config = config
+
+    def reading(self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, time_s: np.ndarray | None) -> np.ndarray:
+        grids = [a.reshape(*a.shape[:-1], self.spec.rows, self.spec.columns) for a in (depth_m, depth_rate_mps)]
+        if time_s is not None:
+            grids = [at_scan_instants(grid, time_s, self.spec) for grid in grids]
+        return normal_reading(*grids, self._config.normal_stiffness_per_m, self._config.normal_damping_s_per_m)
+
+    def clean_counts(self, reading: np.ndarray) -> np.ndarray:
+        return self._config.gain_count * reading
+
+    def digitise(self, reading: np.ndarray, noise: Noise) -> np.ndarray:
+        counts = self.clean_counts(reading) + self._resting.astype(np.float32)
+        normal = standard_normal(noise, counts.shape)
+        if normal is not None:
+            counts += self._config.noise_std_count * normal
+        # The converter cuts off what is below its step, and sends all but its low bits: in counts of the wire, floor.
+        return np.clip(counts, 0, self.spec.max_count).astype(self.spec.wire.dtype)
+
+
+@sensors.register("flexitac")
+@dataclass(kw_only=True)
+class FlexiTacConfig(SensorConfig):
+    """FlexiTac-V2 pads."""
+
+    spec: str = "flexitac_v2"
+    """Sensor file: taxels, wire, converter, scan. A name among data_specs/sensors, or a path."""
+    normal_stiffness_per_m: float = 1600.0
+    """k_n: reading for each metre of depth. A choice, see above."""
+    normal_damping_s_per_m: float = 8.0
+    """k_d: reading for each m/s of rate. A choice: k_d / k_n = 5 ms, 6 counts at a closing speed of 10 mm/s."""
+    gain_count: float = 75.0
+    """Counts for a reading of 1."""
+    resting_count: tuple[int, int] = (10, 40)
+    """Lowest and highest resting count of a taxel; each taxel draws its own from ``seed``."""
+    noise_std_count: float = 1.3
+    """Standard deviation of a taxel's noise, from scan to scan. A choice, as in the stand-in recordings; the boards' own
+    no-contact threshold is 15 counts."""
+
+    def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> FlexiTac:
+        """The sensor on these pads, with effects between law and gain.
+
+        Raises:
+            TaccorlError: a setting that no board can have.
+        """
+        spec = load_sensor_spec(find_spec(self.spec))
+        low, high = self.resting_count
+        if not 0 <= low <= high < spec.max_count:
+            raise TaccorlError(f"flexitac: resting_count {low} … {high}; needs 0 ≤ lowest ≤ highest < {spec.max_count}")
+        for name in ("normal_stiffness_per_m", "normal_damping_s_per_m", "gain_count", "noise_std_count"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise TaccorlError(f"flexitac: {name} {getattr(self, name)}; needs 0 or more")
+        return FlexiTac(self, spec, pads, transforms)

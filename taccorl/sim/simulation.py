@@ -1,0 +1,418 @@
+"""N simulations of one task in lock-step on ``mujoco.batch``: reset, control steps, touch, pictures, exact state.
+
+One simulation is the batch with N = 1, so a run is the same bit for bit alone, in a batch and with any number of threads.
+Letters in shapes: N simulations, S sub-commands of one control step.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects.added import AddedEffects
+from taccorl.sim.effects.history import fill_histories
+from taccorl.sim.outcome import Judge
+from taccorl.sim.pad import PadArray
+from taccorl.sim.randomize import draw
+from taccorl.sim.rendering import Renderer
+from taccorl.sim.robot import ARMS, FINGER_STROKE_M, JOINTS, LINKS, PADS
+from taccorl.sim.sensors import Noise, TactileFrames
+from taccorl.sim.tasks.task import Contact, Reset, Task
+from taccorl.sim.twin import CONTROL_HZ, TwinConfig, build_spec
+
+SUB_COMMANDS = 5
+"""Targets go to their new value in a straight line over a control step, at 150 Hz: a robot's driver does not jump either."""
+OPEN_M = 2 * FINGER_STROKE_M
+ACTION_NAMES = tuple(f"{arm}_{j}" for arm in ARMS for j in (*JOINTS, "gripper"))
+_LIMITS = np.array([*(link.range_rad for link in LINKS), (0.0, OPEN_M)] * 2, np.float32)
+ACTION_LOW = np.nextafter(_LIMITS[:, 0], np.float32(1), dtype=np.float32).astype(float)
+ACTION_HIGH = np.nextafter(_LIMITS[:, 1], np.float32(0), dtype=np.float32).astype(float)
+ACTION_LOW[[6, 13]] = 0.0
+"""Joint limits and gripper opening, in the order of ``action`` (rad, m), as float32 that lie inside: a clipped action is stored
+exactly. Targets beyond are clipped, as the driver does."""
+_ABSURD = np.array([*([2 * np.pi] * 6), 0.5] * 2)  # beyond any limit by this much: another unit
+_UNSTABLE = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL)]
+_UNSTABLE += [int(mujoco.mjtWarning.mjWARN_BADQACC)]
+_BOUND = ("qpos", "qvel", "ctrl", "time", "xpos", "xmat", "cvel", "subtree_com", "site_xpos", "site_xmat", "geom_xpos")
+_BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat", "actuator_force")
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All that is needed to go on bit-exactly from here; rows belong to ``ids`` of the simulation it was taken from."""
+
+    physics: np.ndarray
+    """(n, nstate) ``mjSTATE_INTEGRATION``: positions, velocities, controls, histories, warm start."""
+    judge: dict[str, np.ndarray]
+    seeds: np.ndarray
+    """(n,) of the reset draw: friction and masses follow from it."""
+    memory: dict[str, np.ndarray]
+    """Name → (n, …): targets asked for, and what effects remember."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Wants to see the simulation after some of the physics steps of a control step."""
+
+    at: Sequence[int]
+    """Physics steps since the control step began, ≥ 1."""
+    see: Callable[[int], None]
+    """Called with each of them; positions, velocities and sensors are current."""
+
+
+class Simulation:
+    """N simulations of ``task`` in the twin ``config``.
+
+    Raises:
+        TaccorlError: wrong sizes, unknown names.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        config: TwinConfig | None = None,
+        *,
+        num_sims: int = 1,
+        num_threads: int = 1,
+        scale: float = 1.0,
+    ) -> None:
+        if num_sims < 1 or num_threads < 0:
+            raise TaccorlError(f"simulation: num_sims {num_sims} and num_threads {num_threads} must be ≥ 1 and ≥ 0")
+        self.task, self.config, self.num_sims = task, config or TwinConfig(), num_sims
+        self.randomization_scale = scale
+        self.spec = build_spec(self.config, task)
+        self.model = self.spec.compile()
+        self.batch = Batch(self.model, num_sims, num_threads)
+        self.arrays = {name: self.batch.bind(name) for name in _BOUND}
+        self.judge = Judge(task, num_sims, CONTROL_HZ)
+        self.pads = PadArray(self.model, PADS)
+        self.effects = AddedEffects(self.config.effects, self.arrays["time"])
+        self.sensor = self.config.sensor.build(PADS, [self.effects])
+        self.seeds = np.full(num_sims, -1, dtype=np.int64)
+        self.draws: list[dict[str, np.ndarray]] = [{} for _ in range(num_sims)]
+        self.diverged = np.zeros(num_sims, dtype=bool)
+        self.clipped = np.zeros(num_sims, dtype=bool)
+        """(N,) whether the newest action lay beyond the limits."""
+        self.executed = np.zeros((num_sims, len(ACTION_NAMES)))
+        """(N, 14) the newest action as it acted."""
+        self.targets = np.zeros((num_sims, len(ACTION_NAMES)))
+        """(N, 14) the newest targets asked for; effects may hold them up on their way to the controllers."""
+        self._renderers: dict[tuple, Renderer] = {}
+        self._index()
+
+    def _index(self) -> None:
+        m = self.model
+        self.action_actuators = np.array([m.actuator(name).id for name in ACTION_NAMES])
+        self._encoders = np.array([m.sensor(f"{name}_pos").adr[0] for name in ACTION_NAMES])
+        self._joint_qpos = {arm: np.array([m.joint(f"{arm}_{j}").qposadr[0] for j in JOINTS]) for arm in ARMS}
+        self._fingers = np.array([m.joint(f"{arm}_finger_{f}").qposadr[0] for arm in ARMS for f in "ab"])
+        self._free = {part: m.joint(part) for part in self.task.parts}
+        self._bodies = {name: m.body(name).id for name in (*self.task.parts, *self.task.clamped)}
+        owner = m.geom_bodyid
+        self._part_geoms = np.flatnonzero(np.isin(owner, list(self._bodies.values())) & (m.geom_contype > 0))
+        self._friction = self.batch.expand("geom_friction")
+        self._mass = {name: (m.body_mass[i], m.body_inertia[i].copy()) for name, i in self._bodies.items()}
+        self._body_mass, self._body_inertia = self.batch.expand("body_mass"), self.batch.expand("body_inertia")
+        touching = [[m.sensor(f"{pad}_on_{part}").adr[0] for pad in PADS] for part in self.task.parts]
+        self._touching = {part: np.array(row) for part, row in zip(self.task.parts, touching, strict=True)}
+        self._mating = {
+            pair: (m.sensor("{}_on_{}".format(*pair)).adr[0], m.sensor("{}_on_{}_force".format(*pair)).adr[0])
+            for pair in self.task.mating
+        }
+
+    # reset -----------------------------------------------------------------------------------------------------------
+
+    def reset(self, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None) -> None:
+        """Draw new scenes for ``ids`` (all by default), one seed each. The same seed gives the same scene, bit for bit."""
+        ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
+        seeds = np.asarray(seeds, dtype=np.int64)
+        if seeds.shape != ids.shape:
+            raise TaccorlError(f"reset: {seeds.size} seeds for {ids.size} simulations; give one each")
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        for i, seed in zip(ids, seeds, strict=True):
+            self._place(int(i), int(seed))
+        self.batch.set_const(ids)
+        self._settle(ids)
+        self.batch.forward(ids)
+        self.diverged[ids] = self.clipped[ids] = False
+        self.judge.reset(ids, self)
+
+    def _settle(self, ids: np.ndarray) -> None:
+        """Effects of ``ids`` forget, delayed values included: the controls in force have been so for ever."""
+        self.targets[ids] = self.arrays["ctrl"][ids][:, self.action_actuators]
+        self.effects.reset(ids, self.targets)
+        fill_histories(self.batch, ids)
+
+    def _place(self, i: int, seed: int) -> None:
+        """Write the scene of ``seed`` into simulation ``i``: its model's random fields and its state."""
+        self.seeds[i] = seed
+        self.draws[i] = draw(self.task.rows, np.random.default_rng(seed), self.randomization_scale)
+        scene = self.task.reset(self.draws[i])
+        self._write_model(i, scene)
+        qpos = self.arrays["qpos"]
+        for part, joint in self._free.items():
+            qpos[i, joint.qposadr[0] : joint.qposadr[0] + 7] = scene.poses[part]
+        for body in self.task.clamped:
+            slot = self.model.body(body).mocapid[0]
+            self.arrays["mocap_pos"][i, slot], self.arrays["mocap_quat"][i, slot] = np.split(scene.poses[body], [3])
+        for arm in ARMS:
+            home = np.array(self.task.home_rad[arm])
+            qpos[i, self._joint_qpos[arm]] = home
+            # The arm rests T_ref / K_p away from its target, so that it stands still where it stands.
+            rest = np.array(self.config.controller.torque_ff_nm) / np.array(self.config.controller.kp_nm_per_rad)
+            self.arrays["ctrl"][i, [self.model.actuator(f"{arm}_{j}").id for j in JOINTS]] = home - rest
+            self.arrays["ctrl"][i, self.model.actuator(f"{arm}_gripper").id] = ACTION_HIGH[6]
+        qpos[i, self._fingers] = FINGER_STROKE_M
+
+    def place_arms(self, joints: np.ndarray, targets: np.ndarray) -> None:
+        """Put the arms of every simulation at rest at ``joints`` (14,) [rad, m] with ``targets`` (14,) in force."""
+        qpos, qvel = self.arrays["qpos"], self.arrays["qvel"]
+        joints = joints - (self.effects.encoder(joints[None])[0] - joints)  # where they are when they report ``joints``
+        for a, arm in enumerate(ARMS):
+            qpos[:, self._joint_qpos[arm]] = joints[7 * a : 7 * a + 6]
+            qpos[:, self._fingers[2 * a : 2 * a + 2]] = joints[7 * a + 6] / 2
+        qvel[:] = 0.0
+        self.arrays["ctrl"][:, self.action_actuators] = targets
+        self._settle(np.arange(self.num_sims))
+        self.batch.forward()
+
+    def _write_model(self, i: int, scene: Reset) -> None:
+        self._friction[i, self._part_geoms, 0] = scene.friction
+        for name, (mass, inertia) in self._mass.items():
+            body, change = self._bodies[name], scene.mass_change_kg.get(name, 0.0)
+            self._body_mass[i, body] = mass + change
+            self._body_inertia[i, body] = inertia * ((mass + change) / mass) if mass > 0 else inertia
+
+    # stepping --------------------------------------------------------------------------------------------------------
+
+    def step(self, action: np.ndarray, ids: np.ndarray | None = None, watch: Watch | None = None) -> None:
+        """One control step (1/30 s) with targets ``action`` (N, 14) [rad, m], reached in a straight line over the step.
+
+        ``watch`` sees the state in between; it changes nothing.
+        """
+        goal = self._checked(action)
+        now = self.targets.copy()
+        line = np.arange(1, SUB_COMMANDS + 1)[:, None, None] / SUB_COMMANDS
+        commands = now + (goal - now) * line
+        commands[-1] = goal  # exactly, not to rounding
+        self.advance(commands, self.config.physics.steps_per_control_step // SUB_COMMANDS, ids, watch)
+        self.judge.update(self)
+
+    def advance(
+        self, commands: np.ndarray, num_steps: int, ids: np.ndarray | None = None, watch: Watch | None = None
+    ) -> None:
+        """Physics only: S targets (S, N, 14), each held for ``num_steps`` physics steps. For replay and recording."""
+        watched = set(watch.at) if watch else set()
+        total = len(commands) * num_steps
+        arrive = self._send(commands, num_steps, ids)
+        done = 0
+        for end in sorted({*range(num_steps, total + 1, num_steps), *watched}):
+            self.arrays["ctrl"][:, self.action_actuators] = arrive[done // num_steps]
+            stages = mujoco.mjtStage
+            stage = (
+                stages.mjSTAGE_ACC if end == total else stages.mjSTAGE_VEL if end in watched else stages.mjSTAGE_NONE
+            )
+            self.batch.step(ids, nstep=end - done, stage=stage)
+            done = end
+            ids = self._sound(ids)
+            if watch and end in watched:
+                watch.see(end)
+        if self.effects.remember_touch:
+            self.effects.scan(self.sensor.reading(*self.pads.touch(self.batch), None))
+
+    def _sound(self, ids: np.ndarray | None) -> np.ndarray | None:
+        """Those of ``ids`` that have not diverged. A simulation of NaNs would cost twenty times a sound one's time."""
+        finite = np.isfinite(self.arrays["qvel"]).all(1) & np.isfinite(self.arrays["qpos"]).all(1)
+        bad = ~finite | self.batch.warning[:, _UNSTABLE, 1].any(1)
+        if not bad.any():
+            return ids
+        self.diverged |= bad
+        ids = np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
+        return ids[~bad[ids]]
+
+    def _send(self, commands: np.ndarray, num_steps: int, ids: np.ndarray | None) -> list[np.ndarray]:
+        """What of S targets (S, N, 14), each held for ``num_steps`` physics steps, reaches the controllers."""
+        held_s = np.zeros(self.num_sims)
+        held_s[slice(None) if ids is None else ids] = num_steps * self.config.physics.timestep_s
+        self.targets[:] = commands[-1]
+        return [self.effects.command(command, held_s) for command in commands]
+
+    def _checked(self, action: np.ndarray) -> np.ndarray:
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (self.num_sims, len(ACTION_NAMES)):
+            raise TaccorlError(
+                f"action: shape {action.shape}, the twin wants ({self.num_sims}, {len(ACTION_NAMES)}): "
+                f"{', '.join(ACTION_NAMES[:7])}, and the same of the right arm"
+            )
+        beyond = ~((action >= ACTION_LOW - _ABSURD) & (action <= ACTION_HIGH + _ABSURD))  # NaN is beyond, too
+        if beyond.any():
+            i, k = np.argwhere(beyond)[0]
+            raise TaccorlError(
+                f"action: {ACTION_NAMES[k]} of simulation {i} is {action[i, k]:g}, limits are {ACTION_LOW[k]:g} … "
+                f"{ACTION_HIGH[k]:g}. Joints are in rad, the gripper's opening is in m."
+            )
+        goal = np.clip(action, ACTION_LOW, ACTION_HIGH)
+        self.clipped = (goal != action).any(1)
+        self.executed = goal
+        return goal
+
+    # what is seen ----------------------------------------------------------------------------------------------------
+
+    def proprioception(self) -> np.ndarray:
+        """(N, 14) joint angles [rad] and gripper openings [m] as the encoders report them, in the order of actions."""
+        return self.effects.encoder(self.arrays["sensordata"][:, self._encoders])
+
+    def effort(self) -> np.ndarray:
+        """(N, 14) torque of the joints' motors [N·m] and force of the grippers' [N] in the newest physics step."""
+        return self.arrays["actuator_force"][:, self.action_actuators]
+
+    def reading(self) -> np.ndarray:
+        """(N, 4, 32, 12) float32 what the pads read before gain, noise and rounding: a pure function of the state, and of
+        the past where effects remember it."""
+        reading = self.sensor.reading(*self.pads.touch(self.batch), None)
+        for transform in self.sensor.transforms:
+            reading = transform(reading)
+        return reading
+
+    def touch(self, noise: Noise = None) -> np.ndarray:
+        """(N, 1536) int16 counts above baseline now; without ``noise`` (one generator, or one a simulation) no noise."""
+        counts = self.sensor.digitise(self.reading(), noise)
+        return TactileFrames(counts, self.sensor.baseline, PADS, self.sensor.spec).counts_above_baseline
+
+    def render(
+        self, cameras: Sequence[str] | None = None, ids: np.ndarray | None = None, size: tuple[int, int] = (224, 224)
+    ) -> dict[str, np.ndarray]:
+        """Camera → (n, rows, columns, 3) uint8 RGB of simulations ``ids`` (all by default), letterboxed as in a dataset."""
+        names = tuple(cameras or (camera.name for camera in self.config.cameras))
+        pictures = self._renderer(names, size).render_batch(self.batch, ids)
+        return {name: pictures[:, k] for k, name in enumerate(names)}
+
+    def render_states(
+        self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
+    ) -> Iterator[dict[str, np.ndarray]]:
+        """Camera → (rows, columns, 3) uint8 for each of the stored rows (T, row_size); the simulations stay as they are."""
+        data = mujoco.MjData(self.model)
+        renderer = self._renderer(tuple(cameras), size)
+        for state in states:
+            mujoco.mj_setState(self.model, data, state[: self.batch.nstate], mujoco.mjtState.mjSTATE_INTEGRATION)
+            mujoco.mj_kinematics(self.model, data)
+            mujoco.mj_comPos(self.model, data)
+            mujoco.mj_camlight(self.model, data)
+            pictures = renderer.render([data])[0]
+            yield dict(zip(cameras, pictures, strict=True))
+
+    def _renderer(self, cameras: tuple[str, ...], size: tuple[int, int]) -> Renderer:
+        if (cameras, size) not in self._renderers:
+            self._renderers[cameras, size] = Renderer(self.model, cameras, *size)
+        return self._renderers[cameras, size]
+
+    def close(self) -> None:
+        """Free OpenGL contexts."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+
+    def poses(self, body: str) -> np.ndarray:
+        """World-from-body (N, 4, 4)."""
+        k = self._body(body)
+        pose = np.zeros((self.num_sims, 4, 4))
+        pose[:, :3, :3] = self.arrays["xmat"][:, k].reshape(-1, 3, 3)
+        pose[:, :3, 3], pose[:, 3, 3] = self.arrays["xpos"][:, k], 1.0
+        return pose
+
+    def tcp(self, arm: str) -> np.ndarray:
+        """World-from-TCP (N, 4, 4): z = approach direction, y = closing direction."""
+        k = self.model.site(f"{arm}_tcp").id
+        pose = np.zeros((self.num_sims, 4, 4))
+        pose[:, :3, :3] = self.arrays["site_xmat"][:, k].reshape(-1, 3, 3)
+        pose[:, :3, 3], pose[:, 3, 3] = self.arrays["site_xpos"][:, k], 1.0
+        return pose
+
+    def velocities(self, body: str) -> np.ndarray:
+        """(N, 3) linear velocity of the body's frame origin, world [m/s]."""
+        k = self._body(body)
+        spatial = self.arrays["cvel"][:, k]
+        arm = self.arrays["xpos"][:, k] - self.arrays["subtree_com"][:, self.model.body_rootid[k]]
+        return spatial[:, 3:] + np.cross(spatial[:, :3], arm)
+
+    def pads_touching(self, body: str) -> np.ndarray:
+        """(N, 4) bool in pad order."""
+        return self.arrays["sensordata"][:, self._touching[body]] > 0
+
+    def contact(self, body: str, other: str) -> Contact:
+        """Of a pair in ``task.mating``: touching, deepest penetration and net normal force."""
+        if (body, other) not in self._mating:
+            raise TaccorlError(f"contact {body}–{other}: task {self.task.name} declares {list(self._mating)} as mating")
+        data, at, force = self.arrays["sensordata"], *self._mating[body, other]
+        net_n = np.linalg.norm(data[:, force : force + 3], axis=1)
+        return Contact(data[:, at] > 0, np.maximum(-data[:, at + 1], 0.0), net_n)
+
+    def _body(self, name: str) -> int:
+        return self._bodies[name] if name in self._bodies else self.model.body(name).id
+
+    # state -----------------------------------------------------------------------------------------------------------
+
+    def snapshot(self, ids: np.ndarray | None = None) -> Snapshot:
+        """Everything needed to go on from here."""
+        ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
+        memory = self.effects.snapshot(ids) | {"targets": self.targets[ids].copy()}
+        return Snapshot(self.batch.state[ids].copy(), self.judge.snapshot(ids), self.seeds[ids].copy(), memory)
+
+    def restore(self, snapshot: Snapshot, ids: np.ndarray | None = None) -> None:
+        """Put ``ids`` (all by default) into the snapshot's states."""
+        ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
+        if snapshot.physics.shape != (len(ids), self.batch.nstate):
+            raise TaccorlError(
+                f"restore: states of shape {snapshot.physics.shape} do not fit {len(ids)} simulations of task "
+                f"{self.task.name} with {self.batch.nstate} numbers each; they are another task's or another twin's"
+            )
+        for i, seed in zip(ids, snapshot.seeds, strict=True):
+            self._place(int(i), int(seed))
+        self.batch.set_const(ids)
+        self.batch.state[ids] = snapshot.physics
+        self.batch.forward(ids)
+        self.batch.state[ids] = snapshot.physics  # forward() has written its own warm start
+        self.effects.restore(snapshot.memory, ids)
+        self.targets[ids] = snapshot.memory["targets"]
+        self.judge.restore(snapshot.judge, ids, self)
+        self.diverged[ids] = self.clipped[ids] = False
+
+    @property
+    def row_size(self) -> int:
+        """Numbers in a row of ``state_rows``."""
+        return self.state_rows(np.array([0])).shape[1]
+
+    def state_rows(self, ids: np.ndarray | None = None) -> np.ndarray:
+        """(n, row_size) float64 what a dataset keeps of a simulation at one instant: physics, then what effects remember.
+
+        With the seed, which stands for friction and masses, it restores the simulation bit-exactly but for the judge's counters.
+        """
+        snapshot = self.snapshot(ids)
+        memory = [snapshot.memory[name].reshape(len(snapshot.physics), -1) for name in sorted(snapshot.memory)]
+        return np.concatenate([snapshot.physics, *memory], axis=1)
+
+    def restore_rows(self, rows: np.ndarray, seeds: np.ndarray, ids: np.ndarray | None = None) -> None:
+        """Put ``ids`` (all by default) into stored states; the judge begins anew.
+
+        Raises:
+            TaccorlError: rows of another task or of a twin with other effects.
+        """
+        ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
+        rows = np.asarray(rows, dtype=np.float64)
+        if rows.shape != (len(ids), self.row_size):
+            raise TaccorlError(
+                f"restore: rows of shape {rows.shape} do not fit {len(ids)} simulations of task {self.task.name} with "
+                f"{self.row_size} numbers each; they are another task's or of a twin with other effects"
+            )
+        now = self.snapshot(ids)
+        physics, rest = rows[:, : self.batch.nstate], rows[:, self.batch.nstate :]
+        memory, at = {}, 0
+        for name in sorted(now.memory):
+            size = now.memory[name][0].size
+            memory[name] = rest[:, at : at + size].reshape(now.memory[name].shape).astype(now.memory[name].dtype)
+            at += size
+        self.restore(Snapshot(physics, now.judge, np.asarray(seeds, dtype=np.int64).reshape(-1), memory), ids)
+        self.judge.reset(ids, self)

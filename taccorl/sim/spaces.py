@@ -1,0 +1,34 @@
+"""What an environment of the twin shows and takes, as gymnasium spaces, under the names of data_specs/taccorl_bimanual.yaml."""
+
+import math
+
+import numpy as np
+from gymnasium.spaces import Box, Dict
+
+from taccorl.sim.robot import PAD_TAXELS, PADS
+from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+
+CAMERAS = ("front", "left_wrist", "right_wrist")
+IMAGE_SHAPE = (224, 224, 3)  # rows, columns, rgb: what π0.5 looks at
+NUM_TAXELS = len(PADS) * math.prod(PAD_TAXELS)  # K = 1536
+STATE_KEY, TACTILE_KEY = "observation.state", "observation.tactile"
+IMAGE_KEYS = {name: f"observation.images.{name}" for name in CAMERAS}
+
+Observation = dict[str, np.ndarray]
+
+
+def observation_space(images: bool) -> Dict:
+    """Of one environment: joints [rad] and openings [m], counts above baseline, rgb8 pictures."""
+    counts = np.iinfo(np.int16)
+    spaces = {
+        STATE_KEY: Box(-np.inf, np.inf, (len(ACTION_NAMES),), np.float32),
+        TACTILE_KEY: Box(counts.min, counts.max, (NUM_TAXELS,), np.int16),
+    }
+    if images:
+        spaces |= {key: Box(0, 255, IMAGE_SHAPE, np.uint8) for key in IMAGE_KEYS.values()}
+    return Dict(spaces)
+
+
+def action_space() -> Box:
+    """Of one environment: 14 targets within the joint limits [rad] and the grippers' openings [m]."""
+    return Box(ACTION_LOW.astype(np.float32), ACTION_HIGH.astype(np.float32))

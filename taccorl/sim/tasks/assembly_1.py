@@ -1,0 +1,132 @@
+"""Assembly #1: a tenon goes into a mortise in the air, the axes level; a direction that is off wedges.
+
+The left hand holds the socket, the right hand the plug; both lie on the table at first, their axes along y.
+"""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from taccorl.sim.tasks import tasks
+from taccorl.sim.tasks.parts import Fit, Part, add_part, measure_fit, tenon_plug, tenon_socket
+from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict
+
+SOCKET_AT_M, PLUG_AT_M = (0.30, 0.14), (0.30, -0.16)  # of their mating ends, nominal
+HOME_RAD = {
+    "left": (0.003, 1.732, -0.883, -0.528, 0.884, -1.213),
+    "right": (-0.003, 1.732, -0.883, 0.528, 0.884, 1.213),
+}
+LIFTED_M = 0.03
+_IN_DEPTH_M, _IN_TILT_RAD, _IN_LATERAL_M = 0.034, np.deg2rad(2.0), 0.003
+_WEDGED_M, _WEDGED_N = (0.004, 0.030), 15.0
+
+
+@tasks.register("assembly_1")
+class Assembly1(Task):
+    """Plug into socket, both held."""
+
+    name = "assembly_1"
+    instruction = "insert the orange plug into the grey socket in the air"
+    parts = ("plug", "socket")
+    mating = (("plug", "socket"),)
+    failures = {"dropped": 0.0, "wedged": 1.0}  # noqa: RUF012
+    home_rad = HOME_RAD
+
+    def __init__(self, difficulty: str = "train") -> None:
+        super().__init__(difficulty)
+        self.plug: Part = tenon_plug("plug")
+        self.socket: Part = tenon_socket("socket", self.clearance_m)
+        # Let go, the plug's head hangs by what the play allows: 1.7° at 0.5 mm, 3.4° where it is easy.
+        self.in_tilt_rad = max(_IN_TILT_RAD, 1.2 * 2 * self.clearance_m / _IN_DEPTH_M)
+
+    def add_parts(self, spec: mujoco.MjSpec) -> None:
+        add_part(spec, self.plug)
+        add_part(spec, self.socket)
+
+    def reset(self, draw: dict[str, np.ndarray]) -> Reset:
+        return lying_apart(self.plug, self.socket, draw)
+
+    def look(self, scene: Scene) -> Verdict:
+        fit, contact = self._fit(scene), scene.contact("plug", "socket")
+        between = (fit.depth_m > _WEDGED_M[0]) & (fit.depth_m < _WEDGED_M[1]) & (fit.lateral_m < _IN_LATERAL_M)
+        return Verdict(
+            goal=self._inserted(scene),
+            failures={
+                "dropped": fell(scene.poses("plug")) | fell(scene.poses("socket")),
+                "wedged": between & (contact.force_n > _WEDGED_N),
+            },
+            partial=self._inside(fit).astype(int),
+            measures={"depth_m": fit.depth_m, "tilt_rad": fit.tilt_rad, "lateral_m": fit.lateral_m},
+        )
+
+    def _fit(self, scene: Scene) -> Fit:
+        mate = self.plug.mate
+        assert mate is not None
+        hole = scene.poses("socket") @ self.socket.holes["mortise"].part_from_hole
+        return measure_fit(hole, scene.poses("plug") @ mate.part_from_mate, mate.num_turns)
+
+    def _inside(self, fit: Fit) -> np.ndarray:
+        return (fit.depth_m >= _IN_DEPTH_M) & (fit.tilt_rad < self.in_tilt_rad) & (fit.lateral_m < _IN_LATERAL_M)
+
+    def _inserted(self, scene: Scene) -> np.ndarray:
+        inside = np.asarray(~scene.pads_touching("plug").any(1))
+        if inside.any():
+            inside &= self._inside(self._fit(scene))
+        return inside & at_rest(scene, "plug", "socket") if inside.any() else inside
+
+    def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
+        return lift_and_join("socket", "plug", self._inserted)
+
+
+def lying_apart(plug: Part, holder: Part, draw: dict[str, np.ndarray]) -> Reset:
+    """Both on the table with their axes along y, the holder on the left, mating ends towards each other."""
+    plug_xy, holder_xy = PLUG_AT_M + draw["plug_position"], SOCKET_AT_M + draw["socket_position"]
+    return Reset(
+        poses={
+            plug.name: on_table(plug, plug_xy, -np.pi / 2),
+            holder.name: on_table(holder, holder_xy, np.pi / 2),
+        },
+        mass_change_kg={plug.name: float(draw["plug_mass"][0]), holder.name: float(draw["socket_mass"][0])},
+        friction=float(draw["friction"][0]),
+    )
+
+
+def lift_and_join(holder: str, plug: str, joined: Callable[[Scene], np.ndarray]) -> dict[str, tuple[Subtask, ...]]:
+    """Subtasks of two hands that lift a part each and join them in the air."""
+
+    def lifted(part: str) -> Callable[[Scene], np.ndarray]:
+        return lambda scene: scene.poses(part)[:, 2, 3] > LIFTED_M
+
+    hold, insert = f"hold {holder}", f"insert {plug}"
+    return {
+        "left": (
+            Subtask(name=f"grasp {holder}", object_ref=holder, done=lifted(holder)),
+            Subtask(name=hold, object_ref=plug, held=holder, done=joined, coordinated_with=insert),
+        ),
+        "right": (
+            Subtask(name=f"grasp {plug}", object_ref=plug, done=lifted(plug)),
+            Subtask(name=insert, object_ref=holder, held=plug, done=joined, coordinated_with=hold),
+        ),
+    }
+
+
+def on_table(part: Part, xy_m: np.ndarray, yaw_rad: float) -> np.ndarray:
+    """World pose (7,) of a part that rests on the table, turned by ``yaw_rad``, its origin above ``xy_m``."""
+    rest = part.table_from_part
+    turned = Rotation.from_euler("z", yaw_rad)
+    pos = np.array([*xy_m, rest[2, 3] + 0.0002])  # a hair above: no contact to begin with
+    return np.r_[pos, (turned * Rotation.from_matrix(rest[:3, :3])).as_quat(scalar_first=True)]
+
+
+def at_rest(scene: Scene, part: str, holder: str) -> np.ndarray:
+    """(N,) whether a part moves slower than 20 mm/s against what holds it."""
+    off = scene.velocities(part) - scene.velocities(holder)
+    return np.einsum("ni,ni->n", off, off) < AT_REST_MPS**2
+
+
+def fell(pose: np.ndarray) -> np.ndarray:
+    """(N,) whether a body is below the table's top or beyond its edge."""
+    x, y, z = pose[:, :3, 3].T
+    return (z < -0.02) | (np.abs(y) > 0.7) | (x < -0.15) | (x > 0.85)

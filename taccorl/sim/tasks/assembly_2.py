@@ -1,0 +1,87 @@
+"""Assembly #2: a plug goes into an open cradle in the air, which carries it only if its centre of mass is inside.
+
+The left hand holds the cradle with its open side up, the right hand slides the plug in along the cradle's axis; both lie on
+the table at first, their axes along y. Let go too early, the plug tips over the cradle's lip (research/mimicgen.md §3.6).
+"""
+
+import mujoco
+import numpy as np
+
+from taccorl.sim.tasks import tasks
+from taccorl.sim.tasks.assembly_1 import HOME_RAD, LIFTED_M, at_rest, fell, lift_and_join, lying_apart
+from taccorl.sim.tasks.parts import Fit, Part, add_part, cradle_plug, measure_fit, open_cradle
+from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict
+
+_COM_INSIDE_M = 0.002
+_IN_TILT_RAD, _IN_LATERAL_M = np.deg2rad(5.0), 0.004  # it lies on the cradle's floor, between its walls
+
+
+@tasks.register("assembly_2")
+class Assembly2(Task):
+    """Plug into cradle, both held, then only the cradle.
+
+    Failures: ``fell_out``, the plug is in the air and neither hand nor cradle touches it; ``unsupported``, it has been let go
+    and hangs in the cradle with its centre of mass outside.
+    """
+
+    name = "assembly_2"
+    instruction = "put the violet plug into the teal cradle in the air so that it stays there"
+    parts = ("plug", "cradle")
+    mating = (("plug", "cradle"),)
+    failures = {"dropped": 0.0, "fell_out": 0.1, "unsupported": 1.0}  # noqa: RUF012
+    home_rad = HOME_RAD
+
+    def __init__(self, difficulty: str = "train") -> None:
+        super().__init__(difficulty)
+        self.plug: Part = cradle_plug("plug")
+        self.cradle: Part = open_cradle("cradle", self.clearance_m)
+        self.com_from_tip_m = float(self.plug.com_part_m[2])
+        """z_com; a change of mass scales all of the plug, so the point stays."""
+
+    def add_parts(self, spec: mujoco.MjSpec) -> None:
+        add_part(spec, self.plug)
+        add_part(spec, self.cradle)
+
+    def reset(self, draw: dict[str, np.ndarray]) -> Reset:
+        return lying_apart(self.plug, self.cradle, draw)
+
+    def look(self, scene: Scene) -> Verdict:
+        fit, plug = self._fit(scene), scene.poses("plug")
+        touching = scene.contact("plug", "cradle").touching
+        released = ~scene.pads_touching("plug").any(1)
+        in_the_air = released & ~touching & (plug[:, 2, 3] > LIFTED_M)
+        com_inside_m = fit.depth_m - self.com_from_tip_m
+        return Verdict(
+            goal=self._supported(scene),
+            failures={
+                "dropped": fell(plug) | fell(scene.poses("cradle")),
+                "fell_out": in_the_air,
+                "unsupported": released & touching & (fit.depth_m > 0) & (com_inside_m <= _COM_INSIDE_M),
+            },
+            partial=(touching & self._inside(fit)).astype(int),
+            measures={
+                "depth_m": fit.depth_m,
+                "com_inside_m": com_inside_m,
+                "tilt_rad": fit.tilt_rad,
+                "lateral_m": fit.lateral_m,
+            },
+        )
+
+    def _fit(self, scene: Scene) -> Fit:
+        mate = self.plug.mate
+        assert mate is not None
+        hole = scene.poses("cradle") @ self.cradle.holes["cradle"].part_from_hole
+        return measure_fit(hole, scene.poses("plug") @ mate.part_from_mate, mate.num_turns)
+
+    def _inside(self, fit: Fit) -> np.ndarray:
+        com_inside = fit.depth_m - self.com_from_tip_m > _COM_INSIDE_M
+        return com_inside & (fit.tilt_rad < _IN_TILT_RAD) & (fit.lateral_m < _IN_LATERAL_M)
+
+    def _supported(self, scene: Scene) -> np.ndarray:
+        carried = np.asarray(~scene.pads_touching("plug").any(1))
+        if carried.any():
+            carried &= self._inside(self._fit(scene)) & scene.contact("plug", "cradle").touching
+        return carried & at_rest(scene, "plug", "cradle") if carried.any() else carried
+
+    def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
+        return lift_and_join("cradle", "plug", self._supported)

@@ -1,0 +1,151 @@
+"""Do Puzzle: circle, heart and triangle go into their holes in a tray; a piece that is off by a millimetre rests on the rim.
+
+The tray is clamped in the middle, its row of holes along y: circle to the left. The left hand places the circle, the right
+hand triangle and heart, one hand at the tray at a time.
+"""
+
+from collections.abc import Callable, Sequence
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from taccorl.sim.robot import ARMS, TCP_FROM_LINK6_M
+from taccorl.sim.tasks import tasks
+from taccorl.sim.tasks.assembly_1 import fell, on_table
+from taccorl.sim.tasks.parts import PIECES, Fit, Part, add_part, measure_fit, puzzle_piece, puzzle_tray
+from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict
+
+# Nominal places [m]: outlines stay ≥ 4 mm apart whatever is drawn, and all are reached ≥ 0.2 rad from the joint limits.
+TRAY_AT_M, YAW_RAD = (0.27, -0.02), -np.pi / 2  # the tray's x runs to the right; pieces lie as their holes do
+PIECES_AT_M = {"circle": (0.285, 0.155), "heart": (0.285, -0.195), "triangle": (0.285, -0.324)}
+
+_ABOVE_FLOOR_M, _TILT_RAD = 0.0025, np.deg2rad(3.0)
+_LATERAL_M, _TURN_RAD = 0.003, np.deg2rad(10.0)  # wider than any clearance: only what lies in its own hole is within
+_TIPPED_RAD = np.deg2rad(30.0)
+_LIFTED_M = 0.03
+_KNOB_ABOVE_M = 0.0325  # middle of the knob over the piece's underside
+_LEFT_ALONE_M = 0.10  # knob from both hands: nobody is about to pick it up again
+
+
+@tasks.register("puzzle")
+class Puzzle(Task):
+    """Three pieces into a tray."""
+
+    name = "puzzle"
+    instruction = "put the circle, the heart and the triangle into their holes in the tray"
+    parts = PIECES
+    clamped = ("tray",)
+    mating = tuple((shape, "tray") for shape in PIECES)
+    max_partial = len(PIECES)
+    time_limit_s = 45.0
+    failures = {"dropped": 0.0, "tipped": 1.0, "rim": 3.0}  # noqa: RUF012
+    home_rad = {  # noqa: RUF012
+        "left": (-0.310, 1.704, -0.795, 0.0, 0.749, -0.310),
+        "right": (0.310, 1.704, -0.795, 0.0, 0.749, 0.310),
+    }
+
+    def __init__(self, difficulty: str = "train") -> None:
+        super().__init__(difficulty)
+        self.tray: Part = puzzle_tray("tray", self.clearance_m)
+        self.pieces: dict[str, Part] = {shape: puzzle_piece(shape) for shape in PIECES}
+        holes = [self.tray.holes[shape] for shape in PIECES]
+        self._tray_from_hole = np.stack([hole.part_from_hole for hole in holes])
+        self.in_depth_m = holes[0].depth_m - _ABOVE_FLOOR_M
+        """A piece is in when its underside is that far below the mouth; all holes are as deep."""
+        mates = [piece.mate for piece in self.pieces.values() if piece.mate]
+        self._piece_from_mate = np.stack([mate.part_from_mate for mate in mates])
+        self._is_round = np.array([mate.num_turns is None for mate in mates])
+        self._turn_period_rad = np.array([2 * np.pi / (mate.num_turns or 1) for mate in mates])
+
+    def add_parts(self, spec: mujoco.MjSpec) -> None:
+        for part in (self.tray, *self.pieces.values()):
+            add_part(spec, part)
+
+    def reset(self, draw: dict[str, np.ndarray]) -> Reset:
+        tray_yaw = YAW_RAD + float(draw["tray_yaw"][0])
+        quat = Rotation.from_euler("z", tray_yaw).as_quat(scalar_first=True)
+        poses = {"tray": np.r_[TRAY_AT_M + draw["tray_position"], 0.0, quat]}
+        for shape, piece in self.pieces.items():
+            # The table's "reset support" moves what the piece lies on, "position" the piece on it: both add up.
+            xy = PIECES_AT_M[shape] + draw[f"{shape}_support"] + draw[f"{shape}_position"]
+            poses[shape] = on_table(piece, xy, YAW_RAD + float(draw[f"{shape}_yaw"][0]))
+        return Reset(poses=poses, friction=float(draw["friction"][0]))
+
+    def fits(self, scene: Scene, which: Sequence[int] = range(len(PIECES))) -> Fit:
+        """How pieces (all by default) stand in their own holes; arrays (N, len(which)) in the order of ``PIECES``."""
+        k = list(which)
+        pieces = np.stack([scene.poses(PIECES[i]) for i in k], axis=1)
+        fit = measure_fit(scene.poses("tray")[:, None] @ self._tray_from_hole[k], pieces @ self._piece_from_mate[k], 1)
+        period_rad = self._turn_period_rad[k]
+        turn_rad = fit.turn_rad - period_rad * np.round(fit.turn_rad / period_rad)
+        return fit._replace(turn_rad=np.where(self._is_round[k], 0.0, turn_rad))
+
+    def inside(self, fit: Fit) -> np.ndarray:
+        """Whether pieces that fit like this are in: at most 2.5 mm above the floor, tilted by less than 3°."""
+        # The other two are wider than any clearance: only what is in its own hole is within.
+        turned = np.abs(fit.turn_rad) < _TURN_RAD
+        return (fit.depth_m > self.in_depth_m) & (fit.tilt_rad < _TILT_RAD) & (fit.lateral_m < _LATERAL_M) & turned
+
+    def look(self, scene: Scene) -> Verdict:
+        fit = self.fits(scene)
+        inside, released = self.inside(fit), ~_stack(scene.pads_touching).any(axis=2)
+        placed = inside & released & _slow(scene, inside)
+        on_rim = _stack(lambda shape: scene.contact(shape, "tray").touching) & ~inside & released
+        pieces = _stack(scene.poses)
+        fallen = fell(pieces.reshape(-1, 4, 4)).reshape(-1, len(PIECES))
+        tipped = released & (pieces[..., 2, 2] < np.cos(_TIPPED_RAD))
+        rim = on_rim & _left_alone(scene, pieces, on_rim)
+        failures = {"dropped": fallen, "tipped": tipped, "rim": rim}
+        measures = {"depth_m": fit.depth_m, "tilt_rad": fit.tilt_rad, "lateral_m": fit.lateral_m}
+        return Verdict(
+            goal=placed.sum(axis=1) == len(PIECES),
+            failures={name: np.logical_or.reduce(seen, axis=1) for name, seen in failures.items()},
+            partial=placed.sum(axis=1),
+            measures={f"{shape}_{what}": of[:, k] for what, of in measures.items() for k, shape in enumerate(PIECES)},
+        )
+
+    def placed(self, scene: Scene, shape: str) -> np.ndarray:
+        """(N,) whether a piece is in its hole and let go."""
+        inside = self.inside(self.fits(scene, [PIECES.index(shape)]))[:, 0]
+        return inside & ~scene.pads_touching(shape).any(axis=1)
+
+    def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
+        """Of each piece: grasp, place. One hand places at a time: triangle, then circle (left), then heart."""
+
+        def pair(shape: str) -> tuple[Subtask, Subtask]:
+            def lifted(scene: Scene) -> np.ndarray:
+                return scene.poses(shape)[:, 2, 3] > _LIFTED_M
+
+            def placed(scene: Scene) -> np.ndarray:
+                return self.placed(scene, shape)
+
+            return (
+                Subtask(name=f"grasp {shape}", object_ref=shape, done=lifted),
+                Subtask(name=f"place {shape}", object_ref="tray", held=shape, done=placed),
+            )
+
+        return {"left": pair("circle"), "right": (*pair("triangle"), *pair("heart"))}
+
+
+def _stack(of_piece: Callable[[str], np.ndarray]) -> np.ndarray:
+    """(N, 3, ...) of a function of the piece."""
+    return np.stack([of_piece(shape) for shape in PIECES], axis=1)
+
+
+def _slow(scene: Scene, asked: np.ndarray) -> np.ndarray:
+    """(N, 3) which of the pieces ``asked`` (N, 3) about hardly move."""
+    slow = np.zeros_like(asked)
+    for k in np.flatnonzero(asked.any(axis=0)):
+        slow[:, k] = np.linalg.norm(scene.velocities(PIECES[k]), axis=1) < AT_REST_MPS
+    return slow
+
+
+def _left_alone(scene: Scene, pieces: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """(N, 3) from which pieces both hands are away: nobody is about to pick them up again. Asked about few."""
+    if not asked.any():
+        return asked
+    knobs = pieces[..., :3, 3] + _KNOB_ABOVE_M * pieces[..., :3, 2]
+    hands = np.stack([scene.poses(f"{arm}_link6") for arm in ARMS], axis=1)
+    tcps = hands[..., :3, 3] + TCP_FROM_LINK6_M * hands[..., :3, 2]
+    return np.linalg.norm(knobs[:, :, None] - tcps[:, None], axis=3).min(axis=2) > _LEFT_ALONE_M

@@ -1,0 +1,138 @@
+"""What a task is: parts on the bench, a reset distribution, predicates on the simulator's state, subtasks of each arm.
+
+Letters in shapes: N simulations.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import ClassVar, Protocol
+
+import mujoco
+import numpy as np
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.randomize import PAPER_ROWS, Row
+
+CLEARANCES_M = {"easy": 0.0010, "train": 0.0005, "hard": 0.0003}
+"""Gap on each side between mating parts (research: at 0.6 m a D415 pixel is 3.7 mm after scaling to 224)."""
+HOLD_S = 0.5  # a goal counts when it has held this long after release
+AT_REST_MPS = 0.02  # a part that moves faster than this against its holder is in flight
+
+
+class Scene(Protocol):
+    """What predicates may look at: the privileged state of N simulations after a control step."""
+
+    num_sims: int
+
+    def poses(self, body: str) -> np.ndarray:
+        """World-from-body (N, 4, 4)."""
+        ...
+
+    def velocities(self, body: str) -> np.ndarray:
+        """Linear velocity of the body's frame origin, world (N, 3) [m/s]."""
+        ...
+
+    def pads_touching(self, body: str) -> np.ndarray:
+        """(N, 4) bool in pad order left_a, left_b, right_a, right_b."""
+        ...
+
+    def contact(self, body: str, other: str) -> "Contact":
+        """Between two bodies that the task declared in ``mating``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Of one pair of bodies: deepest penetration [m], net force [N] and whether they touch, each (N,)."""
+
+    touching: np.ndarray
+    penetration_m: np.ndarray
+    force_n: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subtask:
+    """One stretch of one arm's work, as MimicGen cuts demonstrations: it ends when ``done`` turns true."""
+
+    name: str
+    object_ref: str | None
+    """Body whose pose carries the motion over to a new scene; None: the motion does not depend on an object."""
+    done: Callable[[Scene], np.ndarray]
+    """(N,) bool."""
+    held: str | None = None
+    """Body in this arm's hand meanwhile."""
+    coordinated_with: str | None = None
+    """Subtask of the other arm that must run at the same time."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the predicates say now, before anything had to hold for half a second."""
+
+    goal: np.ndarray
+    """(N,) bool: in place, at rest, no pad touches it."""
+    failures: dict[str, np.ndarray]
+    """Category of ``Task.failures`` → (N,) bool: seen now."""
+    partial: np.ndarray
+    """(N,) int: how many of the task's goals are in place (puzzle: 0–3)."""
+    measures: dict[str, np.ndarray] = field(default_factory=dict)
+    """Name with unit → (N,), for reports and privileged state."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reset:
+    """Where an episode begins."""
+
+    poses: dict[str, np.ndarray]
+    """Part or clamped body → world pose (7,): position [m], quaternion wxyz."""
+    mass_change_kg: dict[str, float] = field(default_factory=dict)
+    friction: float = 0.5
+    """Sliding friction of every part."""
+
+
+class Task(ABC):
+    """A scene with a goal. Subclasses register with ``@tasks.register("name")``."""
+
+    name: ClassVar[str]
+    instruction: ClassVar[str]
+    """The sentence the policy reads."""
+    parts: ClassVar[tuple[str, ...]]
+    """Movable bodies, each with a free joint of its own name."""
+    clamped: ClassVar[tuple[str, ...]] = ()
+    """Bodies clamped to the bench (mocap) whose pose is drawn at reset."""
+    mating: ClassVar[tuple[tuple[str, str], ...]] = ()
+    """Pairs of bodies whose contact predicates and reports look at."""
+    max_partial: ClassVar[int] = 1
+    time_limit_s: ClassVar[float] = 30.0
+    failures: ClassVar[dict[str, float]] = {"dropped": 0.0}
+    """Category that ``look`` can name → seconds for which it must last; ``timeout`` and ``diverged`` come on top."""
+    home_rad: ClassVar[dict[str, tuple[float, ...]]]
+    """Arm → six joint angles at reset; grippers open."""
+
+    def __init__(self, difficulty: str = "train") -> None:
+        if difficulty not in CLEARANCES_M:
+            raise TaccorlError(f"task {self.name}: no difficulty {difficulty!r}; {nearest(difficulty, CLEARANCES_M)}")
+        self.difficulty = difficulty
+        self.clearance_m = CLEARANCES_M[difficulty]
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """The paper's randomisation of this task."""
+        return PAPER_ROWS[self.name]
+
+    @abstractmethod
+    def add_parts(self, spec: mujoco.MjSpec) -> None:
+        """Put the parts, at their nominal poses, onto the bench."""
+
+    @abstractmethod
+    def reset(self, draw: dict[str, np.ndarray]) -> Reset:
+        """The scene that belongs to a draw of ``rows``."""
+
+    @abstractmethod
+    def look(self, scene: Scene) -> Verdict:
+        """Predicates of success and failure."""
+
+    @abstractmethod
+    def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
+        """Arm → its subtasks in order."""

@@ -1,0 +1,369 @@
+"""N twins of one task as a ``gymnasium.vector.VectorEnv`` on one batch: single control steps or whole action chunks.
+
+    envs = TaccorlVectorEnv("assembly_1", 128)
+    observation, info = envs.reset(seed=0)
+    chunk = envs.step_chunk(policy(observation))  # (128, H, 14)
+
+Autoreset is ``SAME_STEP`` unless ``DISABLED`` is asked for: an episode that ends is reset within the call that ended it. The
+observation returned is then the new episode's first; ``info["final_obs"]`` and ``info["final_info"]`` are of the instant before
+the reset. Letters in shapes: N environments, H control steps of a chunk.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.episode_seeds import EpisodeSeeds
+from taccorl.sim.simulation import ACTION_NAMES, Simulation, Snapshot
+from taccorl.sim.spaces import (
+    CAMERAS,
+    IMAGE_KEYS,
+    IMAGE_SHAPE,
+    NUM_TAXELS,
+    STATE_KEY,
+    TACTILE_KEY,
+    Observation,
+    action_space,
+    observation_space,
+)
+from taccorl.sim.tasks import tasks
+from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+from taccorl.sim.twin_file import load_twin
+
+Images = Literal["never", "always", "on_request"]
+_OPTIONS = ("state", "reset_mask")
+_NOT_FOR_US = "lerobot_new_rollout"  # LeRobot's rollout marks a new episode by it (lerobot/envs/utils.py, 0.6.1)
+
+
+def shaped(actions: np.ndarray, *leading: int | None) -> np.ndarray:
+    """``actions`` as an array (*leading, 14); None: any number from 1.
+
+    Raises:
+        TaccorlError: it has another shape.
+    """
+    actions, wanted = np.asarray(actions), (*leading, len(ACTION_NAMES))
+    if actions.ndim != len(wanted) or not all(
+        n == w or (w is None and n) for n, w in zip(actions.shape, wanted, strict=True)
+    ):
+        shape = ", ".join("H" if w is None else str(w) for w in wanted)
+        raise TaccorlError(
+            f"action: shape {actions.shape}, wanted is ({shape}): {', '.join(ACTION_NAMES[:7])}, and the same of the right arm"
+        )
+    return actions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk:
+    """What a chunk of actions led to."""
+
+    observation: Observation
+    """After the chunk; of an episode that ended, the next one's first."""
+    reward: np.ndarray
+    """(N,) summed over the chunk: 1 where the task succeeded within it."""
+    terminated: np.ndarray
+    """(N,) bool: succeeded or failed within the chunk."""
+    truncated: np.ndarray
+    """(N,) bool: ran out of time within the chunk."""
+    num_steps: np.ndarray
+    """(N,) actions that were carried out; an episode stands still once it is over."""
+    tactile: np.ndarray
+    """(N, H, 1536) int16 counts after every control step, for policies that read a history."""
+    info: dict[str, Any]
+
+
+class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
+    """N environments of ``task``. Reward is 1 at the step that completes the task, else 0.
+
+    An episode terminates with success or failure (``info["failure"]``) and is truncated when time is up. A simulation that
+    diverges fails as ``diverged``, its seed in ``info["seed"]``, its last observation the one before; the others go on.
+
+    Seeds (``EpisodeSeeds``): after ``reset(seed=s)`` environment i's k-th episode has the scene seed ``episode_seed(s, i, k)``.
+    After ``reset(seed=[s0, s1, …])`` environment i begins with scene seed sᵢ itself, so ``info["seed"]`` brings a scene back.
+
+    ``info`` has, for each environment: ``is_success``, ``failure`` ('' or the category), ``partial``, ``seed``, ``subtask``
+    (left, right), ``steps``, ``clipped`` (an action lay beyond the limits) and ``measures`` (privileged, names with units).
+    """
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        difficulty: str = "train",
+        twin: TwinConfig | str | Path | None = None,
+        images: Images = "never",
+        randomization: float = 1.0,
+        seed: int | None = None,
+        num_threads: int = 0,
+        autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """The task's scene is compiled here; nothing is placed before ``reset``.
+
+        Args:
+            images: ``always`` renders with every observation (a chunk: once), ``on_request`` by ``observe(images=True)``.
+            randomization: share of the task's reset ranges; 0 is the nominal scene.
+            num_threads: of the physics; 0: all CPUs. Results do not depend on it.
+            autoreset: ``SAME_STEP`` or ``DISABLED`` (over means frozen, until ``reset(options={"reset_mask": (N,) bool})``).
+            max_episode_steps: None: the task's own time limit.
+
+        Raises:
+            TaccorlError: unknown task or difficulty, unreadable twin, a setting that does not exist.
+        """
+        _one_of("images", images, ("never", "always", "on_request"))
+        _one_of("autoreset", autoreset, (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED))
+        _one_of("render_mode", render_mode, (None, "rgb_array"))
+        self.sim = Simulation(
+            tasks.get(task)(difficulty),
+            load_twin(Path(twin)) if isinstance(twin, str | Path) else twin,
+            num_sims=num_envs,
+            num_threads=num_threads,
+            scale=randomization,
+        )
+        if max_episode_steps is not None:
+            self.sim.judge.limit_steps = max_episode_steps
+        self.num_envs, self.task, self.task_description = num_envs, task, self.sim.task.instruction
+        self.images, self.autoreset, self.render_mode = images, autoreset, render_mode
+        self.metadata = {"autoreset_mode": autoreset, "render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
+        self.single_observation_space = observation_space(images == "always")
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._seeds = EpisodeSeeds(num_envs, seed)
+        self._begun = False
+        self._over, self._clipped = np.zeros(num_envs, dtype=bool), np.zeros(num_envs, dtype=bool)
+        self._state = np.zeros((num_envs, len(ACTION_NAMES)), dtype=np.float32)
+        self._tactile = np.zeros((num_envs, NUM_TAXELS), dtype=np.int16)
+        self._pictures = {
+            name: np.zeros((num_envs, *IMAGE_SHAPE), dtype=np.uint8) for name in CAMERAS if images != "never"
+        }
+        self._unseen = np.zeros(num_envs, dtype=bool)
+        """(N,) bool: moved since its pictures were rendered."""
+        self._facts: dict[str, Any] = {}
+
+    @property
+    def _all(self) -> np.ndarray:
+        return np.arange(self.num_envs)
+
+    @property
+    def _max_episode_steps(self) -> int:
+        """LeRobot's evaluation asks for it by this name."""
+        return self.sim.judge.limit_steps
+
+    # gymnasium's interface --------------------------------------------------------------------------------------------
+
+    def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, *, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin new episodes.
+
+        Args:
+            seed: root of all seeds, or one scene seed for each environment; None: the next episodes of the stream.
+            options: ``state``: a ``Snapshot`` to begin from; ``reset_mask``: (N,) bool, which environments to reset.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        options = {name: value for name, value in (options or {}).items() if name != _NOT_FOR_US}
+        for name in options:
+            _one_of("reset option", name, _OPTIONS)
+        ids = self._mask_ids(options["reset_mask"]) if "reset_mask" in options else self._all
+        if not self._begun and len(ids) < self.num_envs:
+            raise TaccorlError("reset: the first one is of all environments; leave reset_mask away")
+        if seed is not None:
+            self._seeds.begin(seed, ids.tolist())
+        self._begin(ids, options.get("state"))
+        self._begun = True
+        return self.observe(self.images == "always"), _masked(self.facts(), np.isin(self._all, ids))
+
+    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control step (1/30 s) with targets (N, 14) [rad, m].
+
+        Raises:
+            TaccorlError: wrong shape, a value that is no number or far beyond the limits.
+        """
+        chunk = self.step_chunk(shaped(actions, self.num_envs)[:, None])
+        return chunk.observation, chunk.reward, chunk.terminated, chunk.truncated, chunk.info
+
+    def step_chunk(self, actions: np.ndarray) -> Chunk:
+        """H control steps with targets (N, H, 14), as a policy gives them. An episode that ends within stands still.
+
+        Raises:
+            TaccorlError: as ``step``.
+        """
+        actions = shaped(actions, self.num_envs, None)
+        if not self._begun:
+            raise TaccorlError("step: call reset() first")
+        reward, num_steps = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.int64)
+        tactile = np.empty((*actions.shape[:2], NUM_TAXELS), dtype=np.int16)
+        self._clipped = np.zeros(self.num_envs, dtype=bool)
+        for k in range(actions.shape[1]):
+            num_steps += ~self._over
+            reward += self._advance(actions[:, k])
+            tactile[:, k] = self._tactile
+        facts = self._facts
+        truncated = facts["failure"] == "timeout"
+        observation, info = self._end()
+        return Chunk(
+            observation=observation,
+            reward=reward,
+            terminated=(facts["is_success"] | (facts["failure"] != "")) & ~truncated,
+            truncated=truncated,
+            num_steps=num_steps,
+            tactile=tactile,
+            info=info,
+        )
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The front camera's picture of every environment, (224, 224, 3) uint8 each."""
+        if self.render_mode is None:
+            return None
+        if self.images == "never":
+            return tuple(self.sim.render(["front"])["front"])
+        self._look()
+        return tuple(self._pictures["front"])
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Attribute or method ``name`` for each environment, as gymnasium's own vector environments have it."""
+        value = getattr(self, name)
+        value = value(*args, **kwargs) if callable(value) else value
+        return value if isinstance(value, tuple) else (value,) * self.num_envs
+
+    def close_extras(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.sim.close()
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """As ``call``."""
+        return self.call(name)
+
+    # what is seen -----------------------------------------------------------------------------------------------------
+
+    def observe(self, images: bool = False) -> Observation:
+        """The newest observation of all; with ``images`` the pictures are rendered now (``images="on_request"``)."""
+        if images and self.images == "never":
+            raise TaccorlError(
+                'observe: images are "never" to be rendered here; make the environment with "on_request"'
+            )
+        observation = {STATE_KEY: self._state.copy(), TACTILE_KEY: self._tactile.copy()}
+        if images:
+            self._look()
+            observation |= {IMAGE_KEYS[name]: pictures for name, pictures in self._pictures.items()}
+        return observation
+
+    def _look(self) -> None:
+        """Render those that have moved. Pictures that were handed out are never written to again."""
+        ids = np.flatnonzero(self._unseen & ~self.sim.diverged)
+        if not ids.size:
+            return
+        for name, new in self.sim.render(CAMERAS, ids).items():
+            if len(ids) < self.num_envs:
+                pictures = self._pictures[name].copy()
+                pictures[ids] = new
+                new = pictures
+            self._pictures[name] = new
+        self._unseen[ids] = False
+
+    def facts(self) -> dict[str, Any]:
+        """What is known of each episode, privileged: the arrays of ``info``, copied."""
+        return _each(self._facts, np.copy)
+
+    # one episode after another ----------------------------------------------------------------------------------------
+
+    def _begin(self, ids: np.ndarray, state: Snapshot | None = None) -> None:
+        """New episodes in ``ids``."""
+        self.sim.reset([self._seeds.draw(i) for i in ids.tolist()], ids)
+        if state is not None:
+            self.sim.restore(state, ids)
+        self._over[ids], self._clipped[ids] = self.sim.judge.outcome.over[ids], False
+        self._take(np.isin(self._all, ids))
+
+    def _advance(self, actions: np.ndarray) -> np.ndarray:
+        """One control step of those that are not over; (N,) reward."""
+        running = ~self._over
+        if not running.any():
+            return np.zeros(self.num_envs)
+        self.sim.step(actions, None if running.all() else np.flatnonzero(running))
+        self._clipped = self._clipped | (running & self.sim.clipped)
+        self._take(running)
+        outcome = self.sim.judge.outcome
+        self._over = outcome.over
+        return (running & outcome.success).astype(np.float64)
+
+    def _take(self, rows: np.ndarray) -> None:
+        """Read what has changed in ``rows`` (N,) bool. A diverged simulation's sensors keep what they read before.
+
+        The pads' noise follows from scene seed and step alone, so that neither company nor a restored state changes it.
+        """
+        valid = rows & ~self.sim.diverged
+        self._state = np.where(valid[:, None], self.sim.proprioception(), self._state).astype(np.float32)
+        noise = [np.random.default_rng(of) for of in zip(self.sim.seeds, self.sim.judge.steps, strict=True)]
+        self._tactile = np.where(valid[:, None], self.sim.touch(noise), self._tactile)
+        self._unseen |= valid
+        facts = self._judged()
+        self._facts = facts if rows.all() else _rows_from(self._facts, facts, rows)
+
+    def _judged(self) -> dict[str, Any]:
+        judge = self.sim.judge
+        outcome, verdict = judge.outcome, judge.verdict
+        assert verdict is not None
+        return {
+            "is_success": outcome.success,
+            "failure": outcome.failure,
+            "partial": np.array(outcome.partial),
+            "seed": self.sim.seeds.copy(),
+            "subtask": judge.subtask.copy(),
+            "steps": judge.steps.copy(),
+            "clipped": self._clipped.copy(),
+            "measures": {name: np.array(values) for name, values in verdict.measures.items()},
+        }
+
+    def _end(self) -> tuple[Observation, dict[str, Any]]:
+        """Observation and info after a chunk, and autoreset of what is over."""
+        images, ended, info = self.images == "always", self._over.copy(), {}
+        if self.autoreset is AutoresetMode.SAME_STEP and ended.any():
+            before, ids = self.observe(images), np.flatnonzero(ended)
+            info = {"final_obs": np.full(self.num_envs, None, dtype=object), "final_info": _masked(self.facts(), ended)}
+            for i in ids.tolist():
+                info["final_obs"][i] = {name: values[i].copy() for name, values in before.items()}
+            info |= {f"_{name}": ended.copy() for name in info}
+            self._begin(ids)
+        return self.observe(images), info | _masked(self.facts(), np.ones(self.num_envs, dtype=bool))
+
+    def _mask_ids(self, mask: Any) -> np.ndarray:
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise TaccorlError(f"reset_mask: wanted is ({self.num_envs},) bool with one True at least, found {mask!r}")
+        return np.flatnonzero(mask)
+
+
+def _one_of(what: str, value: Any, known: Sequence[Any]) -> None:
+    if value not in known:
+        raise TaccorlError(f"{what}: {value!r} does not exist; {nearest(str(value), map(str, known))}")
+
+
+def _each(facts: dict[str, Any], change: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
+    return {name: _each(v, change) if isinstance(v, dict) else change(v) for name, v in facts.items()}
+
+
+def _rows_from(old: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
+    """``old`` with ``rows`` (N,) bool of ``new``."""
+    merged = {}
+    for name, values in new.items():
+        if isinstance(values, dict):
+            merged[name] = _rows_from(old[name], values, rows)
+        else:
+            merged[name] = old[name].copy()
+            merged[name][rows] = values[rows]
+    return merged
+
+
+def _masked(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """With gymnasium's ``_name`` (N,) bool beside each entry: whose it is."""
+    inner = {name: _masked(values, mask) if isinstance(values, dict) else values for name, values in info.items()}
+    return inner | {f"_{name}": mask.copy() for name in info}

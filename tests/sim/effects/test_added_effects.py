@@ -1,0 +1,140 @@
+"""Effects together in one twin, and what is said when they cannot be."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from press_bench import BLOCK_M, PressBench, perform, start
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, parameter
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.twin import TwinConfig
+
+
+def many() -> list[Effect]:
+    return [
+        make_effect("command_delay", delay_s=0.01, joints=["joint1", "joint5", "gripper"]),
+        make_effect("sensor_delay", delay_s=0.007),
+        make_effect("command_lag", time_constant_s=0.03, arm="right"),
+        make_effect("coulomb_friction", torque_nm=0.3, joints=["joint4"]),
+        make_effect("coulomb_friction", torque_nm=0.6, joints=["joint2"]),
+        make_effect("stribeck_friction", torque_nm=0.2, joints=["joint5"]),
+        make_effect("backlash", play_rad=0.002, joints=["joint6"]),
+        make_effect("joint_compliance", compliance_rad_per_nm=0.001, joints=["joint6"]),
+        make_effect("payload", mass_kg=0.1, arm="left"),
+        make_effect("taxel_creep", share=0.3),
+        make_effect("taxel_hysteresis", half_width=0.1, pads=["left_a"]),
+        make_effect("baseline_drift", rate_per_min=1.0),
+    ]
+
+
+@pytest.mark.filterwarnings("error")
+def test_many_effects_at_once_run_the_same_whatever_their_order_alone_in_a_batch_and_from_a_snapshot() -> None:
+    alone = perform(start(*many()))
+    again = perform(start(*many()[::-1]))
+    for kind, values in alone.items():
+        np.testing.assert_array_equal(again[kind], values, err_msg=f"other order: {kind}")
+    batch = start(*many(), num_sims=3, num_threads=3)
+    begun = perform(batch, last=5)
+    snapshot = batch.snapshot(np.array([2]))
+    ended = perform(batch, 5)
+    for kind, values in alone.items():
+        np.testing.assert_array_equal(np.concatenate([begun[kind], ended[kind]])[:, 0], values[:, 0], err_msg=kind)
+    other = start(*many(), num_sims=3)
+    perform(other, last=3)
+    other.restore(snapshot, np.array([2]))
+    for kind, values in perform(other, 5).items():
+        np.testing.assert_array_equal(values[:, 2], ended[kind][:, 2], err_msg=f"restored: {kind}")
+
+
+def test_a_reset_forgets_everything() -> None:
+    sim = start(*many(), num_sims=2)
+    fresh = sim.snapshot()
+    perform(sim)
+    sim.reset([0], np.array([1]))
+    sim.reset([0], np.array([0]))
+    other = Simulation(PressBench(), TwinConfig(effects=many()), num_sims=2)
+    other.reset([0, 0])
+    forgotten, never = sim.snapshot(), other.snapshot()
+    for name, values in never.memory.items():
+        np.testing.assert_array_equal(forgotten.memory[name], values, err_msg=name)
+    np.testing.assert_array_equal(forgotten.physics, never.physics)
+    assert fresh.memory.keys() == never.memory.keys()
+
+
+def test_a_diverged_simulation_does_not_spoil_its_neighbour_or_its_own_next_episode() -> None:
+    sim = start(make_effect("taxel_creep", share=0.3), make_effect("command_delay", delay_s=0.02), num_sims=2)
+    targets = sim.targets.copy()
+    targets[:, 6] = BLOCK_M - 0.008
+    sim.arrays["qpos"][0, 3] = np.nan
+    for _ in range(4):
+        sim.step(targets)
+    assert sim.diverged.tolist() == [True, False]
+    assert sim.reading()[1].max() > 0.5
+    sim.reset([0], np.array([0]))
+    sim.step(targets)
+    assert not sim.diverged.any()
+    assert np.isfinite(sim.reading()).all()
+
+
+def test_states_of_a_twin_with_other_effects_are_refused() -> None:
+    state = start(make_effect("taxel_creep", share=0.3)).snapshot()
+    with pytest.raises(TaccorlError, match=r"remembers .*taxel_creep/crept.*another twin"):
+        start(make_effect("taxel_hysteresis", half_width=0.1)).restore(state)
+
+
+def test_one_effect_may_not_act_twice_on_one_joint_but_on_two() -> None:
+    two = [make_effect("armature", added_kgm2=0.1, joints=[joint]) for joint in ("joint1", "joint2")]
+    model = start(*two).model
+    dofs = [model.joint(f"left_joint{k}").dofadr[0] for k in (1, 2, 3)]
+    np.testing.assert_allclose(model.dof_armature[dofs], [0.11, 0.11, 0.01])
+    twice = [*two, make_effect("armature", arm="right", joints=["joint2"])]
+    with pytest.raises(TaccorlError, match=r"armature acts on right_joint2 twice, as entries 2 and 3"):
+        start(*twice)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "said"),
+    [
+        ("coulomb_fricton", {}, "no effect 'coulomb_fricton'; did you mean 'coulomb_friction'?"),
+        ("coulomb_friction", {"torque": 1.0}, "no parameter 'torque'; did you mean 'torque_nm'?"),
+        ("coulomb_friction", {"torque_nm": -1.0}, "torque_nm is -1 N·m, outside of 0 … 20 N·m"),
+        ("coulomb_friction", {"torque_nm": float("nan")}, "torque_nm is nan N·m"),
+        ("coulomb_friction", {"torque_nm": "1"}, "torque_nm is '1'; give a number in N·m"),
+        ("coulomb_friction", {"torque_nm": True}, "torque_nm is True; give a number in N·m"),
+        ("coulomb_friction", {"joints": ["gripper"]}, "no joint 'gripper'; known: joint1"),
+        ("command_delay", {"joints": ["griper"]}, "no joint 'griper'; did you mean 'gripper'?"),
+        ("payload", {"arm": "middle"}, "no arm 'middle'; known: both, left, right"),
+        ("dead_taxels", {"seed": -1}, "seed is -1; give a whole number"),
+        ("taxel_creep", {"pads": ["left_c"]}, "no pad 'left_c'; did you mean 'left_"),
+    ],
+)
+def test_what_cannot_be_is_said_with_the_way_out(name: str, values: dict[str, Any], said: str) -> None:
+    with pytest.raises(TaccorlError) as caught:
+        make_effect(name, **values)
+    assert said in str(caught.value)
+
+
+class Undecorated(TouchEffect):
+    """Planted: without @dataclass its parameter is none."""
+
+    name: ClassVar = "undecorated"
+    layer: ClassVar = "taxel"
+    share: float = parameter(unit="1", symbol="s", absent=0.0, low=0.0, high=1.0, typical=0.5, source="planted")
+
+
+@dataclass(kw_only=True)
+class Shapeless(JointEffect):
+    """Planted: nothing says when it is absent."""
+
+    name: ClassVar = "shapeless"
+    width_s: float = parameter(unit="s", symbol="w", absent=None, low=0.0, high=1.0, typical=0.5, source="planted")
+
+
+@pytest.mark.parametrize(("cls", "said"), [(Undecorated, "@dataclass"), (Shapeless, "absent value")])
+def test_a_class_that_could_never_take_part_says_so(cls: type[Effect], said: str) -> None:
+    with pytest.raises(TaccorlError, match=said):
+        cls()

@@ -1,0 +1,177 @@
+"""What holds for every registered effect, those of outside packages too: absent means absent, and present is reproducible."""
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from press_bench import perform, start
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.effect import Effect, JointEffect, Memory, TouchEffect, parameter
+from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW
+
+SEEN = ("reported", "hands", "reading")
+UNITS = {
+    "_nms_per_rad": "N·m·s/rad",
+    "_rad_per_nm": "rad/(N·m)",
+    "_rad_per_s": "rad/s",
+    "_per_min": "1/min",
+    "_kgm2": "kg·m²",
+    "_nm": "N·m",
+    "_kg": "kg",
+    "_rad": "rad",
+    "_m": "m",
+    "_s": "s",
+}
+
+
+def typical(cls: type[Effect]) -> dict[str, Any]:
+    return {p.name: p.typical for p in cls.parameters()}
+
+
+def nearly_absent(cls: type[Effect]) -> dict[str, Any]:
+    """A hundredth of the way from absent to typical."""
+    values = typical(cls)
+    for p in cls.parameters():
+        if p.absent is not None:
+            values[p.name] = p.absent + 0.01 * (p.typical - p.absent) if math.isfinite(p.absent) else p.high
+    return values
+
+
+@functools.cache
+def nominal() -> dict[str, np.ndarray]:
+    return perform(start())
+
+
+def difference(seen: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, float]:
+    """Root mean square over the run."""
+    return {name: float(np.sqrt(np.mean(np.square(seen[name] - other[name])))) for name in SEEN}
+
+
+def check_fades_out(cls: type[Effect]) -> None:
+    """It does something at typical values, and at most a tenth of that a hundredth of the way from its absent values."""
+    there = difference(perform(start(cls(**typical(cls)))), nominal())
+    nearly = difference(perform(start(cls(**nearly_absent(cls)))), nominal())
+    assert max(there.values()) > 1e-5
+    for name in SEEN:
+        assert nearly[name] <= 0.1 * there[name] + 1e-9, (name, nearly, there)
+
+
+@pytest.mark.parametrize("name", list(effects))
+def test_an_absent_effect_leaves_the_run_bit_identical(name: str) -> None:
+    cls = effects.get(name)
+    shape = [p for p in cls.parameters() if p.absent is None]
+    lows: dict[str, Any] = {p.name: p.low for p in shape}
+    highs: dict[str, Any] = {p.name: p.high for p in shape}
+    variants: list[dict[str, Any]] = [{}, lows, highs]
+    for variant in variants if shape else variants[:1]:
+        effect = cls(**variant)
+        assert effect.is_absent
+        seen = perform(start(effect))
+        for kind, values in nominal().items():
+            np.testing.assert_array_equal(seen[kind], values, err_msg=f"{name} {variant}: {kind}")
+
+
+@pytest.mark.parametrize("name", list(effects))
+def test_an_effect_fades_out_towards_its_absent_value(name: str) -> None:
+    check_fades_out(effects.get(name))
+
+
+@pytest.mark.parametrize("name", list(effects))
+def test_at_its_bounds_the_twin_stays_sound(name: str) -> None:
+    cls = effects.get(name)
+    for p in cls.parameters():
+        for bound in (p.low, p.high):
+            sim = start(make_effect(name, **typical(cls) | {p.name: bound}))
+            seen = perform(sim, last=6)
+            assert not sim.diverged.any(), f"{p.name} = {bound}"
+            assert np.isfinite(seen["reading"]).all()
+            beyond = np.maximum(seen["reported"] - ACTION_HIGH, ACTION_LOW - seen["reported"])
+            assert beyond.max() < 0.25, f"{p.name} = {bound}"
+
+
+@pytest.mark.parametrize("name", list(effects))
+def test_a_run_is_the_same_alone_and_in_a_batch_on_any_number_of_threads_and_from_a_snapshot(name: str) -> None:
+    effect = effects.get(name)(**typical(effects.get(name)))
+    alone = perform(start(effect))
+    batch = start(effect, num_sims=3, num_threads=2)
+    begun = perform(batch, last=6)
+    snapshot = batch.snapshot()
+    ended = perform(batch, 6)
+    for kind, values in alone.items():
+        together = np.concatenate([begun[kind], ended[kind]])
+        np.testing.assert_array_equal(together[:, 0], values[:, 0], err_msg=f"batch: {kind}")
+    other = start(effect, num_sims=3)
+    perform(other, last=2)
+    other.restore(snapshot)
+    for kind, values in perform(other, 6).items():
+        np.testing.assert_array_equal(values, ended[kind], err_msg=f"restored: {kind}")
+
+
+@pytest.mark.parametrize("name", list(effects))
+def test_parameters_are_described(name: str) -> None:
+    cls = effects.get(name)
+    assert cls.name == name
+    assert cls.__doc__
+    assert cls.parameters()
+    assert any(p.absent is not None for p in cls.parameters())
+    for p in cls.parameters():
+        assert p.low <= p.typical <= p.high
+        assert p.absent is None or p.low <= p.absent <= p.high or math.isinf(p.absent)
+        assert p.absent != p.typical
+        assert p.symbol
+        assert p.source
+        unit = next((unit for suffix, unit in UNITS.items() if p.name.endswith(suffix)), "1")
+        assert p.unit == unit, f"{p.name} in {p.unit}"
+        outside = p.high + 0.01 * (p.high - p.low)
+        with pytest.raises(TaccorlError, match=rf"{name}: {p.name} is .* outside of .*{p.high:g}"):
+            make_effect(name, **{p.name: outside})
+
+
+@dataclass(kw_only=True)
+class JumpsIn(JointEffect):
+    """Planted: the slightest bias acts as one of 10 mrad."""
+
+    name: ClassVar = "jumps_in"
+    bias_rad: float = parameter(unit="rad", symbol="b", absent=0.0, low=0.0, high=0.1, typical=0.01, source="planted")
+
+    def encoder(self, values: np.ndarray) -> np.ndarray:
+        return values + 0.01
+
+
+@dataclass(kw_only=True)
+class DoesNothing(JumpsIn):
+    """Planted: a parameter without an effect."""
+
+    def encoder(self, values: np.ndarray) -> np.ndarray:
+        return values
+
+
+@pytest.mark.parametrize("cls", [JumpsIn, DoesNothing])
+def test_an_effect_whose_absent_value_is_wrong_or_that_does_nothing_is_caught(cls: type[Effect]) -> None:
+    with pytest.raises(AssertionError):
+        check_fades_out(cls)
+
+
+@dataclass(kw_only=True)
+class Forgetful(TouchEffect):
+    """Planted: what it remembers is not part of the state."""
+
+    name: ClassVar = "forgetful"
+    layer: ClassVar = "material"
+    share: float = parameter(unit="1", symbol="a", absent=0.0, low=0.0, high=1.0, typical=0.5, source="planted")
+    scans: ClassVar = 0
+
+    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        type(self).scans += 1
+        return reading + self.share * self.scans
+
+
+def test_a_memory_outside_of_the_state_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(effects._entries, "forgetful", Forgetful)
+    with pytest.raises(AssertionError):
+        test_a_run_is_the_same_alone_and_in_a_batch_on_any_number_of_threads_and_from_a_snapshot("forgetful")

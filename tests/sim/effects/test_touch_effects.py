@@ -1,0 +1,208 @@
+"""Each effect of the pads against its closed form, on readings written down here; pads in the order left_a … right_b."""
+
+import numpy as np
+import pytest
+from press_bench import BLOCK_M, perform, start
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.added import AddedEffects
+from taccorl.sim.effects.dead_taxels import DeadTaxels
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.robot import PAD_TAXELS, PADS, RobotConfig
+from taccorl.sim.simulation import Watch
+from taccorl.sim.twin import TwinConfig, empty_bench
+
+SHAPE = (1, len(PADS), *PAD_TAXELS)
+
+
+class Pads:
+    """Effects on the pads of one simulation, with a clock that is set by hand."""
+
+    def __init__(self, *effects: Effect) -> None:
+        self.time_s = np.zeros(1)
+        self.added = AddedEffects(effects, self.time_s)
+
+    def read(self, reading: np.ndarray | float, after_s: float = 0.0) -> np.ndarray:
+        """(4, 32, 12) where ideal pads read ``reading``."""
+        self.time_s += after_s
+        given = np.broadcast_to(np.float32(reading), SHAPE).copy()
+        before = given.copy()
+        seen = self.added(given)
+        self.added.scan(given)
+        np.testing.assert_array_equal(self.added(given), seen, err_msg="after its scan it reads something else")
+        np.testing.assert_array_equal(given, before, err_msg="what the sensor handed over was changed")
+        assert seen.dtype == np.float32
+        assert seen.shape == SHAPE
+        return seen[0]
+
+
+def bumps() -> np.ndarray:
+    """(4, 32, 12) some readings of 0 … 3, with 0 where nothing touches."""
+    reading = np.random.default_rng(0).uniform(-2, 3, SHAPE[1:])
+    return np.maximum(reading, 0).astype(np.float32)
+
+
+@pytest.mark.parametrize(("exponent", "expected"), [(1.5, 2**1.5), (0.5, 2**0.5), (2.0, 4.0)])
+def test_the_power_law_keeps_its_reference_and_bends_the_rest(exponent: float, expected: float) -> None:
+    pads = Pads(make_effect("taxel_power_law", exponent=exponent, reference=0.5))
+    np.testing.assert_allclose(pads.read(0.5), 0.5, rtol=1e-6)
+    np.testing.assert_allclose(pads.read(1.0), 0.5 * expected, rtol=1e-6)
+    np.testing.assert_array_equal(pads.read(0.0), 0.0)
+
+
+def test_hysteresis_reads_less_while_loading_and_more_while_unloading_and_nothing_without_contact() -> None:
+    pads = Pads(make_effect("taxel_hysteresis", half_width=0.1))
+    path = [0.0, 1.0, 2.0, 1.9, 1.0, 1.05, 0.0, 1.0]
+    # loading 0.9 f; at 1.9 the play of 1.71 … 2.09 holds 1.8; unloading 1.1 f; at 1.05 its 0.945 … 1.155 holds 1.1
+    expected = [0.0, 0.9, 1.8, 1.8, 1.1, 1.1, 0.0, 0.9]
+    np.testing.assert_allclose([pads.read(f, 0.01)[2, 3, 4] for f in path], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("scan_s", [0.01, 0.04])
+def test_creep_approaches_its_share_with_its_time_constant_at_any_scan_rate(scan_s: float) -> None:
+    pads = Pads(make_effect("taxel_creep", share=0.3, time_constant_s=0.8))
+    assert pads.read(2.0)[0, 0, 0] == pytest.approx(2.0), "at once, the reading itself"
+    seen = np.array([pads.read(2.0, scan_s)[0, 0, 0] for _ in range(round(1.6 / scan_s))])
+    t = scan_s * np.arange(1, len(seen) + 1)
+    np.testing.assert_allclose(seen, 2.0 * (1 + 0.3 * (1 - np.exp(-t / 0.8))), rtol=1e-5)
+    left = seen[-1] - 2.0
+    assert pads.read(0.0, 0.8)[0, 0, 0] == pytest.approx(left * np.exp(-1), rel=1e-5), "after release it fades"
+
+
+def test_relaxation_sinks_under_a_load_that_stays_and_never_pulls() -> None:
+    pads = Pads(make_effect("taxel_creep", share=-0.5, time_constant_s=0.5))
+    assert pads.read(2.0, 10.0)[0, 0, 0] == pytest.approx(1.0, rel=1e-5)
+    np.testing.assert_array_equal(pads.read(0.0, 0.01), 0.0)
+
+
+def test_looking_between_scans_changes_nothing() -> None:
+    effects = [make_effect("taxel_creep", share=0.3), make_effect("taxel_hysteresis", half_width=0.2)]
+    watched, alone = Pads(*effects), Pads(*effects)
+    for reading in (1.0, 2.0, 0.5, 0.0):
+        watched.time_s += 0.01
+        watched.added(np.full(SHAPE, 5.0, np.float32))
+        np.testing.assert_array_equal(watched.read(reading, 0.02), alone.read(reading, 0.03))
+
+
+def test_crosstalk_gives_a_quarter_of_its_share_to_each_neighbour_and_keeps_the_sum() -> None:
+    pads = Pads(make_effect("taxel_crosstalk", share=0.2))
+    alone = np.zeros(SHAPE[1:], np.float32)
+    alone[1, 10, 5] = alone[1, 0, 0] = 1.0
+    seen = pads.read(alone)
+    expected = np.zeros(PAD_TAXELS)
+    expected[10, 5], expected[0, 0] = 0.8, 0.9  # the corner has two neighbours and keeps two quarters
+    for row, column in ((9, 5), (11, 5), (10, 4), (10, 6), (1, 0), (0, 1)):
+        expected[row, column] = 0.05
+    np.testing.assert_allclose(seen[1], expected, atol=1e-7)
+    field = bumps()
+    np.testing.assert_allclose(pads.read(field).sum(axis=(1, 2)), field.sum(axis=(1, 2)), rtol=1e-5)
+
+
+def test_gain_spread_is_of_the_stated_width_and_belongs_to_the_board() -> None:
+    one, same, other = (Pads(make_effect("taxel_gain_spread", log_std=0.2, seed=s)) for s in (3, 3, 4))
+    gain = one.read(1.0)
+    log = np.log(gain)
+    # 1536 draws: standard errors 0.2 / √1536 = 0.005 of the mean, 0.0036 of the deviation; four of them allowed
+    assert abs(log.mean()) < 0.02
+    assert log.std() == pytest.approx(0.2, abs=0.015)
+    np.testing.assert_array_equal(same.read(1.0), gain)
+    assert (other.read(1.0) != gain).all()
+    np.testing.assert_allclose(one.read(bumps()), bumps() * gain, rtol=1e-6)
+
+
+def test_dead_taxels_are_as_many_as_stated_and_a_greater_share_adds_to_them() -> None:
+    few, more = DeadTaxels(share=0.05, seed=1), DeadTaxels(share=0.10, seed=1)
+    assert few.dead().sum(axis=(1, 2)).tolist() == [19] * 4  # round(0.05 · 384)
+    assert more.dead().sum(axis=(1, 2)).tolist() == [38] * 4
+    assert more.dead()[few.dead()].all()
+    assert (few.dead()[0] != few.dead()[1]).any()
+    np.testing.assert_array_equal(Pads(few).read(1.0) == 0.0, few.dead())
+    np.testing.assert_array_equal(Pads(DeadTaxels(share=1.0)).read(1.0), 0.0)
+
+
+def test_the_baseline_drifts_by_its_rate_even_where_taxels_are_dead() -> None:
+    pads = Pads(make_effect("baseline_drift", rate_per_min=0.5), DeadTaxels(share=1.0))
+    assert pads.read(1.0)[0, 0, 0] == 0.0
+    np.testing.assert_allclose(pads.read(1.0, 90.0), 0.75, rtol=1e-6)
+
+
+def test_effects_act_from_the_material_outwards_whatever_their_order_in_the_file() -> None:
+    """Spread before gain: a taxel's neighbour gets c/4 of the load, times its own gain."""
+    effects = [
+        make_effect("taxel_gain_spread", log_std=0.3),
+        make_effect("taxel_crosstalk", share=0.2),
+        make_effect("taxel_power_law", exponent=2.0, reference=1.0),
+    ]
+    gain = Pads(effects[0]).read(1.0)
+    field = np.zeros(SHAPE[1:], np.float32)
+    field[0, 10, 5] = 3.0
+    for order in (effects, effects[::-1]):
+        seen = Pads(*order).read(field)
+        assert seen[0, 10, 6] == pytest.approx(0.05 * 9.0 * gain[0, 10, 6], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("taxel_power_law", {"exponent": 2.0}),
+        ("taxel_hysteresis", {"half_width": 0.2}),
+        ("taxel_creep", {"share": 0.5}),
+        ("taxel_crosstalk", {"share": 0.5}),
+        ("taxel_gain_spread", {"log_std": 0.2}),
+        ("dead_taxels", {"share": 0.5}),
+        ("baseline_drift", {"rate_per_min": 1.0}),
+    ],
+)
+def test_only_the_chosen_pads_change_and_do_so_as_they_would_among_all(name: str, values: dict[str, float]) -> None:
+    some, everything = Pads(make_effect(name, pads=["right_a", "left_b"], **values)), Pads(make_effect(name, **values))
+    for _ in range(2):
+        seen, full = some.read(bumps(), 0.5), everything.read(bumps(), 0.5)
+        np.testing.assert_array_equal(seen[[0, 3]], bumps()[[0, 3]])
+        np.testing.assert_array_equal(seen[[1, 2]], full[[1, 2]])
+        assert (full != bumps()).any()
+
+
+def test_a_softer_pad_gives_way_by_the_inverse_of_its_stiffness_under_the_same_force() -> None:
+    pressed = {}
+    for factor in (1.0, 0.5):
+        sim = start(make_effect("pad_compliance", stiffness_factor=factor))
+        targets = sim.targets.copy()
+        targets[0, 6] = BLOCK_M - 0.008
+        for _ in range(15):
+            sim.step(targets)
+        compression = [sim.batch.joint(f"left_{f}_spring").qpos[0, 0] for f in "ab"]
+        pressed[factor] = np.mean(compression) / sim.effort()[0, 6]
+    assert pressed[0.5] / pressed[1.0] == pytest.approx(2.0, rel=0.03)
+
+
+def test_pads_without_springs_cannot_be_made_softer() -> None:
+    config = TwinConfig(robot=RobotConfig(pads="rigid"))
+    with pytest.raises(TaccorlError, match=r"pad_compliance.*rigid.*robot\.pads"):
+        make_effect("pad_compliance", stiffness_factor=0.5).edit(empty_bench(config), config)
+
+
+def test_touch_of_a_simulation_passes_through_the_effects() -> None:
+    plain = perform(start())
+    assert plain["reading"].max() > 0.5
+    dead = DeadTaxels(share=0.3, seed=2)
+    seen = perform(start(dead))
+    np.testing.assert_array_equal(seen["reading"], plain["reading"] * ~dead.dead())
+    assert (seen["touch"] != plain["touch"]).any()
+
+
+def test_creep_goes_on_whether_somebody_looks_or_not() -> None:
+    effect = make_effect("taxel_creep", share=0.5, time_constant_s=0.1)
+    watched, alone = start(effect), start(effect)
+
+    def look(_: int) -> None:
+        watched.touch()
+
+    targets = watched.targets.copy()
+    targets[0, 6] = BLOCK_M - 0.008
+    for _ in range(6):
+        watched.step(targets, watch=Watch([10, 25], look))
+        watched.touch()
+        alone.step(targets)
+    assert (alone.reading() > 0).any()
+    np.testing.assert_array_equal(alone.reading(), watched.reading())

@@ -1,0 +1,314 @@
+"""FlexiTac pads: law, scan, converter, noise; what they send goes through ingest and comes back as the same counts."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from taccorl.data.cutting import open_episodes
+from taccorl.data.spec import data_specs_folder, find_spec, load_sensor_spec
+from taccorl.errors import TaccorlError
+from taccorl.sim.robot import RobotConfig
+from taccorl.sim.sensors import Sensor, TactileFrames, sensors
+from taccorl.sim.sensors.flexitac import FlexiTacConfig, at_scan_instants, normal_reading, scan_instants_s
+
+PADS = ("left_a", "left_b", "right_a", "right_b")
+SPEC = load_sensor_spec(find_spec("flexitac_v2"))
+
+
+def touch(num_sims: int = 1, seed: int = 0, deepest_m: float = 0.0009) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 4, 384) depth and rate: every second taxel pressed."""
+    rng = np.random.default_rng(seed)
+    shape = (num_sims, 4, 384)
+    pressed = rng.random(shape) < 0.5
+    depth = (rng.uniform(0, deepest_m, shape) * pressed).astype(np.float32)
+    return depth, (rng.normal(0, 0.005, shape) * pressed).astype(np.float32)
+
+
+def above(sensor: Sensor, depth: np.ndarray, rate: np.ndarray | None = None, **settings) -> np.ndarray:
+    rate = np.zeros_like(depth) if rate is None else rate
+    return sensor.sense(depth, rate, settings.pop("noise", None), **settings).counts_above_baseline
+
+
+# ---- every registered sensor ----
+
+
+@pytest.mark.parametrize("name", list(sensors))
+def test_nothing_is_sent_without_contact(name: str) -> None:
+    sensor = sensors.get(name)().build(PADS)
+    num_taxels = sensor.spec.rows * sensor.spec.columns
+    nothing = np.zeros((3, 4, num_taxels), np.float32)
+    frames = sensor.sense(nothing, nothing, None)
+    assert frames.counts_above_baseline.dtype == np.int16
+    assert frames.counts_above_baseline.shape == (3, 4 * num_taxels)
+    assert not frames.counts_above_baseline.any()
+
+
+@pytest.mark.parametrize("name", list(sensors))
+def test_same_generators_give_the_same_bits_alone_and_in_a_batch(name: str) -> None:
+    sensor = sensors.get(name)().build(PADS)
+    depth, rate = touch(5)
+    together = sensor.sense(depth, rate, [np.random.default_rng([7, i]) for i in range(5)]).counts
+    again = sensor.sense(depth, rate, [np.random.default_rng([7, i]) for i in range(5)]).counts
+    assert together.tobytes() == again.tobytes()
+    for i in range(5):
+        one = depth[i : i + 1], rate[i : i + 1]
+        assert sensor.sense(*one, [np.random.default_rng([7, i])]).counts.tobytes() == together[i].tobytes()
+        assert sensor.sense(*one, np.random.default_rng([7, i])).counts.tobytes() == together[i].tobytes()
+    assert (sensor.sense(depth, rate, [np.random.default_rng([8, i]) for i in range(5)]).counts != together).any()
+
+
+@pytest.mark.parametrize("name", list(sensors))
+def test_transforms_act_in_order_and_none_leaves_every_bit(name: str) -> None:
+    depth, rate = touch(2)
+    config = sensors.get(name)()
+    plain = config.build(PADS).sense(depth, rate, np.random.default_rng(1)).counts
+    untouched = (
+        config.build(PADS, transforms=[lambda reading: reading]).sense(depth, rate, np.random.default_rng(1)).counts
+    )
+    assert untouched.tobytes() == plain.tobytes()
+    half = config.build(PADS, transforms=[lambda r: r + 0.2, lambda r: 0.5 * r])
+    other = config.build(PADS, transforms=[lambda r: 0.5 * r, lambda r: r + 0.1])
+    assert (above(half, depth, rate) == above(other, depth, rate)).mean() > 0.999  # but for rounding
+    assert (above(half, depth, rate) != above(config.build(PADS), depth, rate)).any()
+
+
+# ---- law ----
+
+
+def test_reading_is_a_spring_and_a_damper_that_never_pulls() -> None:
+    """k_n = 2000 /m, k_d = 10 s/m: 0.5 mm at 20 mm/s: 1 + 0.2; at −150 mm/s: 1 − 1.5 < 0; out of contact: 0."""
+    depth = np.array([0.0005, 0.0005, 0.0005, 0.0])
+    rate = np.array([0.0, 0.02, -0.15, 0.3])
+    assert normal_reading(depth, rate, 2000.0, 10.0) == pytest.approx([1.0, 1.2, 0.0, 0.0])
+
+
+def test_a_millimetre_is_120_counts_and_ten_newtons_on_the_twins_pad_are_60() -> None:
+    """1600 /m · 1 mm = 1.6; · 75 = 120 counts, which the policy reads as 1.6 again. 10 N / 2e4 N/m = 0.5 mm."""
+    depth = np.zeros((1, 4, 384), np.float32)
+    depth[0, 2, 100] = 0.001
+    counts = above(FlexiTacConfig().build(PADS), depth)
+    assert counts[0, 2 * 384 + 100] == 120
+    assert np.count_nonzero(counts) == 1
+    assert 120 * SPEC.gain_per_count == pytest.approx(1.6)
+    ten_newtons_m = 10.0 / RobotConfig().pad_stiffness_n_per_m
+    assert above(FlexiTacConfig().build(PADS), depth / np.float32(0.001) * np.float32(ten_newtons_m)).max() == 60
+    # 40 N: 240 counts, of which the wire holds what is left above the resting count (10 to 40 of 255).
+    assert 215 <= above(FlexiTacConfig().build(PADS), 2 * depth).max() <= 240
+
+
+def test_contact_threshold_of_the_paper_is_a_quarter_millimetre() -> None:
+    """λ_f = 0.4 = 30 counts = 0.25 mm = 5 N on a whole sprung pad of 2e4 N/m."""
+    depth = np.full((1, 4, 384), 0.00025, np.float32)
+    assert (above(FlexiTacConfig().build(PADS), depth) == 30).all()
+
+
+def test_gain_and_stiffness_are_one_number_to_the_wire() -> None:
+    depth, _ = touch()
+    assert (
+        above(FlexiTacConfig(normal_stiffness_per_m=800, gain_count=150).build(PADS), depth)
+        == above(FlexiTacConfig().build(PADS), depth)
+    ).all()
+
+
+# ---- converter ----
+
+
+def test_counts_are_the_nearest_whole_number_above_rest() -> None:
+    depth, rate = touch()
+    sensor = FlexiTacConfig().build(PADS)
+    exact = 75 * normal_reading(depth.astype(float), rate, 1600.0, 8.0).reshape(1, -1)
+    counts = above(sensor, depth, rate)
+    inside = exact < 200
+    assert inside.mean() > 0.9
+    assert np.abs(counts - exact)[inside].max() <= 0.5 + 1e-4
+
+
+def test_pressed_hard_the_wire_sends_its_maximum_and_never_wraps() -> None:
+    depth = np.full((1, 4, 384), 0.01, np.float32)
+    sensor = FlexiTacConfig().build(PADS)
+    frames = sensor.sense(depth, np.zeros_like(depth), np.random.default_rng(0))
+    assert frames.counts.dtype == np.uint8
+    assert (frames.counts == 255).all()
+    assert (frames.counts_above_baseline == 255 - sensor.baseline.reshape(1, -1)).all()
+
+
+def test_noise_cannot_push_a_count_below_zero() -> None:
+    sensor = FlexiTacConfig(noise_std_count=50.0).build(PADS)
+    nothing = np.zeros((4, 4, 384), np.float32)
+    frames = sensor.sense(nothing, nothing, np.random.default_rng(0))
+    assert frames.counts.min() == 0
+    assert (frames.counts == 0).mean() > 0.2
+    assert (frames.counts_above_baseline >= -sensor.baseline.reshape(1, -1)).all()
+
+
+def test_resting_counts_belong_to_the_unit() -> None:
+    one, same, other = (FlexiTacConfig(seed=seed).build(PADS).baseline for seed in (3, 3, 4))
+    assert (one == same).all()
+    assert (one != other).mean() > 0.9
+    assert (one.min(), one.max()) == (10, 40)
+    assert one.shape == (4, 32, 12)
+
+
+# ---- noise ----
+
+
+def test_noise_has_the_stated_spread_and_no_pattern() -> None:
+    """σ = 2 counts, rounded to whole ones: variance 4 + 1/12. Taxels and scans are independent."""
+    sensor = FlexiTacConfig(noise_std_count=2.0).build(PADS)
+    nothing = np.zeros((400, 4, 384), np.float32)
+    counts = above(sensor, nothing, noise=np.random.default_rng(5)).astype(float)
+    # 614 400 values: the variance is known to 1.8e-3 of itself (one σ), the mean to 2.6e-3.
+    assert counts.mean() == pytest.approx(0.0, abs=0.015)
+    assert counts.var() == pytest.approx(4 + 1 / 12, rel=0.01)
+    assert np.abs(counts.var(axis=0) / counts.var() - 1).max() < 0.4
+    assert np.corrcoef(counts[:, :-1].ravel(), counts[:, 1:].ravel())[0, 1] == pytest.approx(0, abs=0.01)
+    assert np.corrcoef(counts[:-1].ravel(), counts[1:].ravel())[0, 1] == pytest.approx(0, abs=0.01)
+
+
+def test_default_noise_stays_within_the_boards_no_contact_threshold() -> None:
+    nothing = np.zeros((100, 4, 384), np.float32)
+    counts = above(FlexiTacConfig().build(PADS), nothing, noise=np.random.default_rng(6))
+    assert counts.any()
+    assert np.abs(counts).max() < SPEC.noise_count
+
+
+# ---- scan ----
+
+
+def ramp_m(time_s: np.ndarray) -> np.ndarray:
+    """(S, 1, 4, 384) every taxel pressed in at 50 mm/s, 0.8 mm at the stamp."""
+    return np.broadcast_to((0.0008 + 0.05 * time_s)[:, None, None, None], (len(time_s), 1, 4, 384)).astype(np.float32)
+
+
+@pytest.mark.parametrize("time_s", [[-0.01, 0.0], [-0.02, -0.0125, -0.007, -0.003, 0.0], [-0.0099, -0.0002]])
+def test_each_row_of_the_wire_reads_at_its_own_instant(time_s: list[float]) -> None:
+    """12 rows in 10 ms: row i is read 10 − (i + ½) · 10/12 ms before the stamp. Wire rows are the pad's columns."""
+    times = np.array(time_s)
+    depth = ramp_m(times)
+    sensor = FlexiTacConfig(normal_damping_s_per_m=0.0).build(PADS)
+    instants_s = np.array([-0.010 + (i + 0.5) * 0.010 / 12 for i in range(12)])
+    assert scan_instants_s(SPEC) == pytest.approx(instants_s)
+    reading = sensor.reading(depth, np.zeros_like(depth), times)
+    assert reading.shape == (1, 4, 32, 12)
+    expected = 1600 * (0.0008 + 0.05 * instants_s)
+    assert reading == pytest.approx(np.broadcast_to(expected, (1, 4, 32, 12)), abs=1e-6)
+    frames = sensor.sense(depth, np.zeros_like(depth), None, times)
+    # The first row on the wire is the oldest: 0.0008 − 0.05 · 9.58e-3 = 0.32 mm, 38.5 counts; the last 0.78 mm, 93.5.
+    wire = frames.wire_frame("right_a")[0].astype(int) - sensor.baseline[2].T
+    assert set(wire[0].tolist()) <= {38, 39}
+    assert set(wire[11].tolist()) <= {93, 94}
+
+
+def test_still_pad_reads_the_same_with_and_without_a_history() -> None:
+    depth, rate = touch(2)
+    sensor = FlexiTacConfig().build(PADS)
+    still = np.repeat(depth[None], 3, axis=0), np.repeat(rate[None], 3, axis=0)
+    scanned = sensor.sense(*still, None, np.array([-0.01, -0.004, 0.0])).counts
+    assert scanned.tobytes() == sensor.sense(depth, rate, None).counts.tobytes()
+
+
+@pytest.mark.parametrize("time_s", [[-0.009, 0.0], [-0.01, -0.001], [0.0, -0.01], [-0.01, -0.01]])
+def test_history_that_leaves_out_part_of_the_scan_is_refused(time_s: list[float]) -> None:
+    samples = np.zeros((2, 1, 4, 32, 12), np.float32)
+    with pytest.raises(
+        TaccorlError, match=r"times must rise and cover the scan, -0.0096 to -0.0004 s before the stamp"
+    ):
+        at_scan_instants(samples, np.array(time_s), SPEC)
+
+
+# ---- wire and ingest ----
+
+
+def ingested(folder: Path, frames: Sequence[TactileFrames]) -> tuple[np.ndarray, np.ndarray]:
+    """What ``taccorl.data`` makes of wire frames recorded one after the other: counts above baseline (T, 1536), baseline."""
+    (folder / "dataset.yaml").write_text(
+        "spec_version: 1\nname: pads\nrobot_type: pads\nfps: 100\nfeatures:\n  observation.tactile: {dtype: int16, "
+        "shape: [1536], unit: adc_count, frame: pad, rate_hz: 100, range: [-255, 255], "
+        f"sensor: {data_specs_folder() / 'sensors' / 'flexitac_v2.yaml'}, pads: [{', '.join(PADS)}]}}\n"
+    )
+    channels = "".join(f"  {pad}: {{topic: /{pad}, rate_hz: 100, max_age_s: 0.04}}\n" for pad in PADS)
+    (folder / "recording.yaml").write_text(
+        "spec_version: 1\ndataset: dataset.yaml\nreader: hdf5\nclock: log\nepisodes: {by: whole_file, min_s: 0.1}\n"
+        f"instruction: {{from: spec, text: press}}\nchannels:\n{channels}"
+        f"features:\n  observation.tactile: {{channels: [{', '.join(PADS)}], align: asof}}\n"
+    )
+    with h5py.File(folder / "pads.hdf5", "w") as file:
+        for pad in PADS:
+            file[pad] = np.concatenate([frame.wire_frame(pad) for frame in frames])
+    with open_episodes(folder / "pads.hdf5", folder / "recording.yaml") as [episode]:
+        return episode.arrays["observation.tactile"], episode.baselines["observation.tactile"]
+
+
+def pressed_after_rest(sensor: Sensor, noise: np.random.Generator | None) -> list[TactileFrames]:
+    nothing = np.zeros((1, 4, 384), np.float32)
+    rest = [sensor.sense(nothing, nothing, noise) for _ in range(30)]
+    return rest + [sensor.sense(*touch(seed=k), noise) for k in range(30)]
+
+
+def test_ingest_gives_back_the_counts_of_the_twin(tmp_path: Path) -> None:
+    sensor = FlexiTacConfig().build(PADS)
+    frames = pressed_after_rest(sensor, None)
+    counts, baseline = ingested(tmp_path, frames)
+    assert (baseline == sensor.baseline.reshape(-1)).all()
+    assert counts.dtype == np.int16
+    assert (counts == np.concatenate([f.counts_above_baseline for f in frames])).all()
+    assert counts[30:].max() > 80
+    assert frames[30].wire_frame("left_b").shape == (1, 12, 32)
+
+
+def test_with_noise_ingest_is_off_by_its_own_baseline_and_by_no_more(tmp_path: Path) -> None:
+    """The median of 30 noisy frames is a count off for some taxels, and then for all of their frames."""
+    sensor = FlexiTacConfig().build(PADS)
+    frames = pressed_after_rest(sensor, np.random.default_rng(2))
+    counts, baseline = ingested(tmp_path, frames)
+    off = baseline - sensor.baseline.reshape(-1)
+    assert (off != 0).mean() < 0.2
+    assert np.abs(off).max() <= 1
+    assert (counts + off == np.concatenate([f.counts_above_baseline for f in frames])).all()
+
+
+def test_bytes_on_the_wire_are_rows_across_the_finger() -> None:
+    """Pad row r, column c is byte c · 32 + r of the frame."""
+    depth = np.zeros((1, 4, 384), np.float32)
+    depth[0, 1, 30 * 12 + 2] = 0.001
+    sensor = FlexiTacConfig().build(PADS)
+    wire = sensor.sense(depth, np.zeros_like(depth), None).wire_frame("left_b")[0]
+    data = np.frombuffer(wire.tobytes(), np.uint8).astype(int)
+    assert data[2 * 32 + 30] - sensor.baseline[1, 30, 2] == 120
+
+
+# ---- bad input ----
+
+
+def test_unknown_pad_and_sensor_are_refused_with_the_nearest_name() -> None:
+    nothing = np.zeros((1, 4, 384), np.float32)
+    frames = FlexiTacConfig().build(PADS).sense(nothing, nothing, None)
+    with pytest.raises(TaccorlError, match="no pad 'left_c'; did you mean 'left_"):
+        frames.wire_frame("left_c")
+    with pytest.raises(TaccorlError, match="no sensor 'flexitack'; did you mean 'flexitac'"):
+        sensors.get("flexitack")
+
+
+def test_wrong_shapes_are_refused() -> None:
+    sensor = FlexiTacConfig().build(PADS)
+    nothing = np.zeros((1, 4, 384), np.float32)
+    with pytest.raises(TaccorlError, match=r"depth \(1, 2, 384\) .* give both as \(sims, 4, 384\)"):
+        sensor.sense(nothing[:, :2], nothing[:, :2], None)
+    with pytest.raises(TaccorlError, match="with time_s of the samples"):
+        sensor.sense(nothing[None], nothing[None], None)
+    with pytest.raises(TaccorlError, match="2 generators for 1 sims"):
+        sensor.sense(nothing, nothing, [np.random.default_rng(0), np.random.default_rng(1)])
+    with pytest.raises(TaccorlError, match=r"made \(1, 4, 12, 32\) of a reading \(1, 4, 32, 12\)"):
+        FlexiTacConfig().build(PADS, [lambda reading: reading.swapaxes(2, 3)]).sense(nothing, nothing, None)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("resting_count", (40, 10)), ("resting_count", (0, 255)), ("noise_std_count", -1.0), ("gain_count", float("nan"))],
+)
+def test_settings_that_no_board_has_are_refused(setting: str, value: object) -> None:
+    with pytest.raises(TaccorlError, match=f"flexitac: {setting}"):
+        FlexiTacConfig(**{setting: value}).build(PADS)  # type: ignore[arg-type]

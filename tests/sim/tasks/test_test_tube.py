@@ -1,0 +1,287 @@
+"""Test Tube Insertion: where things begin, what counts as inserted, what is a near miss and what a failure."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.sim.randomize import draw
+from taccorl.sim.robot import RobotConfig
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks.parts import tube_stand
+from taccorl.sim.tasks.test_tube import RACK_AT_M, TUBE_AT_M, TestTube
+
+DEG = np.pi / 180
+HOLD_STEPS = 15  # 0.5 s at 30 Hz
+MOUTH_M, FLOOR_M = 0.050, 0.004  # heights of the rack's top and of its floor: 46 mm deep
+AWAY_M = (0.60, -0.30)  # on the table, far from everything
+
+
+@pytest.fixture(scope="module")
+def built() -> Simulation:
+    return Simulation(TestTube(), scale=0.0)  # nothing drawn: everything at its nominal place
+
+
+@pytest.fixture
+def sim(built) -> Simulation:
+    built.reset([0])
+    rack = built.poses("rack")[0].copy()
+    rack[2, 3] = 0.0  # exactly on the table, from which a reset leaves 0.2 mm
+    put(built, "rack", rack)
+    return built
+
+
+def over_hole(depth_m: float, *, lean_deg: float = 0.0, aside_m: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """World pose (4, 4) of a tube, cap up, its bottom ``depth_m`` below the mouth of the nominal rack's middle hole."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("x", lean_deg, degrees=True).as_matrix()
+    pose[:3, 3] = (RACK_AT_M[0] + aside_m[0], RACK_AT_M[1] + aside_m[1], MOUTH_M - depth_m)
+    return pose
+
+
+def lying(x_m: float, y_m: float, height_m: float) -> np.ndarray:
+    """World pose (4, 4) of a tube along x, its bottom at (x, y)."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    pose[:3, 3] = (x_m, y_m, height_m)
+    return pose
+
+
+def put(sim: Simulation, part: str, pose: np.ndarray, velocity_mps: tuple[float, float, float] = (0, 0, 0)) -> None:
+    """Write a world pose (4, 4) and a velocity into the state."""
+    joint = sim.model.joint(part)
+    quat = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+    sim.arrays["qpos"][0, joint.qposadr[0] : joint.qposadr[0] + 7] = np.r_[pose[:3, 3], quat]
+    sim.arrays["qvel"][0, joint.dofadr[0] : joint.dofadr[0] + 6] = np.r_[velocity_mps, 0, 0, 0]
+    sim.batch.forward(np.array([0]))
+
+
+def goal(sim: Simulation) -> bool:
+    return bool(sim.task.look(sim).goal[0])
+
+
+def failures(sim: Simulation) -> set[str]:
+    """What is seen now, before it has lasted."""
+    return {name for name, seen in sim.task.look(sim).failures.items() if seen[0]}
+
+
+def stay(sim: Simulation, num_steps: int) -> None:
+    action = sim.arrays["ctrl"][:, sim.action_actuators].copy()
+    for _ in range(num_steps):
+        sim.step(action)
+
+
+# where it begins ------------------------------------------------------------------------------------------------------
+
+
+def test_draws_fill_the_ranges_of_the_papers_table():
+    """U(−a, a), 400 draws: none beyond a, and the largest within 5 % of it (missed with probability 0.95^400 = 1e-9)."""
+    rows = TestTube().rows
+    draws = [draw(rows, np.random.default_rng(seed)) for seed in range(400)]
+    half = {"tube_position": (0.02, 0.02), "tube_yaw": (20 * DEG,), "holder_position": (0.005, 0.005)}
+    assert draws[0].keys() == half.keys() | {"friction"}
+    for name, expected in half.items():
+        values = np.abs([d[name] for d in draws]).max(axis=0)
+        assert np.all(values <= expected)
+        assert values == pytest.approx(expected, rel=0.05)
+    friction = np.array([d["friction"] for d in draws])
+    assert (friction.min(), friction.max()) == pytest.approx((0.3, 0.7), abs=0.01)
+    assert friction.min() >= 0.3
+    assert friction.max() <= 0.7
+
+
+@pytest.mark.parametrize("yaw_deg", [-20, 0, 20])
+def test_tube_and_stand_are_drawn_together(yaw_deg):
+    shift = np.array((0.02, -0.013))
+    drawn = {"tube_position": shift, "tube_yaw": np.array([yaw_deg * DEG]), "holder_position": np.zeros(2)}
+    poses = TestTube().reset({**drawn, "friction": np.array([0.4])}).poses
+    turned = {name: Rotation.from_quat(pose[3:], scalar_first=True) for name, pose in poses.items()}
+    along = np.array([-np.sin(yaw_deg * DEG), np.cos(yaw_deg * DEG), 0])  # at 0 the cap points along +y
+    assert turned["tube"].apply((0, 0, 1)) == pytest.approx(along, abs=1e-12)
+    assert turned["stand"].apply((1, 0, 0)) == pytest.approx(along, abs=1e-12)
+    middle = poses["tube"][:3] + 0.050 * along
+    assert middle == pytest.approx([TUBE_AT_M[0] + 0.02, TUBE_AT_M[1] - 0.013, 0.0402 + 0.0002], abs=3e-4)
+    seat = tube_stand().seats["tube"]
+    in_stand = turned["stand"].inv().apply(poses["tube"][:3] - poses["stand"][:3])
+    assert in_stand == pytest.approx(seat[:3, 3], abs=5e-4)
+
+
+def test_the_rack_is_drawn_in_the_plane_its_handle_to_the_left_arm():
+    drawn = {"tube_position": np.zeros(2), "tube_yaw": np.zeros(1), "friction": np.array([0.62])}
+    scene = TestTube().reset(drawn | {"holder_position": np.array((0.005, -0.004))})
+    rack = scene.poses["rack"]
+    assert rack[:2] == pytest.approx((RACK_AT_M[0] + 0.005, RACK_AT_M[1] - 0.004))
+    assert rack[2] == pytest.approx(0.0, abs=5e-4)
+    handle = Rotation.from_quat(rack[3:], scalar_first=True).apply((-0.061, 0, 0))
+    assert handle == pytest.approx((0, 0.061, 0), abs=1e-12)
+    assert scene.friction == 0.62
+
+
+def test_nothing_moves_and_nothing_is_judged_before_the_hands_do(sim):
+    before = {part: sim.poses(part)[0] for part in sim.task.parts}
+    stay(sim, 45)
+    for part, pose in before.items():
+        assert sim.poses(part)[0] == pytest.approx(pose, abs=5e-4)
+    assert failures(sim) == set()
+    assert not sim.judge.outcome.over[0]
+    assert sim.judge.subtask.tolist() == [[0, 0]]
+
+
+def test_the_instruction_says_what_and_where():
+    assert {"tube", "middle", "rack"} <= set(TestTube.instruction.split())
+
+
+# what counts ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_tube_that_stands_in_the_middle_hole_is_a_success_after_half_a_second(sim):
+    put(sim, "tube", over_hole(0.0459))
+    assert goal(sim)
+    stay(sim, HOLD_STEPS - 1)
+    assert not sim.judge.success[0]
+    stay(sim, 2)
+    assert sim.judge.success[0]
+    assert sim.judge.outcome.failure[0] == ""
+
+
+def test_a_tube_in_flight_is_no_success_until_it_has_come_to_rest(sim):
+    put(sim, "tube", over_hole(-0.010))
+    assert not goal(sim)
+    landed = None
+    for step in range(40):
+        stay(sim, 1)
+        speed = sim.judge.verdict.measures["speed_mps"][0]
+        assert not (goal(sim) and speed >= 0.02)
+        assert not (goal(sim) and sim.judge.verdict.measures["depth_m"][0] < 0.040)
+        landed = step if goal(sim) and landed is None else landed
+        if landed is None or step < landed + HOLD_STEPS - 1:
+            assert not sim.judge.success[0]
+    assert landed is not None
+    assert sim.judge.success[0]
+
+
+@pytest.mark.parametrize(("speed_mps", "at_rest"), [(0.0, True), (0.019, True), (0.021, False), (-0.3, False)])
+def test_a_tube_that_moves_in_the_hole_is_not_there_yet(sim, speed_mps, at_rest):
+    put(sim, "tube", over_hole(0.043), velocity_mps=(0, 0, speed_mps))
+    assert goal(sim) == at_rest
+
+
+def test_it_is_the_speed_against_the_rack_that_counts(sim):
+    put(sim, "rack", sim.poses("rack")[0], velocity_mps=(0, 0.1, 0))
+    put(sim, "tube", over_hole(0.043), velocity_mps=(0, 0.1, 0))
+    assert goal(sim)
+
+
+@pytest.mark.parametrize(("depth_mm", "lean_deg", "aside_mm", "inside"), [
+    (39.9, 0, 0, False), (40.1, 0, 0, True),
+    (43, 4.9, 0, True), (43, 5.1, 0, False), (43, -5.1, 0, False), (43, 180, 0, False),
+    (43, 0, 2.9, True), (43, 0, 3.1, False),
+])  # fmt: skip
+def test_depth_lean_and_place_are_judged_to_a_hair(sim, depth_mm, lean_deg, aside_mm, inside):
+    put(sim, "tube", over_hole(depth_mm * 1e-3, lean_deg=lean_deg, aside_m=(aside_mm * 1e-3, 0)))
+    assert goal(sim) == inside
+    assert sim.task.look(sim).partial[0] == inside
+
+
+def test_a_tube_that_is_still_held_is_no_success(sim):
+    ahead = np.array((1, 1, 0)) / np.sqrt(2)  # a hand that comes level from behind on the right, then leans by 35°
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([(0, 0, -1), np.cross(ahead, (0, 0, -1)), ahead], axis=1)
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("y", 35, degrees=True).as_matrix()
+    pose[:3, 3] = (*RACK_AT_M, MOUTH_M + 0.030)
+    joints = sim.proprioception()[0].copy()
+    joints[7:13] = ArmKinematics("right", RobotConfig()).search(pose, np.random.default_rng(0))
+    for opening_m, held in [(0.0155, True), (0.030, False)]:
+        joints[13] = opening_m
+        sim.place_arms(joints, joints)
+        put(sim, "tube", over_hole(0.0455))
+        assert sim.pads_touching("tube")[0].tolist() == [False, False, held, held]
+        assert goal(sim) != held
+
+
+# failures -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("depth_mm", "lean_deg", "aside_mm", "seen"), [
+    (0.2, 0, (0, 7), "rim"),  # its round bottom, R 8, is 8 − √(64 − 1.5²) = 0.14 mm up where it meets the edge at 8.5
+    (0.05, 0, (0, 13), "rim"),  # on the web between two holes
+    (30, 8, (0, 0), "jam"),  # leans by more than 1.8°: it presses into the plates
+    (45.9, 6, (0, 0), "jam"),
+    (20, 0, (0.55, 0), "jam"),  # stuck on its way
+    (46.05, 0, (0, 26), "missed"),  # stands in a hole next to it
+    (49.9, -20, (0, -71), "missed"),  # leans on the rack from outside
+])  # fmt: skip
+def test_each_failure_has_its_name(sim, depth_mm, lean_deg, aside_mm, seen):
+    aside_m = (aside_mm[0] * 1e-3, aside_mm[1] * 1e-3)
+    put(sim, "tube", over_hole(depth_mm * 1e-3, lean_deg=lean_deg, aside_m=aside_m))
+    assert sim.contact("tube", "rack").touching[0]
+    assert failures(sim) == {seen}
+    assert not goal(sim)
+
+
+def test_a_tube_across_the_rack_is_on_the_rim(sim):
+    put(sim, "tube", lying(RACK_AT_M[0] - 0.05, RACK_AT_M[1], MOUTH_M + 0.0079))
+    assert failures(sim) == {"rim"}
+
+
+def test_a_tube_on_the_table_is_dropped_after_half_a_second(sim):
+    put(sim, "tube", lying(*AWAY_M, 0.0101))
+    stay(sim, HOLD_STEPS - 2)
+    assert not sim.judge.outcome.over[0]
+    stay(sim, 3)
+    assert sim.judge.outcome.failure[0] == "dropped"
+
+
+@pytest.mark.parametrize("part", ["tube", "rack"])
+def test_what_falls_off_the_table_is_dropped(sim, part):
+    pose = np.eye(4)
+    pose[:3, 3] = (0.3, -0.8, -0.1)
+    put(sim, part, pose)
+    assert "dropped" in failures(sim)
+
+
+@pytest.mark.parametrize("shift_mm", [(24, 0, 0), (0, -24, 0), (26, 0, 0), (0, -26, 0), (0, 0, 26), (18.5, 18.5, 0)])
+def test_the_rack_may_not_be_moved_away(sim, shift_mm):
+    """By 20 mm from where it stood, at most 5 mm off its nominal place."""
+    rack = sim.poses("rack")[0].copy()
+    rack[:3, 3] += np.array(shift_mm) * 1e-3
+    put(sim, "rack", rack)
+    assert ("rack moved" in failures(sim)) == (np.linalg.norm(shift_mm) > 25)
+
+
+@pytest.mark.parametrize("name", ["rim", "jam", "missed"])
+def test_a_tube_that_is_only_passing_is_no_failure(name):
+    """Half a second: the tube may still slide in, or the hand take it again."""
+    assert TestTube.failures[name] == 0.5
+
+
+def test_failures_of_the_verdict_are_those_that_are_declared(sim):
+    assert list(sim.task.look(sim).failures) == list(TestTube.failures)
+
+
+# subtasks -------------------------------------------------------------------------------------------------------------
+
+
+def test_subtasks_name_what_is_held_and_what_it_refers_to():
+    left, right = (TestTube().subtasks()[arm] for arm in ("left", "right"))
+    assert [(s.object_ref, s.held) for s in left] == [("rack", None), ("rack", "rack")]
+    assert [(s.object_ref, s.held) for s in right] == [("tube", None), (None, "tube"), ("rack", "tube")]
+    names = {s.name: s for s in itertools.chain(left, right)}
+    assert names["hold rack"].coordinated_with == "insert tube"
+    assert names["insert tube"].coordinated_with == "hold rack"
+
+
+def test_a_tube_that_floats_upright_over_the_rack_has_not_been_lifted_by_anyone(sim):
+    put(sim, "tube", over_hole(-0.05))
+    lifted, upright, inserted = (subtask.done(sim)[0] for subtask in sim.task.subtasks()["right"])
+    assert not lifted
+    assert not upright
+    assert not inserted
+
+
+def test_a_tube_in_its_hole_ends_the_last_subtask_of_both(sim):
+    put(sim, "tube", over_hole(0.0459))
+    for arm in ("left", "right"):
+        assert sim.task.subtasks()[arm][-1].done(sim)[0]

@@ -1,0 +1,249 @@
+"""Intrinsics against published units, the letterbox against ingest's own, poses against arithmetic."""
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from taccorl.data.decode import letterbox
+from taccorl.errors import TaccorlError
+from taccorl.sim.cameras import (
+    CameraConfig,
+    CameraOffset,
+    Intrinsics,
+    add_cameras,
+    bench_cameras,
+    letterbox_window,
+    look_at_quat,
+    offset_pose,
+    place_camera,
+    project,
+    sensor_intrinsics,
+)
+
+
+def bench_bodies() -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    for arm, side in (("left", 0.3), ("right", -0.3)):
+        body = spec.worldbody.add_body(name=f"{arm}_link6", pos=[0.3, side, 0.25], quat=[0.6, 0.0, 0.8, 0.0])
+        body.add_joint(name=f"{arm}_joint", axis=[0, 0, 1])
+        body.add_geom(size=[0.01, 0, 0])
+    return spec
+
+
+def pose_of(model: mujoco.MjModel, name: str) -> tuple[np.ndarray, np.ndarray]:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data.camera(name).xpos.copy(), data.camera(name).xmat.reshape(3, 3).copy()
+
+
+def test_a_d415_has_the_datasheets_angles_and_the_sdks_at_4_to_3():
+    full = sensor_intrinsics("d415", 1080, 1920)
+    assert full.fy_px == pytest.approx(540 / math.tan(math.radians(42.5 / 2)))  # 1388.6
+    assert math.degrees(full.vertical_fov_rad) == pytest.approx(42.5)
+    assert math.degrees(full.horizontal_fov_rad) == pytest.approx(69.4, abs=0.1)
+    vga = sensor_intrinsics("d415", 480, 640)  # 1440 × 1080 of the sensor, divided by 2.25
+    assert vga.fx_px == pytest.approx(full.fx_px / 2.25)
+    assert vga.fx_px == pytest.approx(616.8, rel=0.005)  # camera_info of one unit of this imager
+    assert math.degrees(vga.horizontal_fov_rad) == pytest.approx(54.73, abs=0.2)  # librealsense issue 2141
+    assert math.degrees(vga.vertical_fov_rad) == pytest.approx(42.41, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "published"), [(480, 640, (393.03, 390.67, 388.46)), (480, 848, (425.01, 425.19, 426.56))]
+)
+def test_a_d405_has_the_focal_length_of_published_units(rows: int, columns: int, published: tuple[float, ...]):
+    nominal = sensor_intrinsics("d405", rows, columns)
+    assert nominal.fx_px == nominal.fy_px == pytest.approx(np.mean(published), rel=0.015)
+
+
+def test_a_d405_sees_58_degrees_over_720_rows_and_all_800_rows_at_4_to_3():
+    assert math.degrees(sensor_intrinsics("d405", 720, 1280).vertical_fov_rad) == pytest.approx(58.0)
+    vga = sensor_intrinsics("d405", 480, 640)
+    assert vga.fy_px == pytest.approx(0.6 * 360 / math.tan(math.radians(29)))
+    assert (math.degrees(vga.horizontal_fov_rad), math.degrees(vga.vertical_fov_rad)) == pytest.approx(
+        (78.8, 63.3), abs=0.1
+    )
+
+
+def test_a_640_480_recording_fills_168_rows_of_a_224_frame():
+    window = letterbox_window((480, 640), (224, 224))
+    assert (window.top, window.left, window.rows, window.columns) == (28, 0, 168, 224)
+    camera = sensor_intrinsics("d415", 480, 640)
+    boxed = camera.letterboxed(224, 224)
+    assert (boxed.fx_px, boxed.fy_px) == pytest.approx((0.35 * camera.fx_px,) * 2)
+    assert (boxed.cx_px, boxed.cy_px) == pytest.approx((111.5, 111.5))  # the middle of 0 … 223
+    off_centre = dataclasses.replace(camera, cx_px=329.5, cy_px=229.5).letterboxed(224, 224)
+    assert (off_centre.cx_px, off_centre.cy_px) == pytest.approx((111.5 + 3.5, 111.5 - 3.5))
+
+
+@pytest.mark.parametrize("recorded", [(480, 640), (720, 1280), (480, 848), (101, 57), (224, 224), (30, 20)])
+@pytest.mark.parametrize("frame", [(224, 224), (96, 96), (84, 129), (50, 50), (224, 100)])
+def test_the_window_is_where_ingest_puts_the_picture(recorded: tuple[int, int], frame: tuple[int, int]):
+    stored = letterbox(np.full((*recorded, 3), 255, np.uint8), *frame)
+    rows, columns = np.flatnonzero(stored.any((1, 2))), np.flatnonzero(stored.any((0, 2)))
+    window = letterbox_window(recorded, frame)
+    assert (window.top, window.rows) == (rows[0], len(rows))
+    assert (window.left, window.columns) == (columns[0], len(columns))
+
+
+@pytest.mark.parametrize("frame", [(224, 224), (96, 96), (50, 50)])  # 50: 37.5 rows are rounded, fx and fy part
+def test_letterboxed_intrinsics_put_a_ray_where_ingest_puts_its_pixel(frame: tuple[int, int]):
+    camera = Intrinsics(rows=480, columns=640, fx_px=610.0, fy_px=612.0, cx_px=331.0, cy_px=228.0)
+    boxed = camera.letterboxed(*frame)
+    v, u = np.mgrid[:480, :640]
+    for ray in ((0.3, -0.2), (-0.4, 0.25), (0.0, 0.0), (0.45, 0.35)):
+        at_u, at_v = camera.fx_px * ray[0] + camera.cx_px, camera.fy_px * ray[1] + camera.cy_px
+        spot = 255 * np.exp(-((u - at_u) ** 2 + (v - at_v) ** 2) / (2 * 12.0**2))
+        stored = letterbox(np.repeat(np.round(spot).astype(np.uint8)[..., None], 3, axis=2), *frame)[..., 0].astype(
+            float
+        )
+        rows, columns = np.mgrid[: frame[0], : frame[1]]
+        seen = np.array([(stored * columns).sum(), (stored * rows).sum()]) / stored.sum()
+        expected = (boxed.fx_px * ray[0] + boxed.cx_px, boxed.fy_px * ray[1] + boxed.cy_px)
+        assert seen == pytest.approx(expected, abs=0.1)
+
+
+def test_projection_is_the_pinhole_formula_and_knows_no_points_behind():
+    camera = Intrinsics(rows=100, columns=200, fx_px=50.0, fy_px=60.0, cx_px=99.5, cy_px=49.5)
+    # A camera at (0, 0, 1) looking along −z: x right, y up. 0.2 right, 0.1 up, 2 ahead.
+    points = np.array([[0.2, 0.1, -1.0], [0.0, 0.0, 5.0]])
+    pixels = project(points, np.array([0.0, 0.0, 1.0]), np.eye(3), camera)
+    assert pixels[0] == pytest.approx((99.5 + 50 * 0.2 / 2, 49.5 - 60 * 0.1 / 2))
+    assert np.isnan(pixels[1]).all()
+
+
+def test_the_target_is_in_the_middle_and_up_is_up():
+    for config in bench_cameras():
+        spec = bench_bodies()
+        add_cameras(spec, [config])
+        model = spec.compile()
+        position, world_from_camera = pose_of(model, config.name)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        body = data.body(config.body)
+        camera = config.recorded_intrinsics()
+        ahead = body.xpos + body.xmat.reshape(3, 3) @ np.array(config.look_at_m)
+        higher = ahead + 0.02 * body.xmat.reshape(3, 3) @ np.array(config.up)
+        middle, above = project(np.stack([ahead, higher]), position, world_from_camera, camera)
+        assert middle == pytest.approx((319.5, 239.5), abs=1e-9)
+        assert above[0] == pytest.approx(319.5, abs=1e-6) and above[1] < 239.5 - 5
+
+
+def test_the_front_camera_looks_at_the_table_between_the_arms():
+    front = bench_cameras()[0]
+    forward = np.array([0.27 - 0.87, 0, 0.09 - 0.54]) / math.hypot(0.60, 0.45)  # 0.75 m away
+    spec = bench_bodies()
+    add_cameras(spec, [front])
+    position, world_from_camera = pose_of(spec.compile(), "front")
+    assert position == pytest.approx((0.87, 0, 0.54))
+    assert -world_from_camera[:, 2] == pytest.approx(forward)
+    assert world_from_camera[:, 0] == pytest.approx((0, 1, 0))  # seen from the front, the left arm (+y) is at the right
+
+
+def test_a_wrist_camera_moves_with_its_hand():
+    spec = bench_bodies()
+    add_cameras(spec, bench_cameras())
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    seen = []
+    for angle in (0.0, 0.7):
+        data.joint("left_joint").qpos = angle
+        mujoco.mj_forward(model, data)
+        hand = data.body("left_link6")
+        seen.append(hand.xmat.reshape(3, 3).T @ (data.camera("left_wrist").xpos - hand.xpos))
+    assert np.allclose(seen, [(-0.09, 0.0, 0.06)] * 2, atol=1e-12)
+    assert data.camera("right_wrist").xpos[1] < 0 < data.camera("left_wrist").xpos[1]
+
+
+def test_no_offset_leaves_the_pose_bit_identical():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        position, quat = rng.normal(size=3), rng.normal(size=4)
+        moved = offset_pose(position, quat, CameraOffset())
+        assert moved[0].tobytes() == position.tobytes() and moved[1].tobytes() == quat.tobytes()
+
+
+def test_an_offset_moves_the_picture_as_the_pinhole_says():
+    spec = bench_bodies()
+    front = bench_cameras()[0]
+    angle, shift_m = math.radians(1.5), 0.01
+    offsets = {
+        "left": CameraOffset(rotation_rad=(0, angle, 0)),  # about up: the camera turns left, things move right
+        "down": CameraOffset(rotation_rad=(-angle, 0, 0)),  # about right, backwards: looks down, things move up
+        "roll": CameraOffset(rotation_rad=(0, 0, angle)),
+        "right": CameraOffset(translation_m=(shift_m, 0, 0)),
+        "high": CameraOffset(translation_m=(0, shift_m, 0)),
+        "back": CameraOffset(translation_m=(0, 0, shift_m)),
+    }
+    add_cameras(spec, [dataclasses.replace(front, name=name, offset=offset) for name, offset in offsets.items()])
+    model = spec.compile()
+    camera, target = front.recorded_intrinsics(), np.array(front.look_at_m)
+    middle = {name: project(target, *pose_of(model, name), camera) - 239.5 - [80, 0] for name in offsets}
+    depth = 0.75
+    turned, moved = camera.fx_px * math.tan(angle), camera.fx_px * shift_m / depth
+    assert middle["left"] == pytest.approx((turned, 0), abs=1e-6)
+    assert middle["down"] == pytest.approx((0, -turned), abs=1e-6)
+    assert middle["roll"] == pytest.approx((0, 0), abs=1e-6)
+    assert middle["right"] == pytest.approx((-moved, 0), abs=1e-6)
+    assert middle["high"] == pytest.approx((0, moved), abs=1e-6)
+    assert middle["back"] == pytest.approx((0, 0), abs=1e-6)
+    assert np.linalg.norm(pose_of(model, "back")[0] - target) == pytest.approx(depth + shift_m)
+
+
+def test_a_camera_placed_in_a_compiled_model_is_where_compiling_puts_it():
+    moved = dataclasses.replace(
+        bench_cameras()[1], offset=CameraOffset(rotation_rad=(0.02, -0.03, 0.01), translation_m=(0.004, -0.002, 0.006))
+    )
+    spec = bench_bodies()
+    add_cameras(spec, bench_cameras())
+    model = spec.compile()
+    nominal = pose_of(model, "left_wrist")
+    place_camera(model, moved)
+    placed = pose_of(model, "left_wrist")
+    fresh = bench_bodies()
+    add_cameras(fresh, [moved])
+    compiled = pose_of(fresh.compile(), "left_wrist")
+    assert np.allclose(placed[0], compiled[0], atol=1e-15) and np.allclose(placed[1], compiled[1], atol=1e-15)
+    assert np.linalg.norm(placed[0] - nominal[0]) == pytest.approx(math.sqrt(16 + 4 + 36) * 1e-3)
+
+
+def test_a_quaternion_may_stand_in_for_a_target():
+    quat = look_at_quat(np.array([0.0, 0, 1]), np.zeros(3), np.array([0.0, 1, 0]))
+    assert quat == pytest.approx((1, 0, 0, 0))  # straight down with y up is MuJoCo's own default
+    spec = bench_bodies()
+    add_cameras(spec, [CameraConfig(name="top", position_m=(0, 0, 1), quat_wxyz=(1, 0, 0, 0))])
+    position, matrix = pose_of(spec.compile(), "top")
+    assert position == pytest.approx((0, 0, 1)) and matrix == pytest.approx(np.eye(3))
+
+
+def test_the_compiled_model_has_the_recordings_size_and_angle():
+    spec = bench_bodies()
+    add_cameras(spec, bench_cameras())
+    model = spec.compile()
+    assert [model.camera(i).name for i in range(model.ncam)] == ["front", "left_wrist", "right_wrist"]
+    assert model.cam_resolution.tolist() == [[640, 480]] * 3
+    assert model.cam_fovy == pytest.approx((42.5, 63.26, 63.26), abs=0.01)
+
+
+def test_mistakes_are_answered_with_a_way_out():
+    with pytest.raises(TaccorlError, match=r"'d435'.*did you mean 'd415'"):
+        sensor_intrinsics("d435", 480, 640)
+    spec = bench_bodies()
+    with pytest.raises(TaccorlError, match=r"left_wrist: no body 'left_link7'.*did you mean 'left_link6'"):
+        add_cameras(spec, [dataclasses.replace(bench_cameras()[1], body="left_link7")])
+    add_cameras(spec, bench_cameras())
+    with pytest.raises(TaccorlError, match="front: the model has one of that name"):
+        add_cameras(spec, bench_cameras())
+    with pytest.raises(TaccorlError, match="'frnt' is not in the model; did you mean 'front'"):
+        place_camera(spec.compile(), dataclasses.replace(bench_cameras()[0], name="frnt"))
+    with pytest.raises(TaccorlError, match="either look_at_m or quat_wxyz"):
+        CameraConfig(name="x")
+    with pytest.raises(TaccorlError, match="another `up`"):
+        CameraConfig(name="x", position_m=(0, 0, 1), look_at_m=(0, 0, 0)).pose()
+    with pytest.raises(TaccorlError, match="480×640 pictures, recording_size is 720×1280"):
+        CameraConfig(
+            name="x", look_at_m=(1, 0, 0), recording_size=(720, 1280), intrinsics=sensor_intrinsics("d415", 480, 640)
+        )

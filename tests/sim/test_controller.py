@@ -1,0 +1,71 @@
+"""MIT impedance control: the gains of the paper are in the model, and joints answer as the arithmetic says."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM, ControllerConfig
+from taccorl.sim.robot import ARMS, JOINTS
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks.bench import Bench
+from taccorl.sim.twin import TwinConfig, empty_bench
+
+
+def test_actuators_hold_the_paper_s_numbers():
+    model = empty_bench(TwinConfig()).compile()
+    for arm in ARMS:
+        for joint, kp, kd, bias in zip(JOINTS, KP_NM_PER_RAD, KD_NMS_PER_RAD, TORQUE_FF_NM, strict=True):
+            actuator = model.actuator(f"{arm}_{joint}")
+            assert actuator.gainprm[0] == kp
+            np.testing.assert_array_equal(actuator.biasprm[:3], [bias, -kp, -kd])
+
+
+@pytest.mark.parametrize("joint", [0, 3, 4, 5])
+def test_step_response_is_a_first_order_lag_with_kd_over_kp(joint):
+    # τ = K_d / K_p; after one τ a step is 1 − 1/e = 63.2 % done (inertia is small against K_d² / K_p).
+    sim = Simulation(Bench())
+    sim.reset([0])
+    before = sim.proprioception()[0].copy()
+    target = sim.targets[0].copy()
+    target[7 + joint] += 0.05
+    tau_s = KD_NMS_PER_RAD[joint] / KP_NM_PER_RAD[joint]
+    steps = round(tau_s / sim.config.physics.timestep_s)
+    sim.advance(target[None, None], steps)
+    done = (sim.proprioception()[0, 7 + joint] - before[7 + joint]) / 0.05
+    assert done == pytest.approx(1 - np.exp(-1), abs=0.03)
+
+
+def test_arm_rests_torque_over_stiffness_away_from_its_target():
+    sim = Simulation(Bench())
+    sim.reset([0])
+    np.testing.assert_allclose(sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=1e-9)
+    offset = sim.proprioception()[0, 7:13] - sim.targets[0, 7:13]
+    np.testing.assert_allclose(offset, np.array(TORQUE_FF_NM) / KP_NM_PER_RAD, atol=1e-9)
+    for _ in range(30):
+        sim.step(sim.targets.copy())
+    np.testing.assert_allclose(sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=2e-5)  # it stays there
+
+
+def test_without_gravity_compensation_joint_2_sags_by_its_load_over_stiffness():
+    config = TwinConfig()
+    config.robot.gravity_compensation = 0.0
+    sim = Simulation(Bench(), config)
+    sim.reset([0])
+    for _ in range(60):
+        sim.step(sim.targets.copy())
+    data = sim.batch.get_data(0)
+    mujoco.mj_forward(sim.model, data)
+    load_nm = data.qfrc_bias[sim.model.joint("left_joint2").dofadr[0]]
+    offset = sim.proprioception()[0, 1] - sim.targets[0, 1]
+    assert abs(load_nm) > 3.0
+    assert offset == pytest.approx((TORQUE_FF_NM[1] - load_nm) / KP_NM_PER_RAD[1], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [({"kp_nm_per_rad": [1.0] * 5}, "5 values"), ({"kd_nms_per_rad": [1, 1, 1, 1, 1, -1]}, "negative gain")],
+)
+def test_wrong_gains_are_refused_by_name(settings, said):
+    with pytest.raises(TaccorlError, match=said):
+        ControllerConfig(**settings)

@@ -1,0 +1,188 @@
+"""N simulations in lock-step: the same bits alone, in a batch and on any threads; state in, state out; bad actions."""
+
+import numpy as np
+import pytest
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, SUB_COMMANDS, Simulation, Watch
+from taccorl.sim.tasks import tasks
+from taccorl.sim.tasks.assembly_1 import Assembly1
+
+
+def waving(steps: int) -> np.ndarray:
+    """(steps, 14) joint targets that move both arms and grippers, as float32."""
+    sim = Simulation(Assembly1())
+    sim.reset([0])
+    t = np.arange(1, steps + 1)[:, None] / 30
+    phase = np.arange(14)
+    wave = 0.1 * np.sin(2 * np.pi * 0.7 * t + phase) - 0.1 * np.sin(phase)
+    wave[:, [6, 13]] = -0.03 * (1 - np.cos(2 * np.pi * 0.5 * t))
+    return (sim.targets[0] + wave).astype(np.float32)
+
+
+def run(seeds: list[int], actions: np.ndarray, **settings) -> Simulation:
+    sim = Simulation(Assembly1(), num_sims=len(seeds), **settings)
+    sim.reset(seeds)
+    for action in actions:
+        sim.step(np.broadcast_to(action, (len(seeds), 14)))
+    return sim
+
+
+ACTIONS = waving(25)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_same_seed_and_actions_give_the_same_bits_alone_and_in_a_batch(threads):
+    alone = run([7], ACTIONS)
+    batch = run([3, 7, 11, 7, 5], ACTIONS, num_threads=threads)
+    for row in (1, 3):
+        np.testing.assert_array_equal(batch.batch.state[row], alone.batch.state[0])
+        np.testing.assert_array_equal(batch.touch()[row], alone.touch()[0])
+        np.testing.assert_array_equal(batch.proprioception()[row], alone.proprioception()[0])
+    assert not np.array_equal(batch.batch.state[0], alone.batch.state[0])  # another seed, another scene
+
+
+def test_a_run_goes_on_bit_exactly_from_a_snapshot_in_another_simulation():
+    whole = run([7], ACTIONS)
+    first = run([7], ACTIONS[:11])
+    snapshot = first.snapshot()
+    other = Simulation(Assembly1(), num_sims=3)
+    other.reset([1, 2, 3])
+    other.restore(snapshot, np.array([2]))
+    np.testing.assert_array_equal(other.proprioception()[2], first.proprioception()[0])
+    np.testing.assert_array_equal(other.touch()[2], first.touch()[0])
+    for action in ACTIONS[11:]:
+        other.step(np.broadcast_to(action, (3, 14)))
+    np.testing.assert_array_equal(other.batch.state[2], whole.batch.state[0])
+    assert other.judge.steps[2] == whole.judge.steps[0]
+
+
+def test_a_snapshot_of_another_task_is_refused():
+    sim, bench = Simulation(Assembly1()), Simulation(tasks.get("bench")())
+    bench.reset([0])
+    with pytest.raises(TaccorlError, match="another task's or another twin's"):
+        sim.restore(bench.snapshot())
+
+
+def test_watching_changes_nothing():
+    plain, watched = Simulation(Assembly1()), Simulation(Assembly1())
+    seen = []
+    for sim in (plain, watched):
+        sim.reset([4])
+    for action in ACTIONS[:8]:
+        plain.step(action[None])
+        watched.step(
+            action[None], watch=Watch(range(6, 41, 6), lambda step: seen.append((step, watched.touch().sum())))
+        )
+    np.testing.assert_array_equal(plain.batch.state, watched.batch.state)
+    assert [step for step, _ in seen[:6]] == [6, 12, 18, 24, 30, 36]
+
+
+def test_targets_move_in_a_straight_line_over_the_control_step():
+    sim = Simulation(tasks.get("bench")())
+    sim.reset([0])
+    start, goal = sim.targets[0].copy(), sim.targets[0] + 0.05
+    goal[[6, 13]] = 0.03
+    asked = []
+    every = sim.config.physics.steps_per_control_step // SUB_COMMANDS
+    watch = Watch(range(every, SUB_COMMANDS * every + 1, every), lambda _: asked.append(sim.arrays["ctrl"][0].copy()))
+    sim.step(goal[None], watch=watch)
+    line = [start + (goal - start) * k / SUB_COMMANDS for k in range(1, SUB_COMMANDS + 1)]
+    np.testing.assert_allclose(np.array(asked)[:, sim.action_actuators], line, atol=1e-12)
+
+
+def test_reset_draws_mass_and_friction_into_each_simulation_s_own_model():
+    sim = Simulation(Assembly1(), num_sims=2)
+    sim.reset([1, 2])
+    for i in range(2):
+        model = sim.batch.get_model(i)
+        draw = sim.draws[i]
+        assert model.body("plug").mass[0] == pytest.approx(0.080 + draw["plug_mass"][0])
+        assert model.body("socket").mass[0] == pytest.approx(0.150 + draw["socket_mass"][0])
+        assert model.geom("plug_0").friction[0] == pytest.approx(draw["friction"][0])
+        assert model.geom("table").friction[0] == 0.6
+    assert sim.draws[0]["friction"][0] != sim.draws[1]["friction"][0]
+
+
+def test_inertia_follows_the_drawn_mass():
+    sim = Simulation(Assembly1())
+    nominal = sim.model.body("plug").inertia / sim.model.body("plug").mass
+    sim.reset([3])
+    model = sim.batch.get_model(0)
+    np.testing.assert_allclose(model.body("plug").inertia / model.body("plug").mass, nominal)
+
+
+def test_everything_is_at_rest_after_reset():
+    sim = Simulation(Assembly1())
+    for seed in range(5):
+        sim.reset([seed])
+        before = sim.poses("plug")[0].copy(), sim.tcp("left")[0].copy()
+        for _ in range(15):
+            sim.step(sim.targets.copy())
+        assert np.abs(sim.poses("plug")[0] - before[0]).max() < 5e-4
+        assert np.abs(sim.tcp("left")[0] - before[1]).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda a: a[:, :7], r"shape \(1, 7\).*\(1, 14\)"),
+        (lambda a: np.degrees(a), "rad"),
+        (lambda a: np.where(np.arange(14) == 6, 70.0, a), r"left_gripper of simulation 0 is 70.*in m"),
+        (lambda a: np.where(np.arange(14) == 9, np.nan, a), "right_joint3 of simulation 0 is nan"),
+    ],
+)
+def test_a_wrong_action_is_named_with_its_joint_and_unit(spoil, said):
+    sim = Simulation(Assembly1())
+    sim.reset([0])
+    with pytest.raises(TaccorlError, match=said):
+        sim.step(spoil(sim.targets.copy()))
+
+
+def test_an_action_a_little_beyond_the_limits_is_clipped_and_said():
+    sim = Simulation(Assembly1(), num_sims=2)
+    sim.reset([0, 1])
+    action = sim.targets.copy()
+    action[1, 1] = -0.2  # joint 2 ends at 0
+    sim.step(action)
+    assert sim.clipped.tolist() == [False, True]
+    assert sim.executed[1, 1] == ACTION_LOW[1]
+
+
+def test_limits_are_float32_that_lie_inside_the_published_ones():
+    for limits in (ACTION_LOW, ACTION_HIGH):
+        np.testing.assert_array_equal(limits, limits.astype(np.float32).astype(float))
+    assert ACTION_LOW[0] >= -2.618
+    assert ACTION_HIGH[0] <= 2.618
+
+
+def test_a_simulation_that_diverges_fails_alone_and_keeps_its_seed():
+    healthy, sick = Simulation(Assembly1(), num_sims=3), Simulation(Assembly1(), num_sims=3)
+    for sim in (healthy, sick):
+        sim.reset([5, 6, 7])
+        sim.step(np.broadcast_to(ACTIONS[0], (3, 14)))
+    sick.arrays["qvel"][1] = np.nan
+    for sim in (healthy, sick):
+        for action in ACTIONS[1:4]:
+            sim.step(np.broadcast_to(action, (3, 14)))
+    outcome = sick.judge.outcome
+    assert outcome.failure.tolist() == ["", "diverged", ""]
+    assert sick.seeds[1] == 6
+    np.testing.assert_array_equal(sick.batch.state[[0, 2]], healthy.batch.state[[0, 2]])
+    sick.reset([6], np.array([1]))
+    assert sick.judge.outcome.failure[1] == ""
+    assert np.isfinite(sick.batch.state[1]).all()
+
+
+def test_unknown_task_and_difficulty_suggest_the_near_name():
+    with pytest.raises(TaccorlError, match="assembly_1"):
+        tasks.get("asembly_1")
+    with pytest.raises(TaccorlError, match="hard"):
+        Assembly1("hart")
+
+
+def test_contact_of_an_undeclared_pair_is_an_error():
+    sim = Simulation(Assembly1())
+    sim.reset([0])
+    with pytest.raises(TaccorlError, match="mating"):
+        sim.contact("socket", "plug")
