@@ -1,16 +1,16 @@
-"""``make demo``: a recording as the robot's drivers would write it → dataset → checks → Rerun and a contact sheet.
+"""``make demo``: the twin demonstrates → recordings as the robot's drivers would write them → dataset → checks → Rerun.
 
-There is no robot here: the recording is a stand-in, and everything made from it says so.
+There is no robot here: the twin stands in for it, and everything made from it says so.
 """
 
 import shutil
 from pathlib import Path
 
 from taccorl.cli import main as cli
-from taccorl.demos.stand_in import StandInConfig, write_mcap
 
 OUT = Path("outputs/demo")
 SPEC = "piper_flexitac_mcap"
+TASK = "test_tube"
 
 
 def taccorl(*words: str) -> None:
@@ -25,13 +25,8 @@ def main() -> None:
     """Everything lands in outputs/demo, which is made anew."""
     shutil.rmtree(OUT, ignore_errors=True)
     recordings, dataset = OUT / "recordings", OUT / "dataset"
-    recordings.mkdir(parents=True)
-    for k in range(2):
-        path = recordings / f"stand_in_{k}.mcap"
-        write_mcap(path, StandInConfig(duration_s=8.0, seed=k))
-        print(f"wrote {path} ({path.stat().st_size / 1e6:.0f} MB): surrogate, not a robot")
-    first = str(recordings / "stand_in_0.mcap")
-    taccorl("ingest", "inspect", first)
+    taccorl("collect", f"--task={TASK}", "--episodes=2", "--as_recording=true", f"--out={recordings}")
+    taccorl("ingest", "inspect", str(recordings / f"{TASK}_000.mcap"))
     taccorl("ingest", str(recordings), f"--spec={SPEC}", f"--out={dataset}", f"--store={OUT / 'store'}")
     taccorl("check", str(dataset))
     taccorl(

@@ -7,6 +7,9 @@ import sys
 from taccorl.errors import TaccorlError, nearest
 
 VERBS = {
+    "twin": {
+        "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them"
+    },
     "data": {
         "ingest": "recordings → LeRobot dataset with touch; `ingest inspect FILE` looks into one",
         "check": "what is wrong with a recording or a dataset",

@@ -27,6 +27,8 @@ from taccorl.errors import DatasetError, nearest
 PROVENANCE = Path("meta/taccorl")
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """LeRobot's own columns: no features."""
+NUMBERS = ("float32", "float64", "int16", "int64")
+"""Kinds of numbers that are read from flat features."""
 TOLERANCE_S = 1e-4
 """A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``."""
 
@@ -256,6 +258,7 @@ def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
         "baselines": {key: np.asarray(counts).tolist() for key, counts in episode.baselines.items()},
         "timing": [dataclasses.asdict(t) for t in episode.timing],
         "stages": [[int(row), name] for row, name in episode.stages],
+        "simulation": episode.provenance.get("simulation"),
     }
 
 
@@ -267,7 +270,7 @@ def _from_record(record: dict[str, Any]) -> dict[str, Any]:
         "origin": record["origin"],
         "baselines": {key: np.array(counts) for key, counts in record["baselines"].items()},
         "timing": tuple(ChannelTiming(**t) for t in record["timing"]),
-        "provenance": {k: record[k] for k in ("recording", "part", "source_digest")},
+        "provenance": {k: record.get(k) for k in ("recording", "part", "source_digest", "simulation")},
     }
     if record["stages"]:
         fields["stages"] = tuple((int(row), str(name)) for row, name in record["stages"])
@@ -377,8 +380,8 @@ def _derive_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[st
         elif f["dtype"] == "image":
             skipped[key] = "pictures inside the parquet files; lerobot-edit-dataset's convert_image_to_video helps"
             continue
-        elif f["dtype"] not in ("float32", "int16") or len(shape) != 1:
-            skipped[key] = f"{f['dtype']} {list(shape)}: flat float32 and int16 are read"
+        elif f["dtype"] not in NUMBERS or len(shape) != 1:
+            skipped[key] = f"{f['dtype']} {list(shape)}: flat {', '.join(NUMBERS)} are read"
             continue
         features[key] = FeatureSpec(
             dtype=f["dtype"],

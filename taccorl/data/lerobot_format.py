@@ -56,7 +56,7 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
         entry["names"] = ["height", "width", "channels"] if f.dtype == "video" else list(f.names) or None
         if f.dtype != "video":
             entry |= {"unit": list(f.unit) if isinstance(f.unit, tuple) else f.unit, "frame": f.frame}
-            if not isinstance(f.range, dict):
+            if not isinstance(f.range, dict) and np.isfinite(f.range).all():
                 entry["range"] = list(f.range)
         if key in spec.sensors:
             sensor = spec.sensors[key]

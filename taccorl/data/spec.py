@@ -98,7 +98,7 @@ class SensorSpec:
 class FeatureSpec:
     """One feature of the dataset."""
 
-    dtype: Literal["float32", "int16", "video"]
+    dtype: Literal["float32", "float64", "int16", "int64", "video"]
     shape: tuple[int, ...]
     unit: str | tuple[str, ...]
     frame: str
@@ -140,10 +140,12 @@ class DatasetSpec:
     sensors: dict[str, SensorSpec] = dataclasses.field(default_factory=dict)
     """Filled on loading: feature key → its sensor. Not a key of the file."""
 
-    def keys(self, kind: Literal["video", "tactile", "vector"]) -> list[str]:
-        """Feature keys of one kind."""
+    def keys(self, kind: Literal["video", "tactile", "vector", "simulator"]) -> list[str]:
+        """Feature keys of one kind; ``sim.*`` are a simulator's own: its state, seeds and labels."""
 
         def kind_of(key: str) -> str:
+            if key.startswith("sim."):
+                return "simulator"
             f = self.features[key]
             return "video" if f.dtype == "video" else "tactile" if key in self.sensors else "vector"
 

@@ -1,4 +1,4 @@
-"""Figures of reading and writing recordings; ``make bench ONLY=ingest`` and the others."""
+"""Figures of reading and writing recordings, and of the twin's experts; ``make bench ONLY=ingest`` and the others."""
 
 import os
 import resource
@@ -21,6 +21,7 @@ LONG_RECORDING_S = 240.0
 RIVAL_ROWS = 150
 """LeRobot's default writer takes 0.17 CPU-s a row: a part of the recording is enough to know its rate."""
 REPEATS = 3
+EXPERT_EPISODES = 100
 NATIVE = [480, 640, 3]
 
 
@@ -255,3 +256,42 @@ def _children_cpu_s(command: list[str]) -> float:
     subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+@benchmark("experts")
+def expert_rows() -> Iterator[Row]:
+    """The experts of the four tasks under the paper's randomisation. Simulated."""
+    from taccorl.demos.scoring import score_expert
+
+    for task in ("test_tube", "puzzle", "assembly_1", "assembly_2"):
+        score = score_expert(task, EXPERT_EPISODES)
+        n = len(score.outcomes)
+        rate = score.success_rate
+        failures = ", ".join(f"{count} {name}" for name, count in score.failures.items()) or "no failures"
+        yield Row(
+            name=f"{task}: success, {failures}",
+            value=100 * rate,
+            unit="%",
+            goal="≥ 90",
+            n=n,
+            spread=100 * (rate * (1 - rate) / n) ** 0.5,
+        )
+        seconds = score.cpu_s
+        yield Row(
+            name=f"{task}: cost of an episode of {mean(score.duration_s):.1f} s with {mean(score.corrections):.1f} "
+            "corrections, without pictures",
+            value=mean(seconds),
+            unit="CPU-s",
+            goal="≤ 2",
+            n=n,
+            spread=spread(seconds),
+        )
+        deepest = [1e3 * d for d in score.penetration_m]
+        yield Row(
+            name=f"{task}: deepest penetration of mating parts, clearance 0.5 mm (largest force {max(score.force_n):.0f} N)",
+            value=max(deepest),
+            unit="mm",
+            goal="≤ 0.2",
+            n=n,
+            spread=spread(deepest),
+        )

@@ -31,9 +31,9 @@ from taccorl.demos.stand_in_config import (
 from taccorl.demos.stand_in_frame_id import read_frame_id
 from taccorl.demos.stand_in_messages import MessageWriter
 from taccorl.demos.stand_in_robot import JOINT_LIMITS_RAD, JOINT_NAMES
-from taccorl.demos.stand_in_scene import CAMERAS
-from taccorl.demos.stand_in_story import PAD_WIRE_SHAPE, PADS
-from taccorl.demos.stand_in_streams import StandInTruth, Streams, as_piper_publishes, jpeg, motor_effort
+from taccorl.demos.stand_in_scene import CAMERAS, Scene
+from taccorl.demos.stand_in_story import PAD_WIRE_SHAPE, PADS, Story, plan_episodes
+from taccorl.demos.stand_in_streams import StandInTruth, Streams, as_piper_publishes, jpeg
 from taccorl.errors import TaccorlError
 
 __all__ = [
@@ -51,6 +51,7 @@ __all__ = [
     "STATE_TOPICS",
     "StandInConfig",
     "StandInTruth",
+    "publish",
     "read_frame_id",
     "write_cobot_magic_hdf5",
     "write_mcap",
@@ -61,19 +62,35 @@ SURROGATE = "surrogate stand-in, not a robot"
 
 def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
     """Writes one recording as the robot's drivers and rosbag2 would; replaces the file if there is one."""
-    streams = Streams(config)
+    streams, story = _stand_in(config)
+    publish(path, streams, _label(config))
+    return streams.truth(story)
+
+
+def _stand_in(config: StandInConfig) -> tuple[Streams, Story]:
+    plans = plan_episodes(config.duration_s, config.episodes, config.outcomes, config.seed)
+    story = Story(plans, config.duration_s, config.command_lead_s, config.contact_delay_s, config.seed)
+    return Streams(config, story, Scene(story, config.camera_size, config.seed)), story
+
+
+def publish(path: Path, streams: Streams, label: dict[str, str]) -> None:
+    """All messages into one MCAP file, as rosbag2 would; replaces the file if there is one.
+
+    Args:
+        label: the MCAP metadata record ``taccorl``: ``origin`` says what this is.
+    """
+    config = streams.config
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
         compression = CompressionType[config.compression.upper()]
         writer = Writer(file, chunk_size=config.chunk_size_bytes, compression=compression)
-        writer.start(profile="ros2" if config.encoding == "ros2" else "", library="taccorl stand-in")
-        writer.add_metadata("taccorl", _label(config))
+        writer.start(profile="ros2" if config.encoding == "ros2" else "", library="taccorl")
+        writer.add_metadata("taccorl", label)
         encoder = MessageWriter(writer, config.encoding)
         for event in heapq.merge(*streams.all(), key=lambda event: event.log_s):
             encoder.write(event.topic, event.ros_type, event.message, START_UNIX_NS + round(event.log_s * 1e9))
             streams.note(event)
         writer.finish()
-    return streams.truth()
 
 
 def _label(config: StandInConfig) -> dict[str, str]:
@@ -100,13 +117,13 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     """
     if config.episodes != 1:
         raise TaccorlError(f"stand-in: a cobot_magic file holds one episode, not {config.episodes}. Set episodes=1.")
-    streams = Streams(config)
+    streams, story = _stand_in(config)
     time_s = np.arange(int(config.duration_s * CAMERA_HZ)) / CAMERA_HZ
     arms = {
-        "observations/qpos": as_piper_publishes(streams.story.state(time_s), config.joints_in_degrees),
-        "observations/qvel": streams.story.velocity(time_s),
-        "observations/effort": motor_effort(streams.story, time_s),
-        "action": as_piper_publishes(streams.story.command(time_s + 1 / CAMERA_HZ), config.joints_in_degrees),
+        "observations/qpos": as_piper_publishes(story.state(time_s), config.joints_in_degrees),
+        "observations/qvel": story.velocity(time_s),
+        "observations/effort": story.effort(time_s),
+        "action": as_piper_publishes(story.command(time_s + 1 / CAMERA_HZ), config.joints_in_degrees),
     }
     arms["observations/qvel"][:, [6, 13]] = 0.0  # PiPER reports none for its grippers
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -120,7 +137,7 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
             lengths[c] = _write_pictures(file, camera, time_s, streams)
         if config.hdf5_jpeg:
             file["compress_len"] = lengths
-    return streams.truth()
+    return streams.truth(story)
 
 
 def _write_pictures(file: h5py.File, camera: str, time_s: np.ndarray, streams: Streams) -> np.ndarray:

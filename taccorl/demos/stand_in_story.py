@@ -170,6 +170,17 @@ class Story:
         """Rate of the state, rad/s and m/s, (N, 14)."""
         return self._sample(self._velocity, time_s)
 
+    def effort(self, time_s: np.ndarray) -> np.ndarray:
+        """Efforts (N, 14) [N·m] that look right: gravity on the long links, tracking error, the grippers' squeeze."""
+        joints = self.state(time_s)
+        effort = 6.0 * (self.command(time_s) - joints)
+        for a, arm in enumerate(ARMS):
+            shoulder, elbow = joints[:, 7 * a + 1], joints[:, 7 * a + 2]
+            effort[:, 7 * a + 1] += 5.0 * np.cos(shoulder)
+            effort[:, 7 * a + 2] += 2.5 * np.cos(shoulder + elbow)
+            effort[:, 7 * a + 6] = 1.2 * self.grip(arm, time_s)
+        return effort
+
     def grip(self, arm: str, time_s: np.ndarray) -> np.ndarray:
         """Grip as the pads feel it, 0 to 1, any shape."""
         felt_m = self._sample(self._squeeze_m, np.asarray(time_s, float) - self.contact_delay_s)

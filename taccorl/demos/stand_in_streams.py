@@ -5,7 +5,7 @@ import zlib
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -28,8 +28,8 @@ from taccorl.demos.stand_in_config import (
     StandInConfig,
 )
 from taccorl.demos.stand_in_robot import ARMS, JOINT_NAMES
-from taccorl.demos.stand_in_scene import CAMERAS, Scene
-from taccorl.demos.stand_in_story import PAD_WIRE_SHAPE, PADS, EpisodePlan, Story, plan_episodes
+from taccorl.demos.stand_in_scene import CAMERAS
+from taccorl.demos.stand_in_story import PAD_WIRE_SHAPE, PADS, EpisodePlan, Story
 
 _SLICE_S = 1  # streams work in slices of this length, so memory does not grow with pictures and readings
 _GRIPPERS, _JOINTS = [6, 13], [0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]  # columns of the 14
@@ -69,6 +69,40 @@ class StandInTruth:
         return self.story.clean_counts(pad, time_s)
 
 
+class Told(Protocol):
+    """What truly happened at any time, in seconds since the recording began; N instants."""
+
+    plans: list[EpisodePlan]
+
+    def state(self, time_s: np.ndarray) -> np.ndarray:
+        """Joints [rad] and gripper openings [m], (N, 14)."""
+        ...
+
+    def command(self, time_s: np.ndarray) -> np.ndarray:
+        """(N, 14)."""
+        ...
+
+    def velocity(self, time_s: np.ndarray) -> np.ndarray:
+        """(N, 14) rad/s, m/s."""
+        ...
+
+    def effort(self, time_s: np.ndarray) -> np.ndarray:
+        """(N, 14) N·m, N."""
+        ...
+
+    def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
+        """(N, 12, 32) counts above baseline in wire order; ``time_s`` is (N,), or (N, 12): one instant a row."""
+        ...
+
+
+class Seen(Protocol):
+    """What the cameras see."""
+
+    def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
+        """One uint8 picture (rows, columns, 3), blue first, per time."""
+        ...
+
+
 class Event(NamedTuple):
     """One message on its way to the file."""
 
@@ -88,18 +122,6 @@ def as_piper_publishes(joints: np.ndarray, in_degrees: bool) -> np.ndarray:
     return published
 
 
-def motor_effort(story: Story, time_s: np.ndarray) -> np.ndarray:
-    """Efforts (N, 14) [N·m] that look right: gravity on the long links, tracking error, the grippers' squeeze."""
-    joints = story.state(time_s)
-    effort = 6.0 * (story.command(time_s) - joints)
-    for a, arm in enumerate(ARMS):
-        shoulder, elbow = joints[:, 7 * a + 1], joints[:, 7 * a + 2]
-        effort[:, 7 * a + 1] += 5.0 * np.cos(shoulder)
-        effort[:, 7 * a + 2] += 2.5 * np.cos(shoulder + elbow)
-        effort[:, 7 * a + 6] = 1.2 * story.grip(arm, time_s)
-    return effort
-
-
 def jpeg(picture_bgr: np.ndarray, quality: int) -> bytes:
     """An ordinary JPEG file."""
     done, data = cv2.imencode(".jpg", picture_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -110,11 +132,8 @@ def jpeg(picture_bgr: np.ndarray, quality: int) -> bytes:
 class Streams:
     """The messages of one recording, and a note of what was published. Use one object for one file."""
 
-    def __init__(self, config: StandInConfig) -> None:
-        self.config = config
-        plans = plan_episodes(config.duration_s, config.episodes, config.outcomes, config.seed)
-        self.story = Story(plans, config.duration_s, config.command_lead_s, config.contact_delay_s, config.seed)
-        self.scene = Scene(self.story, config.camera_size, config.seed)
+    def __init__(self, config: StandInConfig, story: Told, scene: Seen) -> None:
+        self.config, self.story, self.scene = config, story, scene
         self.baseline_counts = {pad: self._random(f"baseline {pad}").uniform(10, 40, PAD_WIRE_SHAPE) for pad in PADS}
         self._frame_ids = {camera: array("q") for camera in CAMERAS}
         self._sampled_s = {topic: array("d") for topic in SPEC_TOPICS}
@@ -142,16 +161,16 @@ class Streams:
             self._sampled_s[event.topic].append(event.sampled_s)
             self._log_s[event.topic].append(event.log_s)
 
-    def truth(self) -> StandInTruth:
+    def truth(self, story: Story) -> StandInTruth:
         """Everything known, once the file is written."""
         time_s, lag_s = np.arange(0, self.config.duration_s, 1 / JOINT_HZ), self.config.tactile_lag_s
-        touched = {arm: [(a + lag_s, b + lag_s) for a, b in self.story.contact_s(arm)] for arm in ARMS}
+        touched = {arm: [(a + lag_s, b + lag_s) for a, b in story.contact_s(arm)] for arm in ARMS}
         return StandInTruth(
             config=self.config,
-            story=self.story,
+            story=story,
             time_s=time_s,
-            state=self.story.state(time_s),
-            command=self.story.command(time_s),
+            state=story.state(time_s),
+            command=story.command(time_s),
             contact_s={arm: [] for arm in ARMS} if self.config.noise_only_touch else touched,
             baseline_counts=self.baseline_counts,
             sampled_s={topic: np.array(times) for topic, times in self._sampled_s.items()},
@@ -195,7 +214,7 @@ class Streams:
             joints = story.command(stamp_s) if command else story.state(stamp_s)
             position = as_piper_publishes(joints, config.joints_in_degrees)[:, columns].tolist()
             velocity = story.velocity(stamp_s)[:, columns][:, :6].tolist()
-            effort = motor_effort(story, stamp_s)[:, columns].tolist()
+            effort = story.effort(stamp_s)[:, columns].tolist()
             missing = self._in_gap(topic, stamp_s)
             for n, stamp in enumerate(stamp_s.tolist()):
                 log_s = max(log_s, float(arrival_s[n]))

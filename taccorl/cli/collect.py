@@ -1,0 +1,95 @@
+"""``taccorl collect --task=assembly_1 [--source.type=expert] [--episodes=20] [--out=outputs/assembly_1]``
+
+Demonstrations in the twin into a LeRobot dataset with touch, simulator state, subtasks and success. With
+``--as_recording=true`` into MCAP files as the robot's drivers would write them, for ``taccorl ingest``.
+
+A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``; what was done lies in ``outputs/teleop``, and
+``taccorl collect --source.type=actions --source.path=FILE`` makes the episode of it again.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from taccorl.cli.parse import parse
+from taccorl.demos import teleop
+from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
+from taccorl.demos.recorder import ORIGIN
+from taccorl.demos.teleop_actions import ActionsSource
+from taccorl.errors import TaccorlError
+from taccorl.lineage.store import Store
+
+
+@dataclass(kw_only=True)
+class CollectConfig:
+    """Demonstrations in the twin."""
+
+    task: str | None = None
+    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's. Action files say it themselves."""
+    source: Source = field(default_factory=ExpertSource)
+    """Who demonstrates: --source.type=expert, keyboard, gamepad, leader, actions."""
+    episodes: int = 20
+    """How many successful ones."""
+    out: Path | None = None
+    """Folder of the dataset or the recordings; outputs/TASK if not given. It must not hold anything else."""
+    store: Path = Path("outputs/store")
+    """Finished attempts are kept here, so that a second run goes on where the first ended."""
+    difficulty: str = "train"
+    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    twin: Path | None = None
+    """A twin.yaml; the nominal twin if not given."""
+    randomization: float = 1.0
+    """Share of the paper's reset ranges; 0: the nominal scene."""
+    images: bool = True
+    """Render the three cameras (needs OpenGL)."""
+    as_recording: bool = False
+    """Write MCAP recordings instead of a dataset."""
+    keep_failures: bool = False
+    """Keep failed attempts as well."""
+    seed: int = 0
+    """Of all attempts; another seed gives other scenes."""
+    origin: str = ORIGIN
+    """Label in everything that is made; write "surrogate: …" where the twin plays the robot."""
+
+
+def main(argv: list[str]) -> int:
+    """0: collected."""
+    config = parse(CollectConfig, argv, positional=None)
+    if config.episodes < 1:
+        raise TaccorlError(f"--episodes={config.episodes}: at least one")
+    if not config.task and not isinstance(config.source, ActionsSource):
+        raise TaccorlError("missing --task=; --help says more")
+    plan = Plan(
+        task=config.task or "",
+        episodes=config.episodes,
+        source=config.source,
+        difficulty=config.difficulty,
+        twin=config.twin,
+        randomization=config.randomization,
+        images=config.images,
+        seed=config.seed,
+        keep_failures=config.keep_failures,
+        origin=config.origin,
+    )
+    if isinstance(plan.source, ActionsSource):
+        plan = plan.source.plan(plan)
+    teleop.use_leader_driver(_lerobot_leader)
+    out = config.out or Path("outputs") / plan.task
+    if config.as_recording:
+        written = collect_recordings(plan, out)
+        print(f"{len(written)} recordings in {out}: {config.origin}")
+        print(f"next: taccorl ingest {out} --spec=piper_flexitac_mcap --out={out}_dataset")
+        return 0
+    report = collect(plan, out, Store(config.store))
+    print(
+        f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {config.origin}"
+    )
+    print(f"next: taccorl view {out}")
+    return 0
+
+
+def _lerobot_leader(source: teleop.LeaderSource) -> teleop.LeaderDevice:
+    from taccorl.lerobot_plugin.leader import (
+        open_leader,
+    )  # imports LeRobot and torch: only where leader arms are asked for
+
+    return open_leader(source)

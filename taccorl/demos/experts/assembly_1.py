@@ -1,0 +1,102 @@
+"""Assembly #1: left lifts the socket, right lifts the plug, they meet in the air and the plug goes in by touch."""
+
+from abc import abstractmethod
+
+import numpy as np
+
+from taccorl.demos.experts import experts
+from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert
+from taccorl.demos.experts.se3 import inverse, rotvec, transform
+from taccorl.sim.tasks.assembly_1 import Assembly1
+from taccorl.sim.tasks.parts import Part
+
+_LEAN_RAD = 0.40  # hands lean away from each other, so that wrists and cameras keep apart
+_GRIP_M = 0.028  # from the TCP to the part: it is gripped near the fingers' tips
+_LIFT_M, _LIFT_MPS = 0.10, 0.12
+_MEET_M = (0.32, 0.03, 0.16)  # the hole's mouth
+_LEFT_STEADINESS = 0.4  # of a hand that holds still for the other
+_LEVEL_RAD, _FREE_M = 0.03, 0.0004  # it brings a part that was pushed askew back to level once nothing pushes any more
+
+
+class AirAssembly(ScriptedExpert):
+    """Both hands lift; the left one waits where they meet, the right one inserts and lets go."""
+
+    @abstractmethod
+    def holder(self) -> tuple[Part, str, str]:
+        """The part with the hole, its grasp, the hole."""
+
+    @abstractmethod
+    def world_from_level(self) -> np.ndarray:
+        """(3, 3) how the hole is held: its axis along +y."""
+
+    @abstractmethod
+    def plug(self) -> tuple[Part, str]:
+        """The part that goes in, its grasp."""
+
+    @abstractmethod
+    def push_in(self, mating: Mating) -> Script:
+        """From both parts held to the plug in its place, still in the hand."""
+
+    def script(self, arm: str) -> Script:
+        return self._left() if arm == "left" else self._right()
+
+    def _lift(self, arm: str, part: Part, grasp: str) -> Script:
+        goal = self.grasp(part, grasp, lean_rad=_LEAN_RAD, lift_m=0.004, pivot_m=_GRIP_M)
+        above = goal.copy()
+        above[:3, 3] += goal[:3, 2] * -0.08
+        yield from self.move(arm, self.near(above))
+        yield from self.move(arm, goal, speed_mps=0.1, settle=True)
+        yield from self.close(arm, part.grasps[grasp].width_m)
+        up = self.hands[arm].pose.copy()
+        up[2, 3] += _LIFT_M
+        yield from self.move(arm, up, speed_mps=_LIFT_MPS)
+
+    def _left(self) -> Script:
+        part, grasp, hole_name = self.holder()
+        yield from self._lift("left", part, grasp)
+        hole_from_tcp = inverse(self.body(part.name) @ part.holes[hole_name].part_from_hole) @ self.tcp("left")
+        mouth = transform(self.near(transform(_MEET_M))[:3, 3], self.world_from_level())
+        yield from self.move("left", mouth @ hole_from_tcp, speed_mps=_LIFT_MPS, settle=True)
+        self.hands["left"].steadiness, self.hands["left"].learns = _LEFT_STEADINESS, False
+        self.flags.add("holder waits")
+        while "plug is in" not in self.flags:
+            hole = self.body(part.name) @ part.holes[hole_name].part_from_hole
+            if np.linalg.norm(rotvec(mouth, hole)) > _LEVEL_RAD and np.linalg.norm(self.pushed("left")[:3]) < _FREE_M:
+                yield from self.move("left", mouth @ inverse(hole) @ self.tcp("left"))
+                yield from self.settle("left")
+            yield
+
+    def _right(self) -> Script:
+        plug, grasp = self.plug()
+        holder, _, hole = self.holder()
+        yield from self.pause("right", 0.0, 0.4)
+        yield from self._lift("right", plug, grasp)
+        yield from self.wait_for("holder waits")
+        yield from self.push_in(Mating.of(plug, holder, hole))
+        yield from self.open("right")
+        away = self.hands["right"].pose.copy()
+        away[:3, 3] -= 0.08 * away[:3, 2]
+        yield from self.move("right", away, speed_mps=_LIFT_MPS)
+        yield from self.pause("right", 0.6, 0.7)
+        self.flags.add("plug is in")
+
+
+@experts.register("assembly_1")
+class Assembly1Expert(AirAssembly):
+    """The mortise is 38 mm deep; the plug counts as in from 34 mm on."""
+
+    task = "assembly_1"
+
+    def holder(self) -> tuple[Part, str, str]:
+        assert isinstance(self.sim.task, Assembly1)
+        return self.sim.task.socket, "tail", "mortise"
+
+    def world_from_level(self) -> np.ndarray:
+        return np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]).T  # x up, z into the hole
+
+    def plug(self) -> tuple[Part, str]:
+        assert isinstance(self.sim.task, Assembly1)
+        return self.sim.task.plug, "head"
+
+    def push_in(self, mating: Mating) -> Script:
+        yield from self.insert("right", mating, depth_m=0.042, enough_m=0.0352)

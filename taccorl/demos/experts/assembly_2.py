@@ -1,0 +1,35 @@
+"""Assembly #2: left holds the cradle open side up, right slides the plug in up to the stop, lets it down and lets go."""
+
+import numpy as np
+
+from taccorl.demos.experts import experts
+from taccorl.demos.experts.assembly_1 import AirAssembly
+from taccorl.demos.experts.scripted import Mating, Script
+from taccorl.sim.tasks.assembly_2 import Assembly2
+from taccorl.sim.tasks.parts import Part
+
+_LET_DOWN_M, _LET_DOWN_MPS = 0.001, 0.01  # so that the cradle, not the hand, carries the plug before it is let go
+
+
+@experts.register("assembly_2")
+class Assembly2Expert(AirAssembly):
+    """The cradle is 34 mm deep; its stop is felt, and the centre of mass is then 15 mm inside."""
+
+    task = "assembly_2"
+
+    def holder(self) -> tuple[Part, str, str]:
+        assert isinstance(self.sim.task, Assembly2)
+        return self.sim.task.cradle, "tail", "cradle"
+
+    def world_from_level(self) -> np.ndarray:
+        return np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]]).T  # y, the open side, up; z into the cradle
+
+    def plug(self) -> tuple[Part, str]:
+        assert isinstance(self.sim.task, Assembly2)
+        return self.sim.task.plug, "head"
+
+    def push_in(self, mating: Mating) -> Script:
+        yield from self.insert("right", mating, depth_m=0.036, enough_m=0.032)
+        down = self.hands["right"].pose.copy()
+        down[2, 3] -= _LET_DOWN_M
+        yield from self.move("right", down, speed_mps=_LET_DOWN_MPS)

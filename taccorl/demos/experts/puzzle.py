@@ -1,0 +1,169 @@
+"""Do Puzzle: pieces are picked up by their knobs, pressed onto the tray and felt into their holes."""
+
+from collections.abc import Generator
+from dataclasses import replace
+
+import numpy as np
+
+from taccorl.demos.experts import experts
+from taccorl.demos.experts.scripted import DT_S, Aim, Mating, Script, ScriptedExpert
+from taccorl.demos.experts.se3 import inverse, turn
+from taccorl.sim.tasks.parts import Part
+from taccorl.sim.tasks.puzzle import Puzzle
+from taccorl.sim.twin import CONTROL_HZ
+
+# Heights of a piece's underside over the tray's top: when carried (clear of the other knobs), and before it is pressed.
+_CARRY_M, _HOVER_M = 0.045, 0.003
+_REACH_MPS, _CARRY_MPS, _NEAR_MPS = 0.35, 0.30, 0.15  # peak speeds: empty, with a piece, up and down
+# The arm has 7 N/mm over the tray. Pressed on a corner by more than some 10 N, a piece would turn in the fingers.
+_FEEL = 0.4  # of the configuration's: blocked at 4 N more than the hand's own damping
+_LIGHTLY_M = 0.0005  # the command below the piece while it slides on the tray
+_EASE_M = 0.002  # the hand lifts by that much before it presses again
+_IN_MOUTH_M, _AT_FLOOR_M, _FLOOR_M = 0.001, 0.0092, 0.010  # depth from which it has dropped in, lies, and of the hole
+_FASTER_IN_HOLE = 3.0  # than down to the tray, where a quick hand would hit hard: 0.6 N for each mm/s
+_LET_GO_M = 0.045  # between the pads: wider, the fingers would reach the knobs beside
+_LONGEST_S = 10.0  # to press on one piece
+_MOST_TRIES = 4  # to place one piece
+
+
+@experts.register("puzzle")
+class PuzzleExpert(ScriptedExpert):
+    """The right hand places triangle and heart, the left one the circle in between; each waits for the other at the tray."""
+
+    task = "puzzle"
+
+    def script(self, arm: str) -> Script:
+        return self._left() if arm == "left" else self._right()
+
+    def _left(self) -> Script:
+        yield from self.pause("left", 0.0, 1.0)
+        yield from self._lift("left", "circle")
+        yield from self.wait_for("triangle is in", self._task.time_limit_s)
+        yield from self._place("left", "circle")
+        self.flags.add("circle is in")
+        yield from self._retreat("left")
+
+    def _right(self) -> Script:
+        yield from self.pause("right", 0.0, 0.4)
+        yield from self._lift("right", "triangle")
+        yield from self._place("right", "triangle")
+        self.flags.add("triangle is in")
+        yield from self._lift("right", "heart")
+        yield from self.wait_for("circle is in", self._task.time_limit_s)
+        yield from self._place("right", "heart")
+        yield from self._retreat("right")
+
+    # one piece --------------------------------------------------------------------------------------------------------
+
+    def _lift(self, arm: str, shape: str, height_m: float = 0.06) -> Script:
+        """Grip a piece by its knob where it lies and lift it."""
+        goal = self._knob(shape)
+        yield from self.move(arm, self.near(raised(goal, 0.04)), speed_mps=_REACH_MPS)
+        yield from self.move(arm, goal, speed_mps=_NEAR_MPS, settle=True)
+        yield from self.close(arm, self._part(shape).grasps["knob"].width_m)
+        yield from self.move(arm, raised(self.hands[arm].pose, height_m), speed_mps=_NEAR_MPS)
+
+    def _place(self, arm: str, shape: str) -> Script:
+        """Carry a held piece to its hole, feel it in, let go, look; grip it again where it rests on the rim."""
+        mating = Mating.of(self._part(shape), self._task.tray, shape)
+        for attempt in range(_MOST_TRIES):
+            if attempt:
+                self.felt(arm, f"{shape} rests on the rim")
+                yield from self._lift(arm, shape, height_m=0.02)
+            yield from self._press(arm, mating)
+            yield from self.open(arm, _LET_GO_M)
+            yield from self.move(arm, raised(self.hands[arm].pose, 0.035), speed_mps=_NEAR_MPS)
+            self.hands[arm].learns, self.hands[arm].steadiness = True, 1.0
+            if self._task.placed(self.sim, shape)[0]:
+                return
+
+    def _press(self, arm: str, mating: Mating) -> Script:
+        """Press a held piece down; where the rim stops it, slide it on lightly until it drops in; push it to the floor.
+
+        The hole is seen with an error, of which each slide takes a part away. After a slide in vain the hand lifts a little,
+        looks at the piece in its fingers, which may have turned, and presses again.
+        """
+        hand, config = self.hands[arm], self.config
+        aim = Aim(
+            off_m=self.rng.normal(size=2) * config.aim_m,
+            off_rad=self.rng.normal(size=3) * config.aim_rad,
+            part_from_tcp=inverse(self.body(mating.held)) @ self.tcp(arm),
+            turned=mating.turned(self),
+        )
+        yield from self.move(arm, lambda: aim.pose(self, mating, -_CARRY_M), speed_mps=_CARRY_MPS)
+        yield from self.move(arm, lambda: aim.pose(self, mating, -_HOVER_M), speed_mps=_NEAR_MPS, settle=True)
+        hand.learns, hand.steadiness = False, 0.3
+        aim, depth = (yield from self._align(arm, mating, aim, -_HOVER_M)), -_HOVER_M
+        speed_mps = (self.rng.uniform(0.006, 0.010) if config.aim_m > 0 else 0.008) * config.speed
+        began, free = self.step_count, self.pushed(arm)
+        while self.step_count - began < _LONGEST_S * CONTROL_HZ:
+            at, pushed = float(mating.fit(self).depth_m), self.pushed(arm) - free
+            if at > _AT_FLOOR_M:
+                break
+            if pushed[2] > _FEEL * config.feel_m:
+                self.felt(arm, f"{mating.held} blocked at {at * 1e3:.1f} mm")
+                corrected = self._corrected(aim)
+                if at < _IN_MOUTH_M:
+                    yield from self._slide(arm, mating, aim, corrected)
+                aim, depth = corrected, float(mating.fit(self).depth_m)
+                if depth < at + _IN_MOUTH_M:
+                    depth = max(at, 0.0) - _EASE_M
+                    yield from self.move(arm, aim.pose(self, mating, depth), speed_mps=0.04)
+                    yield from self.settle(arm, longest_s=0.5)
+                    aim = yield from self._align(arm, mating, aim, depth)
+            elif at > _IN_MOUTH_M:
+                aim = aim.giving_way(self, mating, config.give_way * pushed)
+            depth = min(depth + speed_mps * DT_S * (_FASTER_IN_HOLE if at > _IN_MOUTH_M else 1), _FLOOR_M)
+            hand.pose = aim.pose(self, mating, depth)
+            yield
+        yield from self.pause(arm, 0.1, 0.25)
+
+    def _align(self, arm: str, mating: Mating, aim: Aim, depth_m: float) -> Generator[None, None, Aim]:
+        """Look at the piece in the fingers, and bring it to where the aim says that it should be."""
+        aim = self._look(arm, mating, aim)
+        yield from self.move(arm, aim.pose(self, mating, depth_m), speed_mps=0.04)
+        yield from self.settle(arm, longest_s=0.5)
+        return aim
+
+    def _slide(self, arm: str, mating: Mating, start: Aim, end: Aim) -> Script:
+        """Slide a piece over the tray under light pressure, until it drops into its hole or the stretch is over."""
+        num = round(self.rng.uniform(0.3, 0.5) / self.config.speed * CONTROL_HZ)
+        for k in range(1, num + 1):
+            at = float(mating.fit(self).depth_m)
+            if at > _IN_MOUTH_M:
+                return
+            off_m = start.off_m + (end.off_m - start.off_m) * k / num
+            off_rad = start.off_rad + (end.off_rad - start.off_rad) * k / num
+            self.hands[arm].pose = replace(end, off_m=off_m, off_rad=off_rad).pose(self, mating, at + _LIGHTLY_M)
+            yield
+
+    def _retreat(self, arm: str) -> Script:
+        """Back to where the hand began."""
+        home = self.kinematics[arm].pose(np.array(self._task.home_rad[arm]))
+        yield from self.move(arm, self.near(home), speed_mps=_REACH_MPS)
+
+    def _knob(self, shape: str) -> np.ndarray:
+        """TCP pose for a piece's knob, from above, among the four ways to grip it that with the hand's x nearest the base."""
+        config, rng = self.config, self.rng
+        grip = self.body(shape) @ self._part(shape).grasps["knob"].part_from_tcp
+        turned = [grip @ turn((0, 0, k * np.pi / 2)) for k in range(4)]
+        pose = min(turned, key=lambda pose: pose[0, 0])
+        pose = pose @ turn(rng.normal(size=3) * config.grasp_rad * (0.3, 1, 0.3))
+        pose[:3, 3] += pose[:3, 0] * rng.normal() * config.grasp_m
+        pose[2, 3] += 0.001 + abs(rng.normal()) * config.grasp_m / 2
+        return pose
+
+    @property
+    def _task(self) -> Puzzle:
+        assert isinstance(self.sim.task, Puzzle)
+        return self.sim.task
+
+    def _part(self, shape: str) -> Part:
+        return self._task.pieces[shape]
+
+
+def raised(pose: np.ndarray, height_m: float) -> np.ndarray:
+    """The pose (4, 4) moved straight up."""
+    up = pose.copy()
+    up[2, 3] += height_m
+    return up

@@ -1,0 +1,450 @@
+"""The scripted demonstrator: two hands that move like a person at leader arms, feel when a part is blocked, and correct.
+
+Each arm is a generator of ``Wish``es (TCP pose, gripper opening), one a control step; ``act`` turns both into 14 joint targets.
+It sees the true poses, as a person sees the bench, but aims with an error: where a mating part is off it notices only by
+being blocked, as a person feels it, backs off and errs less on the next try. Those corrections are what a policy with touch is
+to learn. Figures of the human likeness: research notes on teleoperation in the issue, tuned to ~2 corrections per insertion.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.demos.experts.se3 import between, inverse, rotvec, transform, turn
+from taccorl.errors import TaccorlError
+from taccorl.sim.robot import ARMS
+from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, OPEN_M, Simulation
+from taccorl.sim.tasks.parts import Fit, Part, measure_fit
+from taccorl.sim.twin import CONTROL_HZ
+
+DT_S = 1.0 / CONTROL_HZ
+_TREMOR_KEPT = math.exp(-DT_S / 0.3)  # from one control step to the next; its correlation time is 0.3 s
+_LEARNED = 1 - math.exp(
+    -3.0 * DT_S
+)  # in a control step: what the eye sees to rest off is down to a third after 1 / 3 s
+_PEAK_OF_MEAN = 1.875  # of a minimum-jerk profile's speed
+_RECOIL_MPS = 0.08  # of a hand that has felt a block
+_LONGEST_PUSH_S = 12.0
+_AT_MOUTH_M = 0.004  # shallower is the rim, deeper is a wedge
+
+
+@dataclass(kw_only=True)
+class ScriptedExpertConfig:
+    """How human the hands are. All zero: exact."""
+
+    speed: float = 1.0
+    """Factor on every speed."""
+    tremor_m: float = 0.0004
+    """Standard deviation of the hand's tremor (Ornstein–Uhlenbeck, 0.3 s), per axis."""
+    tremor_rad: float = 0.004
+    """The same in rotation."""
+    waypoint_m: float = 0.004
+    """Spread of way points in free space."""
+    grasp_m: float = 0.0015
+    """Spread of where on a part the hand grips."""
+    grasp_rad: float = 0.03
+    """Spread of how the hand is turned when it grips."""
+    aim_m: float = 0.0010
+    """Spread of the seen position of a hole or mate, per axis."""
+    aim_rad: float = 0.015
+    """Spread of its seen direction, per axis."""
+    grip_n: float = 30.0
+    """Closing force of each pad; PiPER's gripper is rated for 40 N."""
+    feel_m: float = 0.0010
+    """The hand feels a block when it is held back by that much, or the part slips in it by that much: an arm has 5 N/mm
+    upwards and 7 N/mm sideways, and a part that is gripped with 25 N slips at 15 N if its friction is low."""
+    feel_rad: float = 0.06
+    """Or when the part turns over that much against the hole, in either hand."""
+    give_way: float = 0.1
+    """Share of a sideways push or turn to which the wrist yields, each control step."""
+    aim_kept: float = 0.45
+    """Share of the aiming error that is left after a correction by touch."""
+
+
+EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)
+
+
+@dataclass
+class Hand:
+    """What an arm is asked for now."""
+
+    pose: np.ndarray
+    """World-from-TCP (4, 4), without tremor."""
+    opening_m: float
+    joints_rad: np.ndarray
+    """(6,) of the last command without the correction."""
+    bias_rad: np.ndarray
+    """(6,) how far the joints rest from their targets: learned in free motion, as a person's eye corrects the hand."""
+    predicted_rad: np.ndarray
+    """(6,) where the joints are now if nothing touches the arm."""
+    goal: np.ndarray
+    """World-from-TCP (4, 4), with tremor."""
+    learns: bool = True
+    """Off in contact: what holds the hand back there is no bias."""
+    tremor: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    """(6,) [m, rad] now."""
+    steadiness: float = 1.0
+    """Factor on the tremor."""
+
+
+Script = Iterator[None]
+
+
+@dataclass(frozen=True)
+class Mating:
+    """A held part and the hole it goes into."""
+
+    held: str
+    held_from_mate: np.ndarray
+    num_turns: int | None
+    holder: str
+    holder_from_hole: np.ndarray
+
+    @classmethod
+    def of(cls, held: Part, holder: Part, hole: str) -> "Mating":
+        assert held.mate is not None
+        return cls(
+            held.name, held.mate.part_from_mate, held.mate.num_turns, holder.name, holder.holes[hole].part_from_hole
+        )
+
+    def _relative(self, expert: "ScriptedExpert") -> tuple[np.ndarray, np.ndarray]:
+        return expert.body(self.holder) @ self.holder_from_hole, expert.body(self.held) @ self.held_from_mate
+
+    def fit(self, expert: "ScriptedExpert") -> Fit:
+        """How the held part stands in the hole now."""
+        return measure_fit(*self._relative(expert), self.num_turns)
+
+    def axis(self, expert: "ScriptedExpert") -> np.ndarray:
+        """(3,) world, into the hole."""
+        return expert.body(self.holder)[:3, :3] @ self.holder_from_hole[:3, 2]
+
+    def turned(self, expert: "ScriptedExpert") -> np.ndarray:
+        """(4, 4) the turn about the hole's axis, among those that look the same, that is nearest to how it is held."""
+        hole, mate = self._relative(expert)
+        angle = measure_fit(hole, mate, 1).turn_rad
+        wrong = measure_fit(hole, mate, self.num_turns).turn_rad
+        return turn((0, 0, float(angle - wrong)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aim:
+    """Where a hand wants to bring a held part, and how wrong it is about it."""
+
+    off_m: np.ndarray
+    """(2,) error across the hole's axis."""
+    off_rad: np.ndarray
+    """(3,) error of the direction, about the part's leading end."""
+    part_from_tcp: np.ndarray
+    """(4, 4) how the hand held the part when it was last looked at."""
+    turned: np.ndarray
+    """(4, 4) about the hole's axis, among the turns that look the same."""
+    given: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    """(6,) [m, rad], frame of the hole: how far the wrist has given way, about the TCP; never along the axis."""
+
+    def pose(self, expert: "ScriptedExpert", mating: Mating, depth_m: float) -> np.ndarray:
+        """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, as far as the hand knows."""
+        hole = expert.body(mating.holder) @ mating.holder_from_hole
+        mate = transform((*self.off_m, depth_m)) @ turn(self.off_rad) @ self.turned
+        pose = hole @ mate @ inverse(mating.held_from_mate) @ self.part_from_tcp
+        pose[:3, :3] = hole[:3, :3] @ turn(self.given[3:])[:3, :3] @ hole[:3, :3].T @ pose[:3, :3]
+        pose[:3, 3] += hole[:3, :3] @ self.given[:3]
+        return pose
+
+    def giving_way(self, expert: "ScriptedExpert", mating: Mating, push_world: np.ndarray) -> "Aim":
+        """The wrist lets itself be moved by ``push_world`` (6,) [m, rad], but not back out of the hole."""
+        world_from_hole = (expert.body(mating.holder) @ mating.holder_from_hole)[:3, :3]
+        sideways = world_from_hole.T @ push_world[:3] * (1, 1, 0)
+        return replace(self, given=self.given + np.r_[sideways, world_from_hole.T @ push_world[3:]])
+
+
+def deflection(wanted: np.ndarray, actual: np.ndarray) -> np.ndarray:
+    """(6,) [m, rad], world: from one pose (4, 4) to another, the rotation as a rotation vector."""
+    off = np.empty(6)
+    off[:3] = actual[:3, 3] - wanted[:3, 3]
+    off[3:] = wanted[:3, :3] @ rotvec(wanted, actual)
+    return off
+
+
+def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
+    """Where a first-order lag is after one control step in which its target goes straight from ``before`` to ``after``.
+
+    ẋ = (u − x) / τ with u̇ = s constant has the solution x = u − τ s + (x₀ − u₀ + τ s) e^(−t/τ).
+    """
+    behind = lag_s * (after - before) / DT_S
+    return after - behind + (start - before + behind) * np.exp(-DT_S / lag_s)
+
+
+class ScriptedExpert(ABC):
+    """One episode's demonstrator. ``act()`` gives the next action until ``done``.
+
+    Subclasses write ``script(arm)``: a generator that moves ``self.hands[arm]`` and yields once a control step.
+    """
+
+    task: ClassVar[str]
+
+    def __init__(self, sim: Simulation, rng: np.random.Generator, config: ScriptedExpertConfig | None = None) -> None:
+        if sim.num_sims != 1:
+            raise TaccorlError(f"an expert drives one simulation, not {sim.num_sims}")
+        self.sim, self.rng, self.config = sim, rng, config or ScriptedExpertConfig()
+        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+        controller = sim.config.controller
+        self._lag_s = np.array(controller.kd_nms_per_rad) / np.array(controller.kp_nm_per_rad)
+        self._tremor = np.repeat((self.config.tremor_m, self.config.tremor_rad), 3)
+        self.events: list[tuple[int, str]] = []
+        """(control step, what was felt): corrections by touch."""
+        self.unreachable_m = 0.0
+        """Largest error that inverse kinematics left."""
+        self.step_count = 0
+        self.flags: set[str] = set()
+        """How the arms tell each other that a stretch is over."""
+
+    @abstractmethod
+    def script(self, arm: str) -> Script:
+        """The arm's work, one yield a control step."""
+
+    def start(self) -> None:
+        """After a reset of the simulation."""
+        command = self.sim.arrays["ctrl"][0, self.sim.action_actuators]
+        self.hands = {}
+        for a, arm in enumerate(ARMS):
+            joints = self.sim.proprioception()[0, 7 * a : 7 * a + 6].copy()
+            pose = self.kinematics[arm].pose(joints)
+            self.hands[arm] = Hand(
+                pose=pose,
+                opening_m=float(command[7 * a + 6]),
+                joints_rad=joints,
+                bias_rad=joints - command[7 * a : 7 * a + 6],
+                predicted_rad=joints,
+                goal=pose,
+            )
+        self._scripts = {arm: self.script(arm) for arm in ARMS}
+        self._running = set(ARMS)
+        self.step_count = 0
+        self.flags, self.events = set(), []
+
+    @property
+    def done(self) -> bool:
+        """Both arms have nothing left to do."""
+        return not self._running
+
+    def act(self) -> np.ndarray:
+        """(14,) float32 joint targets [rad] and openings [m] of the next control step."""
+        action = np.empty(14)
+        for a, arm in enumerate(ARMS):
+            if arm in self._running:
+                try:
+                    next(self._scripts[arm])
+                except StopIteration:
+                    self._running.discard(arm)
+            action[7 * a : 7 * a + 6] = self._joints(a, arm)
+            action[7 * a + 6] = self.hands[arm].opening_m
+        self.step_count += 1
+        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+
+    def _joints(self, a: int, arm: str) -> np.ndarray:
+        """(6,) targets that bring the hand, with its tremor, to where it wants to be."""
+        hand, actual = self.hands[arm], self.sim.proprioception()[0, 7 * a : 7 * a + 6]
+        if hand.learns:
+            hand.bias_rad = hand.bias_rad + _LEARNED * (actual - hand.predicted_rad)
+        hand.goal = self._shaken(hand)
+        joints, error_m = self.kinematics[arm].solve(hand.goal, hand.joints_rad)
+        self.unreachable_m = max(self.unreachable_m, error_m)
+        hand.predicted_rad = follow(hand.predicted_rad, hand.joints_rad, joints, self._lag_s)
+        hand.joints_rad = joints
+        return joints - hand.bias_rad
+
+    def _shaken(self, hand: Hand) -> np.ndarray:
+        fresh = math.sqrt(1 - _TREMOR_KEPT**2) * self._tremor * self.rng.normal(size=6)
+        hand.tremor = _TREMOR_KEPT * hand.tremor + fresh
+        shake = hand.steadiness * hand.tremor
+        goal = hand.pose @ turn(shake[3:])
+        goal[:3, 3] += shake[:3]
+        return goal
+
+    # primitives: each yields once a control step ----------------------------------------------------------------------
+
+    def move(
+        self,
+        arm: str,
+        goal: np.ndarray | Callable[[], np.ndarray],
+        *,
+        speed_mps: float = 0.2,
+        turn_radps: float = 1.2,
+        settle: bool = False,
+    ) -> Script:
+        """Minimum-jerk to a TCP pose; a callable goal is followed while it moves."""
+        hand, start = self.hands[arm], self.hands[arm].pose.copy()
+        aim = goal if callable(goal) else lambda: goal
+        distance = np.linalg.norm(aim()[:3, 3] - start[:3, 3])
+        angle = np.linalg.norm(rotvec(start, aim()))
+        slow = self.rng.uniform(0.85, 1.2) if self.config.waypoint_m > 0 else 1.0
+        duration_s = slow * max(0.25, _PEAK_OF_MEAN * max(distance / speed_mps, angle / turn_radps)) / self.config.speed
+        num = max(2, round(duration_s * CONTROL_HZ))
+        for k in range(1, num + 1):
+            x = k / num
+            hand.pose = between(start, aim(), 10 * x**3 - 15 * x**4 + 6 * x**5)
+            yield
+        if settle:
+            yield from self.settle(arm)
+
+    def settle(
+        self, arm: str, tolerance_m: float = 0.0004, longest_s: float = 1.2, tolerance_rad: float = 0.006
+    ) -> Script:
+        """Wait until the hand is where it was sent, as a person does before something delicate."""
+        for _ in range(round(longest_s * CONTROL_HZ)):
+            error = deflection(self.hands[arm].goal, self.tcp(arm))
+            if np.linalg.norm(error[:3]) < tolerance_m and np.linalg.norm(error[3:]) < tolerance_rad:
+                return
+            yield
+
+    def pause(self, arm: str, low_s: float = 0.08, high_s: float = 0.3) -> Script:
+        """Do nothing for a moment."""
+        for _ in range(round(self.rng.uniform(low_s, high_s) * CONTROL_HZ)):
+            yield
+
+    def close(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
+        """Close on a part of that width, then squeeze with ``force_n`` (the configuration's by default).
+
+        The command ends at 0, so a narrow part is squeezed with less: 26 N at 20 mm.
+        """
+        robot = self.sim.config.robot
+        force_n = self.config.grip_n if force_n is None else force_n
+        squeeze = force_n / robot.grip_stiffness_n_per_m
+        if robot.pads == "sprung":
+            squeeze += 2 * force_n / robot.pad_stiffness_n_per_m
+        yield from self._grip(arm, max(width_m - squeeze, 0.0), 0.4)
+
+    def open(self, arm: str, width_m: float = OPEN_M) -> Script:
+        """Open to ``width_m`` between the pads."""
+        yield from self._grip(arm, min(width_m, OPEN_M), 0.3)
+
+    def _grip(self, arm: str, opening_m: float, duration_s: float) -> Script:
+        hand, start = self.hands[arm], self.hands[arm].opening_m
+        num = max(2, round(duration_s * CONTROL_HZ))
+        for k in range(1, num + 1):
+            hand.opening_m = start + (opening_m - start) * k / num
+            yield
+        yield from self.pause(arm, 0.15, 0.25)
+
+    def wait_for(self, flag: str, longest_s: float = 25.0) -> Script:
+        """Hold still until the other arm has raised ``flag``."""
+        for _ in range(round(longest_s * CONTROL_HZ)):
+            if flag in self.flags:
+                return
+            yield
+
+    def insert(self, arm: str, mating: "Mating", *, depth_m: float, enough_m: float, start_m: float = -0.02) -> Script:
+        """Bring a held part before a hole and push it in until ``enough_m``; it is pushed towards ``depth_m`` at most.
+
+        Sideways and in rotation the hand gives way to what it feels, as a relaxed wrist does, so that the part finds its way
+        once it is in the mouth. When it is blocked, it backs off, looks at the part in its hand again, which may have turned,
+        and aims again with a smaller error. Afterwards the hand is still steady and learns nothing of its bias.
+        """
+        hand, config = self.hands[arm], self.config
+        aim = yield from self._bring_before(arm, mating, start_m)
+        speed_mps = (self.rng.uniform(0.02, 0.03) if config.aim_m > 0 else 0.025) * config.speed
+        hand.learns, hand.steadiness = False, 0.3
+        depth, began, free = start_m, self.step_count, self.pushed(arm)
+        while self.step_count - began < _LONGEST_PUSH_S * CONTROL_HZ:
+            fit, pushed = mating.fit(self), self.pushed(arm) - free
+            at = float(fit.depth_m)
+            if at > enough_m:
+                break
+            if fit.tilt_rad > config.feel_rad or self._held_back_m(arm, mating, aim, pushed) > config.feel_m:
+                self.felt(arm, f"blocked at {at * 1e3:.1f} mm")
+                back = max(at - _AT_MOUTH_M, start_m)
+                while depth > back:
+                    depth = max(depth - _RECOIL_MPS * DT_S, back)
+                    hand.pose = aim.pose(self, mating, depth)
+                    yield
+                yield from self.settle(arm, longest_s=0.2)
+                aim = self._look(arm, mating, self._corrected(aim))
+                yield from self.move(arm, partial(aim.pose, self, mating, depth))
+                yield from self.settle(arm, longest_s=0.4)
+            elif at > 0:
+                aim = aim.giving_way(self, mating, config.give_way * pushed)
+            depth = min(depth + speed_mps * DT_S, depth_m)
+            hand.pose = aim.pose(self, mating, depth)
+            yield
+        yield from self.pause(arm, 0.1, 0.25)
+
+    def _bring_before(self, arm: str, mating: "Mating", start_m: float) -> Generator[None, None, "Aim"]:
+        """Carry a held part to ``start_m`` before the hole and look twice, the second time when it has come to rest."""
+        config = self.config
+        aim = Aim(
+            off_m=self.rng.normal(size=2) * config.aim_m,
+            off_rad=self.rng.normal(size=3) * config.aim_rad,
+            part_from_tcp=inverse(self.body(mating.held)) @ self.tcp(arm),
+            turned=mating.turned(self),
+        )
+        for _ in range(2):
+            yield from self.move(arm, partial(aim.pose, self, mating, start_m), speed_mps=0.12)
+            yield from self.settle(arm)
+            aim = self._look(arm, mating, aim)
+        return aim
+
+    def _held_back_m(self, arm: str, mating: "Mating", aim: "Aim", pushed: np.ndarray) -> float:
+        """How far the hand is pushed back out of the hole, or the part has slipped in it since it was looked at."""
+        slipped = aim.part_from_tcp[:3, 3] - (inverse(self.body(mating.held)) @ self.tcp(arm))[:3, 3]
+        return max(float(-(mating.axis(self) @ pushed[:3])), float(np.linalg.norm(slipped)))
+
+    def _corrected(self, aim: "Aim") -> "Aim":
+        """Touch has told on which side the rim is."""
+        kept, config = self.config.aim_kept, self.config
+        return replace(
+            aim,
+            off_m=kept * aim.off_m + self.rng.normal(size=2) * 0.1 * config.aim_m,
+            off_rad=kept * aim.off_rad + self.rng.normal(size=3) * 0.1 * config.aim_rad,
+        )
+
+    def _look(self, arm: str, mating: "Mating", aim: "Aim") -> "Aim":
+        """The same aim with the part as it lies in the hand now, and a wrist that has given way to nothing yet."""
+        part_from_tcp = inverse(self.body(mating.held)) @ self.tcp(arm)
+        return replace(aim, part_from_tcp=part_from_tcp, turned=mating.turned(self), given=np.zeros(6))
+
+    def pushed(self, arm: str) -> np.ndarray:
+        """(6,) [m, rad], world: how far contact holds the TCP from where the arm would be without. What a hand feels."""
+        return deflection(self.kinematics[arm].pose(self.hands[arm].predicted_rad), self.tcp(arm))
+
+    # what a person sees and errs about ---------------------------------------------------------------------------------
+
+    def near(self, pose: np.ndarray, spread_m: float | None = None, spread_rad: float = 0.0) -> np.ndarray:
+        """A pose met with human spread (way points by default)."""
+        spread_m = self.config.waypoint_m if spread_m is None else spread_m
+        off = pose @ turn(self.rng.normal(size=3) * spread_rad)
+        off[:3, 3] += self.rng.normal(size=3) * spread_m
+        return off
+
+    def felt(self, arm: str, what: str) -> None:
+        """Note a correction by touch."""
+        self.events.append((self.step_count, f"{arm}: {what}"))
+
+    def grasp(
+        self, part: Part, name: str, *, lean_rad: float = 0.0, lift_m: float = 0.0, pivot_m: float = 0.0
+    ) -> np.ndarray:
+        """TCP pose for a grasp of a part where it lies, with human spread.
+
+        ``lean_rad`` turns the hand about its closing direction, so that it comes from −x of the grasp's frame; about a point
+        ``pivot_m`` ahead of the TCP, where the part is gripped.
+        """
+        config, rng = self.config, self.rng
+        spot = transform((0, 0, pivot_m))
+        pose = self.body(part.name) @ part.grasps[name].part_from_tcp @ spot @ turn((0, lean_rad, 0)) @ inverse(spot)
+        pose = pose @ turn(rng.normal(size=3) * config.grasp_rad * (0.3, 1, 0.3))
+        pose[:3, 3] += pose[:3, 0] * rng.normal() * config.grasp_m
+        pose[2, 3] += lift_m + abs(rng.normal()) * config.grasp_m / 2
+        return pose
+
+    def body(self, name: str) -> np.ndarray:
+        """World-from-body (4, 4) now."""
+        return self.sim.poses(name)[0]
+
+    def tcp(self, arm: str) -> np.ndarray:
+        """World-from-TCP (4, 4) now."""
+        return self.sim.tcp(arm)[0]

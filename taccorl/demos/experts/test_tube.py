@@ -1,0 +1,111 @@
+"""Test Tube Insertion: left grips the rack's handle; right lifts the tube, turns it upright and brings it in by touch."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from taccorl.demos.experts import experts
+from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert, ScriptedExpertConfig
+from taccorl.demos.experts.se3 import inverse, transform, turn
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks.test_tube import TestTube
+from taccorl.sim.twin import CONTROL_HZ
+
+_LEAN_LEFT_RAD = 0.40  # away from the right hand
+_TIPS_M = 0.034  # from the TCP to the fingertips, about which the left hand leans: they keep clear of the rack's body
+_LEAN_RIGHT_RAD = 0.575  # towards the cap; the hand then comes from above and behind when the tube stands
+_TOWARDS_TIPS_M = 0.023  # of the tube, from the pads' middle: the fingers stay above the rack
+_GRIP_M = (0.0600, 0.0645)  # from the tube's bottom: clear of the stand's block now, of the rack later
+_HOVER_M = (0.400, 0.005, 0.110)  # of the upright tube's bottom
+_HEADING_RAD = np.deg2rad(55)  # of the hand above the rack
+_TURN_RADPS = 0.8  # fastest joint while the tube turns, on average
+_GIVE_WAY = 0.25  # at least: both plates of the rack hold the tube, and a stiff wrist would wedge it between them
+_OPEN_M = 0.040  # at the rack: fully open, a finger would touch the left hand
+
+
+@experts.register("test_tube")
+class TestTubeExpert(ScriptedExpert):
+    """The left hand steadies the rack all the while."""
+
+    __test__ = False
+    task = "test_tube"
+
+    def __init__(self, sim: Simulation, rng: np.random.Generator, config: ScriptedExpertConfig | None = None) -> None:
+        config = config or ScriptedExpertConfig()
+        super().__init__(sim, rng, replace(config, give_way=max(config.give_way, _GIVE_WAY)))
+
+    def script(self, arm: str) -> Script:
+        return self._left() if arm == "left" else self._right()
+
+    def _left(self) -> Script:
+        rack, hand = self._task.rack, self.hands["left"]
+        goal = self.grasp(rack, "handle", lean_rad=_LEAN_LEFT_RAD, lift_m=0.004, pivot_m=_TIPS_M)
+        yield from self.move("left", self.near(goal @ transform((0, 0, -0.07))))
+        yield from self.move("left", goal, speed_mps=0.1, settle=True)
+        yield from self.close("left", rack.grasps["handle"].width_m)
+        hand.steadiness, hand.learns = 0.4, False
+        self.flags.add("rack is held")
+        yield from self.wait_for("tube is in")
+
+    def _right(self) -> Script:
+        task = self._task
+        yield from self.pause("right", 0.0, 0.4)
+        yield from self._lift()
+        yield from self._turn_upright()
+        yield from self.wait_for("rack is held")
+        mating = Mating.of(task.tube, task.rack, "middle")
+        yield from self.insert("right", mating, depth_m=0.0445, enough_m=0.0425)
+        yield from self.open("right", _OPEN_M)
+        away = self.hands["right"].pose @ transform((0, 0, -0.08))
+        yield from self.move("right", away, speed_mps=0.12)
+        yield from self.pause("right", 0.6, 0.7)
+        self.flags.add("tube is in")
+
+    def _lift(self) -> Script:
+        tube = self._task.tube
+        goal = self._kept_clear(self.grasp(tube, "middle", lean_rad=_LEAN_RIGHT_RAD)) @ transform(
+            (0, 0, -_TOWARDS_TIPS_M)
+        )
+        yield from self.move("right", self.near(goal @ transform((0, 0, -0.06))))
+        yield from self.move("right", goal, speed_mps=0.1, settle=True)
+        yield from self.close("right", tube.grasps["middle"].width_m)
+        up = self.hands["right"].pose.copy()
+        up[2, 3] += 0.06
+        yield from self.move("right", up, speed_mps=0.12)
+
+    def _kept_clear(self, goal: np.ndarray) -> np.ndarray:
+        """The same grasp moved along the tube to where no finger meets the stand, as the eye would."""
+        grip = inverse(self.body("tube")) @ goal
+        along_m = grip[2, 3] - grip[0, 3] * grip[2, 2] / grip[0, 2]  # where the approach crosses the tube's axis
+        shift_m = np.clip(along_m, *_GRIP_M) - along_m
+        return transform(shift_m * self.body("tube")[:3, 2]) @ goal
+
+    def _turn_upright(self) -> Script:
+        """Bring the tube's bottom to ``_HOVER_M``, cap up, along a straight line in the space of joints.
+
+        The wrist passes through joint 5 = 0, where joints 4 and 6 turn about the same axis: on a straight line of the hand
+        they would have to jump.
+        """
+        hand, kinematics = self.hands["right"], self.kinematics["right"]
+        tube_from_tcp = inverse(self.body("tube")) @ self.tcp("right")
+        heading = np.arctan2(tube_from_tcp[1, 2], tube_from_tcp[0, 2])
+        goal = self.near(transform(_HOVER_M)) @ turn((0, 0, _HEADING_RAD - heading)) @ tube_from_tcp
+        start, end = hand.joints_rad.copy(), kinematics.search(goal, self.rng)
+        yield from self._along_joints(start, end)
+        yield from self.settle("right")
+
+    def _along_joints(self, start: np.ndarray, end: np.ndarray) -> Script:
+        hand = self.hands["right"]
+        slow = self.rng.uniform(0.85, 1.2) if self.config.waypoint_m > 0 else 1.0
+        num = round(slow * np.abs(end - start).max() / _TURN_RADPS / self.config.speed * CONTROL_HZ)
+        for k in range(1, num + 1):
+            x = k / num
+            joints = start + (end - start) * (10 * x**3 - 15 * x**4 + 6 * x**5)
+            hand.pose = self.kinematics["right"].pose(joints)
+            hand.steadiness = min(1.0, abs(joints[4]) / 0.3)  # near joint 5 = 0 a tremor is out of the wrist's reach
+            yield
+
+    @property
+    def _task(self) -> TestTube:
+        assert isinstance(self.sim.task, TestTube)
+        return self.sim.task

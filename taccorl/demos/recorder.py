@@ -1,0 +1,115 @@
+"""One demonstration in the twin as an ``Episode``: what the policy would have seen and done, and the simulator's own state.
+
+A row is the observation before an action, and the action. Pictures are drawn afterwards, row by row, from the stored states:
+only what is kept costs rendering, and a dataset can be rendered again.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from taccorl.data.episode import Episode, Pictures
+from taccorl.data.spec import DatasetSpec, FeatureSpec
+from taccorl.sim.robot import ARMS
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.trajectory import DenseRecorder, Trajectory
+
+ORIGIN = "MuJoCo twin, not a robot"
+_ANY = (-1e12, 1e12)
+PICTURE = "observation.images."
+
+
+def with_simulator(spec: DatasetSpec, sim: Simulation, *, pictures: bool) -> DatasetSpec:
+    """The dataset contract with the simulator's own features: state, seed, subtask of each arm, success.
+
+    ``sim.state`` has the size of the task's scene, so datasets of different tasks merge only without it.
+    """
+    own = {"unit": "1", "frame": "simulator", "rate_hz": float(spec.fps)}
+    features = {
+        key: feature
+        for key, feature in spec.features.items()
+        if not feature.optional and (pictures or feature.dtype != "video")
+    }
+    features |= {
+        "sim.state": FeatureSpec(dtype="float64", shape=(sim.row_size,), range=_ANY, **own),
+        "sim.seed": FeatureSpec(dtype="int64", shape=(1,), range=(0, 2**62), **own),
+        "sim.subtask": FeatureSpec(dtype="int16", shape=(len(ARMS),), range=(0, 99), names=ARMS, **own),
+        "sim.success": FeatureSpec(dtype="int16", shape=(1,), range=(0, 1), **own),
+    }
+    return dataclasses.replace(spec, features=features)
+
+
+@dataclass
+class EpisodeRecorder:
+    """Steps simulation 0 and keeps what a dataset needs. Make one after each reset."""
+
+    sim: Simulation
+    spec: DatasetSpec
+    """With the simulator's features: ``with_simulator``."""
+    sensor_rng: np.random.Generator | None = None
+    """Noise of the pads; None: a noiseless sensor."""
+    dense: bool = False
+    """Keep a 200 Hz trajectory as well, for recordings as the drivers would write them."""
+    rows: list[dict[str, np.ndarray]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._dense = DenseRecorder(self.sim) if self.dense else None
+
+    def step(self, action: np.ndarray) -> None:
+        """One row and one control step. The action is rounded to float32 before it acts: what is stored is what was done."""
+        action = np.asarray(action, dtype=np.float32)
+        sim = self.sim
+        row = {
+            "observation.state": sim.proprioception()[0].astype(np.float32),
+            "observation.tactile": sim.touch(self.sensor_rng)[0],
+            "sim.state": sim.state_rows(np.array([0]))[0],
+            "sim.seed": sim.seeds[:1].copy(),
+            "sim.subtask": sim.judge.subtask[0].astype(np.int16),
+        }
+        sim.step(action[None].astype(np.float64), watch=self._dense.watch() if self._dense else None)
+        row["action"] = sim.executed[0].astype(np.float32)
+        row["sim.success"] = sim.judge.success[:1].astype(np.int16)
+        self.rows.append(row)
+
+    def trajectory(self) -> Trajectory:
+        """The dense record."""
+        assert self._dense is not None, "make the recorder with dense=True"
+        return self._dense.trajectory()
+
+    def episode(self, name: str, simulation: dict[str, Any]) -> Episode:
+        """All rows so far; ``simulation`` says what made them, and is kept in the dataset's provenance."""
+        arrays = {key: np.stack([row[key] for row in self.rows]) for key in self.rows[0]}
+        outcome = self.sim.judge.outcome
+        keys = tuple(key for key in self.spec.keys("video"))
+        return Episode(
+            name=name,
+            spec=self.spec,
+            start_ns=0,
+            arrays=arrays,
+            pictures=lambda: self._pictures(arrays["sim.state"], keys),
+            picture_keys=keys,
+            instruction=self.sim.task.instruction,
+            success=bool(outcome.success[0]),
+            origin=ORIGIN,
+            baselines={"observation.tactile": self.sim.sensor.baseline.reshape(-1)},
+            stages=tuple(self._stages(arrays["sim.subtask"])),
+            provenance={"recording": name, "simulation": simulation},
+        )
+
+    def _pictures(self, states: np.ndarray, keys: tuple[str, ...]) -> Iterator[Pictures]:
+        cameras = [key.removeprefix(PICTURE) for key in keys]
+        for images in self.sim.render_states(states, cameras):
+            yield {PICTURE + camera: image for camera, image in images.items()}
+
+    def _stages(self, subtask: np.ndarray) -> Iterator[tuple[int, str]]:
+        """(first row, "right: insert plug") wherever an arm begins another subtask."""
+        subtasks = self.sim.task.subtasks()
+        for row in np.flatnonzero(np.any(np.diff(subtask, axis=0, prepend=-1) != 0, axis=1)):
+            now = [
+                f"{arm}: {subtasks[arm][k].name if k < len(subtasks[arm]) else 'done'}"
+                for arm, k in zip(ARMS, subtask[row], strict=True)
+            ]
+            yield int(row), ", ".join(now)

@@ -1,0 +1,63 @@
+"""How good a task's expert is: success, what it costs, how hard it presses. All simulated."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taccorl.benchmark import cpu_s
+from taccorl.demos.collect import ExpertSource, Plan, outcome_of
+from taccorl.demos.experts import experts
+from taccorl.sim.twin import CONTROL_HZ
+
+
+@dataclass
+class Score:
+    """Of a number of episodes of one task."""
+
+    outcomes: list[str] = field(default_factory=list)
+    cpu_s: list[float] = field(default_factory=list)
+    """Per episode, without pictures."""
+    duration_s: list[float] = field(default_factory=list)
+    corrections: list[int] = field(default_factory=list)
+    """Corrections by touch per episode."""
+    penetration_m: list[float] = field(default_factory=list)
+    """Deepest between mating parts, per episode, looked at after every control step."""
+    force_n: list[float] = field(default_factory=list)
+    """Largest between mating parts, per episode."""
+
+    @property
+    def success_rate(self) -> float:
+        return self.outcomes.count("success") / len(self.outcomes)
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """Category → how often."""
+        return dict(Counter(o for o in self.outcomes if o != "success"))
+
+
+def score_expert(task: str, num_episodes: int, *, difficulty: str = "train", seed: int = 0) -> Score:
+    """Run the expert of ``task`` as ``taccorl collect`` does, under the paper's randomisation."""
+    plan = Plan(task=task, difficulty=difficulty, seed=seed)
+    assert isinstance(plan.source, ExpertSource)
+    sim = plan.make()
+    score = Score()
+    for k in range(num_episodes):
+        before = cpu_s()
+        episode_seed = plan.attempt_seed(k)
+        sim.reset([episode_seed])
+        expert = experts.get(task)(sim, np.random.default_rng([episode_seed, 1]), plan.source.hands)
+        expert.start()
+        depth_m = force_n = 0.0
+        while not sim.judge.outcome.over[0]:
+            sim.step(expert.act()[None].astype(float))
+            for pair in sim.task.mating:
+                contact = sim.contact(*pair)
+                depth_m, force_n = max(depth_m, contact.penetration_m[0]), max(force_n, contact.force_n[0])
+        score.outcomes.append(outcome_of(sim))
+        score.cpu_s.append(cpu_s() - before)
+        score.duration_s.append(sim.judge.steps[0] / CONTROL_HZ)
+        score.corrections.append(len(expert.events))
+        score.penetration_m.append(depth_m)
+        score.force_n.append(force_n)
+    return score

@@ -1,0 +1,314 @@
+"""Action files: what a demonstrator asked for, step by step, written as it happens; re-executed, they give the same episode.
+
+A file is one JSON value a line, so that a process killed at any moment leaves one that can be read:
+
+    {"format": "taccorl actions 1", "task": "assembly_1", "seed": 123, "twin": "…", "time_limit_s": 300, …}    the scene
+    [0.003, 1.732, …]                                                           14 float32 (rad, m), one line a control step
+    {"end": "finished", "outcome": "success"}          or "discarded"; missing if the demonstrator's process was cut off
+"""
+
+import dataclasses
+import json
+import logging
+import os
+import tempfile
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import mujoco
+import numpy as np
+
+import taccorl
+from taccorl.demos.collect import Actions, Plan, Source, outcome_of
+from taccorl.errors import TaccorlError
+from taccorl.lineage.digest import digest_bytes
+from taccorl.sim.simulation import ACTION_NAMES, Simulation
+from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+from taccorl.sim.twin_file import load_twin, twin_text
+
+FORMAT = "taccorl actions 1"
+_SCENE = ("task", "difficulty", "randomization", "seed", "twin")
+"""What must be equal for a file to be of the same scene."""
+_ENDS = ("finished", "discarded")
+
+logger = logging.getLogger(__name__)
+
+
+def scene_of(sim: Simulation) -> dict[str, Any]:
+    """What defines the scene that simulation 0 was reset to, as JSON."""
+    return {
+        "task": sim.task.name,
+        "difficulty": sim.task.difficulty,
+        "randomization": float(sim.randomization_scale),
+        "seed": int(sim.seeds[0]),
+        "twin": twin_text(sim.config),
+    }
+
+
+def give_time(sim: Simulation, seconds: float) -> None:
+    """From now on an episode is out of time after ``seconds``, whatever the task says: a person is slower than an expert."""
+    sim.judge.limit_steps = round(seconds * CONTROL_HZ)
+
+
+class ActionLog:
+    """Appends actions to a new file ``folder/TASK_SEED_NNN.jsonl``: each goes to the kernel at once, each second to the disk."""
+
+    def __init__(self, folder: Path, sim: Simulation, source: str) -> None:
+        """For what ``source`` does in simulation 0 of ``sim``, which has just been reset."""
+        scene = scene_of(sim)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.path, self._descriptor = _create(folder, f"{scene['task']}_{scene['seed']}")
+        self.num_actions = 0
+        self._write(
+            {
+                "format": FORMAT,
+                **scene,
+                "time_limit_s": sim.judge.limit_steps / CONTROL_HZ,
+                "source": source,
+                "names": list(ACTION_NAMES),
+                "units": "rad, gripper openings in m",
+                "control_hz": CONTROL_HZ,
+                "created": datetime.now(UTC).isoformat(timespec="seconds"),
+                "mujoco": mujoco.__version__,
+                "taccorl": taccorl.__version__,
+            }
+        )
+        os.fsync(self._descriptor)
+        _sync_folder(folder)
+
+    def append(self, action: np.ndarray) -> None:
+        """One control step's action (14,), as float32."""
+        # A float32 is written as the float64 of the same value, which JSON gives back exactly.
+        self._write(np.asarray(action, np.float32).tolist())
+        self.num_actions += 1
+        if self.num_actions % CONTROL_HZ == 0:
+            os.fsync(self._descriptor)
+
+    def end(self, end: str, outcome: str) -> None:
+        """Nothing comes after this."""
+        assert end in _ENDS, end
+        self._write({"end": end, "outcome": outcome})
+        self.close()
+
+    def close(self) -> None:
+        """To the disk. A file that is closed without ``end`` counts as cut off."""
+        if self._descriptor >= 0:
+            os.fsync(self._descriptor)
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _write(self, value: Any) -> None:
+        line = json.dumps(value, ensure_ascii=False).encode() + b"\n"
+        while line:
+            line = line[os.write(self._descriptor, line) :]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _create(folder: Path, name: str) -> tuple[Path, int]:
+    for k in range(10_000):
+        path = folder / f"{name}_{k:03d}.jsonl"
+        try:
+            return path, os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o666)
+        except FileExistsError:
+            continue
+    raise TaccorlError(f"{folder} holds 10000 action files of {name}: move some away")
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@dataclass(frozen=True)
+class ActionFile:
+    """One file, read."""
+
+    path: Path
+    header: dict[str, Any]
+    actions: np.ndarray
+    """(T, 14) float32."""
+    end: str | None
+    """finished or discarded; None: cut off, so the actions are all there is."""
+    outcome: str | None
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        return {key: self.header[key] for key in _SCENE}
+
+    @classmethod
+    def read(cls, path: Path) -> "ActionFile":
+        """A last line that was cut off is left out.
+
+        Raises:
+            TaccorlError: not an action file, or damaged; with file and line.
+        """
+        try:
+            lines = Path(path).read_bytes().split(b"\n")
+        except OSError as error:
+            raise TaccorlError(f"{path}: cannot be read: {error}") from error
+        values = [
+            _value(path, k, line) for k, line in enumerate(lines[:-1], 1)
+        ]  # what follows the last newline is cut off
+        header = values[0] if values else None
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise TaccorlError(f"{path}: is no action file: its first line must say {FORMAT!r}")
+        missing = [key for key in (*_SCENE, "time_limit_s") if key not in header]
+        if missing:
+            raise TaccorlError(f"{path}:1: {missing[0]!r} is missing: the scene cannot be made again")
+        last = values[-1] if len(values) > 1 and isinstance(values[-1], dict) else {}
+        rows = values[1:-1] if last else values[1:]
+        for k, row in enumerate(rows, 2):
+            if not isinstance(row, list) or len(row) != len(ACTION_NAMES):
+                raise TaccorlError(f"{path}:{k}: expected {len(ACTION_NAMES)} numbers, found {str(row)[:60]}")
+        actions = np.array(rows, np.float32).reshape(-1, len(ACTION_NAMES))
+        return cls(Path(path), header, actions, last.get("end"), last.get("outcome"))
+
+
+def _value(path: Path, number: int, line: bytes) -> Any:
+    try:
+        return json.loads(line)
+    except ValueError as error:
+        raise TaccorlError(f"{path}:{number}: is damaged: {error}") from error
+
+
+def find_finished(folder: Path, scene: dict[str, Any], source: str) -> ActionFile | None:
+    """The newest finished demonstration of this very scene by this kind of source in this MuJoCo."""
+    wanted = {**scene, "source": source, "mujoco": mujoco.__version__}
+    for path in sorted(folder.glob(f"{scene['task']}_{scene['seed']}_*.jsonl"), reverse=True):
+        file = ActionFile.read(path)
+        if file.end == "finished" and all(file.header.get(key) == value for key, value in wanted.items()):
+            return file
+    return None
+
+
+def replay(file: ActionFile, sim: Simulation) -> Actions:
+    """The actions of a file, one by one, as a source gives them.
+
+    Raises:
+        TaccorlError: the episode was over when these actions were recorded, and is not now.
+    """
+    if file.header.get("mujoco") != mujoco.__version__:
+        logger.warning(
+            "%s: recorded with MuJoCo %s, this is %s: bits may differ",
+            *(file.path, file.header.get("mujoco"), mujoco.__version__),
+        )
+    give_time(sim, file.header["time_limit_s"])
+    yield from file.actions
+    if file.outcome not in (None, "unfinished") and not sim.judge.outcome.over[0]:
+        raise TaccorlError(
+            f"{file.path}: recorded as {file.outcome} after {len(file.actions)} control steps (MuJoCo "
+            f"{file.header.get('mujoco')}, taccorl {file.header.get('taccorl')}), but re-executed here it is "
+            f"{outcome_of(sim)}: the twin is not the one it was recorded in. Nothing was kept of it."
+        )
+
+
+@Source.register_subclass("actions")
+@dataclass(frozen=True, kw_only=True)
+class ActionsSource(Source):
+    """Re-executes action files: what a person or another source did, in the scenes in which they did it."""
+
+    path: str
+    """An action file, or a folder of them (outputs/teleop); those that say they were discarded are left out of a folder."""
+    digest: str = field(init=False, default="")
+    """Of the files' contents: other actions make other episodes."""
+
+    _MADE_BY_FILE: ClassVar[tuple[str, ...]] = ("task", "difficulty", "randomization")
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "digest", digest_bytes(*(path.read_bytes() for path in self._paths())))
+
+    def _paths(self) -> list[Path]:
+        path = Path(self.path).expanduser()  # the shell leaves the ~ of --source.path=~/x alone
+        return sorted(path.glob("*.jsonl")) if path.is_dir() else [path] * path.is_file()
+
+    def files(self) -> list[ActionFile]:
+        """All of them, in the order in which they were made.
+
+        Raises:
+            TaccorlError: there is none, or one is damaged.
+        """
+        paths = self._paths()
+        files = [ActionFile.read(path) for path in paths]
+        if not Path(self.path).expanduser().is_file():
+            files = [file for file in files if file.end != "discarded"]
+        if not files:
+            what = "holds only discarded action files" if paths else "is not there, or holds no action files (*.jsonl)"
+            raise TaccorlError(f"--source.path={self.path} {what}; teleoperation writes them to outputs/teleop")
+        return sorted(files, key=lambda file: (str(file.header.get("created")), file.path))
+
+    def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
+        scene = scene_of(sim)
+        files = [file for file in self.files() if file.scene == scene]
+        if len(files) != 1:
+            what = f"{len(files)} action files ({', '.join(f.path.name for f in files)})" if files else "no action file"
+            raise TaccorlError(f"{self.path}: {what} of {scene['task']} with seed {scene['seed']}; one is needed")
+        return replay(files[0], sim)
+
+    def plan(self, plan: Plan) -> "ReplayPlan":
+        """``plan`` with the scenes of the files: their task, difficulty, twin, randomisation and seeds.
+
+        Raises:
+            TaccorlError: the files are of several twins or tasks, or ``plan`` asks for another.
+        """
+        files = [file for file in self.files() if plan.task in ("", file.header["task"])]
+        if not files:
+            raise TaccorlError(f"{self.path}: no action file of --task={plan.task}")
+        first = files[0]
+        for file in files:
+            for key in (*self._MADE_BY_FILE, "twin"):
+                if file.header[key] != first.header[key]:
+                    raise TaccorlError(
+                        f"{file.path} is of another {key} than {first.path}: give them one at a time"
+                        + (", or say --task=…" if key == "task" else "")
+                    )
+        default = {f.name: f.default for f in dataclasses.fields(Plan)}
+        for key in self._MADE_BY_FILE[1:]:
+            asked = getattr(plan, key)
+            if asked not in (default[key], first.header[key]):
+                raise TaccorlError(f"{first.path} is of {key} {first.header[key]}, not {asked}: leave --{key} out")
+        if plan.twin and twin_text(plan.twin_config()) != first.header["twin"]:
+            raise TaccorlError(f"{first.path} was recorded in another twin than {plan.twin}: leave --twin out")
+        given = {f.name: getattr(plan, f.name) for f in dataclasses.fields(Plan)}
+        given |= {key: first.header[key] for key in self._MADE_BY_FILE} | {"twin": None, "source": self}
+        good = sum(file.outcome == "success" for file in files)
+        given["episodes"] = min(plan.episodes, good or len(files))
+        # Successes first, so that the others are not needed; last where all are wanted: with the last one collecting ends.
+        files.sort(key=lambda file: (file.outcome == "success") == plan.keep_failures)
+        return ReplayPlan(**given, files=tuple(files))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayPlan(Plan):
+    """A plan whose attempts are the scenes of action files, in their order."""
+
+    files: tuple[ActionFile, ...]
+
+    def twin_config(self) -> TwinConfig:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "twin.yaml"
+            path.write_text(self.files[0].header["twin"], encoding="utf-8")
+            return load_twin(path)
+
+    def attempt_seed(self, k: int) -> int:
+        """Of file ``k``.
+
+        Raises:
+            TaccorlError: there are fewer: too few of them end in success.
+        """
+        if k >= len(self.files):
+            names = ", ".join(file.path.name for file in self.files)
+            raise TaccorlError(
+                f"{self.files[0].path.parent}: all {k} action files were re-executed, and fewer than {self.episodes} of "
+                f"them succeed; ask for fewer: --episodes=…  Files: {names}"
+            )
+        return int(self.files[k].header["seed"])

@@ -1,0 +1,311 @@
+"""Cartesian jogging of the twin's two hands: keys or a gamepad → steps of one hand → joint targets.
+
+A hand moves along the bench's axes (x away from the arms, y left, z up) and turns about its own (x towards its palm's edge,
+y the fingers' closing direction, z the approach). A goal that is out of reach is refused, so that it never runs away from the
+hand, and the hand follows its goal no faster than an arm moves. Nothing here knows a window or a device.
+
+A wish is (7,): x, y, z, about x, about y, about z, gripper; in steps, + opens the gripper.
+"""
+
+import enum
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.demos.experts.se3 import between, rotvec, turn
+from taccorl.errors import TaccorlError
+from taccorl.sim.robot import ARMS, RobotConfig
+from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, OPEN_M, Simulation
+from taccorl.sim.twin import CONTROL_HZ
+
+GRIP_STEP_M = 0.005
+GRIP_N = 30.0  # a held gripper key closes with no more; PiPER's gripper is rated for 40 N
+REACH_M = 0.0005  # a goal is in reach if inverse kinematics errs by less (m, and 0.15 m a radian)
+HELD_STEPS_PER_S = 8.0  # of a key that is held, and of a stick that is fully out
+_HELD_AFTER = round(0.25 * CONTROL_HZ)  # control steps until a key that is down counts as held
+_FASTEST_MPS, _FASTEST_RADPS = 0.25, 1.5  # of a hand on its way to its goal
+_DEAD_ZONE = 0.15  # of a stick's way: worn sticks do not rest at 0
+
+
+class StepSize(NamedTuple):
+    """How far one step goes."""
+
+    name: str
+    move_m: float
+    turn_rad: float
+
+
+STEP_SIZES = (StepSize("fine", 0.001, 0.01), StepSize("medium", 0.005, 0.05), StepSize("coarse", 0.02, 0.2))
+
+
+class Command(enum.Enum):
+    """What a person says besides moving a hand."""
+
+    SWITCH_ARM = "other arm"
+    STEP_SIZE = "next step size: fine, medium, coarse"
+    GO = "begin; when done: finish (all holds still for 1 s while the task is judged)"
+    DISCARD = "discard, and the same scene from its beginning"
+
+
+class Axis(NamedTuple):
+    """Two opposite keys. Codes are GLFW's, which MuJoCo passes on (mjui.h)."""
+
+    labels: str
+    more: tuple[int, ...]
+    less: tuple[int, ...]
+    index: int
+    """In a wish."""
+    meaning: str
+
+
+# Keys that MuJoCo's viewer leaves free: it takes all letters, 0–5, F1–F7 and most punctuation (tests/demos/test_teleop.py).
+AXES = (
+    Axis("Up      Down", (265, 328), (264, 322), 0, "away from the arms / towards them (also keypad 8 2)"),
+    Axis("Left    Right", (263, 324), (262, 326), 1, "left / right (also keypad 4 6)"),
+    Axis("Home    End", (268, 329), (269, 323), 2, "up / down (also keypad 9 3)"),
+    Axis("6       7", (ord("6"),), (ord("7"),), 5, "turn + / − about the approach direction"),
+    Axis("8       9", (ord("8"),), (ord("9"),), 4, "turn + / − about the fingers' closing direction"),
+    Axis("-       =", (ord("-"),), (ord("="),), 3, "turn + / − about the hand's third axis"),
+    Axis("Insert  Delete", (260,), (261,), 6, "open / close the gripper"),
+)
+COMMAND_KEYS = {
+    ord(" "): ("Space", Command.SWITCH_ARM),
+    267: ("Page Down", Command.STEP_SIZE),
+    257: ("Enter", Command.GO),
+    298: ("F9", Command.DISCARD),
+}
+_WISHES = {code: (axis.index, 1.0) for axis in AXES for code in axis.more}
+_WISHES |= {code: (axis.index, -1.0) for axis in AXES for code in axis.less}
+_GAMEPAD_MAP = (
+    ("left stick", "away, towards, left, right"),
+    ("right, left trigger", "up, down"),
+    ("right stick", "turn about the approach and the closing direction"),
+    ("bumpers", "turn about the hand's third axis"),
+    ("A, B", "close, open the gripper"),
+    ("X", Command.SWITCH_ARM.value),
+    ("Y", Command.STEP_SIZE.value),
+    ("START", Command.GO.value),
+    ("BACK", Command.DISCARD.value),
+)
+_BUTTON_COMMANDS = {2: Command.SWITCH_ARM, 3: Command.STEP_SIZE, 7: Command.GO, 6: Command.DISCARD}  # X Y START BACK
+_A, _B, _LEFT_BUMPER, _RIGHT_BUMPER = 0, 1, 4, 5
+_REST = (0,) * 15, (0.0, 0.0, 0.0, 0.0, -1.0, -1.0)  # buttons, axes
+
+
+def label(command: Command) -> str:
+    """The key of a command."""
+    return next(label for label, meant in COMMAND_KEYS.values() if meant is command)
+
+
+def key_map() -> str:
+    """The keys as a person reads them."""
+    rows = [(axis.labels, axis.meaning) for axis in AXES]
+    rows += [(label, command.value) for label, command in COMMAND_KEYS.values()]
+    return "\n".join(f"  {keys:16}{meaning}" for keys, meaning in rows)
+
+
+def gamepad_map() -> str:
+    """The gamepad's sticks and buttons as a person reads them."""
+    return "\n".join(f"  {what:21}{meaning}" for what, meaning in _GAMEPAD_MAP)
+
+
+class Keyboard:
+    """Keys → wishes: a tap is one step, a held key goes on."""
+
+    def __init__(self) -> None:
+        self._down: dict[int, int] = {}
+
+    def wish(self, taps: Iterable[int], held: Collection[int]) -> tuple[np.ndarray, list[Command]]:
+        """Of one control step.
+
+        Args:
+            taps: codes of the keys pressed since the last control step, in order.
+            held: codes of the keys that are down now.
+        """
+        wish, commands = np.zeros(7), []
+        for code in taps:
+            if code in _WISHES:
+                index, sign = _WISHES[code]
+                wish[index] += sign
+            elif code in COMMAND_KEYS:
+                commands.append(COMMAND_KEYS[code][1])
+        self._down = {code: self._down.get(code, 0) + 1 for code in held if code in _WISHES}
+        for code, control_steps in self._down.items():
+            if control_steps > _HELD_AFTER:
+                index, sign = _WISHES[code]
+                wish[index] += sign * HELD_STEPS_PER_S / CONTROL_HZ
+        return wish, commands
+
+
+class Gamepad:
+    """GLFW's gamepad state (an XBox layout, whatever the maker) → wishes."""
+
+    def __init__(self) -> None:
+        self._before: Sequence[int] = _REST[0]
+
+    def wish(self, buttons: Sequence[int] | None, axes: Sequence[float] | None) -> tuple[np.ndarray, list[Command]]:
+        """Of one control step.
+
+        Args:
+            buttons: (15,) 1 where down, in GLFW's order: A B X Y, bumpers, BACK START …; None: the gamepad does not answer.
+            axes: (6,) in −1 … 1: left x, left y (down is +), right x, right y, left trigger, right trigger (at rest −1).
+        """
+        if buttons is None or axes is None:
+            buttons, axes = _REST
+        left_x, left_y, right_x, right_y = (_beyond_dead_zone(value) for value in axes[:4])
+        lift = (axes[5] - axes[4]) / 2
+        lean, grip = buttons[_LEFT_BUMPER] - buttons[_RIGHT_BUMPER], buttons[_B] - buttons[_A]
+        wish = np.array([-left_y, -left_x, lift, lean, -right_y, -right_x, grip]) * HELD_STEPS_PER_S / CONTROL_HZ
+        commands = [c for button, c in _BUTTON_COMMANDS.items() if buttons[button] and not self._before[button]]
+        self._before = list(buttons)
+        return wish, commands
+
+
+def _beyond_dead_zone(value: float) -> float:
+    return float(np.sign(value) * max(0.0, (abs(value) - _DEAD_ZONE) / (1 - _DEAD_ZONE)))
+
+
+@dataclass
+class JoggedHand:
+    """Where one arm is asked to be."""
+
+    goal: np.ndarray
+    """World-from-TCP (4, 4) at which the hand is to arrive; always in reach."""
+    pose: np.ndarray
+    """World-from-TCP (4, 4) on the way there."""
+    joints_rad: np.ndarray
+    """(6,) that belong to ``pose``."""
+    bias_rad: np.ndarray
+    """(6,) how far the joints rest from their targets at the beginning."""
+    opening_m: float
+
+
+class Jogger:
+    """Both hands of simulation 0. Make one after each reset."""
+
+    def __init__(self, sim: Simulation, kinematics: dict[str, ArmKinematics] | None = None) -> None:
+        self.sim = sim
+        self.kinematics = kinematics or {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+        self.arm = ARMS[0]
+        self.size = STEP_SIZES[1]
+        self.notice = ""
+        """Why the newest wish was refused; empty if it was not."""
+        reported, targets = sim.proprioception()[0], sim.targets[0]
+        self.hands = {}
+        for a, arm in enumerate(ARMS):
+            joints = reported[7 * a : 7 * a + 6].copy()
+            pose = self.kinematics[arm].pose(joints)
+            bias = joints - targets[7 * a : 7 * a + 6]
+            self.hands[arm] = JoggedHand(pose, pose, joints, bias, float(targets[7 * a + 6]))
+
+    def switch_arm(self) -> None:
+        """The next wishes are the other hand's."""
+        self.arm = ARMS[1 - ARMS.index(self.arm)]
+        self.notice = ""
+
+    def next_size(self) -> None:
+        """Fine → medium → coarse → fine."""
+        self.size = STEP_SIZES[(STEP_SIZES.index(self.size) + 1) % len(STEP_SIZES)]
+
+    def jog(self, wish: np.ndarray) -> None:
+        """Move the goal of the chosen hand by ``wish`` (7,) steps; not if the new one is out of reach."""
+        if not wish.any():
+            return
+        hand, self.notice = self.hands[self.arm], ""
+        if wish[6]:
+            hand.opening_m = self._opening(hand.opening_m + wish[6] * GRIP_STEP_M)
+        if not wish[:6].any():
+            return
+        goal = hand.goal @ turn(wish[3:6] * self.size.turn_rad)
+        goal[:3, 3] += wish[:3] * self.size.move_m
+        _, error_m = self.kinematics[self.arm].solve(goal, hand.joints_rad)
+        if error_m > REACH_M:
+            self.notice = f"out of reach by {error_m * 1e3:.1f} mm: the {self.arm} hand stays where it is"
+            return
+        hand.goal = goal
+
+    def _opening(self, wanted_m: float) -> float:
+        """Within the gripper's range, and no farther below what it has reached than ``GRIP_N`` takes."""
+        measured_m = float(self.sim.proprioception()[0, 7 * ARMS.index(self.arm) + 6])
+        return float(np.clip(wanted_m, max(0.0, measured_m - squeeze_m(self.sim.config.robot)), OPEN_M))
+
+    def act(self) -> np.ndarray:
+        """(14,) float32 joint targets [rad] and openings [m] of the next control step."""
+        action = np.empty(14)
+        for a, arm in enumerate(ARMS):
+            hand = self.hands[arm]
+            away_m = float(np.linalg.norm(hand.goal[:3, 3] - hand.pose[:3, 3]))
+            away_rad = float(np.linalg.norm(rotvec(hand.pose, hand.goal)))
+            longest = max(away_m / _FASTEST_MPS, away_rad / _FASTEST_RADPS) * CONTROL_HZ
+            hand.pose = between(hand.pose, hand.goal, 1 / longest) if longest > 1 else hand.goal
+            hand.joints_rad, _ = self.kinematics[arm].solve(hand.pose, hand.joints_rad)
+            action[7 * a : 7 * a + 6] = hand.joints_rad - hand.bias_rad
+            action[7 * a + 6] = hand.opening_m
+        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+
+
+class JogHands:
+    """A person's two hands for one attempt: wishes and commands, read by ``read`` from the keys tapped, into actions."""
+
+    def __init__(self, sim: Simulation, read: Callable[[Sequence[int]], tuple[np.ndarray, list[Command]]]) -> None:
+        self.jogger, self._read = Jogger(sim), read
+
+    def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
+        """The next control step's action (14,) [rad, m], and what the person said besides."""
+        wish, commands = self._read(taps)
+        for command in commands:
+            if command is Command.SWITCH_ARM:
+                self.jogger.switch_arm()
+            elif command is Command.STEP_SIZE:
+                self.jogger.next_size()
+        self.jogger.jog(wish)
+        return self.jogger.act(), commands
+
+    def lines(self) -> list[str]:
+        """Which hand, which step, and why the newest wish was refused."""
+        jogger = self.jogger
+        size, opening_mm = jogger.size, jogger.hands[jogger.arm].opening_m * 1e3
+        step = f"step {size.name}: {size.move_m * 1e3:g} mm, {size.turn_rad:g} rad"
+        return [f"{jogger.arm} hand, {step}, gripper {opening_mm:.0f} mm", *([jogger.notice] if jogger.notice else [])]
+
+    def goals(self) -> list[np.ndarray]:
+        """World-from-TCP (4, 4) of the hand that moves."""
+        return [self.jogger.hands[self.jogger.arm].goal]
+
+
+class GlfwGamepad:
+    """The first gamepad that GLFW (its Python module) knows.
+
+    Raises:
+        TaccorlError: there is none; names the joysticks that are there.
+    """
+
+    def __init__(self, glfw: Any) -> None:
+        self._glfw, self._gamepad = glfw, Gamepad()
+        present = [jid for jid in range(glfw.JOYSTICK_LAST + 1) if glfw.joystick_present(jid)]
+        pads = [jid for jid in present if glfw.joystick_is_gamepad(jid)]
+        if not pads:
+            names = [_text(glfw.get_joystick_name(jid)) for jid in present]
+            seen = f"only what is none: {', '.join(names)}" if names else "no joystick at all"
+            raise TaccorlError(
+                f"no gamepad; GLFW sees {seen}. Plug one in (on Linux you need to be allowed to read /dev/input/event*), or "
+                "use --source.type=keyboard. A joystick becomes a gamepad by a line of SDL_GameControllerDB."
+            )
+        self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
+
+    def wish(self) -> tuple[np.ndarray, list[Command]]:
+        """Of this control step; nothing if the gamepad does not answer."""
+        state = self._glfw.get_gamepad_state(self.jid)
+        return self._gamepad.wish(list(state.buttons), list(state.axes)) if state else self._gamepad.wish(None, None)
+
+
+def _text(name: str | bytes | None) -> str:
+    return name.decode(errors="replace") if isinstance(name, bytes) else str(name)
+
+
+def squeeze_m(robot: RobotConfig) -> float:
+    """How far the command must lie below the opening of the fingers for ``GRIP_N``: F / k of the gripper's controller."""
+    return GRIP_N / robot.grip_stiffness_n_per_m

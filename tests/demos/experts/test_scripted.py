@@ -1,0 +1,355 @@
+"""The scripted demonstrator's hands: where they go, what they learn, what they feel, and that a seed decides it all."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from taccorl.demos.experts.scripted import (
+    DT_S,
+    EXACT,
+    Aim,
+    Mating,
+    Script,
+    ScriptedExpert,
+    ScriptedExpertConfig,
+    deflection,
+    follow,
+)
+from taccorl.demos.experts.se3 import inverse, rotvec, transform, turn
+from taccorl.errors import TaccorlError
+from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, Simulation
+from taccorl.sim.tasks.assembly_1 import Assembly1
+
+
+class OneHand(ScriptedExpert):
+    """The left arm does what a test asks for, the right one nothing."""
+
+    def __init__(self, sim: Simulation, work: Callable[["OneHand"], Script], config=EXACT, seed: int = 0) -> None:
+        super().__init__(sim, np.random.default_rng(seed), config)
+        self.work = work
+        sim.reset([0])
+        self.start()
+
+    def script(self, arm: str) -> Script:
+        return self.work(self) if arm == "left" else iter(())
+
+
+@pytest.fixture(scope="module")
+def sim() -> Simulation:
+    return Simulation(Assembly1(), scale=0.0)
+
+
+def run(expert: OneHand, each: Callable[[], object] = lambda: None, longest: int = 300) -> list:
+    seen = []
+    for _ in range(longest):
+        expert.sim.step(expert.act()[None])
+        seen.append(each())
+        if expert.done:
+            return seen
+    raise AssertionError("the script never ended")
+
+
+def shifted(pose: np.ndarray, by_m: tuple) -> np.ndarray:
+    goal = pose.copy()
+    goal[:3, 3] += by_m
+    return goal
+
+
+def off_m(expert: OneHand) -> float:
+    return float(np.linalg.norm(expert.tcp("left")[:3, 3] - expert.hands["left"].pose[:3, 3]))
+
+
+# the bias ---------------------------------------------------------------------------------------------------------------
+
+
+def forgetful(learns: bool) -> Callable[[OneHand], Script]:
+    """Forget the bias, then move by 60 mm and settle."""
+
+    def work(expert: OneHand) -> Script:
+        hand = expert.hands["left"]
+        hand.bias_rad, hand.learns = np.zeros(6), learns
+        yield from expert.move("left", shifted(hand.pose, (0.05, 0.02, -0.02)), settle=True)
+
+    return work
+
+
+def test_the_hand_learns_how_far_its_joints_rest_from_their_targets(sim):
+    expert = OneHand(sim, forgetful(learns=True))
+    run(expert)
+    assert off_m(expert) < 5e-4
+    rest = np.array(TORQUE_FF_NM) / KP_NM_PER_RAD
+    assert rest[4] == pytest.approx(0.01145, abs=1e-5)
+    # What is left after a settle may still be 0.4 mm over a lever of 0.26 m.
+    np.testing.assert_allclose(expert.hands["left"].bias_rad, rest, atol=0.002)
+
+
+def test_a_hand_that_learns_nothing_rests_where_joint_5_leaves_it(sim):
+    expert = OneHand(sim, forgetful(learns=False))
+    run(expert)
+    # 1.73 N·m / 151.1 N·m/rad = 11.4 mrad, over the 0.091 + 0.168 m from joint 5 to the TCP: 3.0 mm
+    assert off_m(expert) == pytest.approx(0.0030, abs=0.0003)
+
+
+def test_it_starts_with_what_the_resting_robot_shows(sim):
+    expert = OneHand(sim, lambda expert: expert.pause("left"))
+    for hand in expert.hands.values():
+        np.testing.assert_allclose(hand.bias_rad, np.array(TORQUE_FF_NM) / KP_NM_PER_RAD, atol=1e-5)
+
+
+# moving -----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_move_ends_where_it_was_asked_to_and_is_fastest_in_the_middle(sim):
+    goals = {}
+
+    def work(expert: OneHand) -> Script:
+        goals["from"] = expert.hands["left"].pose.copy()
+        goals["to"] = shifted(goals["from"] @ turn((0, 0.1, 0)), (0, -0.1, 0))
+        yield from expert.move("left", goals["to"], speed_mps=0.1)
+
+    expert = OneHand(sim, work)
+    poses = run(expert, lambda: expert.hands["left"].pose.copy())
+    np.testing.assert_allclose(poses[-1], goals["to"], atol=1e-12)
+    path_m = np.array([goals["from"][1, 3], *(pose[1, 3] for pose in poses[:-1])])  # the last step has no new wish
+    steps_m = -np.diff(path_m)
+    assert len(steps_m) == round(1.875 * 0.1 / 0.1 * 30)  # a minimum jerk's peak is 15/8 of its mean speed
+    assert steps_m.max() / DT_S == pytest.approx(0.1, rel=0.01)
+    assert steps_m[0] < 0.002 * 0.1  # 10 x³ of the way after one of 56 steps
+    assert steps_m[-1] < 0.002 * 0.1
+    assert steps_m.argmax() in (len(steps_m) // 2 - 1, len(steps_m) // 2)
+
+
+def test_a_goal_that_moves_is_followed(sim):
+    start = {}
+
+    def work(expert: OneHand) -> Script:
+        start["pose"] = expert.hands["left"].pose.copy()
+        yield from expert.move("left", lambda: shifted(start["pose"], (0, 0, 0.001 * expert.step_count)))
+        start["steps"] = expert.step_count
+
+    expert = OneHand(sim, work)
+    run(expert)
+    rise_m = expert.hands["left"].pose[2, 3] - start["pose"][2, 3]
+    assert rise_m == pytest.approx(0.001 * (start["steps"] - 1), abs=1e-9)
+
+
+def test_closing_asks_for_the_part_less_what_motor_and_pads_give(sim):
+    expert = OneHand(sim, lambda expert: expert.close("left", 0.030, force_n=30.0))
+    run(expert)
+    robot = sim.config.robot
+    motor_m, pad_m = 30.0 / robot.grip_stiffness_n_per_m, 30.0 / robot.pad_stiffness_n_per_m
+    assert motor_m == pytest.approx(0.020)  # 30 N / 1500 N/m
+    assert expert.hands["left"].opening_m == pytest.approx(0.030 - 0.020 - 2 * pad_m)
+
+
+def test_waiting_ends_with_the_flag(sim):
+    expert = OneHand(sim, lambda expert: expert.wait_for("go"))
+    for _ in range(5):
+        expert.act()
+    assert not expert.done
+    expert.flags.add("go")
+    expert.act()
+    assert expert.done
+
+
+# noise ------------------------------------------------------------------------------------------------------------------
+
+
+def wander(expert: OneHand) -> Script:
+    home = expert.hands["left"].pose.copy()
+    part = expert.sim.task.socket
+    yield from expert.move("left", expert.near(shifted(home, (0.03, 0.03, 0))))
+    yield from expert.pause("left")
+    yield from expert.move("left", expert.grasp(part, "tail", lean_rad=0.4, lift_m=0.05, pivot_m=0.02))
+
+
+def actions(sim: Simulation, config: ScriptedExpertConfig, seed: int) -> np.ndarray:
+    expert = OneHand(sim, wander, config, seed)
+    made = []
+    for _ in range(75):
+        made.append(expert.act())
+        sim.step(made[-1][None])
+    return np.array(made)
+
+
+def test_the_same_seed_acts_the_same_bit_for_bit_and_another_one_does_not(sim):
+    human = ScriptedExpertConfig()
+    first = actions(sim, human, 5)
+    np.testing.assert_array_equal(first, actions(sim, human, 5))
+    assert np.abs(first - actions(sim, human, 6)).max() > 1e-3
+
+
+def test_without_noise_the_seed_decides_pauses_only(sim):
+    for seed in range(3):
+        expert = OneHand(sim, wander, EXACT, seed)
+        pose = transform((0.3, 0.1, 0.2))
+        np.testing.assert_array_equal(expert.near(pose), pose)
+        part = sim.task.socket
+        np.testing.assert_allclose(
+            expert.grasp(part, "tail", lift_m=0.01),
+            shifted(sim.poses("socket")[0] @ part.grasps["tail"].part_from_tcp, (0, 0, 0.01)),
+            atol=1e-15,
+        )
+        for _ in range(5):
+            expert.act()
+            np.testing.assert_array_equal(expert.hands["left"].goal, expert.hands["left"].pose)
+    np.testing.assert_array_equal(actions(sim, EXACT, 1), actions(sim, EXACT, 1))
+
+
+def test_the_tremor_has_the_spread_that_was_asked_for(sim):
+    expert = OneHand(sim, lambda expert: expert.pause("left", 1e3, 1e3), ScriptedExpertConfig())
+    hand, seen = expert.hands["left"], []
+    for _ in range(3000):
+        expert._shaken(hand)
+        seen.append(hand.tremor)
+    spread = np.std(seen[30:], axis=0)
+    # 100 s of a noise that is correlated over 0.3 s are some 170 independent draws: ±5 % a standard deviation, three of them
+    np.testing.assert_allclose(spread, [4e-4] * 3 + [4e-3] * 3, rtol=0.2)
+
+
+def test_a_lean_turns_the_hand_about_the_part_and_not_about_the_tcp(sim):
+    expert, part = OneHand(sim, wander), sim.task.socket
+    upright = expert.grasp(part, "tail")
+    leaning = expert.grasp(part, "tail", lean_rad=0.3, pivot_m=0.025)
+    spot = (0, 0, 0.025, 1)
+    np.testing.assert_allclose(leaning @ spot, upright @ spot, atol=1e-15)
+    np.testing.assert_allclose(rotvec(upright, leaning), (0, 0.3, 0), atol=1e-12)
+    assert (leaning[:3, 3] - upright[:3, 3]) @ upright[:3, 0] == pytest.approx(-0.025 * np.sin(0.3))  # from −x
+
+
+def test_actions_stay_within_the_limits_whatever_is_asked(sim):
+    def work(expert: OneHand) -> Script:
+        expert.hands["left"].opening_m = 0.2
+        yield from expert.move("left", shifted(expert.hands["left"].pose, (0.8, 0, 0.5)), speed_mps=1.0)
+
+    expert = OneHand(sim, work)
+    made = np.array(run(expert, expert.act))
+    assert made.dtype == np.float32
+    assert (made >= ACTION_LOW).all()
+    assert (made <= ACTION_HIGH).all()
+    assert not sim.clipped.any()
+    assert expert.unreachable_m > 0.1  # and what could not be reached is told
+
+
+# what a hand feels ------------------------------------------------------------------------------------------------------
+
+
+def test_a_lag_follows_a_ramp_as_its_differential_equation_says():
+    lag_s, num = np.array(KD_NMS_PER_RAD) / KP_NM_PER_RAD, 20_000
+    start, before, after = np.full(6, 0.1), np.full(6, 0.15), np.full(6, 0.25)
+    x = start.copy()
+    for k in range(num):  # Euler: wrong by some 1 / num of the way
+        target = before + (after - before) * (k + 0.5) / num
+        x = x + DT_S / num * (target - x) / lag_s
+    np.testing.assert_allclose(follow(start, before, after, lag_s), x, atol=1e-6)
+
+
+def test_in_free_motion_a_hand_feels_next_to_nothing(sim):
+    def work(expert: OneHand) -> Script:
+        yield from expert.move("left", shifted(expert.hands["left"].pose, (0.05, -0.1, 0.03)), speed_mps=0.2)
+
+    expert = OneHand(sim, work)
+    lag, felt = np.array(run(expert, lambda: (off_m(expert), np.linalg.norm(expert.pushed("left")[:3])))).T
+    assert lag.max() > 0.012  # 0.2 m/s for 0.09 to 0.12 s: the hand is some 20 mm behind its command …
+    assert felt.max() < 8e-4  # … but where a free arm would be
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_known_force_is_felt_in_its_direction_and_size(sim, axis):
+    expert = OneHand(sim, lambda expert: expert.pause("left", 1.0, 1.0))
+    hand = expert.hands["left"]
+    hand.learns = False
+    body = sim.model.body("left_link6").id
+    force_n = np.zeros(6)
+    force_n[axis] = 5.0
+    xfrc = sim.batch.bind("xfrc_applied")
+    xfrc[0, body] = force_n
+    try:
+        run(expert)
+    finally:
+        xfrc[0, body] = 0.0
+    # Δq = K⁻¹ Jᵀ F, the force at the body's centre of mass; finite differences for both Jacobians
+    kinematics, joints = expert.kinematics["left"], hand.joints_rad
+    com = np.r_[sim.model.body_ipos[body] - (0, 0, 0.168), 1.0]
+    columns, tcp_columns = np.zeros((3, 6)), np.zeros((3, 6))
+    for j, nudge in enumerate(np.eye(6) * 1e-6):
+        plus, minus = kinematics.pose(joints + nudge), kinematics.pose(joints - nudge)
+        columns[:, j], tcp_columns[:, j] = ((plus - minus) @ com)[:3] / 2e-6, (plus - minus)[:3, 3] / 2e-6
+    expected = tcp_columns @ (columns.T @ force_n[:3] / KP_NM_PER_RAD)
+    pushed = expert.pushed("left")[:3]
+    assert pushed[axis] > 2e-4
+    np.testing.assert_allclose(pushed, expected, atol=5e-5)
+
+
+# giving way -------------------------------------------------------------------------------------------------------------
+
+
+class Still:
+    """A scene in which the holder stands still: all that ``Aim`` asks for."""
+
+    def __init__(self, holder: np.ndarray) -> None:
+        self.holder = holder
+
+    def body(self, name: str) -> np.ndarray:
+        return self.holder
+
+
+@pytest.fixture
+def aim() -> tuple[Still, Mating, Aim]:
+    rng = np.random.default_rng(8)
+    task = Assembly1()
+    still = Still(transform((0.3, 0.05, 0.2)) @ turn(rng.normal(size=3)))
+    part_from_tcp = task.plug.grasps["head"].part_from_tcp @ turn((0, 0.4, 0))
+    return still, Mating.of(task.plug, task.socket, "mortise"), Aim(
+        off_m=np.array((0.001, -0.0005)), off_rad=np.array((0.01, 0, -0.02)), part_from_tcp=part_from_tcp, turned=np.eye(4)
+    )  # fmt: skip
+
+
+def test_an_aim_without_error_brings_the_leading_end_to_its_depth(aim):
+    still, mating, aimed = aim
+    exact = replace(aimed, off_m=np.zeros(2), off_rad=np.zeros(3))
+    mate = exact.pose(still, mating, 0.012) @ inverse(exact.part_from_tcp) @ mating.held_from_mate
+    hole = still.holder @ mating.holder_from_hole
+    np.testing.assert_allclose(inverse(hole) @ mate, transform((0, 0, 0.012)), atol=1e-15)
+
+
+def test_an_error_of_direction_turns_the_part_about_its_leading_end(aim):
+    still, mating, aimed = aim
+    mate = aimed.pose(still, mating, 0.0) @ inverse(aimed.part_from_tcp) @ mating.held_from_mate
+    off = inverse(still.holder @ mating.holder_from_hole) @ mate
+    np.testing.assert_allclose(off[:3, 3], (0.001, -0.0005, 0), atol=1e-15)
+    np.testing.assert_allclose(rotvec(np.eye(4), off), (0.01, 0, -0.02), atol=1e-12)
+
+
+def test_a_wrist_that_is_held_aside_gives_way_until_nothing_pushes_but_along_the_axis(aim):
+    still, mating, aimed = aim
+    wanted = aimed.pose(still, mating, 0.01)
+    hole = (still.holder @ mating.holder_from_hole)[:3, :3]
+    held = wanted @ turn((0.01, -0.02, 0.015))  # a vice holds the hand 1 mm aside, 2 mm back and turned by 27 mrad
+    held[:3, 3] += hole @ (0.0008, -0.0006, -0.002)
+    sizes = []
+    for _ in range(60):
+        pushed = deflection(aimed.pose(still, mating, 0.01), held)
+        sizes.append(np.linalg.norm(np.r_[(hole.T @ pushed[:3])[:2], 0.15 * pushed[3:]]))
+        aimed = aimed.giving_way(still, mating, 0.1 * pushed)
+    assert all(after < 0.93 * before for before, after in pairwise(sizes))  # a tenth less each time
+    left = deflection(aimed.pose(still, mating, 0.01), held)
+    np.testing.assert_allclose(hole.T @ left[:3], (0, 0, -0.002), atol=5e-6)  # what holds it back, it still feels
+    np.testing.assert_allclose(left[3:], 0, atol=1e-4)
+
+
+def test_a_wrist_that_gave_way_the_wrong_way_round_would_be_caught(aim):
+    still, mating, aimed = aim
+    held = aimed.pose(still, mating, 0.01) @ turn((0.01, -0.02, 0.015))
+    before = deflection(aimed.pose(still, mating, 0.01), held)
+    planted = aimed.giving_way(still, mating, -0.1 * before)
+    assert np.linalg.norm(deflection(planted.pose(still, mating, 0.01), held)[3:]) > np.linalg.norm(before[3:])
+
+
+def test_one_expert_drives_one_simulation():
+    with pytest.raises(TaccorlError, match="one simulation, not 2"):
+        OneHand(Simulation(Assembly1(), num_sims=2), wander)

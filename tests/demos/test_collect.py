@@ -1,0 +1,169 @@
+"""Collecting demonstrations: a dataset that LeRobot reads and a run that goes on where it was stopped; recordings that ingest
+reads back."""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from taccorl.cli.main import main as cli
+from taccorl.data.dataset import Dataset
+from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.demos.collect import Plan, Source, attempt, collect, collect_recordings, outcome_of
+from taccorl.demos.recorder import with_simulator
+from taccorl.demos.twin_recording import LEAD_S, TwinStory
+from taccorl.errors import TaccorlError
+from taccorl.lineage.store import Store
+
+ARGUMENTS = ("--task=assembly_1", "--episodes=2", "--images=false", "--seed=5")
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("collect")
+    assert cli(["collect", *ARGUMENTS, f"--out={folder / 'a'}", f"--store={folder / 'store'}"]) == 0
+    return folder
+
+
+def test_dataset_holds_successes_with_state_seed_and_subtasks(collected):
+    dataset = Dataset(collected / "a")
+    assert dataset.num_episodes == 2
+    for k in range(2):
+        episode = dataset.episode(k)
+        assert episode.success
+        assert episode.origin == "MuJoCo twin, not a robot"
+        assert episode.arrays["sim.success"][-1, 0] == 1
+        assert episode.arrays["sim.state"].dtype == np.float64
+        assert len(set(episode.arrays["sim.seed"][:, 0])) == 1
+        assert episode.stages
+        assert episode.provenance["simulation"]["task"] == "assembly_1"
+
+
+def test_an_episode_of_the_dataset_can_be_done_again_from_what_it_holds(collected):
+    episode = Dataset(collected / "a").episode(1)
+    sim = Plan(task="assembly_1").make()
+    sim.reset(episode.arrays["sim.seed"][0])
+    np.testing.assert_array_equal(sim.state_rows()[0], episode.arrays["sim.state"][0])
+    for action in episode.arrays["action"]:
+        sim.step(action[None].astype(float))
+    assert sim.judge.outcome.success[0]
+
+
+def test_same_command_elsewhere_gives_the_same_bytes(collected, tmp_path):
+    assert cli(["collect", *ARGUMENTS, f"--out={tmp_path / 'b'}", f"--store={tmp_path / 'store'}"]) == 0
+    for name in ("data/chunk-000/file-000.parquet", "meta/stats.json", "meta/info.json"):
+        assert (tmp_path / "b" / name).read_bytes() == (collected / "a" / name).read_bytes()
+
+
+def test_more_episodes_go_on_from_those_in_the_store(collected, tmp_path):
+    began = []
+    plan = Plan(task="assembly_1", episodes=3, images=False, seed=5)
+    store = Store(collected / "store")
+    before = {path.name for path in (collected / "store").rglob("entry.json")}
+    collect(plan, tmp_path / "more", store, began.append)
+    assert len(began) >= 3
+    assert before
+    more, first = Dataset(tmp_path / "more"), Dataset(collected / "a")
+    np.testing.assert_array_equal(more.episode(0).arrays["sim.state"], first.episode(0).arrays["sim.state"])
+    demonstrations = list((collected / "store").rglob("entry.json"))
+    assert len(demonstrations) == len(began)  # nothing was done twice
+
+
+def test_kill_in_the_middle_loses_no_finished_attempt(tmp_path):
+    words = [sys.executable, "-m", "taccorl.cli.main", "collect", "--task=assembly_1", "--episodes=9", "--images=false"]
+    words += [f"--out={tmp_path / 'x'}", f"--store={tmp_path / 'store'}"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            if line.startswith("attempt 1"):
+                process.kill()
+                break
+    done = [json.loads(path.read_text()) for path in (tmp_path / "store").rglob("entry.json")]
+    assert {entry["attempt"] for entry in done} >= {0, 1}
+    assert not (tmp_path / "x").exists()
+    said = []
+    collect(Plan(task="assembly_1", episodes=2, images=False), tmp_path / "x", Store(tmp_path / "store"), said.append)
+    assert Dataset(tmp_path / "x").num_episodes == 2
+
+
+def test_what_is_in_the_way_is_left_alone(collected, capsys):
+    (collected / "mine").mkdir()
+    (collected / "mine" / "notes.txt").write_text("keep me")
+    assert cli(["collect", *ARGUMENTS, f"--out={collected / 'mine'}", f"--store={collected / 'store'}"]) == 2
+    assert (collected / "mine" / "notes.txt").read_text() == "keep me"
+    assert "mine" in capsys.readouterr().err
+    with pytest.raises(TaccorlError, match="holds files already"):
+        collect_recordings(Plan(task="assembly_1"), collected / "mine")
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [("--task=asembly_1", "assembly_1"), ("--difficulty=hart", "hard"), ("--episodes=0", "at least one")],
+)
+def test_wrong_words_are_answered_with_the_right_one(word, said, capsys, tmp_path):
+    words = [w for w in ARGUMENTS if w.split("=")[0] != word.split("=")[0]]
+    assert cli(["collect", *words, word, f"--out={tmp_path / 'x'}", f"--store={tmp_path / 's'}"]) == 2
+    assert said in capsys.readouterr().err
+
+
+@Source.register_subclass("idle_in_test")
+@dataclass(frozen=True, kw_only=True)
+class Idle(Source):
+    """Looks at the scene for a moment and gives up."""
+
+    def actions(self, sim, rng):
+        for _ in range(3):
+            yield sim.targets[0].astype(np.float32)
+
+
+def test_a_hopeless_demonstrator_is_stopped(tmp_path):
+    plan = Plan(task="assembly_1", source=Idle(), images=False, episodes=30)
+    with pytest.raises(TaccorlError, match=r"20 of 20 attempts failed \(unfinished\)"):
+        collect(plan, tmp_path / "x", Store(tmp_path / "store"), lambda _: None)
+    assert not (tmp_path / "x").exists()
+
+
+# recordings ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def told():
+    plan = Plan(task="assembly_1", seed=5)
+    sim = plan.make()
+    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    recorder = attempt(plan, sim, spec, 0, dense=True)
+    assert outcome_of(sim) == "success"
+    return sim, recorder, TwinStory(sim, recorder.trajectory(), "success")
+
+
+def test_a_recording_tells_the_trajectory_at_its_own_times(told):
+    _, recorder, story = told
+    rows = recorder.episode("x", {}).arrays["observation.state"]
+    time_s = LEAD_S + np.arange(len(rows)) / 30
+    np.testing.assert_allclose(story.state(time_s), rows, atol=2e-4)  # between 200 Hz samples, moving at up to 1 rad/s
+    np.testing.assert_allclose(story.state(np.array([0.0, LEAD_S / 2]))[0], rows[0], atol=1e-6)  # rest before
+
+
+def test_pads_of_a_recording_read_what_the_sensor_reads_in_wire_order(told):
+    sim, recorder, story = told
+    trajectory = recorder.trajectory()
+    loudest = int(trajectory.reading.sum(axis=(1, 2, 3)).argmax())
+    counts = story.clean_counts("right_robot_left_finger", np.array([LEAD_S + trajectory.time_s[loudest]]))[0]
+    expected = sim.sensor.clean_counts(trajectory.reading[loudest, 2])  # right_a
+    np.testing.assert_allclose(counts, expected.T, atol=1e-4)
+    assert counts.max() > 60
+
+
+def test_a_recording_of_the_twin_is_ingested_with_its_touch(tmp_path):
+    (path,) = collect_recordings(Plan(task="assembly_1", episodes=1, seed=5), tmp_path / "mcap", lambda _: None)
+    assert path.name == "assembly_1_000.mcap"
+    out = tmp_path / "dataset"
+    code = cli(["ingest", str(path), "--spec=piper_flexitac_mcap", f"--out={out}", f"--store={tmp_path / 'store'}"])
+    assert code == 0
+    episode = Dataset(out).episode(0)
+    assert "surrogate" in episode.origin
+    assert episode.success
+    assert episode.arrays["observation.tactile"].max() > 60
+    assert cli(["check", str(out)]) == 0
