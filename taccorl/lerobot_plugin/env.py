@@ -1,0 +1,93 @@
+"""The twin as LeRobot's environment: ``lerobot-eval --policy.path=… --env.type=taccorl --env.task=assembly_2``.
+
+A policy receives ``observation.state``, ``observation.images.front|left_wrist|right_wrist`` and ``observation.tactile``.
+"""
+
+import os
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+
+from taccorl.errors import TaccorlError
+
+# Nothing of the twin is imported before an environment is made: lerobot-train loads this plug-in even where it needs none.
+_CAMERAS = ("front", "left_wrist", "right_wrist")
+_IMAGES = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (224, 224, 3)) for name in _CAMERAS}
+_FEATURES = {
+    "action": PolicyFeature(FeatureType.ACTION, (14,)),
+    "agent_pos": PolicyFeature(FeatureType.STATE, (14,)),
+    "tactile": PolicyFeature(FeatureType.STATE, (1536,)),
+    **_IMAGES,
+}
+_FEATURES_MAP = {
+    "action": "action",
+    "agent_pos": "observation.state",
+    "tactile": "observation.tactile",
+    **{key: key for key in _IMAGES},
+}
+_FPS = 30
+
+
+@EnvConfig.register_subclass("taccorl")
+@dataclass
+class TaccorlEnvConfig(EnvConfig):
+    """A task in the twin. Synchronous environments share one batch and its threads, asynchronous ones are processes."""
+
+    task: str | None = "assembly_1"
+    """assembly_1, assembly_2, puzzle or test_tube, or a task of your own."""
+    fps: int = _FPS
+    """Control steps a second; the twin has no other."""
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: dict(_FEATURES))
+    """By the names that the environment gives them."""
+    features_map: dict[str, str] = field(default_factory=lambda: dict(_FEATURES_MAP))
+    """To the names that datasets and policies give them."""
+    difficulty: str = "train"
+    """easy, train or hard: 1.0, 0.5 or 0.3 mm of clearance a side."""
+    twin: str | None = None
+    """Path of a twin.yaml; None: the nominal twin."""
+    randomization: float = 1.0
+    """Share of the task's reset ranges: 0 is the nominal scene."""
+    episode_length: int | None = None
+    """Control steps until an episode is cut off; None: the task's own time limit."""
+
+    def __post_init__(self) -> None:
+        if self.fps != _FPS:
+            raise TaccorlError(f"env.fps: {self.fps}; the twin is controlled at {_FPS} steps a second")
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Settings of one environment."""
+        return {
+            "difficulty": self.difficulty,
+            "twin": self.twin,
+            "randomization": self.randomization,
+            "max_episode_steps": self.episode_length,
+            "render_mode": "rgb_array",
+        }
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
+        """``{"taccorl": {0: environments}}``, as LeRobot wants them.
+
+        LeRobot's own way, ``gymnasium.make`` in each worker, fails: workers do not know the plug-in's ids.
+
+        Raises:
+            TaccorlError: unknown task or difficulty (the nearest name is given), unreadable twin.
+        """
+        from taccorl.sim.lerobot_env import LeRobotEnv, LeRobotVectorEnv
+
+        task, settings = str(self.task), self.gym_kwargs
+        if use_async_envs and n_envs > 1:
+            make = partial(LeRobotEnv, task, **settings)
+            envs = gymnasium.vector.AsyncVectorEnv(
+                [make] * n_envs, context="forkserver", autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP
+            )
+        else:
+            num_threads = min(n_envs, len(os.sched_getaffinity(0)))
+            envs = LeRobotVectorEnv(task, n_envs, num_threads=num_threads, **settings)
+        return {self.type: {0: envs}}

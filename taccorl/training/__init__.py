@@ -1,0 +1,1 @@
+"""Training on datasets and in the twin."""

@@ -1,0 +1,143 @@
+"""LeRobot finds ``--env.type=taccorl`` and makes environments of it; its policies get the names of the dataset."""
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.env import TaccorlEnv
+from taccorl.sim.spaces import CAMERAS, IMAGE_SHAPE, NUM_TAXELS
+
+KEYS = {"observation.state", "observation.tactile", *(f"observation.images.{name}" for name in CAMERAS)}
+
+
+def env_config(**settings):
+    from taccorl.lerobot_plugin.env import TaccorlEnvConfig
+
+    return TaccorlEnvConfig(**settings)
+
+
+def test_command_line_becomes_the_config() -> None:
+    import draccus
+    from lerobot.envs.configs import EnvConfig
+
+    import taccorl.lerobot_plugin  # noqa: F401
+
+    @dataclass
+    class Evaluation:
+        env: EnvConfig
+
+    said = {"type": "taccorl", "task": "assembly_2", "difficulty": "hard", "twin": "a/twin.yaml", "episode_length": 40}
+    config = draccus.parse(Evaluation, args=[f"--env.{name}={value}" for name, value in said.items()]).env
+    assert config == env_config(task="assembly_2", difficulty="hard", twin="a/twin.yaml", episode_length=40)
+    assert config.type == "taccorl" and config.fps == 30
+    with pytest.raises(TaccorlError, match="fps: 50"):
+        env_config(fps=50)
+
+
+def test_features_are_those_of_the_dataset_spec() -> None:
+    from lerobot.envs.utils import env_to_policy_features
+
+    from taccorl.data.spec import find_spec, load_dataset_spec
+
+    features = env_to_policy_features(env_config())
+    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
+    wanted = {name: tuple(f.shape) for name, f in spec.features.items() if not f.optional}
+    found = {name: f.shape for name, f in features.items()}
+    for name, shape in wanted.items():
+        assert found.pop(name) == (shape if len(shape) == 1 else (shape[2], *shape[:2]))  # LeRobot: channels first
+    assert not found
+    assert wanted["observation.tactile"] == (NUM_TAXELS,) and wanted["observation.images.front"] == IMAGE_SHAPE
+
+
+def test_synchronous_environments_reach_the_policy_under_the_names_of_the_dataset() -> None:
+    import torch
+    from lerobot.envs import make_env, preprocess_observation
+    from lerobot.envs.utils import NEW_ROLLOUT_OPTION
+
+    envs = make_env(env_config(task="assembly_1", episode_length=2), n_envs=2)["taccorl"][0]
+    observation, _ = envs.reset(seed=[1000, 1001], options={NEW_ROLLOUT_OPTION: True})
+    assert observation in envs.observation_space
+    seen = preprocess_observation(observation)
+    assert set(seen) == KEYS and all(tensor.dtype == torch.float32 for tensor in seen.values())
+    assert seen["observation.images.front"].shape == (2, 3, 224, 224)
+    assert (
+        0.2 < float(seen["observation.images.front"].mean()) < 0.8 < float(seen["observation.images.front"].max()) <= 1
+    )
+    assert seen["observation.tactile"].shape == (2, 1536)
+    # The scenes are those of the seeds, as anywhere else.
+    single = TaccorlEnv("assembly_1", images=False).reset(seed=1001)[0]
+    assert np.array_equal(seen["observation.state"][1].numpy(), single["observation.state"])
+    assert np.array_equal(seen["observation.tactile"][1].numpy(), single["observation.tactile"])
+    envs.close()
+
+
+@pytest.mark.parametrize("in_processes", [False, True])
+def test_lerobots_own_rollout_runs(in_processes: bool) -> None:
+    """The loop of ``lerobot-eval``, with a policy that stays where it is."""
+    import torch
+    from lerobot.envs import make_env
+    from lerobot.scripts.lerobot_eval import rollout
+
+    class Stay(torch.nn.Module):
+        seen: list[dict] = []  # noqa: RUF012
+
+        def reset(self) -> None:
+            self.seen.clear()
+
+        def select_action(self, observation: dict) -> torch.Tensor:
+            self.seen.append(observation)
+            return observation["observation.state"]
+
+    config, frames = env_config(task="assembly_1", episode_length=4), []
+    envs = make_env(config, n_envs=2, use_async_envs=in_processes)["taccorl"][0]
+    pipelines = config.get_env_processors()
+    done = rollout(
+        envs,
+        Stay(),  # pyright: ignore[reportArgumentType]
+        *pipelines,
+        preprocessor=lambda batch: batch,  # pyright: ignore[reportArgumentType]
+        postprocessor=lambda action: action,  # pyright: ignore[reportArgumentType]
+        seeds=[1000, 1001],
+        render_callback=lambda envs: frames.append(np.stack(envs.call("render"))),
+    )
+    assert done["action"].shape == (2, 4, 14) and done["done"][:, -1].all() and not done["done"][:, :-1].any()
+    assert done["reward"].sum() == 0 and not done["success"].any()
+    assert set(Stay.seen[0]) >= KEYS and Stay.seen[0]["task"][0].startswith("insert the orange plug")
+    assert [f.shape for f in frames] == [(2, 224, 224, 3)] * 5 and envs.unwrapped.metadata["render_fps"] == 30
+    envs.close()
+    # Scenes are those of the seeds, and the same in one batch as in processes.
+    single = TaccorlEnv("assembly_1", images=False)
+    observation = single.reset(seed=1001)[0]
+    for seen in Stay.seen:
+        assert np.array_equal(seen["observation.tactile"][1].numpy(), observation["observation.tactile"])
+        assert np.array_equal(seen["observation.state"][1].numpy(), observation["observation.state"])
+        observation = single.step(observation["observation.state"])[0]
+
+
+def test_unknown_task_is_named_with_its_neighbour() -> None:
+    from lerobot.envs import make_env
+
+    with pytest.raises(TaccorlError, match="no task 'puzle'; did you mean 'puzzle'"):
+        make_env(env_config(task="puzle"))
+
+
+@pytest.mark.slow
+def test_loading_the_plugin_loads_no_simulator() -> None:
+    code = (
+        "import sys, lerobot.envs.configs; before = set(sys.modules); import taccorl.lerobot_plugin\n"
+        "new = set(sys.modules) - before; assert all(m.startswith('taccorl') for m in new), new\n"
+        "assert 'mujoco' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_worker_processes_need_no_torch() -> None:
+    code = (
+        "import sys, taccorl.sim.lerobot_env; assert not {'torch', 'lerobot'} & {m.split('.')[0] for m in sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env={**os.environ, "MUJOCO_GL": "egl"})

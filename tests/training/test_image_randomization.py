@@ -1,0 +1,155 @@
+"""Each row against arithmetic done beforehand; all rows absent against the identity."""
+
+import math
+
+import pytest
+import torch
+
+from taccorl.errors import TaccorlError
+from taccorl.training.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
+
+ABSENT = {"crop": 1.0, "rotation_deg": 0.0, "brightness": (1, 1), "contrast": (1, 1), "saturation": (1, 1)}
+
+
+def only(**row):
+    return ImageRandomizationConfig(**{**ABSENT, **row}).build()
+
+
+def flat_image(*rgb: float, size: int = 8) -> torch.Tensor:
+    return torch.tensor(rgb).reshape(3, 1, 1).expand(3, size, size).contiguous()
+
+
+def test_defaults_are_the_papers_rows():
+    config = ImageRandomizationConfig()
+    assert (config.crop, config.rotation_deg) == (0.95, 5.0)
+    assert (config.brightness, config.contrast, config.saturation) == ((0.7, 1.3), (0.6, 1.4), (0.5, 1.5))
+    assert config.noise_std == 0.0  # that of co-training is asked for by name
+    assert COTRAINING_NOISE_STD == 0.03
+
+
+def test_with_every_row_absent_images_stay_bit_identical():
+    images = torch.rand(4, 3, 32, 48)
+    assert torch.equal(only()(images), images)
+
+
+def test_brightness_doubles_and_saturates_at_one():
+    changed = only(brightness=(2.0, 2.0))(flat_image(0.1, 0.25, 0.6))
+    assert changed[:, 0, 0].tolist() == pytest.approx([0.2, 0.5, 1.0])
+
+
+def test_contrast_halves_the_distance_from_the_mean_grey():
+    image = torch.full((3, 8, 8), 0.4)
+    image[:, :, 4:] = 0.8  # mean grey 0.6
+    changed = only(contrast=(0.5, 0.5))(image)
+    assert changed[0, 0, 0].item() == pytest.approx(0.5, abs=1e-3)  # 0.6 + (0.4 − 0.6)/2
+    assert changed[0, 0, 7].item() == pytest.approx(0.7, abs=1e-3)
+
+
+def test_saturation_zero_leaves_the_grey_of_the_standard_weights():
+    grey = 0.299 * 0.9 + 0.587 * 0.5 + 0.114 * 0.1  # 0.574
+    changed = only(saturation=(0.0, 0.0))(flat_image(0.9, 0.5, 0.1))
+    assert changed[:, 3, 3].tolist() == pytest.approx([grey] * 3, abs=1e-3)
+    half = only(saturation=(0.5, 0.5))(flat_image(0.9, 0.5, 0.1))
+    assert half[:, 3, 3].tolist() == pytest.approx([(grey + c) / 2 for c in (0.9, 0.5, 0.1)], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("row", "low", "high"), [("brightness", 0.7, 1.3), ("contrast", 0.6, 1.4), ("saturation", 0.5, 1.5)]
+)
+def test_factors_fill_the_papers_range_uniformly(row: str, low: float, high: float):
+    torch.manual_seed(0)
+    n = 400
+    # Grey 0.5 except for one bright and one dark column; every factor can be read off without clipping.
+    if row == "brightness":
+        images, read = flat_image(0.5, 0.5, 0.5).expand(n, 3, 8, 8), lambda x: x[:, 0, 0, 0] / 0.5
+    elif row == "contrast":
+        image = torch.full((3, 8, 8), 0.4)
+        image[:, :, 4:] = 0.6
+        images, read = image.expand(n, 3, 8, 8), lambda x: (x[:, 0, 0, 7] - x[:, 0, 0, 0]) / 0.2
+    else:
+        images, read = flat_image(0.6, 0.5, 0.4).expand(n, 3, 8, 8), lambda x: (x[:, 0, 0, 0] - x[:, 2, 0, 0]) / 0.2
+    drawn = read(only(**{row: (low, high)})(images))
+    assert drawn.min() >= low - 1e-4 and drawn.max() <= high + 1e-4
+    width = high - low
+    assert drawn.min() < low + 0.05 * width and drawn.max() > high - 0.05 * width  # missed with 0.95^400 = 1e-9
+    standard_error = width / math.sqrt(12 * n)
+    assert abs(drawn.mean() - 1.0) < 4 * standard_error
+    assert abs(drawn.std() - width / math.sqrt(12)) < 0.1 * width
+
+
+def test_crop_of_0_95_keeps_212_of_224_pixels_and_reaches_every_corner():
+    torch.manual_seed(0)
+    ramp = torch.arange(224.0) / 255
+    image = torch.stack([ramp.expand(224, 224), ramp.expand(224, 224).T, torch.zeros(224, 224)])  # red: u, green: v
+    changed = only(crop=0.95)(image.expand(250, 3, 224, 224)) * 255
+    # Output pixel o shows source pixel shift + (o + ½)·212/224 − ½: 9.4375 + shift at o = 10, 202.5625 on at o = 214.
+    shift_u, shift_v = changed[:, 0, 10, 10] - 9.4375, changed[:, 1, 10, 10] - 9.4375
+    for shift in (shift_u, shift_v):
+        assert torch.allclose(shift, shift.round(), atol=1e-3)
+        assert set(shift.round().int().tolist()) == set(range(13))  # 224 − 212 = 12 is the last; all drawn
+    span = 204 * 212 / 224
+    assert torch.allclose(changed[:, 0, 10, 214] - changed[:, 0, 10, 10], torch.tensor(span), atol=1e-3)
+    assert abs(torch.corrcoef(torch.stack([shift_u, shift_v]))[0, 1]) < 0.25  # drawn apart
+
+
+def test_rotation_turns_about_the_middle_by_at_most_five_degrees():
+    torch.manual_seed(0)
+    image = torch.zeros(3, 101, 101)
+    image[:, 48:53, 88:93] = 1.0  # a spot 40 pixels right of the middle (50, 50)
+    turned = only(rotation_deg=5.0)(image.expand(200, 3, 101, 101))[:, 0]
+    v, u = torch.meshgrid(torch.arange(101.0), torch.arange(101.0), indexing="ij")
+    weight = turned.sum((1, 2))
+    x, y = (turned * u).sum((1, 2)) / weight - 50, (turned * v).sum((1, 2)) / weight - 50
+    angle_deg = torch.rad2deg(torch.atan2(y, x))
+    assert torch.allclose(torch.hypot(x, y), torch.tensor(40.0), atol=0.1)
+    assert angle_deg.abs().max() <= 5.05 and angle_deg.max() > 4.5 and angle_deg.min() < -4.5
+    assert abs(angle_deg.mean()) < 4 * 10 / math.sqrt(12 * 200)
+
+
+def test_noise_has_the_co_training_deviation_and_stays_within_the_range():
+    torch.manual_seed(0)
+    noisy = only(noise_std=COTRAINING_NOISE_STD)(torch.full((3, 200, 200), 0.5))
+    assert noisy.std().item() == pytest.approx(0.03, rel=0.02)  # n = 120 000: standard error 0.2 %
+    assert noisy.mean().item() == pytest.approx(0.5, abs=4 * 0.03 / math.sqrt(120_000))
+    white = only(noise_std=COTRAINING_NOISE_STD)(torch.ones(3, 50, 50))
+    assert white.max() <= 1.0 and white.min() < 1.0
+
+
+def test_each_image_of_a_batch_is_drawn_for_itself_and_a_seed_repeats_them():
+    change = ImageRandomizationConfig(noise_std=0.03).build()
+    image = torch.rand(3, 32, 32)
+    torch.manual_seed(7)
+    batch = change(image.expand(2, 3, 3, 32, 32))
+    assert batch.shape == (2, 3, 3, 32, 32) and batch.dtype == torch.float32
+    assert len({picture.numpy().tobytes() for picture in batch.reshape(6, 3, 32, 32)}) == 6
+    torch.manual_seed(7)
+    one_by_one = torch.stack([change(image) for _ in range(6)])
+    assert torch.equal(one_by_one.reshape(batch.shape), batch)
+
+
+def test_an_empty_batch_stays_empty():
+    assert ImageRandomizationConfig().build()(torch.zeros(0, 3, 8, 8)).shape == (0, 3, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"crop": 1.2}, "crop is 1.2"),
+        ({"crop": 0.0}, "crop is 0.0"),
+        ({"rotation_deg": -5.0}, "rotation_deg is -5.0"),
+        ({"brightness": (1.3, 0.7)}, "brightness is (1.3, 0.7)"),
+        ({"saturation": (-0.5, 1.5)}, "saturation is (-0.5, 1.5)"),
+        ({"contrast": (0.6, math.nan)}, "contrast is (0.6, nan)"),
+        ({"noise_std": -0.1}, "noise_std is -0.1"),
+    ],
+)
+def test_values_that_mean_nothing_are_refused_by_name(fields: dict, named: str):
+    with pytest.raises(TaccorlError) as caught:
+        ImageRandomizationConfig(**fields)
+    assert named in str(caught.value)
+
+
+@pytest.mark.parametrize("images", [torch.zeros(3, 8, 8, dtype=torch.uint8), torch.zeros(8, 8, 3), torch.zeros(8, 8)])
+def test_counts_and_colours_in_the_wrong_place_are_refused(images: torch.Tensor):
+    with pytest.raises(TaccorlError, match="float in"):
+        ImageRandomizationConfig().build()(images)
