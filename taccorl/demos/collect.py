@@ -26,6 +26,7 @@ from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.demos.twin_recording import write_twin_mcap
 from taccorl.errors import TaccorlError
+from taccorl.lineage.canonical import canonical
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
@@ -34,6 +35,7 @@ from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
 ATTEMPT_VERSION = 1
+_MANY = 20  # attempts after which a success rate means something
 _AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long
 
 Actions = Iterator[np.ndarray]
@@ -101,6 +103,15 @@ class Plan:
         """
         return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
 
+    @property
+    def num_attempts(self) -> int | None:
+        """How many there can be; None: as many as it takes."""
+        return None
+
+    def hopeless(self, attempts: int, successes: int) -> bool:
+        """Whether a demonstrator that works by itself fails so often that something is wrong. A person may try for ever."""
+        return self.source.repeatable and attempts >= _MANY and successes < attempts / 4
+
     def attempt_seed(self, k: int) -> int:
         """Seed of attempt ``k``: independent of all others and of how many there are."""
         sequence = np.random.SeedSequence(self.seed, spawn_key=(zlib.crc32(self.task.encode()), k))
@@ -129,7 +140,7 @@ def collect(plan: Plan, out: Path, store: Store, progress: Progress = print) -> 
     """A LeRobot dataset of ``plan.episodes`` successes at ``out``; returns the report.
 
     Raises:
-        TaccorlError: more than half of the attempts fail for long: something is wrong with the task or the twin.
+        TaccorlError: three of four attempts of an expert fail: something is wrong with the task or the twin.
     """
     sim = plan.make()
     spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=plan.images)
@@ -137,7 +148,8 @@ def collect(plan: Plan, out: Path, store: Store, progress: Progress = print) -> 
     shards: list[Artefact] = []
     entries: list[dict[str, Any]] = []
     successes = k = 0
-    while successes < plan.episodes:
+    enough = plan.num_attempts if plan.keep_failures else None
+    while successes < plan.episodes and k != enough:
         config = _attempt_config(plan, twin, k)
         stage = Stage("demonstration", functools.partial(_build_attempt, plan, sim, spec, k), ATTEMPT_VERSION)
         artefact = store.run(stage, config, [])
@@ -148,7 +160,7 @@ def collect(plan: Plan, out: Path, store: Store, progress: Progress = print) -> 
             shards.append(artefact)
         progress(f"attempt {k}: {entry['outcome']} after {entry['seconds']:.1f} s ({successes} of {plan.episodes})")
         k += 1
-        if k >= 20 and successes < k / 4:
+        if plan.hopeless(k, successes):
             raise TaccorlError(
                 f"{plan.task}: {k - successes} of {k} attempts failed ({', '.join(sorted({e['outcome'] for e in entries}))}); "
                 f"nothing was written to {out}. Look at one: taccorl collect --task={plan.task} --keep_failures=true"
@@ -167,7 +179,7 @@ _MANIFEST = "meta/taccorl/manifest.json"
 def _attempt_config(plan: Plan, twin: str, k: int) -> dict[str, Any]:
     """What an attempt depends on; not on how many there are."""
     source = {"type": plan.source.get_choice_name(type(plan.source)), **dataclasses.asdict(plan.source)}
-    return {
+    config = {
         "task": plan.task,
         "difficulty": plan.difficulty,
         "twin": twin,
@@ -180,6 +192,7 @@ def _attempt_config(plan: Plan, twin: str, k: int) -> dict[str, Any]:
         "mujoco": mujoco.__version__,
         "taccorl": taccorl.__version__,
     }
+    return canonical(config)
 
 
 def _build_attempt(
@@ -239,7 +252,8 @@ def collect_recordings(plan: Plan, out: Path, progress: Progress = print) -> lis
     spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
     written: list[Path] = []
     k = 0
-    while len(written) < plan.episodes:
+    enough = plan.num_attempts if plan.keep_failures else None
+    while len(written) < plan.episodes and k != enough:
         recorder = attempt(plan, sim, spec, k, dense=True)
         outcome = outcome_of(sim)
         progress(f"attempt {k}: {outcome} after {len(recorder.rows) / CONTROL_HZ:.1f} s")
@@ -251,7 +265,7 @@ def collect_recordings(plan: Plan, out: Path, progress: Progress = print) -> lis
             part.replace(path)
             written.append(path)
         k += 1
-        if k >= 20 and len(written) < k / 4:
+        if plan.hopeless(k, len(written)):
             raise TaccorlError(f"{plan.task}: only {len(written)} of {k} attempts succeeded; {out} holds those")
     return written
 

@@ -299,6 +299,10 @@ class ReplayPlan(Plan):
             path.write_text(self.files[0].header["twin"], encoding="utf-8")
             return load_twin(path)
 
+    @property
+    def num_attempts(self) -> int:
+        return len(self.files)
+
     def attempt_seed(self, k: int) -> int:
         """Of file ``k``.
 
