@@ -78,7 +78,9 @@ class Judge:
         before = self.subtask.copy()
         for a, arm in enumerate(ARMS):
             for k, subtask in enumerate(self._subtasks[arm]):
-                self.subtask[(before[:, a] == k) & subtask.done(scene), a] = k + 1
+                waiting = before[:, a] == k
+                if waiting.any():
+                    self.subtask[waiting & subtask.done(scene), a] = k + 1
 
     def snapshot(self, ids: np.ndarray) -> dict[str, np.ndarray]:
         return {

@@ -183,10 +183,10 @@ def test_rack_and_tray_have_the_volume_of_their_drawing():
     frame = 0.090 * 0.044 * 0.004 + 2 * 0.090 * 0.003 * 0.046 + 0.032 * 0.020 * 0.044
     assert sum(solid.volume_m3 for solid in tube_rack().solids) == pytest.approx(plates + frame, rel=1e-9)
 
-    circle = 32 * 0.0205**2 * math.tan(math.pi / 32)
+    circle = 16 * 0.0205**2 * math.tan(math.pi / 16)
     side = 0.046 + 2 * math.sqrt(3) * 0.0005  # all three sides move out by c
     # The heart's hole by shapely's own mitred buffer, an independent way.
-    heart = Polygon(heart_outline(0.044)).buffer(0.0005, join_style="mitre", mitre_limit=10).area
+    heart = Polygon(heart_outline(0.044, 8)).buffer(0.0005, join_style="mitre", mitre_limit=10).area
     top = 0.010 * (0.200 * 0.080 - circle - math.sqrt(3) / 4 * side**2 - heart)
     base = 0.200 * 0.080 * 0.004
     assert sum(solid.volume_m3 for solid in puzzle_tray().solids) == pytest.approx(top + base, rel=1e-9)

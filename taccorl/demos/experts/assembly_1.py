@@ -9,13 +9,16 @@ from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert
 from taccorl.demos.experts.se3 import inverse, rotvec, transform
 from taccorl.sim.tasks.assembly_1 import Assembly1
 from taccorl.sim.tasks.parts import Part
+from taccorl.sim.twin import CONTROL_HZ
 
 _LEAN_RAD = 0.40  # hands lean away from each other, so that wrists and cameras keep apart
 _GRIP_M = 0.028  # from the TCP to the part: it is gripped near the fingers' tips
 _LIFT_M, _LIFT_MPS = 0.10, 0.12
 _MEET_M = (0.32, 0.03, 0.16)  # the hole's mouth
 _LEFT_STEADINESS = 0.4  # of a hand that holds still for the other
+_FIRMER = 1.2  # than the hand that inserts: what it holds is pushed
 _LEVEL_RAD, _FREE_M = 0.03, 0.0004  # it brings a part that was pushed askew back to level once nothing pushes any more
+_LONGEST_REGAIN_S = 1.0
 
 
 class AirAssembly(ScriptedExpert):
@@ -46,7 +49,7 @@ class AirAssembly(ScriptedExpert):
         above[:3, 3] += goal[:3, 2] * -0.08
         yield from self.move(arm, self.near(above))
         yield from self.move(arm, goal, speed_mps=0.1, settle=True)
-        yield from self.close(arm, part.grasps[grasp].width_m)
+        yield from self.close(arm, part.grasps[grasp].width_m, self.config.grip_n * (_FIRMER if arm == "left" else 1.0))
         up = self.hands[arm].pose.copy()
         up[2, 3] += _LIFT_M
         yield from self.move(arm, up, speed_mps=_LIFT_MPS)
@@ -60,10 +63,24 @@ class AirAssembly(ScriptedExpert):
         self.hands["left"].steadiness, self.hands["left"].learns = _LEFT_STEADINESS, False
         self.flags.add("holder waits")
         while "plug is in" not in self.flags:
-            hole = self.body(part.name) @ part.holes[hole_name].part_from_hole
-            if np.linalg.norm(rotvec(mouth, hole)) > _LEVEL_RAD and np.linalg.norm(self.pushed("left")[:3]) < _FREE_M:
+            if self._askew_rad() > _LEVEL_RAD and np.linalg.norm(self.pushed("left")[:3]) < _FREE_M:
+                hole = self.body(part.name) @ part.holes[hole_name].part_from_hole
                 yield from self.move("left", mouth @ inverse(hole) @ self.tcp("left"))
                 yield from self.settle("left")
+            yield
+
+    def _askew_rad(self) -> float:
+        """How far the hole is turned from how it is to be held."""
+        part, _, hole_name = self.holder()
+        hole = self.body(part.name) @ part.holes[hole_name].part_from_hole
+        return float(np.linalg.norm(rotvec(self.world_from_level(), hole)))
+
+    def regain(self, arm: str) -> Script:
+        """Wait until the left hand has brought the hole back to level."""
+        yield from super().regain(arm)
+        for _ in range(round(_LONGEST_REGAIN_S * CONTROL_HZ)):
+            if self._askew_rad() < _LEVEL_RAD:
+                return
             yield
 
     def _right(self) -> Script:

@@ -60,7 +60,7 @@ class ScriptedExpertConfig:
     """The hand feels a block when it is held back by that much, or the part slips in it by that much: an arm has 5 N/mm
     upwards and 7 N/mm sideways, and a part that is gripped with 25 N slips at 15 N if its friction is low."""
     feel_rad: float = 0.06
-    """Or when the part turns over that much against the hole, in either hand."""
+    """Or when the part turns over that much against the hole, or the hole since the hand last looked at it."""
     give_way: float = 0.1
     """Share of a sideways push or turn to which the wrist yields, each control step."""
     aim_kept: float = 0.45
@@ -195,6 +195,8 @@ class ScriptedExpert(ABC):
         self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
         controller = sim.config.controller
         self._lag_s = np.array(controller.kd_nms_per_rad) / np.array(controller.kp_nm_per_rad)
+        # Of its own, so that what a hand decides does not depend on how many control steps went before.
+        self._tremor_rng = rng.spawn(1)[0]
         self._tremor = np.repeat((self.config.tremor_m, self.config.tremor_rad), 3)
         self.events: list[tuple[int, str]] = []
         """(control step, what was felt): corrections by touch."""
@@ -260,7 +262,7 @@ class ScriptedExpert(ABC):
         return joints - hand.bias_rad
 
     def _shaken(self, hand: Hand) -> np.ndarray:
-        fresh = math.sqrt(1 - _TREMOR_KEPT**2) * self._tremor * self.rng.normal(size=6)
+        fresh = math.sqrt(1 - _TREMOR_KEPT**2) * self._tremor * self._tremor_rng.normal(size=6)
         hand.tremor = _TREMOR_KEPT * hand.tremor + fresh
         shake = hand.steadiness * hand.tremor
         goal = hand.pose @ turn(shake[3:])
@@ -350,21 +352,22 @@ class ScriptedExpert(ABC):
         aim = yield from self._bring_before(arm, mating, start_m)
         speed_mps = (self.rng.uniform(0.02, 0.03) if config.aim_m > 0 else 0.025) * config.speed
         hand.learns, hand.steadiness = False, 0.3
-        depth, began, free = start_m, self.step_count, self.pushed(arm)
+        depth, began, free, holder = start_m, self.step_count, self.pushed(arm), self.body(mating.holder)
         while self.step_count - began < _LONGEST_PUSH_S * CONTROL_HZ:
             fit, pushed = mating.fit(self), self.pushed(arm) - free
             at = float(fit.depth_m)
             if at > enough_m:
                 break
-            if fit.tilt_rad > config.feel_rad or self._held_back_m(arm, mating, aim, pushed) > config.feel_m:
+            turned_rad = max(float(fit.tilt_rad), float(np.linalg.norm(rotvec(holder, self.body(mating.holder)))))
+            if turned_rad > config.feel_rad or self._held_back_m(arm, mating, aim, pushed) > config.feel_m:
                 self.felt(arm, f"blocked at {at * 1e3:.1f} mm")
                 back = max(at - _AT_MOUTH_M, start_m)
                 while depth > back:
                     depth = max(depth - _RECOIL_MPS * DT_S, back)
                     hand.pose = aim.pose(self, mating, depth)
                     yield
-                yield from self.settle(arm, longest_s=0.2)
-                aim = self._look(arm, mating, self._corrected(aim))
+                yield from self.regain(arm)
+                aim, holder = self._look(arm, mating, self._corrected(aim)), self.body(mating.holder)
                 yield from self.move(arm, partial(aim.pose, self, mating, depth))
                 yield from self.settle(arm, longest_s=0.4)
             elif at > 0:
@@ -388,6 +391,10 @@ class ScriptedExpert(ABC):
             yield from self.settle(arm)
             aim = self._look(arm, mating, aim)
         return aim
+
+    def regain(self, arm: str) -> Script:
+        """What comes between a block and the next look; experts whose other hand holds the hole have it come to rest, too."""
+        yield from self.settle(arm, longest_s=0.2)
 
     def _held_back_m(self, arm: str, mating: "Mating", aim: "Aim", pushed: np.ndarray) -> float:
         """How far the hand is pushed back out of the hole, or the part has slipped in it since it was looked at."""

@@ -20,7 +20,7 @@ _HOVER_M = (0.400, 0.005, 0.110)  # of the upright tube's bottom
 _HEADING_RAD = np.deg2rad(55)  # of the hand above the rack
 _TURN_RADPS = 0.8  # fastest joint while the tube turns, on average
 _GIVE_WAY = 0.25  # at least: both plates of the rack hold the tube, and a stiff wrist would wedge it between them
-_OPEN_M = 0.040  # at the rack: fully open, a finger would touch the left hand
+_OPEN_M = 0.040  # at the rack, wide enough for the cap: the left hand is near
 
 
 @experts.register("test_tube")
@@ -63,9 +63,8 @@ class TestTubeExpert(ScriptedExpert):
 
     def _lift(self) -> Script:
         tube = self._task.tube
-        goal = self._kept_clear(self.grasp(tube, "middle", lean_rad=_LEAN_RIGHT_RAD)) @ transform(
-            (0, 0, -_TOWARDS_TIPS_M)
-        )
+        grip = self._kept_clear(self.grasp(tube, "middle", lean_rad=_LEAN_RIGHT_RAD))
+        goal = grip @ transform((0, 0, -_TOWARDS_TIPS_M))
         yield from self.move("right", self.near(goal @ transform((0, 0, -0.06))))
         yield from self.move("right", goal, speed_mps=0.1, settle=True)
         yield from self.close("right", tube.grasps["middle"].width_m)

@@ -282,7 +282,7 @@ _PIECE_HEIGHT_M, _KNOB_HEIGHT_M, _KNOB_HALF_M = 0.020, 0.025, 0.009
 _TRAY_BASE_M, _TRAY_DEPTH_M, _TRAY_HALF_M = 0.004, 0.010, (0.100, 0.040)
 _PIECE_OUTLINES = {
     "circle": circle_outline(0.020, 32),
-    "heart": heart_outline(0.044),
+    "heart": heart_outline(0.044, 8),
     "triangle": triangle_outline(0.046),
 }
 _PIECE_LOOKS = {"circle": ("yellow", 0.045), "heart": ("pink", 0.045), "triangle": ("green", 0.035)}  # colour, kg
@@ -327,7 +327,7 @@ def puzzle_tray(name: str = "tray", clearance_m: float = CLEARANCE_M) -> Part:
         outline = _PIECE_OUTLINES[shape]
         y = -(outline[:, 1].min() + outline[:, 1].max()) / 2  # in the middle of the tray as the eye sees it
         if shape == "circle":
-            cut = circle_outline(0.020 + clearance_m, 32, circumscribed=True)
+            cut = circle_outline(0.020 + clearance_m, 16, circumscribed=True)
         else:
             cut = offset_outline(outline, clearance_m)
         x0, x1 = (x - 0.030 if x >= 0 else -x_half), (x + 0.030 if x <= 0 else x_half)

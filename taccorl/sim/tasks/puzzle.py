@@ -113,7 +113,7 @@ class Puzzle(Task):
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
         """Of each piece: grasp, place. One hand places at a time: triangle, then circle (left), then heart."""
 
-        def pair(shape: str) -> tuple[Subtask, Subtask]:
+        def pair(shape: str, after: str | None = None) -> tuple[Subtask, Subtask]:
             def lifted(scene: Scene) -> np.ndarray:
                 return scene.poses(shape)[:, 2, 3] > _LIFTED_M
 
@@ -122,10 +122,11 @@ class Puzzle(Task):
 
             return (
                 Subtask(name=f"grasp {shape}", object_ref=shape, done=lifted),
-                Subtask(name=f"place {shape}", object_ref="tray", held=shape, done=placed),
+                Subtask(name=f"place {shape}", object_ref="tray", held=shape, done=placed, after=after),
             )
 
-        return {"left": pair("circle"), "right": (*pair("triangle"), *pair("heart"))}
+        right = (*pair("triangle"), *pair("heart", after="place circle"))
+        return {"left": pair("circle", after="place triangle"), "right": right}
 
 
 def _stack(of_piece: Callable[[str], np.ndarray]) -> np.ndarray:

@@ -63,7 +63,9 @@ class Subtask:
     held: str | None = None
     """Body in this arm's hand meanwhile."""
     coordinated_with: str | None = None
-    """Subtask of the other arm that must run at the same time."""
+    """Subtask of the other arm that must run at the same time (MimicGen's COORDINATION)."""
+    after: str | None = None
+    """Subtask of the other arm that must have ended before this one begins (MimicGen's SEQUENTIAL)."""
 
 
 @dataclass(frozen=True)
