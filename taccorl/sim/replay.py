@@ -5,6 +5,7 @@ when it sent the command are compared with it row by row. (MuJoCo's own ``sensor
 one step of 2 ms off turned K_p 151 into 690 in an identification, research notes.)
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,8 @@ import numpy as np
 from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
 from taccorl.sim.simulation import ACTION_NAMES, Simulation
+
+_COMMAND_HZ = 150.0  # as Simulation.step sends them
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,10 @@ class Replay:
 
 
 def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarray | None = None) -> Replay:
-    """Feed ``targets`` (T, 14) [rad, m], each held for 1 / ``rate_hz``, into simulation 0 from its present scene; reset it first.
+    """Feed ``targets`` (T, 14) [rad, m] at ``rate_hz`` into simulation 0 from its present scene; reset it first.
+
+    Between two of them the command goes in a straight line, in steps of at most 1/150 s: rows of a dataset are samples of a
+    command that moved on at 200 Hz. From 150 Hz on each is held.
 
     Args:
         start: (14,) joints and openings as measured when the first command was sent; the first targets by default.
@@ -48,12 +54,17 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
             f"replay: {rate_hz:g} Hz is {steps:.3f} physics steps of {sim.config.physics.timestep_s * 1e3:.3f} ms; "
             "resample the commands to 30, 100 or 200 Hz first"
         )
+    parts = math.ceil(_COMMAND_HZ / rate_hz)
+    while round(steps) % parts:
+        parts -= 1
+    share = np.arange(1, parts + 1)[:, None, None] / parts if parts > 1 else np.zeros((1, 1, 1))  # as Simulation.step
     sim.place_arms(targets[0] if start is None else start, targets[0])
     reported, counts, effort = [], [], []
-    for target in targets:
+    for target, following in zip(targets, [*targets[1:], targets[-1]], strict=True):
         reported.append(sim.proprioception()[0])
         counts.append(sim.touch()[0])
-        sim.advance(np.broadcast_to(target, (1, sim.num_sims, len(target))), round(steps))
+        line = target + share * (following - target)
+        sim.advance(np.broadcast_to(line, (parts, sim.num_sims, len(target))), round(steps) // parts)
         effort.append(sim.effort()[0])
     return Replay(np.arange(len(targets)) / rate_hz, np.array(reported), np.array(counts), np.array(effort))
 

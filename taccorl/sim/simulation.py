@@ -240,6 +240,20 @@ class Simulation:
         self.targets[:] = commands[-1]
         return [self.effects.command(command, held_s) for command in commands]
 
+    def check(self, actions: np.ndarray) -> None:
+        """Targets (N, …, 14) are numbers in rad and m; a little beyond the limits is not wrong, it is clipped.
+
+        Raises:
+            TaccorlError: names the joint, the simulation, the value and the limits.
+        """
+        beyond = ~((actions >= ACTION_LOW - _ABSURD) & (actions <= ACTION_HIGH + _ABSURD))  # NaN is beyond, too
+        if beyond.any():
+            at = np.argwhere(beyond)[0]
+            raise TaccorlError(
+                f"action: {ACTION_NAMES[at[-1]]} of simulation {at[0]} is {actions[tuple(at)]:g}, limits are "
+                f"{ACTION_LOW[at[-1]]:g} … {ACTION_HIGH[at[-1]]:g}. Joints are in rad, the gripper's opening is in m."
+            )
+
     def _checked(self, action: np.ndarray) -> np.ndarray:
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (self.num_sims, len(ACTION_NAMES)):
@@ -247,13 +261,7 @@ class Simulation:
                 f"action: shape {action.shape}, the twin wants ({self.num_sims}, {len(ACTION_NAMES)}): "
                 f"{', '.join(ACTION_NAMES[:7])}, and the same of the right arm"
             )
-        beyond = ~((action >= ACTION_LOW - _ABSURD) & (action <= ACTION_HIGH + _ABSURD))  # NaN is beyond, too
-        if beyond.any():
-            i, k = np.argwhere(beyond)[0]
-            raise TaccorlError(
-                f"action: {ACTION_NAMES[k]} of simulation {i} is {action[i, k]:g}, limits are {ACTION_LOW[k]:g} … "
-                f"{ACTION_HIGH[k]:g}. Joints are in rad, the gripper's opening is in m."
-            )
+        self.check(action)
         goal = np.clip(action, ACTION_LOW, ACTION_HIGH)
         self.clipped = (goal != action).any(1)
         self.executed = goal

@@ -200,6 +200,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         actions = shaped(actions, self.num_envs, None)
         if not self._begun:
             raise TaccorlError("step: call reset() first")
+        self.sim.check(actions)  # all of it, before any of it acts
         reward, num_steps = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.int64)
         tactile = np.empty((*actions.shape[:2], NUM_TAXELS), dtype=np.int16)
         self._clipped = np.zeros(self.num_envs, dtype=bool)

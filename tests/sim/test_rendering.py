@@ -449,3 +449,24 @@ def test_workers_draw_before_and_after_a_fork_or_say_why_they_cannot():
     assert first == parent == again and first.startswith("drew") and int(first.split()[1]) > 50
     assert second.startswith("TaccorlError: pictures were drawn before this process was forked") and "spawn" in second
     assert kept.startswith("kept pictures were drawn before this process was forked") and status == "0"
+
+
+def test_a_library_that_mujoco_gl_asks_for_and_is_not_there_is_named():
+    script = "import taccorl.sim.simulation"
+    environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": "osmesa"}
+    if subprocess.run([sys.executable, "-c", "import mujoco"], env=environment, capture_output=True).returncode == 0:
+        pytest.skip("libOSMesa is installed here")
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=REPOSITORY, env=environment, capture_output=True, text=True
+    )
+    assert "TaccorlError: MUJOCO_GL=osmesa, but its library does not load" in done.stderr
+    assert "apt-get install libosmesa6" in done.stderr
+
+
+def test_demonstrations_without_images_need_no_opengl(tmp_path):
+    words = ["-m", "taccorl.cli.main", "collect", "--task=assembly_1", "--episodes=1", "--images=false"]
+    environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": "disable"}
+    words += [f"--out={tmp_path / 'out'}", f"--store={tmp_path / 'store'}"]
+    done = subprocess.run([sys.executable, *words], cwd=REPOSITORY, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "meta" / "info.json").is_file()

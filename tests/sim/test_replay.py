@@ -3,12 +3,16 @@
 import numpy as np
 import pytest
 
+from taccorl.data.episode import Episode
+from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
-from taccorl.sim.replay import replay
+from taccorl.sim.effects import make_effect
+from taccorl.sim.replay import replay, replay_episode
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.trajectory import SAMPLE_HZ, DenseRecorder
+from taccorl.sim.twin import TwinConfig
 
 
 @pytest.fixture
@@ -41,6 +45,34 @@ def test_replay_of_a_twin_s_own_commands_gives_its_own_answer(bench):
     bench.reset([0])
     again = replay(bench, walk, 100.0, start)
     np.testing.assert_array_equal(first.reported, again.reported)
+
+
+def test_a_measured_episode_is_replayed_row_by_row(bench):
+    # "Measured" in a twin with friction: its rows hold the state and the command in force at each 1/30 s. The twin without
+    # friction replays it: same rows, same commands, and the residual is what friction does; with friction it is nothing.
+    def sticky() -> Simulation:
+        sim = Simulation(Bench(), TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=1.0)]))
+        sim.reset([0])
+        return sim
+
+    measured = sticky()
+    state, action = [], []
+    for k in range(45):
+        state.append(measured.proprioception()[0].astype(np.float32))
+        action.append(measured.targets[0].astype(np.float32))
+        measured.step(measured.targets + 0.01 * np.sin(0.25 * k) * (np.arange(14) % 7 != 6))
+    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
+    arrays = {"observation.state": np.array(state), "action": np.array(action)}
+    episode = Episode("run 1", spec, 0, arrays, lambda: iter(()), (), "sweep", origin="surrogate")
+    twin = replay_episode(bench, episode)
+    np.testing.assert_array_equal(twin.arrays["action"], episode.arrays["action"])
+    assert twin.arrays["observation.state"].shape == (45, 14)
+    assert twin.arrays["observation.tactile"].shape == (45, 1536)
+    assert "twin replay of: surrogate" in twin.origin
+    residual = np.abs(twin.arrays["observation.state"] - episode.arrays["observation.state"]).max()
+    same = replay_episode(sticky(), episode)
+    assert residual > 3e-4
+    np.testing.assert_allclose(same.arrays["observation.state"], episode.arrays["observation.state"], atol=2e-5)
 
 
 def test_rates_that_fall_between_physics_steps_are_refused(bench):

@@ -279,3 +279,14 @@ def test_calls_answer_for_every_environment() -> None:
     envs = vector(3)
     assert envs.call("task_description") == ("insert the orange plug into the grey socket in the air",) * 3
     assert envs.get_attr("_max_episode_steps") == (900, 900, 900)
+
+
+def test_a_bad_value_late_in_a_chunk_is_refused_before_any_of_it_acts():
+    env = TaccorlVectorEnv("bench", num_envs=2, num_threads=1)
+    env.reset(seed=0)
+    before = env.sim.snapshot()
+    actions = np.repeat(env.sim.targets[:, None], 4, axis=1).astype(np.float32)
+    actions[1, 3, 9] = np.nan
+    with pytest.raises(TaccorlError, match="right_joint3 of simulation 1 is nan"):
+        env.step_chunk(actions)
+    np.testing.assert_array_equal(env.sim.snapshot().physics, before.physics)

@@ -11,7 +11,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 
 TASKS = ("assembly_1", "assembly_2")
-SEED = {"assembly_1": 1, "assembly_2": 4}  # the first try misses the hole
+SEED = {"assembly_1": 12, "assembly_2": 0}  # the first try misses the hole
 
 
 @dataclass
