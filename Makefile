@@ -26,9 +26,10 @@ lint: .venv/.ready
 bench: .venv/.ready
 	$(BIN)/python -m taccorl.benchmark $(if $(ONLY),--only=$(ONLY))
 
-# The pictures of the README: docs/task_*.png.
+# The pictures of the README, docs/task_*.png, and the page of effects, docs/effects.md.
 pictures: .venv/.ready
 	$(BIN)/python -m pipelines.task_pictures
+	$(BIN)/python -m pipelines.effects_page
 
 # Names and versions only: no addresses, no hashes.
 lock: .venv/.ready

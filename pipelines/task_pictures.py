@@ -15,12 +15,12 @@ OUT = Path("docs")
 
 
 def episode(sim: Simulation, plan: Plan, seed: int) -> np.ndarray:
-    """States (T, nstate) of one successful attempt."""
+    """States (T, row_size) of one successful attempt."""
     for k in range(20):
         sim.reset([seed + k])
         states = []
         for action in plan.source.actions(sim, np.random.default_rng([seed + k, 1])):
-            states.append(sim.snapshot().physics[0])
+            states.append(sim.state_rows()[0])
             sim.step(action[None].astype(float))
             if sim.judge.outcome.over[0]:
                 break

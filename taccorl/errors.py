@@ -24,6 +24,10 @@ class InTheWayError(DatasetError):
     """Something else lies where a dataset is to be; it was not touched."""
 
 
+class UnreachableError(TaccorlError):
+    """A pose that no joint angles of an arm reach."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """`` did you mean 'x'? `` for the closest known name, else the list of all; ends without a full stop."""
     names = sorted(str(k) for k in known)

@@ -28,7 +28,7 @@ class CollectConfig:
     source: Source = field(default_factory=ExpertSource)
     """Who demonstrates: --source.type=expert, keyboard, gamepad, leader, actions."""
     episodes: int = 20
-    """How many successful ones."""
+    """How many successful ones, of a dataset and of recordings alike."""
     out: Path | None = None
     """Folder of the dataset or the recordings; outputs/TASK if not given. It must not hold anything else."""
     store: Path = Path("outputs/store")
@@ -38,7 +38,7 @@ class CollectConfig:
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Share of the paper's reset ranges; 0: the nominal scene."""
+    """Share of the paper's reset ranges, 0 … 1; 0: the nominal scene."""
     images: bool = True
     """Render the three cameras (needs OpenGL)."""
     as_recording: bool = False
@@ -46,7 +46,7 @@ class CollectConfig:
     keep_failures: bool = False
     """Keep failed attempts as well."""
     seed: int = 0
-    """Of all attempts; another seed gives other scenes."""
+    """Of all attempts, at least 0; another seed gives other scenes."""
     origin: str = ORIGIN
     """Label in everything that is made; write "surrogate: …" where the twin plays the robot."""
 
@@ -54,8 +54,6 @@ class CollectConfig:
 def main(argv: list[str]) -> int:
     """0: collected."""
     config = parse(CollectConfig, argv, positional=None)
-    if config.episodes < 1:
-        raise TaccorlError(f"--episodes={config.episodes}: at least one")
     if not config.task and not isinstance(config.source, ActionsSource):
         raise TaccorlError("missing --task=; --help says more")
     plan = Plan(

@@ -5,7 +5,7 @@ Nothing is invented and no middle row is deleted: what cannot become rows is lis
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ from taccorl.errors import RecordingError
 
 START_UP_S = 1.0
 """Channels need not start and stop together: this much at either end is no loss worth a word."""
+END_SLACK_S = 0.25
+"""So much may be missing at an end that was marked."""
 MAX_WAITING_PICTURES = 1000
 """Cameras of one recording come interleaved; more waiting than this means that they do not."""
 
@@ -57,6 +59,11 @@ class _Interval:
     success: bool | None
     marked: bool
     """Its ends were marked, rather than being those of the file."""
+
+    @property
+    def slack_ns(self) -> int:
+        """Missing at an end without being a loss."""
+        return round(((0.0 if self.marked else START_UP_S) + END_SLACK_S) * NS_PER_S)
 
 
 class BrokenPicture(RecordingError):
@@ -276,7 +283,11 @@ class Cutter:
                 continue
             part = f"part {number}" if len(pieces) > 1 else ""
             name = " ".join(w for w in (self.recording.source.name, label, part) if w)
-            result.episodes.append(self._episode(name, interval, grid_ns[a:b], matches, slice(a, b)))
+            # The outcome is what was to be seen at the end: of a part without it, nobody said one.
+            row_ns = NS_PER_S // self.spec.target.fps
+            has_end = b == pieces[-1][1] and interval.end_ns - grid_ns[b - 1] <= interval.slack_ns + row_ns
+            shown = interval if has_end else replace(interval, success=None)
+            result.episodes.append(self._episode(name, shown, grid_ns[a:b], matches, slice(a, b)))
 
     def _last_ns(self) -> dict[str, int]:
         """Channel → time of its last sample; a held one goes on for ever."""
@@ -299,7 +310,6 @@ class Cutter:
         return max(firsts)
 
     def _report_ends(self, interval: _Interval, start_ns: int, end_ns: int, result: Cut) -> None:
-        slack_ns = round((0.0 if interval.marked else START_UP_S) * NS_PER_S) + NS_PER_S // 4
         late = max(self.clocks, key=lambda c: int(self.clocks[c].time_ns[0]))
         last_ns = self._last_ns()
         early = min(last_ns, key=last_ns.__getitem__, default=late)
@@ -308,9 +318,9 @@ class Cutter:
             reason = f"{early} ends early" if start_ns <= interval.end_ns else f"{late} begins late"
             result.losses.append(Loss(begin_s, finish_s, reason))
             return
-        if start_ns - interval.start_ns > slack_ns:
+        if start_ns - interval.start_ns > interval.slack_ns:
             result.losses.append(Loss(begin_s, self.seconds(start_ns), f"{late} begins late"))
-        if interval.end_ns - end_ns > slack_ns:
+        if interval.end_ns - end_ns > interval.slack_ns:
             result.losses.append(Loss(self.seconds(end_ns), finish_s, f"{early} ends early"))
 
     def _match(self, key: str, grid_ns: np.ndarray) -> dict[str, timing.Matched]:

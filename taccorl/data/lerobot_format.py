@@ -119,6 +119,7 @@ def write_episodes(
 def _write(episodes: Sequence[Episode], root: Path, progress: Callable[[int], None] | None, streaming: bool) -> None:
     with quiet_lerobot():
         from lerobot.configs import RGBEncoderConfig
+        from lerobot.datasets import dataset_metadata
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
         first = episodes[0]
@@ -146,7 +147,7 @@ def _write(episodes: Sequence[Episode], root: Path, progress: Callable[[int], No
                         _normal_priority()
                     if progress is not None:
                         progress(done)
-                with _large_features_in_blocks(dataset.writer):
+                with _large_features_in_blocks(dataset.writer), _statistics_in_order(dataset_metadata):
                     dataset.save_episode()
             dataset.finalize()
         except BaseException:
@@ -194,9 +195,9 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
     embed, fingerprint = dataset_writer.embed_images, arrow_dataset.generate_fingerprint
 
     def compute_in_blocks(data: dict[str, Any], features: dict[str, Any], *args: Any) -> dict[str, Any]:
-        large = {k for k, v in data.items() if is_large(v)}
-        stats = compute({k: v for k, v in data.items() if k not in large}, features, *args)
-        return stats | {k: exact_stats(data[k]) for k in large}
+        large = {k: exact_stats(v) for k, v in data.items() if is_large(v)}
+        stats = compute({k: v for k, v in data.items() if k not in large}, features, *args) | large
+        return {k: stats[k] for k in data if k in stats}  # they become the episodes' columns, in this order
 
     def save_as_arrow(episode_buffer: dict[str, Any]) -> dict[str, Any]:
         return save({k: as_arrow(v) if is_large(v) else v for k, v in episode_buffer.items()})
@@ -209,6 +210,25 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
     finally:
         dataset_writer.compute_episode_stats, writer._save_episode_data = compute, save
         dataset_writer.embed_images, arrow_dataset.generate_fingerprint = embed, fingerprint
+
+
+@contextlib.contextmanager
+def _statistics_in_order(module: Any) -> Iterator[None]:
+    """While open, LeRobot's ``module`` keeps statistics in the features' order, so that equal data make equal files.
+
+    LeRobot 0.6.1's ``aggregate_stats`` takes its keys from a set of strings, whose order is another one in every process.
+    """
+    aggregate = module.aggregate_stats
+
+    def in_order(stats: list[dict[str, Any]]) -> dict[str, Any]:
+        total = aggregate(stats)
+        return {key: total[key] for key in dict.fromkeys(key for each in stats for key in each)}
+
+    module.aggregate_stats = in_order
+    try:
+        yield
+    finally:
+        module.aggregate_stats = aggregate
 
 
 def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
@@ -259,17 +279,18 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
         shutil.copytree(roots[0], destination, dirs_exist_ok=True)
     else:
         with quiet_lerobot():
-            from lerobot.datasets.aggregate import aggregate_datasets
+            from lerobot.datasets import aggregate
 
             if destination.exists():
                 destination.rmdir()  # LeRobot wants to make it; not empty is an error here
             try:
-                aggregate_datasets(
-                    repo_ids=[f"local/{r.name}" for r in roots],
-                    aggr_repo_id=f"local/{destination.name}",
-                    roots=list(roots),
-                    aggr_root=destination,
-                )
+                with _statistics_in_order(aggregate):
+                    aggregate.aggregate_datasets(
+                        repo_ids=[f"local/{r.name}" for r in roots],
+                        aggr_repo_id=f"local/{destination.name}",
+                        roots=list(roots),
+                        aggr_root=destination,
+                    )
             except ValueError as error:
                 raise DatasetError(f"these datasets do not merge: {error}") from error
     problems = Dataset(destination).video_problems()

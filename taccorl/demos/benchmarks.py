@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from typing import Any
 
 from taccorl.benchmark import ROOT, Row, benchmark, cpu_s, spread
@@ -22,6 +22,7 @@ RIVAL_ROWS = 150
 """LeRobot's default writer takes 0.17 CPU-s a row: a part of the recording is enough to know its rate."""
 REPEATS = 3
 EXPERT_EPISODES = 100
+PENETRATION_EPISODES = 20
 NATIVE = [480, 640, 3]
 
 
@@ -286,12 +287,14 @@ def expert_rows() -> Iterator[Row]:
             n=n,
             spread=spread(seconds),
         )
-        deepest = [1e3 * d for d in score.penetration_m]
+        fine = score_expert(task, PENETRATION_EPISODES, seed=1, every_step=True)
+        deepest = [1e3 * d for d in fine.penetration_m]
         yield Row(
-            name=f"{task}: deepest penetration of mating parts, clearance 0.5 mm (largest force {max(score.force_n):.0f} N)",
+            name=f"{task}: deepest penetration of mating parts at any physics step, clearance 0.5 mm "
+            f"(median episode {median(deepest):.2f} mm, largest force {max(fine.force_n):.0f} N)",
             value=max(deepest),
             unit="mm",
             goal="≤ 0.2",
-            n=n,
+            n=len(deepest),
             spread=spread(deepest),
         )

@@ -8,6 +8,7 @@ import abc
 import dataclasses
 import functools
 import json
+import os
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -25,8 +26,9 @@ from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.demos.twin_recording import write_twin_mcap
-from taccorl.errors import TaccorlError
+from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
 from taccorl.lineage.canonical import canonical
+from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
@@ -34,7 +36,7 @@ from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
-ATTEMPT_VERSION = 1
+ATTEMPT_VERSION = 2
 _MANY = 20  # attempts after which a success rate means something
 _AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long
 
@@ -91,6 +93,16 @@ class Plan:
     origin: str = ORIGIN
     """Label of everything that is made: "surrogate: …" where the twin plays the robot."""
 
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise TaccorlError(f"--episodes={self.episodes}: at least one")
+        if self.seed < 0:
+            raise TaccorlError(f"--seed={self.seed}: seeds are 0, 1, 2, …")
+        if not 0 <= self.randomization <= 1:
+            raise TaccorlError(
+                f"--randomization={self.randomization:g}: it is a share of the paper's reset ranges, from 0 to 1"
+            )
+
     def twin_config(self) -> TwinConfig:
         """The twin to demonstrate in."""
         return load_twin(self.twin) if self.twin else TwinConfig()
@@ -118,15 +130,33 @@ class Plan:
         return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(2))
 
 
-def attempt(plan: Plan, sim: Simulation, spec: DatasetSpec, k: int, *, dense: bool = False) -> EpisodeRecorder:
-    """Run attempt ``k`` to its end: success, failure, time limit, or the demonstrator has finished."""
+@dataclass
+class Attempt(EpisodeRecorder):
+    """What was recorded of an attempt, and how it ended."""
+
+    outcome: str = "unfinished"
+    """As ``outcome_of``, or ``unreachable``: the demonstrator wanted a pose that its arm does not reach."""
+    reason: str = ""
+    """Which pose."""
+
+    def is_kept(self, plan: Plan) -> bool:
+        """Whether ``plan`` wants it as an episode; one that ended before its first row is none."""
+        return self.outcome == "success" or (plan.keep_failures and bool(self.rows))
+
+
+def attempt(plan: Plan, sim: Simulation, spec: DatasetSpec, k: int, *, dense: bool = False) -> Attempt:
+    """Run attempt ``k`` to its end: success, failure, time limit, the demonstrator has finished, or cannot go on."""
     seed = plan.attempt_seed(k)
     sim.reset([seed])
-    recorder = EpisodeRecorder(sim, spec, np.random.default_rng([seed, 2]), dense=dense)
-    for action in plan.source.actions(sim, np.random.default_rng([seed, 1])):
-        recorder.step(action)
-        if sim.judge.outcome.over[0]:
-            break
+    recorder = Attempt(sim, spec, np.random.default_rng([seed, 2]), dense=dense)
+    try:
+        for action in plan.source.actions(sim, np.random.default_rng([seed, 1])):
+            recorder.step(action)
+            if sim.judge.outcome.over[0]:
+                break
+        recorder.outcome = outcome_of(sim)
+    except UnreachableError as error:
+        recorder.outcome, recorder.reason = "unreachable", str(error)
     return recorder
 
 
@@ -140,8 +170,10 @@ def collect(plan: Plan, out: Path, store: Store, progress: Progress = print) -> 
     """A LeRobot dataset of ``plan.episodes`` successes at ``out``; returns the report.
 
     Raises:
+        InTheWayError: ``out`` holds something else, as far as can be told before the first attempt; else after the last.
         TaccorlError: three of four attempts of an expert fail: something is wrong with the task or the twin.
     """
+    _check_out(plan, out, store)
     sim = plan.make()
     spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=plan.images)
     twin = twin_text(plan.twin_config())
@@ -151,8 +183,8 @@ def collect(plan: Plan, out: Path, store: Store, progress: Progress = print) -> 
     enough = plan.num_attempts if plan.keep_failures else None
     while successes < plan.episodes and k != enough:
         config = _attempt_config(plan, twin, k)
-        stage = Stage("demonstration", functools.partial(_build_attempt, plan, sim, spec, k), ATTEMPT_VERSION)
-        artefact = store.run(stage, config, [])
+        build = functools.partial(_build_attempt, plan, sim, spec, k)
+        artefact = store.run(dataclasses.replace(_DEMONSTRATION, fn=build), config, [])
         entry = json.loads((artefact.path / "entry.json").read_text())
         entries.append(entry)
         successes += entry["outcome"] == "success"
@@ -167,13 +199,52 @@ def collect(plan: Plan, out: Path, store: Store, progress: Progress = print) -> 
             )
     report = _report(plan, entries)
     config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": twin}
-    stage = Stage("collection", lambda _, inputs, folder: _assemble(spec, report, inputs, folder), manifest=_MANIFEST)
-    store.run(stage, config, shards, destination=out)
+    assemble = dataclasses.replace(_COLLECTION, fn=lambda _, inputs, folder: _assemble(spec, report, inputs, folder))
+    store.run(assemble, config, shards, destination=out)
     sim.close()
     return report
 
 
-_MANIFEST = "meta/taccorl/manifest.json"
+def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
+    raise NotImplementedError("the function comes with the attempts")
+
+
+_DEMONSTRATION = Stage("demonstration", _not_yet, ATTEMPT_VERSION)
+_COLLECTION = Stage("collection", _not_yet, manifest=f"{PROVENANCE}/manifest.json")
+_REPORT = "collect_report.json"
+
+
+def _check_out(plan: Plan, out: Path, store: Store) -> None:
+    """Refuses what cannot be the dataset of this plan: hours of attempts would end at the store's refusal."""
+    if not os.path.lexists(out) or _may_be_of(plan, out, store):
+        return
+    manifest = read_manifest(out)
+    if manifest:
+        held = (
+            f"holds {manifest['stage']} v{manifest['stage_version']}, key {manifest['key']}, made {manifest['created']}"
+        )
+    else:
+        kind = f"a folder of {sum(1 for _ in out.rglob('*'))} entries" if out.is_dir() else "a file"
+        held = f"is {kind} without a taccorl manifest"
+    raise InTheWayError(
+        f"{out} is in the way: it {held}; this run makes {_COLLECTION.name} v{_COLLECTION.version} of {plan.task}. "
+        "Nothing was touched: give another destination, or move that one away yourself."
+    )
+
+
+def _may_be_of(plan: Plan, out: Path, store: Store) -> bool:
+    """Whether the dataset at ``out`` is made of attempts of this very plan, and of as many."""
+    manifest, report = read_manifest(out), out / PROVENANCE / _REPORT
+    if not manifest or manifest["stage"] != _COLLECTION.name or not report.is_file():
+        return False
+    told, twin = json.loads(report.read_text()), twin_text(plan.twin_config())
+    count, enough = told["attempts"], plan.num_attempts
+    if told["outcomes"].get("success", 0) != plan.episodes and count != enough:
+        return False
+    if enough is not None and count > enough:
+        return False
+    attempts = {store.key(_DEMONSTRATION, _attempt_config(plan, twin, k), []) for k in range(count)}
+    return {entry["key"] for entry in manifest["inputs"]} <= attempts
 
 
 def _attempt_config(plan: Plan, twin: str, k: int) -> dict[str, Any]:
@@ -202,11 +273,12 @@ def _build_attempt(
     from taccorl.data.lerobot_format import write_episodes
 
     recorder = attempt(plan, sim, spec, k)
-    outcome = outcome_of(sim)
-    keep = outcome == "success" or plan.keep_failures
-    entry = {"attempt": k, "seed": config["seed"], "outcome": outcome, "kept": keep, "rows": len(recorder.rows)}
-    entry["seconds"] = len(recorder.rows) / CONTROL_HZ
-    if keep:
+    kept, rows = recorder.is_kept(plan), len(recorder.rows)
+    entry = {"attempt": k, "seed": config["seed"], "outcome": recorder.outcome, "kept": kept, "rows": rows}
+    entry["seconds"] = rows / CONTROL_HZ
+    if recorder.reason:
+        entry["reason"] = recorder.reason
+    if kept:
         episode = recorder.episode(f"{plan.task} seed {config['seed']}", config)
         episode = dataclasses.replace(episode, origin=plan.origin)
         write_episodes([episode], folder / "dataset")
@@ -223,7 +295,7 @@ def _assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], fol
     meta.mkdir(parents=True, exist_ok=True)
     records = [record for shard in shards for record in json.loads((shard / "episodes.json").read_text())]
     _dump(meta / "episodes.json", records)
-    _dump(meta / "collect_report.json", report)
+    _dump(meta / _REPORT, report)
     _dump(meta / "dataset_spec.json", dataset_spec_to_json(spec))
 
 
@@ -243,30 +315,33 @@ def _report(plan: Plan, entries: list[dict[str, Any]]) -> dict[str, Any]:
 def collect_recordings(plan: Plan, out: Path, progress: Progress = print) -> list[Path]:
     """``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` …, as the robot's drivers would write them.
 
+    Failures, if they are kept, lie between them and are not counted.
+
     Raises:
         TaccorlError: ``out`` holds something already.
     """
-    if out.exists() and any(out.iterdir()):
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise TaccorlError(f"{out} holds files already; nothing was touched: give another folder")
     sim = plan.make()
     spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
     written: list[Path] = []
-    k = 0
+    successes = k = 0
     enough = plan.num_attempts if plan.keep_failures else None
-    while len(written) < plan.episodes and k != enough:
+    while successes < plan.episodes and k != enough:
         recorder = attempt(plan, sim, spec, k, dense=True)
-        outcome = outcome_of(sim)
-        progress(f"attempt {k}: {outcome} after {len(recorder.rows) / CONTROL_HZ:.1f} s")
-        if outcome == "success" or plan.keep_failures:
+        success = recorder.outcome == "success"
+        successes += success
+        progress(f"attempt {k}: {recorder.outcome} after {len(recorder.rows) / CONTROL_HZ:.1f} s")
+        if recorder.is_kept(plan):
             path = out / f"{plan.task}_{len(written):03d}.mcap"
             part = path.with_suffix(".part")
             origin = f"surrogate recording from the {plan.origin}"
-            write_twin_mcap(part, sim, recorder.trajectory(), success=outcome == "success", origin=origin)
+            write_twin_mcap(part, sim, recorder.trajectory(), success=success, origin=origin)
             part.replace(path)
             written.append(path)
         k += 1
-        if plan.hopeless(k, len(written)):
-            raise TaccorlError(f"{plan.task}: only {len(written)} of {k} attempts succeeded; {out} holds those")
+        if plan.hopeless(k, successes):
+            raise TaccorlError(f"{plan.task}: only {successes} of {k} attempts succeeded; {out} holds what was kept")
     return written
 
 

@@ -33,6 +33,8 @@ def with_simulator(spec: DatasetSpec, sim: Simulation, *, pictures: bool) -> Dat
         for key, feature in spec.features.items()
         if not feature.optional and (pictures or feature.dtype != "video")
     }
+    if pictures:
+        sim.require_cameras([key.removeprefix(PICTURE) for key, f in features.items() if f.dtype == "video"])
     features |= {
         "sim.state": FeatureSpec(dtype="float64", shape=(sim.row_size,), range=_ANY, **own),
         "sim.seed": FeatureSpec(dtype="int64", shape=(1,), range=(0, 2**62), **own),

@@ -1,7 +1,8 @@
-"""A demonstration in the twin as the robot's drivers would have recorded it: MCAP with their rates, jitter and losses.
+"""A demonstration in the twin as the robot's drivers would have recorded it: MCAP with their rates and jitter.
 
 The same streams as the stand-in's, told by a trajectory of the twin: joints at 200 Hz, pads at 100 Hz with their rolling scan,
-pictures at 30 Hz from the state at their own stamps. Nothing here comes from a robot, and the file says so.
+pictures at 30 Hz from the state at their own stamps. No picture is lost on the way: two lost in a row would split the episode.
+Lost pictures are a fault, which the stand-in's recordings show. Nothing here comes from a robot, and the file says so.
 """
 
 import json
@@ -128,7 +129,11 @@ def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, succ
     """
     story = TwinStory(sim, trajectory, "success" if success else "failure")
     config = StandInConfig(
-        duration_s=story.duration_s, seed=int(sim.seeds[0]), instruction=sim.task.instruction, pad_gain_spread=0.0
+        duration_s=story.duration_s,
+        seed=int(sim.seeds[0]),
+        instruction=sim.task.instruction,
+        camera_loss_probability=0.0,
+        pad_gain_spread=0.0,
     )
     scene = TwinScene(story, config.camera_size)
     try:

@@ -11,6 +11,7 @@ import mujoco
 
 from taccorl.errors import TaccorlError
 from taccorl.sim.robot import JOINTS, RobotConfig
+from taccorl.sim.settings import check_numbers
 
 # J0 … J5 of the paper are joint1 … joint6 here. Table in Fig. "Per-joint controller SysID", App. B.1.
 KP_NM_PER_RAD = (1813.0, 1392.4, 974.8, 587.1, 151.1, 151.8)
@@ -33,9 +34,10 @@ class ControllerConfig:
                 raise TaccorlError(
                     f"controller.{name}: {len(values)} values, the arm has {len(JOINTS)} joints: {values}"
                 )
-        for name in ("kp_nm_per_rad", "kd_nms_per_rad"):
-            if min(getattr(self, name)) < 0:
-                raise TaccorlError(f"controller.{name}: {getattr(self, name)} has a negative gain; gains are ≥ 0")
+        # Without stiffness no joint has a place where it rests.
+        check_numbers(
+            "controller", self, finite=("torque_ff_nm",), not_negative=("kd_nms_per_rad",), positive=("kp_nm_per_rad",)
+        )
 
 
 def add_actuators(spec: mujoco.MjSpec, arm: str, robot: RobotConfig, controller: ControllerConfig) -> None:

@@ -71,8 +71,8 @@ class TaccorlEnv(gymnasium.Env):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode; ``options={"state": snapshot}`` begins it from ``sim.snapshot()``, bit-exactly."""
-        super().reset(seed=seed)
         observation, _ = self._envs.reset(seed=None if seed is None else [seed], options=options)
+        super().reset(seed=seed)
         return _only(observation), _only(self._envs.facts())
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -89,6 +89,10 @@ class TaccorlEnv(gymnasium.Env):
         """The front camera's picture (224, 224, 3) uint8."""
         pictures = self._envs.render()
         return None if pictures is None else pictures[0].copy()
+
+    def close(self) -> None:
+        """Free OpenGL contexts; nothing else can be done with it afterwards."""
+        self._envs.close()
 
 
 def _only(batch: dict[str, Any]) -> dict[str, Any]:

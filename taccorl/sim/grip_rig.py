@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from taccorl.sim.part import PART_CONTACT
 from taccorl.sim.robot import ARMS, JOINTS
-from taccorl.sim.tasks.parts import PART_CONTACT
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig, empty_bench
 
 HOME_RAD = np.array([0.0, 1.45, -1.35, 0.0, 0.9, 0.0])

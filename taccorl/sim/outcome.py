@@ -59,16 +59,19 @@ class Judge:
         self.subtask[ids] = self.lasted[ids] = 0
         self.verdict = self.task.look(scene)
 
-    def update(self, scene: "Simulation") -> None:
-        """After each control step. An episode that is over keeps its outcome."""
+    def update(self, scene: "Simulation", ids: np.ndarray | None = None) -> None:
+        """After a control step of ``ids`` (all by default). An episode that is over keeps its outcome."""
         verdict = self.verdict = self.task.look(scene)
-        running = ~self.success & (self.failure == "")
+        stepped = np.zeros(len(self.held), dtype=bool)
+        stepped[slice(None) if ids is None else ids] = True
+        running = stepped & ~self.success & (self.failure == "")
         self.steps[running] += 1
-        self.held = np.where(verdict.goal & ~scene.diverged, self.held + 1, 0)
+        held = np.where(verdict.goal & ~scene.diverged, self.held + 1, 0)
+        self.held = np.where(stepped, held, self.held)
         self.success |= running & (self.held >= self.hold_steps)
         running &= ~self.success
         seen = np.array([verdict.failures[name] for name in self.task.failures], bool).reshape(-1, len(self.held)).T
-        self.lasted = np.where(seen, self.lasted + 1, 0)
+        self.lasted = np.where(stepped[:, None], np.where(seen, self.lasted + 1, 0), self.lasted)
         failed = np.column_stack([self.lasted >= self._limits, np.ones(len(self.held), bool)])
         failure = np.array([*self.task.failures, ""], dtype=object)[failed.argmax(1)]  # the first, or none
         failure[(failure == "") & (self.steps >= self.limit_steps)] = "timeout"
@@ -78,7 +81,7 @@ class Judge:
         before = self.subtask.copy()
         for a, arm in enumerate(ARMS):
             for k, subtask in enumerate(self._subtasks[arm]):
-                waiting = before[:, a] == k
+                waiting = stepped & (before[:, a] == k)
                 if waiting.any():
                     self.subtask[waiting & subtask.done(scene), a] = k + 1
 

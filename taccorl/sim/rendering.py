@@ -5,6 +5,7 @@ through EGL unless MUJOCO_GL names another, and is touched only when the first p
 same bytes whether drawn alone or with others; another OpenGL driver may round pixels differently.
 """
 
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Self
 
@@ -116,7 +117,8 @@ class Renderer:
         self.close()
 
     def __del__(self) -> None:
-        if getattr(self, "_gl", None) is not None:
+        # When Python shuts down, OpenGL's modules may be gone already, and the process ends anyway.
+        if not sys.is_finalizing() and getattr(self, "_gl", None) is not None:
             self.close()
 
 

@@ -13,6 +13,7 @@ from taccorl.sim.rendering import style
 from taccorl.sim.robot import ARMS, JOINTS, PADS, RobotConfig, add_arm
 from taccorl.sim.sensors import SensorConfig
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
+from taccorl.sim.settings import check_numbers
 from taccorl.sim.tasks.task import Task
 
 CONTROL_HZ = 30  # the dataset's fps: one action a row
@@ -33,6 +34,7 @@ class PhysicsConfig:
                 f"physics.steps_per_control_step: {self.steps_per_control_step} is not a multiple of 20; 20 is a step of "
                 "1.67 ms, 40 of 0.83 ms"
             )
+        check_numbers("physics", self, positive=("impratio",))
 
     @property
     def timestep_s(self) -> float:

@@ -42,17 +42,28 @@ _HEADER = """\
 
 
 def load_twin(path: Path) -> TwinConfig:
-    """The twin that a file describes.
+    """The twin that a file describes; one that says nothing is the nominal twin.
 
     Raises:
         SpecError: the file cannot be read, or holds a key, value or effect that does not exist; with file and line.
     """
-    document = _TwinDocument(TwinConfig, Path(path))
+    path = Path(path)
+    if _says_nothing(path):
+        return TwinConfig()
+    document = _TwinDocument(TwinConfig, path)
     try:
         present(document.value.effects)
     except TaccorlError as error:
         raise document.error("effects", str(error)) from error
     return document.value
+
+
+def _says_nothing(path: Path) -> bool:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return False  # what reads it says so
+    return all(not line.strip() or line.lstrip().startswith("#") for line in lines)
 
 
 def twin_text(config: TwinConfig) -> str:

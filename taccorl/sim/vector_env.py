@@ -21,7 +21,7 @@ from gymnasium.vector.utils import batch_space
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.episode_seeds import EpisodeSeeds
-from taccorl.sim.simulation import ACTION_NAMES, Simulation, Snapshot
+from taccorl.sim.simulation import ACTION_NAMES, Simulation, Snapshot, checked_seeds
 from taccorl.sim.spaces import (
     CAMERAS,
     IMAGE_KEYS,
@@ -116,7 +116,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             max_episode_steps: None: the task's own time limit.
 
         Raises:
-            TaccorlError: unknown task or difficulty, unreadable twin, a setting that does not exist.
+            TaccorlError: unknown task or difficulty, unreadable twin, one without a camera that is asked for, a setting that
+                does not exist.
         """
         _one_of("images", images, ("never", "always", "on_request"))
         _one_of("autoreset", autoreset, (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED))
@@ -128,7 +129,11 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             num_threads=num_threads,
             scale=randomization,
         )
+        self.sim.require_cameras(CAMERAS if images != "never" else ["front"] if render_mode else [])
+        checked_seeds([] if seed is None else seed)
         if max_episode_steps is not None:
+            if not isinstance(max_episode_steps, int | np.integer) or max_episode_steps < 1:
+                raise TaccorlError(f"max_episode_steps: {max_episode_steps!r} is no whole number ≥ 1")
             self.sim.judge.limit_steps = max_episode_steps
         self.num_envs, self.task, self.task_description = num_envs, task, self.sim.task.instruction
         self.images, self.autoreset, self.render_mode = images, autoreset, render_mode
@@ -169,16 +174,21 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             seed: root of all seeds, or one scene seed for each environment; None: the next episodes of the stream.
             options: ``state``: a ``Snapshot`` to begin from; ``reset_mask``: (N,) bool, which environments to reset.
         """
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        self._check_open("reset")
+        checked_seeds([] if seed is None else seed)
         options = {name: value for name, value in (options or {}).items() if name != _NOT_FOR_US}
         for name in options:
             _one_of("reset option", name, _OPTIONS)
         ids = self._mask_ids(options["reset_mask"]) if "reset_mask" in options else self._all
         if not self._begun and len(ids) < self.num_envs:
             raise TaccorlError("reset: the first one is of all environments; leave reset_mask away")
+        state = options.get("state")
+        if state is not None:
+            self.sim.check_snapshot(state, ids)  # before any of it acts
+        super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None:
             self._seeds.begin(seed, ids.tolist())
-        self._begin(ids, options.get("state"))
+        self._begin(ids, state)
         self._begun = True
         return self.observe(self.images == "always"), _masked(self.facts(), np.isin(self._all, ids))
 
@@ -197,6 +207,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             TaccorlError: as ``step``.
         """
+        self._check_open("step")
         actions = shaped(actions, self.num_envs, None)
         if not self._begun:
             raise TaccorlError("step: call reset() first")
@@ -223,6 +234,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The front camera's picture of every environment, (224, 224, 3) uint8 each."""
+        self._check_open("render")
         if self.render_mode is None:
             return None
         if self.images == "never":
@@ -239,6 +251,10 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def close_extras(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         self.sim.close()
 
+    def _check_open(self, what: str) -> None:
+        if self.closed:
+            raise TaccorlError(f"{what}: this environment was closed; make a new one")
+
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """As ``call``."""
         return self.call(name)
@@ -251,6 +267,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             raise TaccorlError(
                 'observe: images are "never" to be rendered here; make the environment with "on_request"'
             )
+        self._check_open("observe")
         observation = {STATE_KEY: self._state.copy(), TACTILE_KEY: self._tactile.copy()}
         if images:
             self._look()

@@ -247,6 +247,36 @@ def test_a_silent_camera_splits_exactly_there_and_losses_add_up(tmp_path: Path, 
     assert [e.name.split()[-1] for e in found.episodes] == ["0", "1"]
 
 
+@pytest.mark.parametrize("outcome", [True, False])
+def test_only_the_part_with_the_episodes_end_carries_its_outcome(tmp_path: Path, outcome: bool) -> None:
+    word = "success" if outcome else "failure"
+    made = Made(
+        tmp_path / "gap.mcap", duration_s=4.0, outcomes=(word,), gap=(LEFT, 1.6, 2.1), camera_loss_probability=0
+    )
+    assert [e.success for e in cut(made.path).episodes] == [None, outcome]
+
+
+@pytest.mark.parametrize(("silent_from_s", "success"), [(3.2, None), (3.75, True)])
+def test_an_episode_whose_end_is_missing_has_no_outcome(
+    tmp_path: Path, silent_from_s: float, success: bool | None
+) -> None:
+    # The end marker is at 3.9 s. Silent from 3.2 s, the last row is at 3.2 s; from 3.75 s, it is 0.15 s before the marker.
+    gap = (LEFT, silent_from_s, 9.0)
+    [episode] = cut(Made(tmp_path / "a.mcap", duration_s=4.0, gap=gap, camera_loss_probability=0.0).path).episodes
+    assert episode.success is success
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "success"),
+    [((1.6, 2.1), [None, True]), ((3.0, 3.5), [None])],  # what follows the second gap is shorter than a second
+)
+def test_a_part_that_is_too_short_takes_the_outcome_with_it(
+    tmp_path: Path, gap_s: tuple[float, float], success: list[bool | None]
+) -> None:
+    made = Made(tmp_path / "a.mcap", duration_s=4.0, gap=(LEFT, *gap_s), camera_loss_probability=0.0)
+    assert [e.success for e in cut(made.path).episodes] == success
+
+
 def test_pieces_shorter_than_min_s_are_reported_and_not_written(tmp_path: Path) -> None:
     # fresh from 0.1 s, stale from 0.7 + 0.08 − one frame: 0.65 s, under the spec's 1 s; then 2.9 − 1.2 = 1.7 s
     made = Made(tmp_path / "early.mcap", gap=(FRONT, 0.7, 1.2))

@@ -3,7 +3,10 @@
 import dataclasses
 import json
 import logging
+import os
 import shutil
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -339,6 +342,58 @@ def test_folders_that_lerobot_would_misread_are_refused(
     with pytest.raises(DatasetError, match="LeRobot cannot work in a folder with"):
         merge(shards[1:], tmp_path / name / "all")
     assert list(tmp_path.iterdir()) == []
+
+
+SAME_DATASET = """
+import dataclasses, sys
+from pathlib import Path
+from test_lerobot_format import SPEC, blind
+from taccorl.data.lerobot_format import merge, write_episodes
+from taccorl.data.spec import load_dataset_spec
+
+folder = Path(sys.argv[1])
+(folder / "small.yaml").write_text(SPEC)
+spec = load_dataset_spec(folder / "small.yaml")
+write_episodes([blind(spec, 0), blind(spec, 1, "or that")], folder / "a")
+write_episodes([blind(spec, 2, "or that")], folder / "b")
+merge([folder / "a", folder / "b"], folder / "all")
+"""
+
+
+def blind(spec: DatasetSpec, seed: int, instruction: str = "touch it") -> Episode:
+    """Nine rows without pictures, with four features so large that their statistics are ours."""
+    wide = {
+        f"observation.{name}": dataclasses.replace(spec.features["action"], shape=(300,), names=(), unit="rad")
+        for name in ("one", "two", "three")
+    }
+    episode = made_up(spec, 9, seed=seed)
+    rows = np.random.default_rng(seed).normal(size=(9, 300)).astype(np.float32)
+    return dataclasses.replace(
+        episode,
+        spec=dataclasses.replace(spec, features={**spec.features, **wide}),
+        arrays={**episode.arrays, **dict.fromkeys(wide, rows)},
+        picture_keys=(),
+        instruction=instruction,
+    )
+
+
+def test_every_process_writes_and_merges_the_same_bytes(tmp_path: Path) -> None:
+    folders = [tmp_path / hash_seed for hash_seed in "12"]  # of the order in which Python's sets of strings go
+    processes = []
+    for folder in folders:
+        folder.mkdir()
+        environment = os.environ | {"PYTHONHASHSEED": folder.name, "TACCORL_PROGRAM": "1", "OMP_NUM_THREADS": "1"}
+        words = [sys.executable, "-c", SAME_DATASET, str(folder)]
+        processes.append(subprocess.Popen(words, cwd=Path(__file__).parent, env=environment))
+    assert [process.wait(timeout=120) for process in processes] == [0, 0]
+    one, two = ({p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in folders)
+    assert [str(name) for name in one if one[name] != two.get(name)] == []
+    assert set(one) == set(two)
+    stats = json.loads((folders[0] / "all/meta/stats.json").read_text())
+    features = json.loads((folders[0] / "all/meta/info.json").read_text())["features"]
+    assert [key for key in stats if key in ("action", TOUCH, "observation.one", "observation.state")] == [
+        key for key in features if key in ("action", TOUCH, "observation.one", "observation.state")
+    ]
 
 
 def test_an_episode_of_one_row_is_written(spec: DatasetSpec, tmp_path: Path) -> None:

@@ -64,8 +64,18 @@ def test_without_gravity_compensation_joint_2_sags_by_its_load_over_stiffness():
 
 @pytest.mark.parametrize(
     ("settings", "said"),
-    [({"kp_nm_per_rad": [1.0] * 5}, "5 values"), ({"kd_nms_per_rad": [1, 1, 1, 1, 1, -1]}, "negative gain")],
+    [
+        ({"kp_nm_per_rad": [1.0] * 5}, "kp_nm_per_rad: 5 values"),
+        ({"kp_nm_per_rad": [1.0] * 5 + [0.0]}, r"controller\.kp_nm_per_rad: .*0\.0\].* finite number > 0"),
+        ({"kd_nms_per_rad": [1, 1, 1, 1, 1, -1]}, r"controller\.kd_nms_per_rad: .*-1\].* finite number ≥ 0"),
+        ({"torque_ff_nm": [0.0] * 5 + [float("nan")]}, r"controller\.torque_ff_nm: .*nan\].* finite number"),
+        ({"kp_nm_per_rad": [1.0] * 5 + ["2"]}, r"controller\.kp_nm_per_rad: .*'2'\].* finite number"),
+    ],
 )
 def test_wrong_gains_are_refused_by_name(settings, said):
     with pytest.raises(TaccorlError, match=said):
         ControllerConfig(**settings)
+
+
+def test_a_drive_without_damping_or_torque_is_one() -> None:
+    ControllerConfig(kd_nms_per_rad=[0.0] * 6, torque_ff_nm=[0.0] * 6)

@@ -9,10 +9,14 @@ import pytest
 from expert_episode import MIDDLE, SEED, expert_episode
 from gymnasium.utils.env_checker import check_env
 
+from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.demos.recorder import with_simulator
 from taccorl.errors import TaccorlError
 from taccorl.sim.env import TaccorlEnv, env_id
 from taccorl.sim.episode_seeds import episode_seed
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
+from taccorl.sim.twin_file import load_twin
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 STATE, TACTILE = "observation.state", "observation.tactile"
@@ -168,6 +172,71 @@ def test_wrong_settings_are_named(env: TaccorlEnv, tmp_path: Path) -> None:
         TaccorlEnv("assembly_1", twin=tmp_path / "twin.yaml")
     with pytest.raises(TaccorlError, match=r"call reset\(\) first"):
         TaccorlEnv("assembly_1", images=False).step(np.zeros(14))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"max_episode_steps": 0}, "max_episode_steps: 0 is no whole number ≥ 1"),
+        ({"max_episode_steps": 2.5}, "max_episode_steps: 2.5 is no"),
+        ({"randomization": 2.0}, r"randomization: 2\.0 .* give 0"),
+        ({"seed": -1}, "seed: -1 is no whole number"),
+        ({"seed": 2**63}, f"seed: {2**63} is no whole number"),
+        ({"twin": {"robot": {}}}, r"twin: found \{'robot'.*dict.*give a TwinConfig"),
+    ],
+)
+def test_settings_beyond_reason_are_named(settings: dict, said: str) -> None:
+    with pytest.raises(TaccorlError, match=said):
+        TaccorlEnv("bench", images=False, **settings)
+
+
+def test_a_reset_that_is_refused_changes_nothing() -> None:
+    env = TaccorlEnv("bench", images=False, seed=4)
+    env.reset()
+    before = env.sim.state_rows()
+    other = TaccorlEnv("bench", images=False, randomization=0.5)
+    other.reset()
+    for arguments, said in (
+        ({"options": {"state": 1}}, r"state: 1 is no Snapshot; give what sim\.snapshot\(\)"),
+        ({"options": {"state": other.sim.snapshot()}}, "another task, difficulty, twin or randomisation"),
+        ({"seed": -1}, "seed: -1 is no whole number"),
+        ({"seed": 2**70}, f"seed: {2**70} is no whole number"),
+    ):
+        with pytest.raises(TaccorlError, match=said):
+            env.reset(**arguments)
+    np.testing.assert_array_equal(env.sim.state_rows(), before)
+    assert env.reset()[1]["seed"] == episode_seed(4, 0, 1)  # and no seed of the stream was used up
+    assert env.reset(seed=2**63 - 1)[1]["seed"] == 2**63 - 1
+
+
+def test_a_closed_environment_frees_its_renderers_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    env, closed = TaccorlEnv("bench", images=False), []
+    monkeypatch.setattr(env.sim, "close", lambda: closed.append("sim"))
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    assert closed == ["sim"]
+    for use in (env.reset, env.render, lambda: env.step(np.zeros(14))):
+        with pytest.raises(TaccorlError, match="this environment was closed; make a new one"):
+            use()
+
+
+def test_a_twin_without_a_camera_is_refused_only_where_pictures_are_wanted(tmp_path: Path) -> None:
+    path = tmp_path / "twin.yaml"
+    path.write_text("cameras: {front: null}\n")
+    said = "the twin has no camera front; it has left_wrist, right_wrist.*do without images"
+    with pytest.raises(TaccorlError, match=said):
+        TaccorlEnv("bench", twin=path)
+    with pytest.raises(TaccorlError, match=said):
+        TaccorlEnv("bench", twin=path, images=False, render_mode="rgb_array")
+    with pytest.raises(TaccorlError, match=said):
+        TaccorlVectorEnv("bench", twin=path, images="on_request")
+    TaccorlEnv("bench", twin=path, images=False).reset(seed=0)
+    sim = Simulation(tasks.get("bench")(), load_twin(path))
+    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
+    with pytest.raises(TaccorlError, match=said):
+        with_simulator(spec, sim, pictures=True)
+    with_simulator(spec, sim, pictures=False)
 
 
 def test_a_twin_file_is_obeyed(tmp_path: Path) -> None:

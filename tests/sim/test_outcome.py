@@ -108,6 +108,28 @@ def test_subtasks_end_in_order_and_one_a_step(judged):
     assert judge.subtask[0, 0] == 2
 
 
+def test_who_is_not_stepped_is_not_judged():
+    task, scene = Scripted(), SimpleNamespace(diverged=np.array([False, False, True]))
+    task.now = {name: [False] * 3 for name in task.now} | {
+        "goal": [True] * 3,
+        "first": [True] * 3,
+        "wedged": [True] * 3,
+    }
+    judge = Judge(task, 3, 30)
+    judge.reset(np.arange(3), scene)
+    judge.update(scene, np.array([0]))
+    judge.update(scene, np.array([0, 1]))
+    assert judge.steps.tolist() == [2, 1, 0]
+    assert judge.held.tolist() == [2, 1, 0]
+    assert judge.lasted[:, 1].tolist() == [2, 1, 0]
+    assert judge.subtask[:, 0].tolist() == [1, 1, 0]
+    assert judge.failure.tolist() == ["", "", ""]  # the third diverged, but nobody has stepped it
+    task.now = {name: [False] * 3 for name in task.now}
+    judge.update(scene, np.array([0]))
+    assert judge.held.tolist() == [0, 1, 0]
+    assert judge.lasted[:, 1].tolist() == [0, 1, 0]
+
+
 def test_snapshot_and_restore_keep_counters(judged):
     step, judge, scene = judged
     step(14, goal=True, first=True)

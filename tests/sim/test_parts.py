@@ -14,16 +14,13 @@ from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
 from taccorl.errors import TaccorlError
+from taccorl.sim.part import COLORS, Part, add_part, measure_fit
 from taccorl.sim.robot import FINGER_STROKE_M, PAD_LENGTH_M, PAD_THICKNESS_M, PAD_WIDTH_M
 from taccorl.sim.shapes import Box, Cylinder, Prism, circle_outline, extrude, heart_outline
 from taccorl.sim.tasks.parts import (
-    COLORS,
     PIECES,
-    Part,
-    add_part,
     cradle_plug,
     glass_tube,
-    measure_fit,
     open_cradle,
     puzzle_piece,
     puzzle_tray,

@@ -326,6 +326,23 @@ def test_close_frees_and_another_picture_opens_again(cluttered):
         assert np.array_equal(one.render(datas[2:3]), together[2:3])
 
 
+def test_a_renderer_that_outlives_python_is_left_alone(monkeypatch):
+    model, closed = spots(), []
+    monkeypatch.setattr(Renderer, "close", lambda self: closed.append(self._gl))
+    renderers = [Renderer(model, []), Renderer(model, [])]
+    for renderer in renderers:
+        renderer._gl = object()  # as if it had drawn
+    monkeypatch.setattr(sys, "is_finalizing", lambda: True)
+    del renderer
+    renderers.pop()
+    gc.collect()
+    assert closed == []
+    monkeypatch.setattr(sys, "is_finalizing", lambda: False)
+    renderers.pop()
+    gc.collect()
+    assert len(closed) == 1
+
+
 def test_a_renderer_may_be_used_from_another_thread(cluttered):
     model, datas, together = cluttered
     drawn = []

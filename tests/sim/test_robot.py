@@ -1,9 +1,12 @@
 """The arm from its number table: joint frames, masses, and what gripping does."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
 
+from taccorl.errors import TaccorlError
 from taccorl.sim.grip_rig import gripped, in_hand_m, rest, shake
 from taccorl.sim.robot import (
     ARMS,
@@ -40,6 +43,22 @@ def test_forward_kinematics_agrees_with_the_published_joint_frames():
                 body = data.body(f"{arm}_{link.name}")
                 np.testing.assert_allclose(body.xpos - base, ours[:3, 3], atol=1e-12)
                 np.testing.assert_allclose(body.xmat.reshape(3, 3), ours[:3, :3], atol=1e-12)
+
+
+def test_joint_frames_lie_where_the_published_numbers_put_them():
+    """By hand from the URDF. At zero: link 2 is turned by rpy (π/2, −0.1359, −π), so its x axis is Rz(−π) Ry(−0.1359) x =
+    (−cos 0.1359, 0, sin 0.1359); joint 3 lies 0.28503 m along it from (0, 0, 0.123): (−0.28240, 0, 0.16161). Joint 2 turns
+    the upper arm about −y: at q₂ = 0.1359 + π/2 it stands upright."""
+    at_zero = link_poses(np.zeros(6))
+    np.testing.assert_allclose(at_zero[0, :3, 3], [0, 0, 0.123], atol=1e-6)
+    np.testing.assert_allclose(at_zero[2, :3, 3], [-0.28240, 0, 0.16161], atol=2e-5)
+    upright = link_poses(np.array([0, np.pi / 2 - 0.1359, 0, 0, 0, 0]))
+    np.testing.assert_allclose(upright[2, :3, 3], [0, 0, 0.123 + 0.28503], atol=2e-5)
+    # Joint 1 turns everything about z; the forearm's elbow offset is 0.25171 m whatever the angles.
+    turned = link_poses(np.array([np.pi / 2, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(turned[2, :3, 3], [0, -0.28240, 0.16161], atol=2e-5)
+    # From joint 5 (same origin as joint 4) to joint 6: 0.091 m and 0.0883 mm.
+    assert np.linalg.norm(at_zero[5, :3, 3] - at_zero[4, :3, 3]) == pytest.approx(0.0910000, abs=1e-6)
 
 
 def test_stretched_arm_reaches_as_far_as_its_links_are_long():
@@ -162,3 +181,37 @@ def test_an_arm_can_be_built_alone():
     add_arm(spec, "left", RobotConfig(pads="rigid"))
     model = spec.compile()
     assert model.nv == 8  # six joints, two fingers, no springs
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "wanted"),
+    [
+        *(
+            (name, wrong, "finite number > 0")
+            for name in ("mount_spacing_m", "pad_stiffness_n_per_m", "grip_stiffness_n_per_m", "grip_force_max_n")
+            for wrong in (0.0, -1.0, float("inf"))
+        ),
+        *(
+            (name, wrong, "finite number ≥ 0")
+            for name in ("armature_kgm2", "pad_damping_ns_per_m", "grip_damping_ns_per_m")
+            for wrong in (-1e-9, float("nan"))
+        ),
+        *((name, float("nan"), "finite number") for name in ("mount_height_m", "gravity_compensation")),
+        ("pad_tilt_stiffness_nm_per_rad", (40.0, 0.0), "finite number > 0"),
+        ("pad_tilt_stiffness_nm_per_rad", (40.0,), "not two numbers"),
+        ("armature_kgm2", "0.01", "finite number ≥ 0"),
+    ],
+)
+def test_numbers_that_no_robot_has_are_refused_by_name(name, wrong, wanted):
+    with pytest.raises(TaccorlError, match=rf"robot\.{name}: {re.escape(str(wrong))} .*{wanted}"):
+        RobotConfig(**{name: wrong})
+
+
+def test_an_arm_may_have_no_rotor_inertia_no_damping_and_carry_more_than_its_weight():
+    RobotConfig(
+        armature_kgm2=0.0,
+        pad_damping_ns_per_m=0.0,
+        grip_damping_ns_per_m=0,
+        gravity_compensation=1.2,
+        mount_height_m=-0.1,
+    )

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects import make_effect
 from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, SUB_COMMANDS, Simulation, Watch
 from taccorl.sim.tasks import tasks
 from taccorl.sim.tasks.assembly_1 import Assembly1
+from taccorl.sim.twin import TwinConfig
 
 
 def waving(steps: int) -> np.ndarray:
@@ -62,6 +64,121 @@ def test_a_snapshot_of_another_task_is_refused():
     bench.reset([0])
     with pytest.raises(TaccorlError, match="another task's or another twin's"):
         sim.restore(bench.snapshot())
+
+
+def scene(task: str = "assembly_1", difficulty: str = "train", effect: tuple = (), scale: float = 1.0) -> Simulation:
+    effects = [make_effect(effect[0], **effect[1])] if effect else []
+    sim = Simulation(tasks.get(task)(difficulty), TwinConfig(effects=effects), scale=scale)
+    sim.reset([5])
+    return sim
+
+
+CREEP, HYSTERESIS = ("taxel_creep", {"share": 0.3}), ("taxel_hysteresis", {"half_width": 0.1})
+
+
+@pytest.mark.parametrize(
+    ("mine", "other"),
+    [
+        ({}, {"task": "assembly_2"}),
+        ({}, {"difficulty": "hard"}),
+        ({}, {"effect": ("coulomb_friction", {"torque_nm": 0.4})}),
+        ({"effect": ("coulomb_friction", {"torque_nm": 0.5})}, {"effect": ("coulomb_friction", {"torque_nm": 0.4})}),
+        ({"effect": CREEP}, {"effect": HYSTERESIS}),
+        ({}, {"scale": 0.0}),
+    ],
+)
+def test_a_state_of_another_scene_is_refused_before_anything_is_written(mine: dict, other: dict):
+    sim, origin = scene(**mine), scene(**other)
+    sim.step(sim.targets + 0.01)
+    state, rows = sim.batch.state.copy(), sim.state_rows()
+    foreign, foreign_rows = origin.snapshot(), origin.state_rows()
+    if rows.shape == foreign_rows.shape:  # else sizes tell them apart
+        said = "another task, difficulty, twin or randomisation.*assembly_1, train"
+    else:
+        said = "another t"
+    with pytest.raises(TaccorlError, match=r"another t(ask|win)"):
+        sim.restore(foreign)
+    with pytest.raises(TaccorlError, match=said):
+        sim.restore_rows(foreign_rows, [5])
+    np.testing.assert_array_equal(sim.batch.state, state)
+    np.testing.assert_array_equal(sim.state_rows(), rows)
+    assert sim.judge.steps[0] == 1
+
+
+def test_a_state_of_the_same_scene_made_anew_is_taken():
+    for settings in ({}, {"effect": CREEP}, {"difficulty": "hard", "scale": 0.5}):
+        origin, sim = scene(**settings), scene(**settings)
+        origin.step(origin.targets + 0.01)
+        sim.restore(origin.snapshot())
+        np.testing.assert_array_equal(sim.state_rows(), origin.state_rows())
+        sim.reset([1])
+        sim.restore_rows(origin.state_rows(), origin.seeds)
+        np.testing.assert_array_equal(sim.state_rows(), origin.state_rows())
+
+
+def test_a_row_begins_with_its_scene_and_then_has_the_physics():
+    sim = scene()
+    row = sim.state_rows()[0]
+    assert row.shape == (sim.row_size,)
+    assert 0 < row[0] < 1 and row[0] * 2**52 == int(row[0] * 2**52)
+    np.testing.assert_array_equal(row[1 : 1 + sim.batch.nstate], sim.batch.state[0])
+    spoilt = row.copy()
+    spoilt[0] += 2**-52  # the last bit
+    with pytest.raises(TaccorlError, match="randomisation"):
+        sim.restore_rows(spoilt[None], [5])
+    with pytest.raises(TaccorlError, match="2 seeds"):
+        sim.restore_rows(row[None], [5, 6])
+    with pytest.raises(TaccorlError, match="render_states: wanted are rows"):
+        next(sim.render_states(sim.snapshot().physics, ["front"]))
+
+
+@pytest.mark.parametrize("effects", [[], ["command_delay", "command_lag", "taxel_creep"]])
+def test_a_simulation_that_is_not_stepped_keeps_everything(effects: list[str]):
+    typical = [effect(name) for name in effects]
+    sim = Simulation(Assembly1(), TwinConfig(effects=typical), num_sims=3)
+    alone = Simulation(Assembly1(), TwinConfig(effects=typical))
+    sim.reset([3, 7, 11])
+    alone.reset([7])
+    for k, action in enumerate(ACTIONS[:6]):
+        before = sim.snapshot()
+        sim.judge.held[[0, 2]] = 4 + k  # would be broken off if they were judged
+        executed, targets = sim.executed.copy(), sim.targets.copy()
+        beyond = action + np.where(np.arange(3) == 1, 0.0, 4.0)[:, None] * (
+            np.arange(14) == 0
+        )  # clipped, if it counted
+        sim.step(beyond, np.array([1]))
+        alone.step(action[None])
+        now = sim.snapshot()
+        for i in (0, 2):
+            np.testing.assert_array_equal(now.physics[i], before.physics[i])
+            np.testing.assert_array_equal(sim.targets[i], targets[i])
+            np.testing.assert_array_equal(sim.executed[i], executed[i])
+            for name, values in before.memory.items():
+                np.testing.assert_array_equal(now.memory[name][i], values[i], err_msg=name)
+        assert sim.judge.steps.tolist() == [0, k + 1, 0]
+        assert sim.judge.held[[0, 2]].tolist() == [4 + k] * 2
+        assert not sim.clipped.any()
+    np.testing.assert_array_equal(sim.batch.state[1], alone.batch.state[0])
+    np.testing.assert_array_equal(sim.targets[1], alone.targets[0])
+
+
+def effect(name: str):
+    return make_effect(name, **{p.name: p.typical for p in type(make_effect(name)).parameters()})
+
+
+@pytest.mark.parametrize("wrong", [-1, 2**63, 1.5, "7", True])
+def test_a_seed_that_is_none_is_named(wrong):
+    sim = Simulation(tasks.get("bench")(), num_sims=2)
+    with pytest.raises(TaccorlError, match=rf"seed: {wrong!r} is no whole number"):
+        sim.reset([0, wrong])
+    sim.reset([0, 2**63 - 1])
+    assert sim.seeds.tolist() == [0, 2**63 - 1]
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), "1"])
+def test_a_randomisation_beyond_the_table_is_refused(wrong):
+    with pytest.raises(TaccorlError, match=rf"randomization: {wrong!r} .*0 \(nominal scene\) … 1"):
+        Simulation(tasks.get("bench")(), scale=wrong)
 
 
 def test_watching_changes_nothing():

@@ -1,6 +1,7 @@
 """twin.yaml: what is written is read back equal, what is wrong is named with file, line and the nearest name."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,23 @@ def test_the_nominal_twin_is_written_as_nothing_at_all(tmp_path: Path) -> None:
     lines = [line for line in written(tmp_path, TwinConfig()).splitlines() if not line.startswith("#")]
     assert lines == ["effects: []"]
     assert load_twin(tmp_path / "twin.yaml") == TwinConfig()
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", "# effects: []\n", "  # nothing yet\n\n# at all"])
+def test_a_file_that_says_nothing_is_the_nominal_twin(tmp_path: Path, text: str) -> None:
+    assert read(tmp_path, text) == TwinConfig()
+
+
+def test_the_shipped_file_names_only_commands_that_exist() -> None:
+    text = (CONFIGS / "twin.yaml").read_text(encoding="utf-8")
+    assert not re.search(r"taccorl (diagnose|add-effect)", text)
+
+
+@pytest.mark.parametrize("name", ["impratio"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_physics_without_sense_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(TaccorlError, match=rf"physics\.{name}: {value} .* finite number > 0"):
+        PhysicsConfig(**{name: value})
 
 
 def changed_everywhere() -> TwinConfig:
@@ -116,6 +134,8 @@ ONE = "effects:\n- effect: coulomb_friction\n  torque_nm: 0.4\n"
         ("robot:\n  mount_hight_m: 0.2\n", 2, "'mount_hight_m'; did you mean 'mount_height_m'?"),
         ("robot:\n  pads: sprang\n", 2, "'sprang' is none of 'sprung', 'rigid'"),
         ("physics:\n  impratio: 1\n  steps_per_control_step: 33\n", 3, "33 is not a multiple of 20"),
+        ("physics:\n  impratio: 0\n", 2, "physics.impratio: 0.0 is not wanted here; give a finite number > 0"),
+        ("robot:\n  pad_stiffness_n_per_m: -1\n", 2, "robot.pad_stiffness_n_per_m: -1.0 is not wanted"),
         ("physics: {impratio: ten}\n", 1, "expected float, found 'ten'"),
         ("controller:\n  kp_nm_per_rad: [1, 2]\n", 2, "2 values, the arm has 6 joints"),
         ("controller:\n  kp_nm_per_rad: 1813\n", 2, "expected a list, found '1813'"),
@@ -154,7 +174,7 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, text: str, line: i
     assert said in message
 
 
-@pytest.mark.parametrize("text", ["", "\t- x", "a: [", "- 1\n", "effects: &x [*x]\n"])
+@pytest.mark.parametrize("text", ["null", "\t- x", "a: [", "- 1\n", "effects: &x [*x]\n"])
 def test_what_is_no_twin_file_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(SpecError, match=r"twin\.yaml"):
         read(tmp_path, text)
@@ -163,7 +183,8 @@ def test_what_is_no_twin_file_is_refused(tmp_path: Path, text: str) -> None:
 def test_a_file_that_cannot_be_written_leaves_the_old_one_alone(tmp_path: Path) -> None:
     save_twin(changed_everywhere(), tmp_path / "twin.yaml")
     before = (tmp_path / "twin.yaml").read_bytes()
-    config = TwinConfig(robot=RobotConfig(mount_height_m=float("inf")))
+    config = TwinConfig()
+    config.robot.mount_height_m = float("inf")
     with pytest.raises(TaccorlError, match="mount_height_m is inf"):
         save_twin(config, tmp_path / "twin.yaml")
     assert (tmp_path / "twin.yaml").read_bytes() == before

@@ -259,7 +259,7 @@ def test_wrong_input_is_named(episode: ExpertEpisode) -> None:
         envs.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(TaccorlError, match=r"seed: \[1, 2, 3\] is neither"):
         envs.reset(seed=[1, 2, 3])
-    with pytest.raises(TaccorlError, match="seed: -4 is neither"):
+    with pytest.raises(TaccorlError, match="seed: -4 is no whole number"):
         vector(1, seed=-4)
     envs.reset(seed=0)
     for wrong in (episode.actions[:3], episode.actions[0], episode.actions[:2, :13]):

@@ -7,8 +7,8 @@ import numpy as np
 from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert
 from taccorl.demos.experts.se3 import inverse, rotvec, transform
+from taccorl.sim.part import Part
 from taccorl.sim.tasks.assembly_1 import Assembly1
-from taccorl.sim.tasks.parts import Part
 from taccorl.sim.twin import CONTROL_HZ
 
 _LEAN_RAD = 0.40  # hands lean away from each other, so that wrists and cameras keep apart

@@ -5,8 +5,8 @@ import numpy as np
 from taccorl.demos.experts import experts
 from taccorl.demos.experts.assembly_1 import AirAssembly
 from taccorl.demos.experts.scripted import Mating, Script
+from taccorl.sim.part import Part
 from taccorl.sim.tasks.assembly_2 import Assembly2
-from taccorl.sim.tasks.parts import Part
 
 _LET_DOWN_M, _LET_DOWN_MPS = 0.001, 0.01  # so that the cradle, not the hand, carries the plug before it is let go
 

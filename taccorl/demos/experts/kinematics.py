@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from taccorl.demos.experts.se3 import rotvec
-from taccorl.errors import TaccorlError
+from taccorl.errors import UnreachableError
 from taccorl.sim.robot import JOINTS, RobotConfig, add_arm
 
 _METRES_PER_RAD = 0.15  # how an orientation error weighs against a position error: the hand's own length
@@ -98,7 +98,7 @@ class ArmKinematics:
         """The solution farthest from the joint limits among random starts.
 
         Raises:
-            TaccorlError: the pose is out of reach.
+            UnreachableError: the pose is out of reach.
         """
         low, high = self._low, self._high
         best, best_margin, best_error = None, -np.inf, np.inf
@@ -110,7 +110,7 @@ class ArmKinematics:
                 best, best_margin = joints, margin
         if best is None:
             place = np.round(tcp_world[:3, 3], 3).tolist()
-            raise TaccorlError(
+            raise UnreachableError(
                 f"{self.arm} arm: TCP at {place} m with approach {np.round(tcp_world[:3, 2], 2).tolist()} is out of reach: "
                 f"{best_error * 1e3:.1f} mm short after {tries} starts. Move the pose, or tilt the approach."
             )

@@ -8,7 +8,7 @@ import numpy as np
 from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import DT_S, Aim, Mating, Script, ScriptedExpert
 from taccorl.demos.experts.se3 import inverse, turn
-from taccorl.sim.tasks.parts import Part
+from taccorl.sim.part import Part
 from taccorl.sim.tasks.puzzle import Puzzle
 from taccorl.sim.twin import CONTROL_HZ
 

@@ -16,11 +16,12 @@ from typing import ClassVar
 import numpy as np
 
 from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.demos.experts.mating import Aim, Mating, deflection
 from taccorl.demos.experts.se3 import between, inverse, rotvec, transform, turn
 from taccorl.errors import TaccorlError
+from taccorl.sim.part import Part
 from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, OPEN_M, Simulation
-from taccorl.sim.tasks.parts import Fit, Part, measure_fit
 from taccorl.sim.twin import CONTROL_HZ
 
 DT_S = 1.0 / CONTROL_HZ
@@ -94,81 +95,6 @@ class Hand:
 
 
 Script = Iterator[None]
-
-
-@dataclass(frozen=True)
-class Mating:
-    """A held part and the hole it goes into."""
-
-    held: str
-    held_from_mate: np.ndarray
-    num_turns: int | None
-    holder: str
-    holder_from_hole: np.ndarray
-
-    @classmethod
-    def of(cls, held: Part, holder: Part, hole: str) -> "Mating":
-        assert held.mate is not None
-        return cls(
-            held.name, held.mate.part_from_mate, held.mate.num_turns, holder.name, holder.holes[hole].part_from_hole
-        )
-
-    def _relative(self, expert: "ScriptedExpert") -> tuple[np.ndarray, np.ndarray]:
-        return expert.body(self.holder) @ self.holder_from_hole, expert.body(self.held) @ self.held_from_mate
-
-    def fit(self, expert: "ScriptedExpert") -> Fit:
-        """How the held part stands in the hole now."""
-        return measure_fit(*self._relative(expert), self.num_turns)
-
-    def axis(self, expert: "ScriptedExpert") -> np.ndarray:
-        """(3,) world, into the hole."""
-        return expert.body(self.holder)[:3, :3] @ self.holder_from_hole[:3, 2]
-
-    def turned(self, expert: "ScriptedExpert") -> np.ndarray:
-        """(4, 4) the turn about the hole's axis, among those that look the same, that is nearest to how it is held."""
-        hole, mate = self._relative(expert)
-        angle = measure_fit(hole, mate, 1).turn_rad
-        wrong = measure_fit(hole, mate, self.num_turns).turn_rad
-        return turn((0, 0, float(angle - wrong)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Aim:
-    """Where a hand wants to bring a held part, and how wrong it is about it."""
-
-    off_m: np.ndarray
-    """(2,) error across the hole's axis."""
-    off_rad: np.ndarray
-    """(3,) error of the direction, about the part's leading end."""
-    part_from_tcp: np.ndarray
-    """(4, 4) how the hand held the part when it was last looked at."""
-    turned: np.ndarray
-    """(4, 4) about the hole's axis, among the turns that look the same."""
-    given: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    """(6,) [m, rad], frame of the hole: how far the wrist has given way, about the TCP; never along the axis."""
-
-    def pose(self, expert: "ScriptedExpert", mating: Mating, depth_m: float) -> np.ndarray:
-        """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, as far as the hand knows."""
-        hole = expert.body(mating.holder) @ mating.holder_from_hole
-        mate = transform((*self.off_m, depth_m)) @ turn(self.off_rad) @ self.turned
-        pose = hole @ mate @ inverse(mating.held_from_mate) @ self.part_from_tcp
-        pose[:3, :3] = hole[:3, :3] @ turn(self.given[3:])[:3, :3] @ hole[:3, :3].T @ pose[:3, :3]
-        pose[:3, 3] += hole[:3, :3] @ self.given[:3]
-        return pose
-
-    def giving_way(self, expert: "ScriptedExpert", mating: Mating, push_world: np.ndarray) -> "Aim":
-        """The wrist lets itself be moved by ``push_world`` (6,) [m, rad], but not back out of the hole."""
-        world_from_hole = (expert.body(mating.holder) @ mating.holder_from_hole)[:3, :3]
-        sideways = world_from_hole.T @ push_world[:3] * (1, 1, 0)
-        return replace(self, given=self.given + np.r_[sideways, world_from_hole.T @ push_world[3:]])
-
-
-def deflection(wanted: np.ndarray, actual: np.ndarray) -> np.ndarray:
-    """(6,) [m, rad], world: from one pose (4, 4) to another, the rotation as a rotation vector."""
-    off = np.empty(6)
-    off[:3] = actual[:3, 3] - wanted[:3, 3]
-    off[3:] = wanted[:3, :3] @ rotvec(wanted, actual)
-    return off
 
 
 def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
@@ -341,7 +267,7 @@ class ScriptedExpert(ABC):
                 return
             yield
 
-    def insert(self, arm: str, mating: "Mating", *, depth_m: float, enough_m: float, start_m: float = -0.02) -> Script:
+    def insert(self, arm: str, mating: Mating, *, depth_m: float, enough_m: float, start_m: float = -0.02) -> Script:
         """Bring a held part before a hole and push it in until ``enough_m``; it is pushed towards ``depth_m`` at most.
 
         Sideways and in rotation the hand gives way to what it feels, as a relaxed wrist does, so that the part finds its way
@@ -377,7 +303,7 @@ class ScriptedExpert(ABC):
             yield
         yield from self.pause(arm, 0.1, 0.25)
 
-    def _bring_before(self, arm: str, mating: "Mating", start_m: float) -> Generator[None, None, "Aim"]:
+    def _bring_before(self, arm: str, mating: Mating, start_m: float) -> Generator[None, None, Aim]:
         """Carry a held part to ``start_m`` before the hole and look twice, the second time when it has come to rest."""
         config = self.config
         aim = Aim(
@@ -396,12 +322,12 @@ class ScriptedExpert(ABC):
         """What comes between a block and the next look; experts whose other hand holds the hole have it come to rest, too."""
         yield from self.settle(arm, longest_s=0.2)
 
-    def _held_back_m(self, arm: str, mating: "Mating", aim: "Aim", pushed: np.ndarray) -> float:
+    def _held_back_m(self, arm: str, mating: Mating, aim: Aim, pushed: np.ndarray) -> float:
         """How far the hand is pushed back out of the hole, or the part has slipped in it since it was looked at."""
         slipped = aim.part_from_tcp[:3, 3] - (inverse(self.body(mating.held)) @ self.tcp(arm))[:3, 3]
         return max(float(-(mating.axis(self) @ pushed[:3])), float(np.linalg.norm(slipped)))
 
-    def _corrected(self, aim: "Aim") -> "Aim":
+    def _corrected(self, aim: Aim) -> Aim:
         """Touch has told on which side the rim is."""
         kept, config = self.config.aim_kept, self.config
         return replace(
@@ -410,7 +336,7 @@ class ScriptedExpert(ABC):
             off_rad=kept * aim.off_rad + self.rng.normal(size=3) * 0.1 * config.aim_rad,
         )
 
-    def _look(self, arm: str, mating: "Mating", aim: "Aim") -> "Aim":
+    def _look(self, arm: str, mating: Mating, aim: Aim) -> Aim:
         """The same aim with the part as it lies in the hand now, and a wrist that has given way to nothing yet."""
         part_from_tcp = inverse(self.body(mating.held)) @ self.tcp(arm)
         return replace(aim, part_from_tcp=part_from_tcp, turned=mating.turned(self), given=np.zeros(6))

@@ -3,8 +3,9 @@
 Law (paper eq. 10): f = [k_n δ + k_d δ̇]₊ where δ > 0. The reading f has the unit of the policy's normalised reading: with the
 default gain 1 is 75 counts, since the data spec's gain is 1/75 a count, and contact is f > λ_f = 0.4, 30 counts.
 
-k_n and the gain are a choice, not a measurement: 10 N on a whole sprung pad (2e4 N/m: 0.5 mm) read f = 0.8 at the deepest
-taxel, 60 counts; 30 N read 180, and at 40 N a taxel with a high resting count saturates. No force calibration of these boards
+k_n and the gain are a choice, not a measurement: 10 N on a whole sprung pad (2e4 N/m: 0.5 mm) read f = 0.6 at the deepest
+taxel, 45 counts; 40 N, all that the gripper has, read 180, which every taxel can still send.
+No force calibration of these boards
 is known to us; alignment fits both on a robot.
 
 Board and wire: data_specs/sensors/flexitac_v2.yaml. Letters in shapes: as in ``taccorl.sim.sensors``, S samples.
@@ -100,10 +101,10 @@ class FlexiTacConfig(SensorConfig):
 
     spec: str = "flexitac_v2"
     """Sensor file: taxels, wire, converter, scan. A name among data_specs/sensors, or a path."""
-    normal_stiffness_per_m: float = 1600.0
+    normal_stiffness_per_m: float = 1200.0
     """k_n: reading for each metre of depth. A choice, see above."""
-    normal_damping_s_per_m: float = 8.0
-    """k_d: reading for each m/s of rate. A choice: k_d / k_n = 5 ms, 6 counts at a closing speed of 10 mm/s."""
+    normal_damping_s_per_m: float = 6.0
+    """k_d: reading for each m/s of rate. A choice: k_d / k_n = 5 ms, 5 counts at a closing speed of 10 mm/s."""
     gain_count: float = 75.0
     """Counts for a reading of 1."""
     resting_count: tuple[int, int] = (10, 40)

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
 from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.parts import Fit, Part, add_part, measure_fit, tenon_plug, tenon_socket
-from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict
+from taccorl.sim.tasks.parts import tenon_plug, tenon_socket
+from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict, at_rest, fell
 
 SOCKET_AT_M, PLUG_AT_M = (0.30, 0.14), (0.30, -0.16)  # of their mating ends, nominal
 HOME_RAD = {
@@ -110,23 +110,3 @@ def lift_and_join(holder: str, plug: str, joined: Callable[[Scene], np.ndarray])
             Subtask(name=insert, object_ref=holder, held=plug, done=joined, coordinated_with=hold),
         ),
     }
-
-
-def on_table(part: Part, xy_m: np.ndarray, yaw_rad: float) -> np.ndarray:
-    """World pose (7,) of a part that rests on the table, turned by ``yaw_rad``, its origin above ``xy_m``."""
-    rest = part.table_from_part
-    turned = Rotation.from_euler("z", yaw_rad)
-    pos = np.array([*xy_m, rest[2, 3] + 0.0002])  # a hair above: no contact to begin with
-    return np.r_[pos, (turned * Rotation.from_matrix(rest[:3, :3])).as_quat(scalar_first=True)]
-
-
-def at_rest(scene: Scene, part: str, holder: str) -> np.ndarray:
-    """(N,) whether a part moves slower than 20 mm/s against what holds it."""
-    off = scene.velocities(part) - scene.velocities(holder)
-    return np.einsum("ni,ni->n", off, off) < AT_REST_MPS**2
-
-
-def fell(pose: np.ndarray) -> np.ndarray:
-    """(N,) whether a body is below the table's top or beyond its edge."""
-    x, y, z = pose[:, :3, 3].T
-    return (z < -0.02) | (np.abs(y) > 0.7) | (x < -0.15) | (x > 0.85)

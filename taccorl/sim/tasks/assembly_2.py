@@ -7,10 +7,11 @@ the table at first, their axes along y. Let go too early, the plug tips over the
 import mujoco
 import numpy as np
 
+from taccorl.sim.part import Fit, Part, add_part, measure_fit
 from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.assembly_1 import HOME_RAD, LIFTED_M, at_rest, fell, lift_and_join, lying_apart
-from taccorl.sim.tasks.parts import Fit, Part, add_part, cradle_plug, measure_fit, open_cradle
-from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict
+from taccorl.sim.tasks.assembly_1 import HOME_RAD, LIFTED_M, lift_and_join, lying_apart
+from taccorl.sim.tasks.parts import cradle_plug, open_cradle
+from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict, at_rest, fell
 
 _COM_INSIDE_M = 0.002
 _IN_TILT_RAD, _IN_LATERAL_M = np.deg2rad(5.0), 0.004  # it lies on the cradle's floor, between its walls

@@ -1,33 +1,18 @@
-"""The parts of the four tasks: geometry, mass, and where to hold and mate them (research/mimicgen.md §3).
-
-A part is plain numbers (``Part``); ``add_part`` puts it into a MuJoCo spec. Lengths in metres, poses are (4, 4) matrices
-``a_from_b``. Conventions that experts and predicates rely on:
-
-- *mate*: the pose of the part's leading end; *hole*: of a hole's mouth. Both have z along the insertion. A part is aligned
-  when the two agree (up to its symmetry); its depth is then the z of the mate in the hole. ``measure_fit`` does it.
-- *grasp*: pose of the TCP (taccorl.sim.robot: middle between the pads, z = approach, fingers close along y).
-- A movable part hangs on a free joint named like its body. A clamped one is a mocap body: its pose is simulation state
-  (``Batch.mocap_pos``, ``mocap_quat``), so it differs from sim to sim, is saved with the state, and costs no solver rows.
-- Clearance is per side: the hole's outline is the part's, moved out by it.
-"""
+"""The parts of the four tasks (research/mimicgen.md §3). Clearance is per side: a hole is its part's outline, moved out."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
 
-import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 from shapely.geometry import Polygon, box
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.part import Grasp, Hole, Mate, Part
 from taccorl.sim.robot import PAD_LENGTH_M
 from taccorl.sim.shapes import (
     Capsule,
     Cylinder,
     Solid,
-    add_geom,
     box_between,
     circle_outline,
     extrude,
@@ -38,146 +23,9 @@ from taccorl.sim.shapes import (
     with_mass,
 )
 
-PART_CONTACT: Mapping[str, Any] = {
-    "solref": (0.002, 1.0),
-    "solimp": (0.99, 0.999, 0.0005, 0.5, 2.0),
-    "condim": 4,
-    "priority": 1,
-}
-"""Contact of a part with anything: as stiff as the time step allows, because MuJoCo's defaults let parts of 0.5 mm clearance
-overlap by 1–2 mm (research/mimicgen.md §4.2). Priority 1: the part's friction and stiffness count, not the table's or the
-pad's, because the paper randomises the part's friction. Friction itself is ``geom_friction``, which ``Batch.expand`` gives
-each sim."""
-PART_FRICTION = 0.5  # middle of the paper's U(0.3, 0.7), App. E
-_TORSION_M, _ROLLING_M = 0.002, 0.0001  # torsional and rolling friction; a contact patch of some mm
-
 CLEARANCE_M = 0.0005  # per side; 0.001 is easy, 0.0003 hard (research/mimicgen.md §3.1)
 _FINGER_ROOM_M = 0.004  # between the fingers' tips and what lies below them
 _TCP_ABOVE_M = PAD_LENGTH_M / 2 + _FINGER_ROOM_M  # lowest TCP over a surface: the pads reach 32 mm beyond it
-
-COLORS: Mapping[str, tuple[float, float, float]] = {
-    "glass": (0.62, 0.86, 0.90),
-    "red": (0.80, 0.12, 0.12),
-    "blue": (0.12, 0.30, 0.68),
-    "sand": (0.80, 0.66, 0.40),
-    "walnut": (0.36, 0.22, 0.13),
-    "yellow": (0.93, 0.75, 0.10),
-    "pink": (0.88, 0.22, 0.45),
-    "green": (0.12, 0.58, 0.30),
-    "orange": (0.92, 0.43, 0.08),
-    "slate": (0.25, 0.32, 0.40),
-    "violet": (0.48, 0.26, 0.66),
-    "teal": (0.05, 0.46, 0.48),
-}
-"""Matte colours by name, RGB 0–1."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Mate:
-    """The leading end of a part that goes into a hole."""
-
-    part_from_mate: np.ndarray
-    """(4, 4) z along the insertion."""
-    num_turns: int | None
-    """How many turns about z look the same: 1, 2, 3 …; None for any angle."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Hole:
-    """A hole in a part, up to which depth it takes a mate."""
-
-    part_from_hole: np.ndarray
-    """(4, 4) in the middle of the mouth, z into the hole."""
-    depth_m: float
-    """From the mouth to the floor."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Grasp:
-    """One way to grip a part with flat jaws."""
-
-    part_from_tcp: np.ndarray
-    """(4, 4) pose of the TCP: z = approach, fingers close along y."""
-    width_m: float
-    """Between the pads when closed."""
-    num_turns: int = 2
-    """How many turns about the approach are as good."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Part:
-    """One body: its solids, and what experts and predicates need to know, all in the part's own frame."""
-
-    name: str
-    solids: list[Solid]
-    clamped: bool = False
-    """Clamped to the bench (a mocap body) instead of free."""
-    table_from_part: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """How it rests on a table whose top is z = 0."""
-    mate: Mate | None = None
-    holes: Mapping[str, Hole] = field(default_factory=dict)
-    grasps: Mapping[str, Grasp] = field(default_factory=dict)
-    seats: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Poses (4, 4), in this part, at which other parts lie ready, by the other part's kind."""
-
-    @property
-    def mass_kg(self) -> float:
-        return sum(solid.mass_kg for solid in self.solids)
-
-    @property
-    def com_part_m(self) -> np.ndarray:
-        """(3,) Centre of mass."""
-        return sum((s.mass_kg * s.com_part_m for s in self.solids), np.zeros(3)) / self.mass_kg
-
-
-class Fit(NamedTuple):
-    """How a mate stands in a hole; each an array of the poses' leading shape."""
-
-    depth_m: np.ndarray
-    """Positive inside."""
-    lateral_m: np.ndarray
-    """Between the two axes, at the leading end."""
-    tilt_rad: np.ndarray
-    """Between the two axes."""
-    turn_rad: np.ndarray
-    """About the axis, to the nearest look-alike; 0 for a round part."""
-
-
-def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_turns: int | None) -> Fit:
-    """Depth, lateral error, tilt and turn of mates (..., 4, 4) in holes (..., 4, 4)."""
-    turned = np.swapaxes(world_from_hole[..., :3, :3], -1, -2)
-    hole_from_mate = turned @ world_from_mate[..., :3, :3]
-    shift = world_from_mate[..., :3, 3] - world_from_hole[..., :3, 3]
-    x, y, depth = np.moveaxis((turned @ shift[..., None])[..., 0], -1, 0)
-    tilt = np.arctan2(np.hypot(hole_from_mate[..., 0, 2], hole_from_mate[..., 1, 2]), hole_from_mate[..., 2, 2])
-    turn = np.arctan2(
-        hole_from_mate[..., 1, 0] - hole_from_mate[..., 0, 1], np.einsum("...ii", hole_from_mate[..., :2, :2])
-    )
-    period = 2 * math.pi / num_turns if num_turns else math.inf
-    turn = np.zeros_like(turn) if num_turns is None else turn - period * np.round(turn / period)
-    return Fit(depth, np.hypot(x, y), tilt, turn)
-
-
-def add_part(spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION) -> mujoco.MjsBody:
-    """Put a part into the world as it rests on the table at the origin; poses are set in the state at reset.
-
-    Body, free joint (if not clamped) and geoms are named after the part: ``rack``, ``rack_0``, ``rack_1`` …
-    """
-    rest = part.table_from_part
-    quat = Rotation.from_matrix(rest[:3, :3]).as_quat(scalar_first=True)
-    body = spec.worldbody.add_body(name=part.name, pos=rest[:3, 3], quat=quat, mocap=part.clamped)
-    if not part.clamped:
-        body.add_freejoint(name=part.name)
-    for color in sorted({solid.color for solid in part.solids if solid.touches}):
-        spec.add_material(name=f"{part.name}_{color}", rgba=(*COLORS[color], 1), specular=0, shininess=0)
-    for i, solid in enumerate(part.solids):
-        settings = dict(
-            PART_CONTACT, friction=(friction, _TORSION_M, _ROLLING_M), material=f"{part.name}_{solid.color}"
-        )
-        if not solid.touches:
-            settings = {"contype": 0, "conaffinity": 0, "group": 5, "rgba": (0, 0, 0, 0)}
-        add_geom(spec, body, solid, f"{part.name}_{i}", **settings)
-    return body
 
 
 def _pose(x_axis: tuple = (1, 0, 0), z_axis: tuple = (0, 0, 1), at: tuple = (0, 0, 0)) -> np.ndarray:

@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
 from taccorl.sim.robot import ARMS, TCP_FROM_LINK6_M
 from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.assembly_1 import fell, on_table
-from taccorl.sim.tasks.parts import PIECES, Fit, Part, add_part, measure_fit, puzzle_piece, puzzle_tray
-from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict
+from taccorl.sim.tasks.parts import PIECES, puzzle_piece, puzzle_tray
+from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell
 
 # Nominal places [m]: outlines stay ≥ 4 mm apart whatever is drawn, and all are reached ≥ 0.2 rad from the joint limits.
 TRAY_AT_M, YAW_RAD = (0.27, -0.02), -np.pi / 2  # the tray's x runs to the right; pieces lie as their holes do

@@ -138,3 +138,15 @@ class Task(ABC):
     @abstractmethod
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
         """Arm → its subtasks in order."""
+
+
+def at_rest(scene: Scene, part: str, holder: str) -> np.ndarray:
+    """(N,) whether a part moves slower than 20 mm/s against what holds it."""
+    off = scene.velocities(part) - scene.velocities(holder)
+    return np.einsum("ni,ni->n", off, off) < AT_REST_MPS**2
+
+
+def fell(pose: np.ndarray) -> np.ndarray:
+    """(N,) whether a body is below the table's top or beyond its edge."""
+    x, y, z = pose[:, :3, 3].T
+    return (z < -0.02) | (np.abs(y) > 0.7) | (x < -0.15) | (x > 0.85)

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
 from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.assembly_1 import fell, on_table
-from taccorl.sim.tasks.parts import Fit, Part, add_part, glass_tube, measure_fit, tube_rack, tube_stand
-from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict
+from taccorl.sim.tasks.parts import glass_tube, tube_rack, tube_stand
+from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell
 
 TUBE_AT_M, TUBE_YAW_RAD = (0.175, -0.315), np.pi / 2  # of the tube's middle; heading from its bottom to its cap
 RACK_AT_M, RACK_YAW_RAD = (0.400, 0.035), -np.pi / 2  # nominal; the handle looks to +y

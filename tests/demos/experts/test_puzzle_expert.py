@@ -104,7 +104,8 @@ def test_human_hands_feel_the_rim_and_one_is_at_the_tray_at_a_time(sim):
 
 def test_a_piece_that_rests_on_the_rim_is_picked_up_again_before_it_is_lost(sim, monkeypatch):
     monkeypatch.setattr(puzzle, "_LONGEST_S", 1.0)  # no patience: it lets go on the rim
-    episode = Episode(sim, 5)
-    assert episode.noted("rests on the rim") > 0
-    assert episode.outcome.success[0]
-    assert episode.lost_steps < 30
+    episodes = [Episode(sim, seed) for seed in (0, 1, 7)]
+    assert sum(episode.noted("rests on the rim") for episode in episodes) >= 2
+    for episode in episodes:
+        assert episode.outcome.success[0]
+        assert episode.lost_steps < 30

@@ -7,20 +7,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from taccorl.demos.experts.mating import Aim, Mating, deflection
 from taccorl.demos.experts.scripted import (
     DT_S,
     EXACT,
-    Aim,
-    Mating,
     Script,
     ScriptedExpert,
     ScriptedExpertConfig,
-    deflection,
     follow,
 )
 from taccorl.demos.experts.se3 import inverse, rotvec, transform, turn
 from taccorl.errors import TaccorlError
 from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.sim.part import Part
 from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, Simulation
 from taccorl.sim.tasks.assembly_1 import Assembly1
 
@@ -142,8 +141,8 @@ def test_closing_asks_for_the_part_less_what_motor_and_pads_give(sim):
     run(expert)
     robot = sim.config.robot
     motor_m, pad_m = 30.0 / robot.grip_stiffness_n_per_m, 30.0 / robot.pad_stiffness_n_per_m
-    assert motor_m == pytest.approx(0.020)  # 30 N / 1500 N/m
-    assert expert.hands["left"].opening_m == pytest.approx(0.030 - 0.020 - 2 * pad_m)
+    assert motor_m == pytest.approx(0.015)  # 30 N / 2000 N/m
+    assert expert.hands["left"].opening_m == pytest.approx(0.030 - 0.015 - 2 * pad_m)
 
 
 def test_waiting_ends_with_the_flag(sim):
@@ -159,9 +158,14 @@ def test_waiting_ends_with_the_flag(sim):
 # noise ------------------------------------------------------------------------------------------------------------------
 
 
+def socket(sim: Simulation) -> Part:
+    assert isinstance(sim.task, Assembly1)
+    return sim.task.socket
+
+
 def wander(expert: OneHand) -> Script:
     home = expert.hands["left"].pose.copy()
-    part = expert.sim.task.socket
+    part = socket(expert.sim)
     yield from expert.move("left", expert.near(shifted(home, (0.03, 0.03, 0))))
     yield from expert.pause("left")
     yield from expert.move("left", expert.grasp(part, "tail", lean_rad=0.4, lift_m=0.05, pivot_m=0.02))
@@ -188,7 +192,7 @@ def test_without_noise_the_seed_decides_pauses_only(sim):
         expert = OneHand(sim, wander, EXACT, seed)
         pose = transform((0.3, 0.1, 0.2))
         np.testing.assert_array_equal(expert.near(pose), pose)
-        part = sim.task.socket
+        part = socket(sim)
         np.testing.assert_allclose(
             expert.grasp(part, "tail", lift_m=0.01),
             shifted(sim.poses("socket")[0] @ part.grasps["tail"].part_from_tcp, (0, 0, 0.01)),
@@ -212,7 +216,7 @@ def test_the_tremor_has_the_spread_that_was_asked_for(sim):
 
 
 def test_a_lean_turns_the_hand_about_the_part_and_not_about_the_tcp(sim):
-    expert, part = OneHand(sim, wander), sim.task.socket
+    expert, part = OneHand(sim, wander), socket(sim)
     upright = expert.grasp(part, "tail")
     leaning = expert.grasp(part, "tail", lean_rad=0.3, pivot_m=0.025)
     spot = (0, 0, 0.025, 1)

@@ -1,6 +1,7 @@
 """Assembly #1: what counts as in, what as wedged, and the misses that come close."""
 
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -8,13 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.errors import TaccorlError
 from taccorl.sim.outcome import Judge
+from taccorl.sim.part import Mate
 from taccorl.sim.randomize import PAPER_ROWS, draw
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.assembly_1 import PLUG_AT_M, SOCKET_AT_M, Assembly1
 from taccorl.sim.tasks.task import Contact
 
 TASK = Assembly1()
-IN = {"depth_mm": 36.0}  # in the socket, let go, at rest
+MATE = cast(Mate, TASK.plug.mate)
+IN: dict[str, Any] = {"depth_mm": 36.0}  # in the socket, let go, at rest
 
 
 def placed(
@@ -34,7 +37,7 @@ def placed(
     mate = np.eye(4)
     mate[:3, :3] = Rotation.from_euler("zx", (turned_deg, tilt_deg), degrees=True).as_matrix()
     mate[:3, 3] = (aside_mm / 1e3, 0, depth_mm / 1e3)
-    plug = socket @ TASK.socket.holes["mortise"].part_from_hole @ mate @ np.linalg.inv(TASK.plug.mate.part_from_mate)
+    plug = socket @ TASK.socket.holes["mortise"].part_from_hole @ mate @ np.linalg.inv(MATE.part_from_mate)
     drift = np.array((0.1, 0, 0))  # both hands move together: what counts is the one against the other
     return {
         "poses": {"plug": plug, "socket": socket},
@@ -44,7 +47,7 @@ def placed(
     }
 
 
-def scene(*cases: dict) -> SimpleNamespace:
+def scene(*cases: dict) -> Any:
     """N scenes, one a row."""
     forces = np.array([case["force_n"] for case in cases])
     contact = Contact(forces > 0, np.zeros(len(cases)), forces)
@@ -86,7 +89,7 @@ def test_the_plug_is_in_when_deep_straight_let_go_and_at_rest(case, goal):
 
 
 def test_each_simulation_is_looked_at_on_its_own():
-    verdict = TASK.look(scene(placed(**IN), placed(10.0), placed(**IN | {"pads": (3,)})))
+    verdict = TASK.look(scene(placed(**IN), placed(10.0), placed(36.0, pads=(3,))))
     assert verdict.goal.tolist() == [True, False, False]
     assert verdict.partial.tolist() == [1, 0, 1]  # in place counts as partial while it is still held
     np.testing.assert_allclose(verdict.measures["depth_m"], (0.036, 0.010, 0.036), atol=1e-12)
@@ -173,7 +176,7 @@ def test_both_parts_lie_on_the_table_within_the_papers_ranges(sim):
 def test_the_axes_lie_along_y_mating_ends_towards_each_other(sim):
     sim.reset([3])
     hole = sim.poses("socket")[0] @ TASK.socket.holes["mortise"].part_from_hole
-    mate = sim.poses("plug")[0] @ TASK.plug.mate.part_from_mate
+    mate = sim.poses("plug")[0] @ MATE.part_from_mate
     np.testing.assert_allclose(hole[:3, 2], (0, 1, 0), atol=1e-6)
     np.testing.assert_allclose(mate[:3, 2], (0, 1, 0), atol=1e-6)
     assert hole[1, 3] - mate[1, 3] > 0.2
@@ -181,7 +184,7 @@ def test_the_axes_lie_along_y_mating_ends_towards_each_other(sim):
 
 def test_a_plug_that_lies_in_the_socket_succeeds_after_half_a_second_and_not_before(sim):
     sim.reset([0])
-    mate_from_plug = np.linalg.inv(TASK.plug.mate.part_from_mate)
+    mate_from_plug = np.linalg.inv(MATE.part_from_mate)
     put(sim, "plug", sim.poses("socket")[0] @ lifted(0.036) @ mate_from_plug)
     still = sim.arrays["ctrl"][:, sim.action_actuators].copy()
     held = 0

@@ -1,22 +1,25 @@
 """Assembly #2: the cradle carries the plug only where its centre of mass is inside; predicates, near misses, and the physics."""
 
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from taccorl.sim.outcome import Judge
+from taccorl.sim.part import Mate
 from taccorl.sim.randomize import PAPER_ROWS, draw
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.assembly_2 import Assembly2
 from taccorl.sim.tasks.task import Contact
 
 TASK = Assembly2()
+MATE = cast(Mate, TASK.plug.mate)
 # Of the plug, from its tip: 28.8 g of plastic, split by volume 20·20·36 : 24·20·30 = 1 : 1 at 18 and 51 mm, and a 41.2 g core
 # at 8.2 mm: (14.4 · 18 + 14.4 · 51 + 41.2 · 8.2) / 70
 COM_MM = 19.02
-IN = {"depth_mm": 33.0}
+IN: dict[str, Any] = {"depth_mm": 33.0}
 
 
 def placed(
@@ -35,7 +38,7 @@ def placed(
     mate = np.eye(4)
     mate[:3, :3] = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
     mate[:3, 3] = (aside_mm / 1e3, 0, depth_mm / 1e3)
-    plug = cradle @ TASK.cradle.holes["cradle"].part_from_hole @ mate @ np.linalg.inv(TASK.plug.mate.part_from_mate)
+    plug = cradle @ TASK.cradle.holes["cradle"].part_from_hole @ mate @ np.linalg.inv(MATE.part_from_mate)
     return {
         "poses": {"plug": plug, "cradle": cradle},
         "velocities": {"plug": np.array((0, 0, -speed_mps)), "cradle": np.zeros(3)},
@@ -44,7 +47,7 @@ def placed(
     }
 
 
-def scene(*cases: dict) -> SimpleNamespace:
+def scene(*cases: dict) -> Any:
     """N scenes, one a row."""
     touching = np.array([case["touching"] for case in cases])
     contact = Contact(touching, np.zeros(len(cases)), touching * 0.7)
@@ -132,7 +135,7 @@ def left_to_itself(sim: Simulation, depth_m: float) -> str:
     sim.reset([0])
     mate = np.eye(4)
     mate[:3, 3] = (0, 1e-4 - TASK.clearance_m, depth_m)
-    put(sim, "plug", sim.poses("cradle")[0] @ mate @ np.linalg.inv(TASK.plug.mate.part_from_mate))
+    put(sim, "plug", sim.poses("cradle")[0] @ mate @ np.linalg.inv(MATE.part_from_mate))
     still = sim.arrays["ctrl"][:, sim.action_actuators].copy()
     for _ in range(60):
         sim.step(still)

@@ -11,11 +11,12 @@ from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
 from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.sim.part import Part
 from taccorl.sim.randomize import draw
 from taccorl.sim.robot import ARMS, RobotConfig
 from taccorl.sim.shapes import Box, Cylinder, Prism
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.parts import PIECES, Part
+from taccorl.sim.tasks.parts import PIECES
 from taccorl.sim.tasks.puzzle import PIECES_AT_M, TRAY_AT_M, YAW_RAD, Puzzle
 
 STEP_S = 1 / 30

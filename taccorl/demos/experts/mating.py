@@ -1,0 +1,92 @@
+"""A held part and the hole it is to go into: how it fits now, and where a hand has to be that aims with an error."""
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from taccorl.demos.experts.se3 import inverse, rotvec, transform, turn
+from taccorl.sim.part import Fit, Part, measure_fit
+
+
+class Seen(Protocol):
+    """What is looked at: an expert's scene."""
+
+    def body(self, name: str) -> np.ndarray:
+        """World-from-body (4, 4) now."""
+        ...
+
+
+@dataclass(frozen=True)
+class Mating:
+    """A held part and the hole it goes into."""
+
+    held: str
+    held_from_mate: np.ndarray
+    num_turns: int | None
+    holder: str
+    holder_from_hole: np.ndarray
+
+    @classmethod
+    def of(cls, held: Part, holder: Part, hole: str) -> "Mating":
+        assert held.mate is not None
+        return cls(
+            held.name, held.mate.part_from_mate, held.mate.num_turns, holder.name, holder.holes[hole].part_from_hole
+        )
+
+    def _relative(self, scene: Seen) -> tuple[np.ndarray, np.ndarray]:
+        return scene.body(self.holder) @ self.holder_from_hole, scene.body(self.held) @ self.held_from_mate
+
+    def fit(self, scene: Seen) -> Fit:
+        """How the held part stands in the hole now."""
+        return measure_fit(*self._relative(scene), self.num_turns)
+
+    def axis(self, scene: Seen) -> np.ndarray:
+        """(3,) world, into the hole."""
+        return scene.body(self.holder)[:3, :3] @ self.holder_from_hole[:3, 2]
+
+    def turned(self, scene: Seen) -> np.ndarray:
+        """(4, 4) the turn about the hole's axis, among those that look the same, that is nearest to how it is held."""
+        hole, mate = self._relative(scene)
+        angle = measure_fit(hole, mate, 1).turn_rad
+        wrong = measure_fit(hole, mate, self.num_turns).turn_rad
+        return turn((0, 0, float(angle - wrong)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aim:
+    """Where a hand wants to bring a held part, and how wrong it is about it."""
+
+    off_m: np.ndarray
+    """(2,) error across the hole's axis."""
+    off_rad: np.ndarray
+    """(3,) error of the direction, about the part's leading end."""
+    part_from_tcp: np.ndarray
+    """(4, 4) how the hand held the part when it was last looked at."""
+    turned: np.ndarray
+    """(4, 4) about the hole's axis, among the turns that look the same."""
+    given: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    """(6,) [m, rad], frame of the hole: how far the wrist has given way, about the TCP; never along the axis."""
+
+    def pose(self, scene: Seen, mating: Mating, depth_m: float) -> np.ndarray:
+        """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, as far as the hand knows."""
+        hole = scene.body(mating.holder) @ mating.holder_from_hole
+        mate = transform((*self.off_m, depth_m)) @ turn(self.off_rad) @ self.turned
+        pose = hole @ mate @ inverse(mating.held_from_mate) @ self.part_from_tcp
+        pose[:3, :3] = hole[:3, :3] @ turn(self.given[3:])[:3, :3] @ hole[:3, :3].T @ pose[:3, :3]
+        pose[:3, 3] += hole[:3, :3] @ self.given[:3]
+        return pose
+
+    def giving_way(self, scene: Seen, mating: Mating, push_world: np.ndarray) -> "Aim":
+        """The wrist lets itself be moved by ``push_world`` (6,) [m, rad], but not back out of the hole."""
+        world_from_hole = (scene.body(mating.holder) @ mating.holder_from_hole)[:3, :3]
+        sideways = world_from_hole.T @ push_world[:3] * (1, 1, 0)
+        return replace(self, given=self.given + np.r_[sideways, world_from_hole.T @ push_world[3:]])
+
+
+def deflection(wanted: np.ndarray, actual: np.ndarray) -> np.ndarray:
+    """(6,) [m, rad], world: from one pose (4, 4) to another, the rotation as a rotation vector."""
+    off = np.empty(6)
+    off[:3] = actual[:3, 3] - wanted[:3, 3]
+    off[3:] = wanted[:3, :3] @ rotvec(wanted, actual)
+    return off

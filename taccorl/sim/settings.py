@@ -1,0 +1,33 @@
+"""Numbers of a config, refused by name where physics has no use for them."""
+
+import math
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any
+
+from taccorl.errors import TaccorlError
+
+
+def check_numbers(
+    section: str,
+    config: Any,
+    *,
+    finite: Sequence[str] = (),
+    not_negative: Sequence[str] = (),
+    positive: Sequence[str] = (),
+) -> None:
+    """Fields of ``config``, numbers or lists of them, are finite, and ≥ 0 or > 0 where that is asked for.
+
+    Raises:
+        TaccorlError: names the field in its ``section``, and the value.
+    """
+    for names, above, wanted in ((finite, -math.inf, ""), (not_negative, 0.0, " ≥ 0"), (positive, 0.0, " > 0")):
+        for name in names:
+            value = getattr(config, name)
+            for number in value if isinstance(value, list | tuple) else (value,):
+                if not (_finite(number) and (number > above or (number == above and names is not positive))):
+                    raise TaccorlError(f"{section}.{name}: {value} is not wanted here; give a finite number{wanted}")
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
