@@ -26,8 +26,9 @@ from taccorl.demos.collect import Actions, Source, outcome_of
 from taccorl.demos.teleop_actions import ActionLog, find_finished, give_time, replay, scene_of
 from taccorl.demos.teleop_jog import AXES, Command, GlfwGamepad, JogHands, Keyboard, gamepad_map, key_map, label
 from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
 from taccorl.sim.robot import ARMS
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, Simulation
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
 _AFTER_S = 1.0  # what is called finished is watched for so long, as in the experts' episodes

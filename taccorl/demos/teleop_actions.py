@@ -24,7 +24,8 @@ import taccorl
 from taccorl.demos.collect import Actions, Plan, Source, outcome_of
 from taccorl.errors import TaccorlError
 from taccorl.lineage.digest import digest_bytes
-from taccorl.sim.simulation import ACTION_NAMES, Simulation
+from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 

@@ -17,8 +17,9 @@ import numpy as np
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.se3 import between, rotvec, turn
 from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
 from taccorl.sim.robot import ARMS, RobotConfig
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, OPEN_M, Simulation
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
 GRIP_STEP_M = 0.005

@@ -22,7 +22,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.teleop import LeaderSource
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, OPEN_M
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
 
 JOINT_UNITS = ("rad", "deg", "range_m100_100")
 GRIPPER_UNITS = ("m", "range_0_100")

@@ -12,7 +12,8 @@ import numpy as np
 
 from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
-from taccorl.sim.simulation import ACTION_NAMES, Simulation
+from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.simulation import Simulation
 
 _COMMAND_HZ = 150.0  # as Simulation.step sends them
 

@@ -4,7 +4,7 @@ One simulation is the batch with N = 1, so a run is the same bit for bit alone, 
 Letters in shapes: N simulations, S sub-commands of one control step.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -12,29 +12,21 @@ import numpy as np
 from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, check_actions
 from taccorl.sim.effects.added import AddedEffects
 from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.outcome import Judge
 from taccorl.sim.pad import PadArray
 from taccorl.sim.randomize import draw
 from taccorl.sim.rendering import Renderer
-from taccorl.sim.robot import ARMS, FINGER_STROKE_M, JOINTS, LINKS, PADS
+from taccorl.sim.robot import ARMS, FINGER_STROKE_M, JOINTS, PADS
 from taccorl.sim.scene_digest import scene_digest
-from taccorl.sim.sensors import Noise, TactileFrames
-from taccorl.sim.tasks.task import Contact, Reset, Task
+from taccorl.sim.seen_scene import SeenScene
+from taccorl.sim.tasks.task import Reset, Task
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig, build_spec
 
 SUB_COMMANDS = 5
 """Targets go to their new value in a straight line over a control step, at 150 Hz: a robot's driver does not jump either."""
-OPEN_M = 2 * FINGER_STROKE_M
-ACTION_NAMES = tuple(f"{arm}_{j}" for arm in ARMS for j in (*JOINTS, "gripper"))
-_LIMITS = np.array([*(link.range_rad for link in LINKS), (0.0, OPEN_M)] * 2, np.float32)
-ACTION_LOW = np.nextafter(_LIMITS[:, 0], np.float32(1), dtype=np.float32).astype(float)
-ACTION_HIGH = np.nextafter(_LIMITS[:, 1], np.float32(0), dtype=np.float32).astype(float)
-ACTION_LOW[[6, 13]] = 0.0
-"""Joint limits and gripper opening, in the order of ``action`` (rad, m), as float32 that lie inside: a clipped action is stored
-exactly. Targets beyond are clipped, as the driver does."""
-_ABSURD = np.array([*([2 * np.pi] * 6), 0.5] * 2)  # beyond any limit by this much: another unit
 _UNSTABLE = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL)]
 _UNSTABLE += [int(mujoco.mjtWarning.mjWARN_BADQACC)]
 _BOUND = ("qpos", "qvel", "ctrl", "time", "xpos", "xmat", "cvel", "subtree_com", "site_xpos", "site_xmat", "geom_xpos")
@@ -66,7 +58,7 @@ class Watch:
     """Called with each of them; positions, velocities and sensors are current."""
 
 
-class Simulation:
+class Simulation(SeenScene):
     """N simulations of ``task`` in the twin ``config``.
 
     Args:
@@ -262,20 +254,6 @@ class Simulation:
         self.targets[sent] = commands[-1][sent]
         return [self.effects.command(command, held_s) for command in commands]
 
-    def check(self, actions: np.ndarray) -> None:
-        """Targets (N, …, 14) are numbers in rad and m; a little beyond the limits is not wrong, it is clipped.
-
-        Raises:
-            TaccorlError: names the joint, the simulation, the value and the limits.
-        """
-        beyond = ~((actions >= ACTION_LOW - _ABSURD) & (actions <= ACTION_HIGH + _ABSURD))  # NaN is beyond, too
-        if beyond.any():
-            at = np.argwhere(beyond)[0]
-            raise TaccorlError(
-                f"action: {ACTION_NAMES[at[-1]]} of simulation {at[0]} is {actions[tuple(at)]:g}, limits are "
-                f"{ACTION_LOW[at[-1]]:g} … {ACTION_HIGH[at[-1]]:g}. Joints are in rad, the gripper's opening is in m."
-            )
-
     def _checked(self, action: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
         """``action`` (N, 14) within the limits; kept as what ``ids`` execute."""
         action = np.asarray(action, dtype=np.float64)
@@ -284,132 +262,12 @@ class Simulation:
                 f"action: shape {action.shape}, the twin wants ({self.num_sims}, {len(ACTION_NAMES)}): "
                 f"{', '.join(ACTION_NAMES[:7])}, and the same of the right arm"
             )
-        self.check(action)
+        check_actions(action)
         goal = np.clip(action, ACTION_LOW, ACTION_HIGH)
         sent = slice(None) if ids is None else ids
         self.clipped[sent] = (goal != action).any(1)[sent]
         self.executed[sent] = goal[sent]
         return goal
-
-    # what is seen ----------------------------------------------------------------------------------------------------
-
-    def proprioception(self) -> np.ndarray:
-        """(N, 14) joint angles [rad] and gripper openings [m] as the encoders report them, in the order of actions."""
-        return self.effects.encoder(self.arrays["sensordata"][:, self._encoders])
-
-    def effort(self) -> np.ndarray:
-        """(N, 14) torque of the joints' motors [N·m] and force of the grippers' [N] in the newest physics step."""
-        return self.arrays["actuator_force"][:, self.action_actuators]
-
-    def reading(self) -> np.ndarray:
-        """(N, 4, 32, 12) float32 what the pads read before gain, noise and rounding: a pure function of the state, and of
-        the past where effects remember it."""
-        reading = self.sensor.reading(*self.pads.touch(self.batch), None)
-        for transform in self.sensor.transforms:
-            reading = transform(reading)
-        return reading
-
-    def touch(self, noise: Noise = None) -> np.ndarray:
-        """(N, 1536) int16 counts above baseline now; without ``noise`` (one generator, or one a simulation) no noise."""
-        counts = self.sensor.digitise(self.reading(), noise)
-        return TactileFrames(counts, self.sensor.baseline, PADS, self.sensor.spec).counts_above_baseline
-
-    def render(
-        self, cameras: Sequence[str] | None = None, ids: np.ndarray | None = None, size: tuple[int, int] = (224, 224)
-    ) -> dict[str, np.ndarray]:
-        """Camera → (n, rows, columns, 3) uint8 RGB of simulations ``ids`` (all by default), letterboxed as in a dataset."""
-        names = tuple(cameras or (camera.name for camera in self.config.cameras))
-        pictures = self._renderer(names, size).render_batch(self.batch, ids)
-        return {name: pictures[:, k] for k, name in enumerate(names)}
-
-    def render_states(
-        self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
-    ) -> Iterator[dict[str, np.ndarray]]:
-        """Camera → (rows, columns, 3) uint8 for each of the stored rows (T, row_size) of ``state_rows``.
-
-        The simulations stay as they are. States of another twin are drawn as well: its cameras may be what is new.
-
-        Raises:
-            TaccorlError: rows of another size.
-        """
-        states = np.asarray(states)
-        if states.ndim != 2 or states.shape[1] != self.row_size:
-            raise TaccorlError(
-                f"render_states: wanted are rows (T, {self.row_size}) of state_rows, found {states.shape}"
-            )
-        data = mujoco.MjData(self.model)
-        renderer = self._renderer(tuple(cameras), size)
-        for physics in states[:, 1 : 1 + self.batch.nstate]:
-            mujoco.mj_setState(self.model, data, physics, mujoco.mjtState.mjSTATE_INTEGRATION)
-            mujoco.mj_kinematics(self.model, data)
-            mujoco.mj_comPos(self.model, data)
-            mujoco.mj_camlight(self.model, data)
-            pictures = renderer.render([data])[0]
-            yield dict(zip(cameras, pictures, strict=True))
-
-    def require_cameras(self, names: Sequence[str]) -> None:
-        """The twin has these cameras.
-
-        Raises:
-            TaccorlError: names those that it lacks.
-        """
-        known = [camera.name for camera in self.config.cameras]
-        if missing := [name for name in names if name not in known]:
-            raise TaccorlError(
-                f"pictures: the twin has no camera {', '.join(missing)}; it has {', '.join(known) or 'none'}. A dataset's "
-                "pictures need it: put it back into the twin's cameras, or do without images"
-            )
-
-    def _renderer(self, cameras: tuple[str, ...], size: tuple[int, int]) -> Renderer:
-        if (cameras, size) not in self._renderers:
-            self._renderers[cameras, size] = Renderer(self.model, cameras, *size)
-        return self._renderers[cameras, size]
-
-    def close(self) -> None:
-        """Free OpenGL contexts."""
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
-
-    def poses(self, body: str) -> np.ndarray:
-        """World-from-body (N, 4, 4)."""
-        k = self._body(body)
-        pose = np.zeros((self.num_sims, 4, 4))
-        pose[:, :3, :3] = self.arrays["xmat"][:, k].reshape(-1, 3, 3)
-        pose[:, :3, 3], pose[:, 3, 3] = self.arrays["xpos"][:, k], 1.0
-        return pose
-
-    def tcp(self, arm: str) -> np.ndarray:
-        """World-from-TCP (N, 4, 4): z = approach direction, y = closing direction."""
-        k = self.model.site(f"{arm}_tcp").id
-        pose = np.zeros((self.num_sims, 4, 4))
-        pose[:, :3, :3] = self.arrays["site_xmat"][:, k].reshape(-1, 3, 3)
-        pose[:, :3, 3], pose[:, 3, 3] = self.arrays["site_xpos"][:, k], 1.0
-        return pose
-
-    def velocities(self, body: str) -> np.ndarray:
-        """(N, 3) linear velocity of the body's frame origin, world [m/s]."""
-        k = self._body(body)
-        spatial = self.arrays["cvel"][:, k]
-        turn, arm = spatial[:, :3], self.arrays["xpos"][:, k] - self.arrays["subtree_com"][:, self.model.body_rootid[k]]
-        # Written out: np.cross costs ten times as much on a few rows.
-        across = turn[:, [1, 2, 0]] * arm[:, [2, 0, 1]] - turn[:, [2, 0, 1]] * arm[:, [1, 2, 0]]
-        return spatial[:, 3:] + across
-
-    def pads_touching(self, body: str) -> np.ndarray:
-        """(N, 4) bool in pad order."""
-        return self.arrays["sensordata"][:, self._touching[body]] > 0
-
-    def contact(self, body: str, other: str) -> Contact:
-        """Of a pair in ``task.mating``: touching, deepest penetration and net normal force."""
-        if (body, other) not in self._mating:
-            raise TaccorlError(f"contact {body}–{other}: task {self.task.name} declares {list(self._mating)} as mating")
-        data, at, force = self.arrays["sensordata"], *self._mating[body, other]
-        net_n = np.linalg.norm(data[:, force : force + 3], axis=1)
-        return Contact(data[:, at] > 0, np.maximum(-data[:, at + 1], 0.0), net_n)
-
-    def _body(self, name: str) -> int:
-        return self._bodies[name] if name in self._bodies else self.model.body(name).id
 
     # state -----------------------------------------------------------------------------------------------------------
 

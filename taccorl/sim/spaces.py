@@ -5,8 +5,8 @@ import math
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
 from taccorl.sim.robot import PAD_TAXELS, PADS
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
 
 CAMERAS = ("front", "left_wrist", "right_wrist")
 IMAGE_SHAPE = (224, 224, 3)  # rows, columns, rgb: what π0.5 looks at

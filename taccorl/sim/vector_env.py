@@ -20,8 +20,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.actions import ACTION_NAMES, check_actions
 from taccorl.sim.episode_seeds import EpisodeSeeds
-from taccorl.sim.simulation import ACTION_NAMES, Simulation, Snapshot, checked_seeds
+from taccorl.sim.simulation import Simulation, Snapshot, checked_seeds
 from taccorl.sim.spaces import (
     CAMERAS,
     IMAGE_KEYS,
@@ -211,7 +212,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         actions = shaped(actions, self.num_envs, None)
         if not self._begun:
             raise TaccorlError("step: call reset() first")
-        self.sim.check(actions)  # all of it, before any of it acts
+        check_actions(actions)  # all of it, before any of it acts
         reward, num_steps = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.int64)
         tactile = np.empty((*actions.shape[:2], NUM_TAXELS), dtype=np.int16)
         self._clipped = np.zeros(self.num_envs, dtype=bool)

@@ -28,7 +28,8 @@ from taccorl.demos.teleop import GamepadSource, KeyboardSource, LeaderHands, Lea
 from taccorl.demos.teleop_actions import ActionFile, ActionLog, ActionsSource, find_finished, scene_of
 from taccorl.demos.teleop_jog import AXES, COMMAND_KEYS, Command, Gamepad, GlfwGamepad, Jogger, Keyboard, key_map
 from taccorl.errors import TaccorlError
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, OPEN_M, Simulation
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 
 UP, DOWN, LEFT, RIGHT, HOME, END = 265, 264, 263, 262, 268, 269  # mjui.h, the same as GLFW's

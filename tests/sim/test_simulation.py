@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.effects import make_effect
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, SUB_COMMANDS, Simulation, Watch
+from taccorl.sim.simulation import SUB_COMMANDS, Simulation, Watch
 from taccorl.sim.tasks import tasks
 from taccorl.sim.tasks.assembly_1 import Assembly1
 from taccorl.sim.twin import TwinConfig

@@ -19,9 +19,10 @@ from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.mating import Aim, Mating, deflection
 from taccorl.demos.experts.se3 import between, inverse, rotvec, transform, turn
 from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
 from taccorl.sim.part import Part
 from taccorl.sim.robot import ARMS
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, OPEN_M, Simulation
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
 DT_S = 1.0 / CONTROL_HZ

@@ -18,9 +18,10 @@ from taccorl.demos.experts.scripted import (
 )
 from taccorl.demos.experts.se3 import inverse, rotvec, transform, turn
 from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
 from taccorl.sim.part import Part
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW, Simulation
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.assembly_1 import Assembly1
 
 

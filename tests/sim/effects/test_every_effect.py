@@ -10,9 +10,9 @@ import pytest
 from press_bench import perform, start
 
 from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect, JointEffect, Memory, TouchEffect, parameter
-from taccorl.sim.simulation import ACTION_HIGH, ACTION_LOW
 
 SEEN = ("reported", "hands", "reading")
 UNITS = {

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from press_bench import RIGHT_HOME, PressBench, start
 
+from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM, ControllerConfig
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import CHANNELS, Effect
-from taccorl.sim.simulation import ACTION_NAMES, Simulation
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 
 COLUMN = CHANNELS.index("right_joint5")
