@@ -1,0 +1,67 @@
+"""Measurements from datasets of this project: rows at the dataset's rate, one episode a measurement."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from taccorl.alignment.measurement import Measurement, Touch
+from taccorl.alignment.quantisation import find_quantum
+from taccorl.alignment.recorded import TACTILE, signal_names, signal_units
+from taccorl.data.arms import ACTION, STATE
+from taccorl.data.dataset import Dataset
+from taccorl.data.episode import Episode
+from taccorl.errors import RecordingError, TaccorlError
+
+
+def read_dataset(root: Path) -> list[Measurement]:
+    """Every episode of a dataset as a measurement at the dataset's rate.
+
+    Raises:
+        TaccorlError: not a dataset, or one whose numbers have no units.
+    """
+    dataset = Dataset(root)
+    try:
+        names, units = signal_names(dataset.spec), signal_units(dataset.spec)
+    except RecordingError as error:
+        raise TaccorlError(
+            f"{root}: {error}. Units are in the meta/taccorl/ that this project writes; others' datasets come in by "
+            "`taccorl ingest` with a spec"
+        ) from error
+    return [from_episode(dataset.episode(k), names, units, Path(root), k) for k in range(dataset.num_episodes)]
+
+
+def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...], root: Path, k: int) -> Measurement:
+    """One episode of a dataset.
+
+    Row k of a dataset made from a recording holds the command in force at time k. Row k of one collected in the twin holds
+    the action that was reached, in a straight line, at time k + 1: in force at time k was the action before.
+    """
+    state, action = (episode.arrays[key].astype(float) for key in (STATE, ACTION))
+    late = 1 if episode.provenance.get("simulation") else 0
+    target, measured = action[: len(action) - late], state[late:]
+    if len(measured) < 2:
+        raise TaccorlError(f"{episode.name}: {len(state)} rows are no measurement")
+    time_s = np.arange(len(measured)) / episode.spec.fps
+    touch = None
+    if TACTILE in episode.arrays:
+        counts = episode.arrays[TACTILE][late:].astype(np.int16)
+        baseline = np.asarray(episode.baselines.get(TACTILE, np.zeros(counts.shape[1])))
+        touch = Touch(time_s=np.repeat(time_s[:, None], 4, axis=1), counts=counts, baseline=baseline)
+    ages = [t.age_max_s for t in episode.timing if t.feature in (STATE, ACTION) and math.isfinite(t.age_max_s)]
+    return Measurement(
+        name=f"{root.name}/episode_{k}",
+        time_s=time_s,
+        target=target,
+        measured=measured,
+        signals=names,
+        units=units,
+        quantum=np.array([find_quantum(column) for column in measured.T]),
+        touch=touch,
+        source=root,
+        origin=episode.origin,
+        instruction=episode.instruction,
+        start_ns=episode.start_ns,
+        time_error_s=max(ages, default=0.0),
+        timing=tuple(t for t in episode.timing if t.feature in (STATE, ACTION)),
+    )

@@ -1,0 +1,163 @@
+"""The simplest answer of a joint to its command, fitted: a first-order lag behind a pure delay.
+
+    y(t) = g · f(t − d) + b,   τ ḟ = q* − f
+
+A PiPER joint is nearly that (K_d / K_p ≈ 0.1 s; its second pole, inertia over K_d, lies below 3 ms and shows as delay). The delay
+tells about clocks: no joint answers before it is asked, so d < 0 is a fault of time stamps. Where the lag does not describe the
+joint (friction, backlash, …), d means nothing, and ``rms`` says so.
+
+Letters in shapes: T rows.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from taccorl.errors import TaccorlError
+
+COMMAND_HZ = 150.0
+"""Below this rate rows are samples of a command that moved on in between, as in ``taccorl.sim.replay``."""
+TAU_S = (1e-3, 2.0)
+"""Time constants that are looked for."""
+LEAST_ROWS = 20
+DELAY_ROWS, DELAY_S = 8.0, 0.15
+"""Delays that are looked for: from so many rows too early to so many seconds late."""
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """The fit of one joint."""
+
+    time_constant_s: float
+    delay_s: float
+    delay_sd_s: float
+    """Standard deviation of the delay, with the residual's own correlation taken into account."""
+    gain: float
+    rms: float
+    """What is left (rad, m)."""
+    row_rms: float
+    """How far the fitted answer goes in one row (RMS; rad, m): what an offset of one row would leave."""
+
+
+def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -> FirstOrder:
+    """Least squares over τ and d; g and b follow.
+
+    Args:
+        target: (T,) in force from row k on.
+        measured: (T,) at row k; rows with NaN are left out.
+
+    Raises:
+        TaccorlError: too few rows.
+    """
+    rows = _rows(target, measured, period_s)
+    answer = _Answer(target - target[0], period_s)
+    wanted = measured[rows] - measured[rows].mean()
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        shape = answer.at(rows, math.exp(x[0]), x[1])
+        shape = shape - shape.mean()
+        power = float(shape @ shape)
+        return wanted - (float(shape @ wanted) / power if power > 0 else 0.0) * shape
+
+    low = np.array([math.log(TAU_S[0]), -DELAY_ROWS])
+    high = np.array([math.log(TAU_S[1]), DELAY_S / period_s])
+    starts = [
+        least_squares(residual, (math.log(tau), 0.0), bounds=(low, high), x_scale=(0.1, 0.5)) for tau in (0.03, 0.1)
+    ]
+    best = min(starts, key=lambda fit: fit.cost)
+    spread = _spread(best.fun, best.jac)
+    shape = answer.at(rows, math.exp(best.x[0]), best.x[1])
+    shape = shape - shape.mean()
+    gain = float(shape @ wanted / max(shape @ shape, 1e-300))
+    return FirstOrder(
+        time_constant_s=math.exp(best.x[0]),
+        delay_s=float(best.x[1]) * period_s,
+        delay_sd_s=math.sqrt(max(float(spread[1, 1]), 0.0)) * period_s,
+        gain=gain,
+        rms=_rms(best.fun),
+        row_rms=abs(gain) * float(np.sqrt(np.mean(np.diff(shape) ** 2))),
+    )
+
+
+@dataclass(frozen=True)
+class Shift:
+    """How much later one answer to a command comes than another, apart from other gains."""
+
+    delay_s: float
+    delay_sd_s: float
+    rms: float
+    """What neither a shift nor other gains explain (rad, m)."""
+    row_rms: float
+    """What an offset of one row would leave."""
+
+
+def delay_between(target: np.ndarray, measured: np.ndarray, other: np.ndarray, period_s: float) -> Shift:
+    """Delay of ``measured`` (T,) after ``other`` (T,), both answers to ``target``.
+
+    measured − other = b + δg f + δτ ∂f/∂τ + δd ∂f/∂d, linear about the middle of both fits: what the lag describes in neither
+    falls out of the difference.
+
+    Raises:
+        TaccorlError: too few rows.
+    """
+    fits = [fit_first_order(target, values, period_s) for values in (measured, other)]
+    rows = _rows(target, measured, period_s)
+    answer = _Answer(target - target[0], period_s)
+    log_tau = float(np.mean([math.log(f.time_constant_s) for f in fits]))
+    delay, gain = float(np.mean([f.delay_s for f in fits])) / period_s, float(np.mean([f.gain for f in fits]))
+
+    def slope(d_log_tau: float, d_delay: float) -> np.ndarray:
+        up = answer.at(rows, math.exp(log_tau + d_log_tau), delay + d_delay)
+        return (up - answer.at(rows, math.exp(log_tau - d_log_tau), delay - d_delay)) * gain / 2
+
+    f = answer.at(rows, math.exp(log_tau), delay)
+    design = np.column_stack([np.ones(len(rows)), f, slope(0.05, 0.0) / 0.05, slope(0.0, 0.5) / 0.5])
+    difference = (measured - other)[rows]
+    solution = np.linalg.lstsq(design, difference, rcond=None)[0]
+    left = difference - design @ solution
+    sd = math.sqrt(max(float(_spread(left, design)[3, 3]), 0.0))
+    row = abs(gain) * float(np.sqrt(np.mean(np.diff(f) ** 2)))
+    return Shift(float(solution[3]) * period_s, sd * period_s, _rms(left), row)
+
+
+def _rows(target: np.ndarray, measured: np.ndarray, period_s: float) -> np.ndarray:
+    """Rows that every delay looked for can reach, and that were measured."""
+    rows = np.arange(math.ceil(DELAY_S / period_s) + 1, len(target) - math.ceil(DELAY_ROWS) - 1)
+    rows = rows[np.isfinite(measured[rows])] if len(rows) else rows
+    if len(rows) < LEAST_ROWS:
+        raise TaccorlError(f"first-order fit: {len(target)} rows at {1 / period_s:g} Hz are too few")
+    return rows
+
+
+def _rms(left: np.ndarray) -> float:
+    """Of a residual of a fit with four parameters."""
+    return math.sqrt(float(left @ left) / max(len(left) - 4, 1))
+
+
+def _spread(left: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """Covariance of the parameters; a residual that is like its neighbour counts for fewer samples."""
+    likeness = float(np.clip(left[1:] @ left[:-1] / max(left @ left, 1e-300), 0.0, 0.999))
+    return _rms(left) ** 2 * np.linalg.pinv(jacobian.T @ jacobian) * (1 + likeness) / (1 - likeness)
+
+
+class _Answer:
+    """f at any time, exactly: between two commands it is an exponential."""
+
+    def __init__(self, target: np.ndarray, period_s: float) -> None:
+        self.parts = math.ceil(COMMAND_HZ * period_s - 1e-9) if period_s * COMMAND_HZ > 1 else 1
+        share = np.arange(1, self.parts + 1) / self.parts if self.parts > 1 else np.zeros(1)
+        following = np.append(target[1:], target[-1:])
+        self.command = (target[:, None] + share * (following - target)[:, None]).ravel()
+        self.step_s = period_s / self.parts
+
+    def at(self, rows: np.ndarray, tau_s: float, delay_rows: float) -> np.ndarray:
+        """(len(rows),) f at ``rows`` − ``delay_rows``."""
+        keep = math.exp(-self.step_s / tau_s)
+        after = np.concatenate([[0.0], lfilter([1 - keep], [1, -keep], self.command)])
+        when = (rows - delay_rows) * self.parts
+        whole = np.clip(np.floor(when).astype(int), 0, len(self.command) - 1)
+        command = self.command[whole]
+        return command + (after[whole] - command) * keep ** (when - whole)

@@ -1,0 +1,184 @@
+"""A measurement: what was commanded and what was measured, on one clock. The twin is compared with it row by row.
+
+The rule of every row, and of every reader: **the target of row k is in force from time k on, and the position of row k is
+where the joint was at time k**, before that target could act. ``taccorl.sim.replay`` answers by the same rule. One row off (5 ms)
+turned K_p 151 into 690 in an identification (MuJoCo's sensordata after a step is the state before it).
+
+Letters in shapes: T rows, J signals (14 for the robot, in the order of actions), N touch frames, K taxels.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from taccorl.data.episode import ChannelTiming
+from taccorl.data.finding import Finding
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.actions import ACTION_NAMES
+
+UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}
+"""Unit of a position → those of its velocity and effort."""
+
+
+def unit_of(name: str) -> str:
+    """Unit of one of the robot's 14 signals."""
+    return "m" if name.endswith("gripper") else "rad"
+
+
+ROBOT_UNITS = tuple(unit_of(name) for name in ACTION_NAMES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Touch:
+    """Frames of the pads at their own rate. Pads are scanned at different times, so each has its own."""
+
+    time_s: np.ndarray
+    """(N, 4) when each pad's frame was taken, on the measurement's clock, in the order of
+    ``taccorl.sim.robot.PADS``."""
+    counts: np.ndarray
+    """(N, K) int16 counts above baseline, unclipped; K = 1536."""
+    baseline: np.ndarray
+    """(K,) counts that were subtracted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """One recording on one clock, at the rate at which commands were sent.
+
+    Raises:
+        TaccorlError: shapes that do not fit each other.
+    """
+
+    name: str
+    time_s: np.ndarray
+    """(T,) since the first row. Even for recordings; a table keeps its own times, which the checks judge."""
+    target: np.ndarray
+    """(T, J) rad, m: in force from ``time_s[k]`` on."""
+    measured: np.ndarray
+    """(T, J) rad, m: at ``time_s[k]``; NaN where nothing was measured for too long."""
+    velocity: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) rad/s, m/s as the driver reports it; NaN where it does not."""
+    effort: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) N·m, N as the driver reports it; NaN where it does not. PiPER firmware may report another scale."""
+    signals: tuple[str, ...] = ACTION_NAMES
+    units: tuple[str, ...] = ROBOT_UNITS
+    """Of positions, one per signal: rad or m."""
+    quantum: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(J,) step between neighbouring encoder readings [rad, m], found before any interpolation; 0 where none shows."""
+    touch: Touch | None = None
+    source: Path = Path()
+    """File or dataset it was read from."""
+    origin: str = ""
+    """What made it, e.g. "surrogate recording …"; empty where the file does not say."""
+    instruction: str = ""
+    start_ns: int = 0
+    """The recording's clock at row 0 (ns)."""
+    repeat_of: str | None = None
+    """Name of the measurement whose motion this one repeats, command for command."""
+    kp: dict[str, float] = field(default_factory=dict)
+    """Signal → gain that was commanded [N·m/rad, N/m], where somebody wrote it down."""
+    kd: dict[str, float] = field(default_factory=dict)
+    """Signal → [N·m·s/rad, N·s/m]."""
+    payload_kg: dict[str, float] = field(default_factory=dict)
+    """Arm → known mass in its gripper."""
+    time_error_s: float = 0.0
+    """A row's position and target may be taken this much apart from its time (rows of a dataset show the last
+    sample)."""
+    timing: tuple[ChannelTiming, ...] = ()
+    """How each channel's own samples came; empty for tables."""
+    findings: tuple[Finding, ...] = ()
+    """What reading it brought up."""
+
+    def __post_init__(self) -> None:
+        shape = (len(self.time_s), len(self.signals))
+        for name in ("velocity", "effort"):
+            if getattr(self, name).size == 0:
+                object.__setattr__(self, name, np.full(shape, np.nan))
+        if self.quantum.size == 0:
+            object.__setattr__(self, "quantum", np.zeros(shape[1]))
+        for name in ("target", "measured", "velocity", "effort"):
+            found = getattr(self, name).shape
+            if found != shape:
+                raise TaccorlError(f"measurement {self.name}: {name} is {found}, times and signals say {shape}")
+        if len(self.units) != shape[1] or self.quantum.shape != shape[1:] or len(set(self.signals)) != shape[1]:
+            raise TaccorlError(f"measurement {self.name}: units, quantum and names do not fit signals {self.signals}")
+        wrong = [u for u in self.units if u not in UNITS]
+        if wrong:
+            raise TaccorlError(f"measurement {self.name}: positions are in rad or m, not in {wrong[0]!r}")
+
+    @property
+    def num_rows(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def period_s(self) -> float:
+        """Median time between rows."""
+        return float(np.median(np.diff(self.time_s))) if self.num_rows > 1 else float("nan")
+
+    @property
+    def rate_hz(self) -> float:
+        """Rows a second, rounded to a thousandth."""
+        return round(1.0 / self.period_s, 3)
+
+    def column(self, signal: str) -> int:
+        """Number of a signal.
+
+        Raises:
+            TaccorlError: there is none of that name.
+        """
+        if signal not in self.signals:
+            raise TaccorlError(f"{self.name} has no signal {signal!r}; {nearest(signal, self.signals)}")
+        return self.signals.index(signal)
+
+    def has_effort(self) -> np.ndarray:
+        """(J,) bool: recorded, and not only zeros."""
+        return np.isfinite(self.effort).any(axis=0) & (np.nan_to_num(self.effort) != 0).any(axis=0)
+
+    def resampled(self, rate_hz: float) -> "Measurement":
+        """The same at an even ``rate_hz``, in straight lines between rows: keeps the mean time of every command and position.
+
+        Raises:
+            TaccorlError: less than two rows, or time that does not run forwards.
+        """
+        if self.num_rows < 2 or (np.diff(self.time_s) <= 0).any():
+            raise TaccorlError(f"{self.name}: its time does not run forwards; it cannot be brought to {rate_hz:g} Hz")
+        steps = int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1
+        time_s = self.time_s[0] + np.arange(steps) / rate_hz
+        columns = {
+            name: np.column_stack([np.interp(time_s, self.time_s, c) for c in getattr(self, name).T])
+            for name in ("target", "measured", "velocity", "effort")
+        }
+        return dataclasses.replace(self, time_s=time_s, **columns)
+
+    def on_robot(self, rest: np.ndarray) -> "Measurement":
+        """All 14 signals in the order of actions: those that it lacks stay at ``rest`` (14,) and were not measured.
+
+        Raises:
+            TaccorlError: a signal that the robot does not have, or has in another unit.
+        """
+        for name, unit in zip(self.signals, self.units, strict=True):
+            if name not in ACTION_NAMES:
+                raise TaccorlError(
+                    f"{self.name}: the robot has no signal {name!r}; {nearest(name, ACTION_NAMES)}. Rename it in "
+                    "the columns file"
+                )
+            if unit != unit_of(name):
+                raise TaccorlError(f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}")
+        at = [ACTION_NAMES.index(name) for name in self.signals]
+        arrays: dict[str, np.ndarray] = {
+            name: np.full((self.num_rows, len(ACTION_NAMES)), np.nan) for name in ("measured", "velocity", "effort")
+        }
+        arrays["target"] = np.tile(np.asarray(rest, dtype=float), (self.num_rows, 1))
+        for name, values in arrays.items():
+            values[:, at] = getattr(self, name)
+        quantum = np.zeros(len(ACTION_NAMES))
+        quantum[at] = self.quantum
+        return dataclasses.replace(self, **arrays, quantum=quantum, signals=ACTION_NAMES, units=ROBOT_UNITS)
+
+
+def other_arm(signal: str) -> str:
+    """``left_joint5`` → ``right_joint5``; a name without an arm stays."""
+    swap = {"left_": "right_", "right_": "left_"}
+    return next((new + signal.removeprefix(old) for old, new in swap.items() if signal.startswith(old)), signal)

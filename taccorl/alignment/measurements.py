@@ -1,0 +1,326 @@
+"""All measurements of a folder, and which of them are for fitting, for judging and for the final figures.
+
+A folder of recordings may hold a ``measurements.yaml`` that says what the files cannot::
+
+    spec: piper_flexitac_mcap         # how its recordings are read; not needed where only one shipped spec reads the format
+    columns: columns.yaml             # names and units of its tables
+    held_out_every: 3                 # every third motion judges; or say it recording by recording
+    recordings:
+      sweep_05.mcap: {use: held_out}
+      sweep_02.mcap: {repeat_of: sweep_01.mcap}
+      sweep_03.mcap: {kp: {left_joint5: 40}, kd: {left_joint5: 4}, payload_kg: {left: 0.5}, effort_scale: {left_joint1: 0.25}}
+"""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from taccorl.alignment.dataset_rows import read_dataset
+from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.recorded import read_recording
+from taccorl.alignment.tables import SUFFIXES, TableSpec, load_table_spec, read_table
+from taccorl.data.decode import natural_key
+from taccorl.data.recording import find_sources
+from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_recording_specs
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import RecordingError, TaccorlError, nearest
+
+INDEX = "measurements.yaml"
+Use = Literal["fit", "held_out", "test"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingNote:
+    """What is known of one recording besides its file."""
+
+    use: Use | None = None
+    """fit: parameters are fitted to it; held_out: choices are made on it; test: nothing is chosen on it."""
+    repeat_of: str | None = None
+    kp: dict[str, float] = field(default_factory=dict)
+    """Signal → commanded gain [N·m/rad, N/m]."""
+    kd: dict[str, float] = field(default_factory=dict)
+    """Signal → [N·m·s/rad, N·s/m]."""
+    payload_kg: dict[str, float] = field(default_factory=dict)
+    """Arm → mass held."""
+    effort_scale: dict[str, float] = field(default_factory=dict)
+    """Signal → factor to N·m, N: PiPER's firmware 1.5 to 1.8 reports joints 1 to 3 four times too large
+    (piper_sdk issue 73)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementIndex:
+    """``measurements.yaml``."""
+
+    spec: str | None = None
+    columns: str | None = None
+    held_out_every: int = 0
+    """0: only what is named."""
+    recordings: dict[str, RecordingNote] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Several measurements and what each is for; the split is part of every result made from them."""
+
+    fit: tuple[Measurement, ...]
+    held_out: tuple[Measurement, ...] = ()
+    test: tuple[Measurement, ...] = ()
+    rule: str = ""
+    """How they were divided, in words."""
+    skipped: tuple[str, ...] = ()
+    """What else lay in the folder and was not read, and why."""
+
+    @property
+    def all(self) -> tuple[Measurement, ...]:
+        return (*self.fit, *self.held_out, *self.test)
+
+    def record(self) -> dict[str, object]:
+        """The split for a report: rule and names."""
+        names = {use: [m.name for m in getattr(self, use)] for use in ("fit", "held_out", "test")}
+        return {"rule": self.rule, **names, "skipped": list(self.skipped)}
+
+
+def read_measurements(
+    path: Path,
+    *,
+    spec: str | Path | RecordingSpec | None = None,
+    columns: Path | TableSpec | None = None,
+    held_out: Sequence[str] = (),
+    test: Sequence[str] = (),
+    held_out_every: int | None = None,
+) -> Measurements:
+    """A recording, a table, a dataset, or a folder of those, divided.
+
+    Args:
+        spec: recording spec; else the index's, else the only shipped one that reads the format.
+        columns: columns file of the tables; else the index's, else our own names.
+        held_out, test: names of measurements; with those the index's ``use`` is not looked at.
+        held_out_every: every k-th motion that is not named is held out; else the index's.
+
+    Raises:
+        TaccorlError: nothing to read, unknown names, or a motion and its repeat on both sides.
+    """
+    path = Path(path)
+    folder = path if path.is_dir() else path.parent
+    index = _load_index(folder)
+    spec = spec if spec is not None or index.spec is None else _beside(folder, index.spec)
+    columns = columns if columns is not None or index.columns is None else folder / index.columns
+    table_spec = columns if isinstance(columns, TableSpec) or columns is None else load_table_spec(columns)
+    skipped: list[str] = []
+    found = sorted(_read(path, spec, table_spec, skipped), key=lambda m: natural_key(m.name))
+    found = _noted(found, index, folder, whole=path.is_dir())
+    whole = path.is_dir()
+    if held_out or test or not whole:  # who asks for one file wants to fit it
+        named = {"held_out": list(held_out), "test": list(test)}
+    else:
+        named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "held_out", "test")}
+    every = index.held_out_every * whole if held_out_every is None else held_out_every
+    return dataclasses.replace(split(found, **named, held_out_every=every), skipped=tuple(skipped))
+
+
+def split(
+    measurements: Iterable[Measurement],
+    *,
+    fit: Sequence[str] = (),
+    held_out: Sequence[str] = (),
+    test: Sequence[str] = (),
+    held_out_every: int = 0,
+) -> Measurements:
+    """Divide by name, and every k-th of the other motions to ``held_out``. The same list gives the same split.
+
+    A motion and its repeats count as one and stay together: held out, a repeat would measure the noise and not the model.
+
+    Raises:
+        TaccorlError: a name that no measurement has, one named twice, a motion on both sides, or nothing left to fit.
+    """
+    measurements = list(measurements)
+    names = [m.name for m in measurements]
+    if len(set(names)) != len(names):
+        raise TaccorlError(
+            f"two measurements are called {next(n for n in names if names.count(n) > 1)!r}; rename one file"
+        )
+    uses: dict[str, str] = {}
+    for use, listed in (("fit", fit), ("held_out", held_out), ("test", test)):
+        for name in listed:
+            if name not in names:
+                raise TaccorlError(f"{use}: no measurement {name!r}; {nearest(name, names)}")
+            if uses.setdefault(name, use) != use:
+                raise TaccorlError(f"{name} is both {uses[name]} and {use}; name it once")
+    if held_out_every < 0 or held_out_every == 1:
+        raise TaccorlError(
+            f"held_out_every: {held_out_every} leaves nothing to fit; 0 holds nothing out, 2 every second"
+        )
+    motion = motions(measurements)
+    for name, use in list(uses.items()):
+        for other in (n for n in names if motion[n] == motion[name]):
+            if uses.setdefault(other, use) != use:
+                raise TaccorlError(
+                    f"{name} ({use}) and {other} ({uses[other]}) repeat one motion: put both on one side"
+                )
+    free = list(dict.fromkeys(motion[n] for n in names if n not in uses))
+    taken = {m for k, m in enumerate(free) if held_out_every and k % held_out_every == held_out_every - 1}
+    for name in names:
+        uses.setdefault(name, "held_out" if motion[name] in taken else "fit")
+    sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "held_out", "test")}
+    if not sides["fit"]:
+        raise TaccorlError(
+            f"nothing is left to fit: {len(sides['held_out'])} held out, {len(sides['test'])} for the test"
+        )
+    words = [f"{len(held_out) + len(test)} by name"] * bool(held_out or test)
+    words += [f"every {held_out_every}. of {len(free)} motions held out"] * bool(held_out_every)
+    return Measurements(sides["fit"], sides["held_out"], sides["test"], rule=", ".join(words) or "all for fitting")
+
+
+def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
+    """Name → name of the first recording of its motion, which need not be at hand.
+
+    Raises:
+        TaccorlError: repeats in a circle.
+    """
+    of = {m.name: m.repeat_of for m in measurements}
+    roots = {}
+    for name in of:
+        root, seen = name, [name]
+        while of.get(root) is not None:
+            root = str(of[root])
+            if root in seen:
+                raise TaccorlError(f"{' repeats '.join([*seen, root])}: a circle; mend repeat_of")
+            seen.append(root)
+        roots[name] = root
+    return roots
+
+
+def _load_index(folder: Path) -> MeasurementIndex:
+    path = folder / INDEX
+    if not path.is_file():
+        return MeasurementIndex()
+    document = Document(MeasurementIndex, path)
+    index = document.value
+    for name, note in index.recordings.items():
+        for key in ("kp", "kd", "payload_kg"):
+            bad = next((s for s, v in getattr(note, key).items() if v < 0), None)
+            if bad:
+                raise document.error(f"recordings/{name}/{key}/{bad}", f"{getattr(note, key)[bad]:g} is below 0")
+        arm = next((a for a in note.payload_kg if a not in ("left", "right")), None)
+        if arm:
+            raise document.error(f"recordings/{name}/payload_kg/{arm}", f"no arm {arm!r}; left, right")
+    if index.columns and not (folder / index.columns).is_file():
+        raise document.error("columns", f"no file {index.columns!r} beside it")
+    return index
+
+
+def _beside(folder: Path, name: str) -> str | Path:
+    """A spec beside the index, or the shipped one of that name."""
+    return folder / name if (folder / name).is_file() else name
+
+
+def _note(index: MeasurementIndex, measurement: Measurement) -> RecordingNote:
+    return index.recordings.get(measurement.name, RecordingNote())
+
+
+def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, whole: bool) -> list[Measurement]:
+    names = [m.name for m in found]
+    unknown = [name for name in index.recordings if name not in names]
+    if whole and unknown:
+        raise TaccorlError(f"{folder / INDEX}: no recording {unknown[0]!r} here; {nearest(unknown[0], names)}")
+    noted = []
+    for m in found:
+        note = _note(index, m)
+        if whole and note.repeat_of is not None and note.repeat_of not in names:
+            raise TaccorlError(
+                f"{folder / INDEX}: recordings → {m.name} → repeat_of: no recording {note.repeat_of!r} here; "
+                f"{nearest(note.repeat_of, names)}"
+            )
+        for key in ("kp", "kd", "effort_scale"):
+            for name in getattr(note, key):
+                if name not in m.signals:
+                    raise TaccorlError(
+                        f"{folder / INDEX}: recordings → {m.name} → {key}: no signal {name!r}; "
+                        f"{nearest(name, m.signals)}"
+                    )
+        scale = np.array([note.effort_scale.get(name, 1.0) for name in m.signals])
+        noted.append(
+            dataclasses.replace(
+                m,
+                repeat_of=note.repeat_of or m.repeat_of,
+                kp=m.kp | note.kp,
+                kd=m.kd | note.kd,
+                payload_kg=m.payload_kg | note.payload_kg,
+                effort=m.effort * scale,
+            )
+        )
+    return noted
+
+
+def _read(
+    path: Path, spec: str | Path | RecordingSpec | None, columns: TableSpec | None, skipped: list[str]
+) -> list[Measurement]:
+    if not path.exists():
+        siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+        raise RecordingError(f"{path}: no such file or folder; {nearest(path.name, siblings)}")
+    if (path / "meta" / "info.json").is_file():
+        return read_dataset(path)
+    if path.is_file():
+        if path.suffix in SUFFIXES:
+            return [read_table(path, columns)]
+        return _read_recordings(path, spec, skipped)
+    children = sorted(path.iterdir(), key=lambda p: natural_key(p.name))
+    datasets = [p for p in children if (p / "meta" / "info.json").is_file()]
+    tables = [p for p in children if p.is_file() and p.suffix in SUFFIXES]
+    found = [m for p in datasets for m in read_dataset(p)] + [read_table(p, columns) for p in tables]
+    left: list[str] = []
+    try:
+        found += _read_recordings(path, spec, left)
+    except _NoRecording as error:
+        if not found:
+            raise RecordingError(
+                f"{error}; tables ({', '.join(SUFFIXES)}) and datasets there are none either"
+            ) from error
+    read = {p.name for p in (*datasets, *tables)} | {INDEX}
+    read |= {p.name for p in children if p.suffix in (".yaml", ".yml")}  # specs and columns files
+    skipped += [text for text in left if text.split(" (")[0] not in read]
+    return found
+
+
+class _NoRecording(RecordingError):
+    """A folder without recordings, which may still hold tables."""
+
+
+def _read_recordings(path: Path, spec: str | Path | RecordingSpec | None, skipped: list[str]) -> list[Measurement]:
+    loaded = spec if isinstance(spec, RecordingSpec) or spec is None else load_recording_spec(spec)
+    try:
+        found = find_sources(
+            path,
+            reader=loaded.reader if loaded else None,
+            split_bag=bool(loaded and loaded.split_bag),
+            skipped=skipped if path.is_dir() else None,
+        )
+    except RecordingError as error:
+        raise _NoRecording(str(error)) from error
+    # Datasets were read before; find_sources lists them as recordings, too.
+    found = [(reader, source) for reader, source in found if reader != "lerobot"]
+    if not found:
+        raise _NoRecording(f"{path}: no recording here")
+    measurements = []
+    for reader, source in found:
+        own = loaded or _only_spec(path, reader)
+        try:
+            measurements.append(read_recording(source, own))
+        except TaccorlError as error:
+            text = str(error)
+            raise RecordingError(text if text.startswith(source.name) else f"{source.name}: {text}") from error
+    return measurements
+
+
+def _only_spec(path: Path, reader: str) -> RecordingSpec:
+    fitting = {name: spec for name, spec in shipped_recording_specs().items() if spec.reader == reader}
+    if len(fitting) != 1:
+        raise RecordingError(
+            f"{path}: {len(fitting)} shipped specs read {reader} ({', '.join(fitting) or 'none'}); say which: "
+            f"--spec=NAME, or `spec:` in {INDEX}. `taccorl inspect` drafts one"
+        )
+    return next(iter(fitting.values()))

@@ -1,0 +1,36 @@
+"""The step of an encoder, found in its readings: every reading is offset + n · q with whole n."""
+
+import numpy as np
+
+SAME = 0.05
+"""A difference counts as a whole number of steps if it misses one by less than this share of a step. Readings stored as 32-bit
+numbers miss 0.001° by up to 1 %."""
+MANY = 8
+"""So many differences are whole multiples by chance once in 10⁸ (0.1⁸)."""
+REPEATS = 10.0
+"""With fewer levels than that, each must have been read so often: noise without steps never reads the same twice."""
+
+
+def find_quantum(values: np.ndarray) -> float:
+    """Step q of (T,) readings in their unit; 0 where they show none (or only one level).
+
+    q is the smallest difference between two levels, refined over all of them: q = Σ d / Σ round(d / q).
+    """
+    values = np.asarray(values, dtype=float)
+    values = values[np.isfinite(values)]
+    if len(values) < 2:
+        return 0.0
+    levels = np.unique(values)
+    # The same level computed in two ways differs in the last bits of a 64-bit number.
+    apart = np.diff(levels) > 1e-12 * max(1.0, float(np.abs(levels).max()))
+    levels = levels[np.concatenate([[True], apart])]
+    steps = np.diff(levels)
+    if len(steps) == 0 or (len(steps) < MANY and len(values) < REPEATS * len(levels)):
+        return 0.0
+    quantum = float(steps.min())
+    near = steps[steps < 10 * quantum]  # where a rounded multiple is sure before the step is known well
+    quantum = float(near.sum() / np.round(near / quantum).sum())
+    counts = np.round(steps / quantum)
+    quantum = float(steps.sum() / counts.sum())
+    off = np.abs(steps / quantum - counts)
+    return quantum if (off < SAME * np.maximum(1.0, counts * 1e-3)).all() else 0.0

@@ -1,0 +1,312 @@
+"""Measurements from CSV and parquet files: one row an instant, one column a quantity.
+
+Without a columns file the table speaks our own language: ``t`` [s], and for every signal ``left_joint5.q`` [rad, m],
+``left_joint5.q_target``, and where recorded ``left_joint5.qd`` [rad/s, m/s] and ``left_joint5.tau`` [N·m, N]. Other names and
+units are written down in a columns file; no unit is ever guessed::
+
+    time: {column: stamp, unit: ms}
+    signals:
+      left_joint5:
+        q:        {column: pos_5, unit: deg}
+        q_target: {column: cmd_5, unit: deg}
+        qd:       {column: speed_5, unit: rpm}
+        tau:      {column: torque_5, unit: Nmm}
+"""
+
+import csv
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from taccorl.alignment.measurement import Measurement, unit_of
+from taccorl.alignment.quantisation import find_quantum
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import RecordingError, nearest
+from taccorl.sim.actions import ACTION_NAMES
+
+SUFFIXES = (".csv", ".parquet")
+SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
+
+_TURN, _DEG = 2 * math.pi, math.pi / 180
+TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+"""Unit of time → seconds."""
+POSITION = {"rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "deg": ("rad", _DEG), "mdeg": ("rad", 1e-3 * _DEG)}
+POSITION |= {
+    "rev": ("rad", _TURN),
+    "m": ("m", 1.0),
+    "cm": ("m", 1e-2),
+    "mm": ("m", 1e-3),
+    "um": ("m", 1e-6),
+    "µm": ("m", 1e-6),
+}
+"""Unit of a position → ours and the factor to it."""
+VELOCITY = {"rad/s": ("rad", 1.0), "mrad/s": ("rad", 1e-3), "deg/s": ("rad", _DEG), "rpm": ("rad", _TURN / 60)}
+VELOCITY |= {"rev/s": ("rad", _TURN), "m/s": ("m", 1.0), "cm/s": ("m", 1e-2), "mm/s": ("m", 1e-3)}
+"""Unit of a velocity → the position's unit that it goes with, and the factor to that a second."""
+EFFORT = {"Nm": ("rad", 1.0), "N·m": ("rad", 1.0), "Ncm": ("rad", 1e-2), "Nmm": ("rad", 1e-3), "mNm": ("rad", 1e-3)}
+EFFORT |= {"kgcm": ("rad", 0.0980665), "N": ("m", 1.0), "kN": ("m", 1e3), "mN": ("m", 1e-3)}
+"""Unit of an effort → the position's unit that it goes with, and the factor to N·m or N. Amperes are no effort: a torque
+constant is somebody's guess until it is written down as a column in N·m."""
+_CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One column of the table."""
+
+    column: str
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class SignalColumns:
+    """Where one signal stands."""
+
+    q: Column
+    """Measured position."""
+    q_target: Column
+    """Commanded position."""
+    qd: Column | None = None
+    """Measured velocity."""
+    tau: Column | None = None
+    """Effort of the motor."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableSpec:
+    """Names and units of a table's columns."""
+
+    time: Column
+    signals: dict[str, SignalColumns]
+    """Signal → its columns. The robot's signals are ``left_joint1`` … ``right_gripper``; others may have any name."""
+    separator: str = "comma"
+    """Of CSV files: comma, semicolon or tab."""
+    target_rows_late: int = 0
+    """Rows by which the file shows a target too late: 1 where row k holds the target that was in force from row k − 1 on,
+    −1 where it holds the one of row k + 1."""
+    origin: str = ""
+    """What made the file, e.g. "surrogate …"."""
+    instruction: str = ""
+
+
+def load_table_spec(path: Path) -> TableSpec:
+    """A columns file, checked.
+
+    Raises:
+        SpecError: with file, line, key and the way out.
+    """
+    document = Document(TableSpec, Path(path))
+    spec = document.value
+    if spec.separator not in SEPARATORS:
+        raise document.error("separator", f"{spec.separator!r}; {nearest(spec.separator, SEPARATORS)}")
+    if spec.time.unit not in TIME_S:
+        raise document.error("time/unit", f"{spec.time.unit!r} is no unit of time; {nearest(spec.time.unit, TIME_S)}")
+    if not spec.signals:
+        raise document.error("signals", "names no signal")
+    for name, signal in spec.signals.items():
+        kinds: dict[str, str] = {}
+        for key, column in _columns_of(signal):
+            known, where = _CONVERSIONS[key], f"signals/{name}/{key}/unit"
+            if column.unit not in known:
+                hint = (
+                    "; a current needs its motor's torque constant: write a column in Nm"
+                    if column.unit in ("A", "mA")
+                    else ""
+                )
+                raise document.error(where, f"{column.unit!r} is no unit of {key}; {nearest(column.unit, known)}{hint}")
+            kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
+        if len(kinds) > 1:
+            raise document.error(f"signals/{name}", f"{' and '.join(kinds.values())}: does it turn or slide?")
+        unit = POSITION[signal.q.unit][0]
+        if name in ACTION_NAMES and unit != unit_of(name):
+            raise document.error(
+                f"signals/{name}/q/unit", f"{signal.q.unit!r}: {name} is in {unit_of(name)} or a part of it"
+            )
+    names = [c.column for c in (spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s)))]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise document.error("signals", f"column {twice[0]!r} is used twice")
+    return spec
+
+
+def _columns_of(signal: SignalColumns) -> Iterable[tuple[str, Column]]:
+    for field in fields(signal):
+        column = getattr(signal, field.name)
+        if column is not None:
+            yield field.name, column
+
+
+def own_spec(path: Path, header: list[str]) -> TableSpec:
+    """The columns of a table that speaks our language.
+
+    Raises:
+        RecordingError: ``t`` or a position or a target is missing, or a column is unknown; names file and column.
+    """
+    if "t" not in header:
+        raise RecordingError(
+            f"{path}: no column 't' [s]; it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}. Other "
+            "names and units are written down in a columns file (taccorl/alignment/tables.py shows one)"
+        )
+    parts: dict[str, set[str]] = {}
+    for k, column in enumerate(header):
+        name, _, key = column.rpartition(".")
+        if column == "t":
+            continue
+        if key not in _CONVERSIONS or not name:
+            own = [f"{n}.{key}" for n in ACTION_NAMES for key in _CONVERSIONS]
+            raise RecordingError(
+                f"{path}: column {k + 1} {column!r} is not NAME.q, .q_target, .qd or .tau; {nearest(column, own)}"
+            )
+        if name not in ACTION_NAMES:
+            raise RecordingError(
+                f"{path}: column {k + 1} {column!r}: the robot has no {name!r}; {nearest(name, ACTION_NAMES)}. "
+                "Signals of other machines need a columns file, which states their units"
+            )
+        parts.setdefault(name, set()).add(key)
+    for name, keys in parts.items():
+        for needed in ("q", "q_target"):
+            if needed not in keys:
+                raise RecordingError(
+                    f"{path}: column '{name}.{needed}' is missing; {name} has {', '.join(sorted(keys))}"
+                )
+    units = {
+        "rad": {"q": "rad", "q_target": "rad", "qd": "rad/s", "tau": "Nm"},
+        "m": {"q": "m", "q_target": "m", "qd": "m/s", "tau": "N"},
+    }
+    signals = {
+        name: SignalColumns(
+            **{key: Column(column=f"{name}.{key}", unit=units[unit_of(name)][key]) for key in parts[name]}
+        )
+        for name in sorted(parts, key=ACTION_NAMES.index)
+    }
+    if not signals:
+        raise RecordingError(f"{path}: it holds times and no signal")
+    return TableSpec(time=Column(column="t", unit="s"), signals=signals)
+
+
+def read_table(path: Path, spec: TableSpec | None = None) -> Measurement:
+    """A CSV or parquet file as a measurement; its rows stay as they are.
+
+    Raises:
+        RecordingError: a column is missing, a cell is empty or no number; names file, line and column.
+    """
+    path = Path(path)
+    read = _read_parquet if path.suffix == ".parquet" else _read_csv
+    header, columns = read(path, spec)
+    spec = spec or own_spec(path, header)
+    time_s = columns[spec.time.column] * TIME_S[spec.time.unit]
+    if len(time_s) < 2:
+        raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
+    shape = (len(time_s), len(spec.signals))
+    values = {key: np.full(shape, np.nan) for key in _CONVERSIONS}
+    units = []
+    for j, signal in enumerate(spec.signals.values()):
+        units.append(POSITION[signal.q.unit][0])
+        for key, column in _columns_of(signal):
+            values[key][:, j] = columns[column.column] * _CONVERSIONS[key][column.unit][1]
+    late = spec.target_rows_late
+    if abs(late) >= len(time_s) - 1:
+        raise RecordingError(f"{path}: target_rows_late {late} leaves nothing of {len(time_s)} rows")
+    rows = slice(max(0, -late), len(time_s) - max(0, late))  # rows for which the target in force is in the file
+    start = time_s[rows][0]
+    return Measurement(
+        name=path.name,
+        time_s=time_s[rows] - start,
+        target=values["q_target"][rows.start + late : rows.stop + late],
+        measured=values["q"][rows],
+        velocity=values["qd"][rows],
+        effort=values["tau"][rows],
+        signals=tuple(spec.signals),
+        units=tuple(units),
+        quantum=np.array([find_quantum(column) for column in values["q"].T]),
+        source=path,
+        origin=spec.origin,
+        instruction=spec.instruction,
+        start_ns=round(start * 1e9),
+    )
+
+
+def _wanted(spec: TableSpec) -> list[str]:
+    return [spec.time.column, *(c.column for s in spec.signals.values() for _, c in _columns_of(s))]
+
+
+def _check_header(path: Path, header: list[str], spec: TableSpec | None) -> list[str]:
+    """Columns to read: all of the spec's, or all."""
+    twice = sorted({h for h in header if header.count(h) > 1})
+    wanted = header if spec is None else _wanted(spec)
+    if spec is None:
+        own_spec(path, header)
+    for name in wanted:
+        if name not in header:
+            raise RecordingError(f"{path}: no column {name!r}; {nearest(name, header)}")
+        if name in twice:
+            raise RecordingError(f"{path}: column {name!r} stands there twice")
+    return wanted
+
+
+def _read_csv(path: Path, spec: TableSpec | None) -> tuple[list[str], dict[str, np.ndarray]]:
+    separator = SEPARATORS[spec.separator if spec else "comma"]
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.reader(file, delimiter=separator, strict=True)
+            header = [cell.strip() for cell in next(rows, [])]
+            if not header:
+                raise RecordingError(f"{path}: is empty")
+            other = next((word for word, sign in SEPARATORS.items() if len(header) == 1 and sign in header[0]), None)
+            if other:
+                raise RecordingError(
+                    f"{path}: its columns are parted by {other}; write `separator: {other}` in a columns file"
+                )
+            wanted = _check_header(path, header, spec)
+            at = [header.index(name) for name in wanted]
+            found: list[list[float]] = []
+            for row in rows:
+                if not row:
+                    continue
+                if len(row) != len(header):
+                    raise RecordingError(f"{path}:{rows.line_num}: {len(row)} cells, the header has {len(header)}")
+                found.append([_number(row[k], path, rows.line_num, header[k]) for k in at])
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f"{path}: cannot be read as CSV: {error}") from error
+    return header, dict(zip(wanted, np.array(found, dtype=float).reshape(-1, len(wanted)).T, strict=True))
+
+
+def _number(cell: str, path: Path, line: int, column: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        comma = (
+            " (a decimal comma? write points)"
+            if cell.strip().replace(",", ".").replace(".", "", 1).strip("-").isdigit()
+            else ""
+        )
+        what = f"{cell!r} is no number{comma}" if cell.strip() else "is empty; leave the row out"
+        raise RecordingError(f"{path}:{line}: column {column!r}: {what}") from None
+    if not math.isfinite(value):
+        raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; leave the row out")
+    return value
+
+
+def _read_parquet(path: Path, spec: TableSpec | None) -> tuple[list[str], dict[str, np.ndarray]]:
+    try:
+        header = list(pq.read_schema(path).names)
+        wanted = _check_header(path, header, spec)
+        table = pq.read_table(path, columns=wanted)
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(f"{path}: cannot be read as parquet: {' '.join(str(error).split())}") from error
+    columns = {}
+    for name in wanted:
+        column = table[name]
+        if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+            raise RecordingError(f"{path}: column {name!r} holds {column.type}, not numbers")
+        values = np.asarray(column.to_numpy(), dtype=float)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            raise RecordingError(f"{path}: column {name!r}: row {bad[0]} is empty or not finite; leave the row out")
+        columns[name] = values
+    return header, columns
