@@ -118,7 +118,9 @@ def run(only: str | None = None) -> list[Row]:
             full = dataclasses.replace(
                 row,
                 name=f"{name}: {row.name}",
-                met=meets(row.value, row.goal),
+                value=float(row.value),  # NumPy's numbers are not JSON's
+                spread=float(row.spread),
+                met=meets(float(row.value), row.goal),
                 command=f"make bench ONLY={name}",
                 machine=machine(),
                 date=datetime.date.today().isoformat(),
@@ -155,7 +157,7 @@ def render(rows: list[dict[str, Any]]) -> str:
         "# Benchmarks",
         "",
         "Written by `make bench` from `bench.json`; do not edit. Value ± half the range of n measurements. Timings are",
-        "CPU-seconds or ratios within one run: the machine is shared. Recordings here are stand-ins, never a robot's.",
+        "CPU-seconds or ratios within one run: the machine is shared. Recordings are stand-ins and the twin is simulated: no robot.",
         "",
         "| what | value | unit | goal | met | rival in the same run | n | command | machine | date |",
         "|---|---|---|---|---|---|---|---|---|---|",
