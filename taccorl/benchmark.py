@@ -157,7 +157,7 @@ def render(rows: list[dict[str, Any]]) -> str:
         "# Benchmarks",
         "",
         "Written by `make bench` from `bench.json`; do not edit. Value ± half the range of n measurements. Timings are",
-        "CPU-seconds or ratios within one run: the machine is shared. Recordings are stand-ins and the twin is simulated: no robot.",
+        "CPU-seconds or ratios within one run: the machine is shared. Recordings and the twin are simulated: no robot was near.",
         "",
         "| what | value | unit | goal | met | rival in the same run | n | command | machine | date |",
         "|---|---|---|---|---|---|---|---|---|---|",
