@@ -6,12 +6,13 @@ from taccorl.errors import TaccorlError
 
 _DEBIAN = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
 _wanted = os.environ.get("MUJOCO_GL", "").lower()
-if _wanted in _DEBIAN:
+if _wanted:
     # With the variable set, MuJoCo loads that library as soon as it is imported, and what it says then helps nobody.
     try:
         import mujoco as _mujoco  # noqa: F401
-    except (AttributeError, ImportError, OSError) as error:
+    except (AttributeError, ImportError, OSError, RuntimeError) as error:
+        _install = f" On Debian: apt-get install {_DEBIAN[_wanted]};" if _wanted in _DEBIAN else ""
         raise TaccorlError(
-            f"MUJOCO_GL={_wanted}, but its library does not load ({error}). On Debian: apt-get install {_DEBIAN[_wanted]}; "
+            f"MUJOCO_GL={_wanted}, but its library does not load ({error}).{_install} Set egl or osmesa, "
             "or unset MUJOCO_GL: everything but images works without OpenGL"
         ) from error

@@ -1,7 +1,6 @@
 """Figures of the twin: physics, touch, pictures, gripping. ``make bench ONLY=twin_speed`` and the others."""
 
 import dataclasses
-import os
 import time
 from collections.abc import Callable, Iterator
 from statistics import median
@@ -248,6 +247,3 @@ def physics_step() -> Iterator[Row]:
             n=len(rates),
             spread=spread(rates),
         )
-
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -19,13 +19,11 @@ class Row:
     high: tuple[float, ...]
     unit: str
     probability: float = 1.0
-    nominal: tuple[float, ...] | None = None
-    """Value when nothing is drawn; None: the middle of the range."""
 
     @property
     def absent(self) -> np.ndarray:
-        middle = (np.array(self.low) + np.array(self.high)) / 2
-        return middle if self.nominal is None else np.array(self.nominal)
+        """Value when nothing is drawn: the middle of the range."""
+        return (np.array(self.low) + np.array(self.high)) / 2
 
 
 def symmetric(name: str, half: float | Sequence[float], unit: str) -> Row:

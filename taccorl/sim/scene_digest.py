@@ -1,5 +1,6 @@
 """Which scene a stored state belongs to, as one number: states of one scene have no meaning in another."""
 
+import dataclasses
 import hashlib
 from typing import TYPE_CHECKING
 
@@ -17,8 +18,11 @@ _BITS = 52  # a float64 holds so many exactly
 def scene_digest(task: "Task", config: "TwinConfig", scale: float) -> float:
     """Of task, difficulty, twin and randomisation: k / 2⁵², 0 ≤ k < 2⁵², from SHA-256. Equal ones have the same bits.
 
+    What is only said about an effect (interval, evidence) does not count: nothing moves differently for it.
     A fraction, so that it stays within the range that a dataset declares for ``sim.state``.
     """
+    bare = [dataclasses.replace(effect, interval={}, evidence="") for effect in config.effects]
+    config = dataclasses.replace(config, effects=bare)
     try:
         twin = twin_text(config)
     except TaccorlError:

@@ -31,12 +31,6 @@ def circle_outline(radius_m: float, num_sides: int, *, circumscribed: bool = Fal
     return corner_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def rectangle_outline(low_m: Sequence[float], high_m: Sequence[float]) -> np.ndarray:
-    """Axis-parallel rectangle (4, 2) between two corners."""
-    (x0, y0), (x1, y1) = low_m, high_m
-    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], float)
-
-
 def triangle_outline(side_m: float) -> np.ndarray:
     """Equilateral triangle (3, 2) about its centroid; one corner points to +y."""
     height = side_m * math.sqrt(3) / 2

@@ -487,3 +487,11 @@ def test_demonstrations_without_images_need_no_opengl(tmp_path):
     done = subprocess.run([sys.executable, *words], cwd=REPOSITORY, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "meta" / "info.json").is_file()
+
+
+def test_a_value_that_mujoco_gl_cannot_have_is_answered_with_those_it_can():
+    environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": "foo"}
+    words = [sys.executable, "-c", "import taccorl.sim.simulation"]
+    done = subprocess.run(words, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
+    assert "TaccorlError: MUJOCO_GL=foo" in done.stderr
+    assert "Set egl or osmesa, or unset MUJOCO_GL" in done.stderr

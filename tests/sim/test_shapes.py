@@ -24,7 +24,6 @@ from taccorl.sim.shapes import (
     heart_outline,
     moved,
     offset_outline,
-    rectangle_outline,
     triangle_outline,
     with_mass,
 )
@@ -78,7 +77,7 @@ def test_offset_outline_is_the_clearance_away_along_every_side_and_nowhere_neare
 
 
 def test_offset_square_has_the_obvious_corners():
-    square = rectangle_outline((-1, -1), (1, 1))
+    square = np.array([(-1.0, -1), (1, -1), (1, 1), (-1, 1)])
     assert offset_outline(square, 0.25).tolist() == [[-1.25, -1.25], [1.25, -1.25], [1.25, 1.25], [-1.25, 1.25]]
 
 

@@ -46,16 +46,6 @@ def turn(rotvec_rad: np.ndarray | tuple) -> np.ndarray:
     )
 
 
-def from_pos_quat(pose7: np.ndarray) -> np.ndarray:
-    """Position [m] and quaternion wxyz (7,) → matrix."""
-    return transform(pose7[:3], Rotation.from_quat(pose7[3:], scalar_first=True).as_matrix())
-
-
-def to_pos_quat(pose: np.ndarray) -> np.ndarray:
-    """Matrix → position [m] and quaternion wxyz (7,)."""
-    return np.r_[pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)]
-
-
 def rotvec(rotation_from: np.ndarray, rotation_to: np.ndarray) -> np.ndarray:
     """Rotation vector (3,) [rad], in the first frame, that turns the first pose's rotation into the second's."""
     matrix = rotation_from[:3, :3].T @ rotation_to[:3, :3]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from taccorl.demos.experts.se3 import between, from_pos_quat, inverse, rotvec, to_pos_quat, transform, turn
+from taccorl.demos.experts.se3 import between, inverse, rotvec, transform, turn
 
 
 def drawn(rng: np.random.Generator) -> np.ndarray:
@@ -71,17 +71,3 @@ def test_between_is_straight_and_turns_at_one_rate_about_one_axis():
     quarter = between(start, end, 0.25)
     np.testing.assert_allclose(quarter[:3, 3], (0.025, 0.05, 0))
     np.testing.assert_allclose(quarter[:3, :3], turn((0, 0, 0.3))[:3, :3], atol=1e-15)
-
-
-def test_position_and_quaternion_hold_the_whole_pose(rng):
-    for _ in range(20):
-        pose = drawn(rng)
-        np.testing.assert_allclose(from_pos_quat(to_pos_quat(pose)), pose, atol=1e-15)
-
-
-def test_the_quaternion_is_wxyz():
-    # A quarter turn about z: w = cos 45°, z = sin 45°.
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose(
-        to_pos_quat(transform((1.0, 2, 3)) @ turn((0, 0, np.pi / 2))), (1, 2, 3, half, 0, 0, half)
-    )

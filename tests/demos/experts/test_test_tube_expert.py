@@ -5,11 +5,12 @@ import itertools
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from taccorl.demos.experts import test_tube
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
-from taccorl.demos.experts.se3 import from_pos_quat, transform, turn
+from taccorl.demos.experts.se3 import transform, turn
 from taccorl.demos.experts.test_tube import TestTubeExpert
 from taccorl.sim.robot import LINKS
 from taccorl.sim.simulation import Simulation
@@ -145,7 +146,9 @@ def test_every_corner_of_the_reset_range_is_within_reach(sim):
     for dx, dy, yaw_deg in itertools.product((-0.02, 0.02), (-0.02, 0.02), (-20, 20)):
         drawn = {"tube_position": np.array((dx, dy)), "tube_yaw": np.array([np.deg2rad(yaw_deg)])}
         scene = sim.task.reset(drawn | {"holder_position": np.zeros(2), "friction": np.array([0.5])})
-        grip = from_pos_quat(scene.poses["tube"]) @ tcp @ transform((0, 0, -test_tube._TOWARDS_TIPS_M))
+        lying = scene.poses["tube"]
+        tube = transform(lying[:3], Rotation.from_quat(lying[3:], scalar_first=True).as_matrix())
+        grip = tube @ tcp @ transform((0, 0, -test_tube._TOWARDS_TIPS_M))
         up = grip.copy()
         up[2, 3] += 0.06
         for pose in (grip @ transform((0, 0, -0.06)), grip, up):

@@ -1,0 +1,23 @@
+"""What makes a scene another one, and what is only said about it."""
+
+from taccorl.sim.effects import make_effect
+from taccorl.sim.scene_digest import scene_digest
+from taccorl.sim.tasks.assembly_1 import Assembly1
+from taccorl.sim.twin import TwinConfig
+
+
+def digest(**effect) -> float:
+    return scene_digest(Assembly1(), TwinConfig(effects=[make_effect("coulomb_friction", **effect)]), 1.0)
+
+
+def test_evidence_and_interval_of_an_effect_make_no_other_scene_but_its_value_does():
+    told = digest(torque_nm=0.4, interval={"torque_nm": (0.3, 0.5)}, evidence="held-out error halves")
+    assert told == digest(torque_nm=0.4)
+    assert told != digest(torque_nm=0.41)
+
+
+def test_telling_changes_nothing_in_the_twin_itself():
+    effect = make_effect("coulomb_friction", torque_nm=0.4, evidence="kept")
+    config = TwinConfig(effects=[effect])
+    scene_digest(Assembly1(), config, 1.0)
+    assert config.effects[0].evidence == "kept"
