@@ -20,7 +20,7 @@ file lists them does not matter.
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -82,6 +82,16 @@ class Effect:
     name: ClassVar[str]
     """As registered."""
     layer: ClassVar[Literal["robot", "material", "spread", "taxel", "baseline"]]
+    equation: ClassVar[str] = ""
+    in_words: ClassVar[str] = ""
+    """What it is, on a robot, for somebody who has never met it."""
+    at_a_policy: ClassVar[str] = ""
+    """What it does to a policy that was trained without it."""
+    to_record: ClassVar[str] = ""
+    """Which recording shows it."""
+    near_twins: ClassVar[dict[str, str]] = {}
+    """Name of another effect, or of a number that is always fitted (kp, kd, torque_ff, k_n, k_d) → why measurements can hardly
+    tell them apart, and which recording can."""
 
     interval: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameter → 95 % interval of its estimate, in the parameter's unit."""
@@ -127,6 +137,33 @@ class Effect:
     def is_absent(self) -> bool:
         """Whether every parameter that has an absent value stands at it."""
         return all(getattr(self, p.name) == p.absent for p in self.parameters() if p.absent is not None)
+
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """Where a search for it starts: one set of parameters each, those left out at their typical values.
+
+        By default a third of, all of and three times the typical strength, and for one that has two signs both of them.
+
+        Args:
+            seen: facts of the recordings that the parameters may hang on. Of joints: ``peak_torque_nm`` that the twin's
+                controller asks for, ``peak_speed_rad_per_s`` of the targets (99th percentile), ``span_rad``, ``duration_s``.
+        """
+        strength = next(p for p in cls.parameters() if p.absent is not None)
+        if strength.absent is None or not math.isfinite(strength.absent):
+            return [{}]
+        shift = strength.typical - strength.absent
+        two_sided = strength.low <= strength.absent - abs(shift) and strength.absent + abs(shift) <= strength.high
+        shares = (-1.0, 1.0) if two_sided else (1 / 3, 1.0, 3.0)
+        values = [strength.absent + share * shift for share in shares]
+        return [{strength.name: v} for v in values if strength.low <= v <= strength.high]
+
+    def drive(self) -> dict[str, float] | None:
+        """Its numbers in the one-joint model of ``taccorl.alignment.joint_kernel``, by the names there, for identification.
+
+        None: only MuJoCo knows it, and identification runs MuJoCo. Empty: it changes bodies only, and inertia and weight are
+        read from the compiled model.
+        """
+        return None
 
     def acts_on(self) -> list[str]:
         """Joints, arms or pads."""

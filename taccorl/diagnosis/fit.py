@@ -1,0 +1,171 @@
+"""Fit all numbers of a hypothesis to recordings: residuals in noise floors, bounded least squares, several starts.
+
+A hypothesis is a list of effects; its numbers are those that are always fitted and those of its effects, all at once.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import fftconvolve
+
+from taccorl.diagnosis.problem import Free, Problem, Recording, Values, chosen
+from taccorl.sim.effects.effect import Effect
+
+FAR = 1e3
+"""Residual in floors where a simulation ended in NaN, and the most that one row counts."""
+_STEP = 1e-3
+"""Of finite differences, in coordinates of order 1."""
+_AT_BOUND = 1e-3
+"""Share of a parameter's range from its end that counts as being there."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What came out of one fit."""
+
+    names: tuple[str, ...]
+    """Effects in the hypothesis."""
+    values: Values
+    residuals: np.ndarray = field(repr=False)
+    """(n,) simulation − measurement in floors, all recordings one after the other."""
+    jacobian: np.ndarray = field(repr=False)
+    """(n, p) by the coordinates of ``frees``."""
+    frees: tuple[Free, ...]
+    at_bound: tuple[str, ...]
+    trouble: str
+    """Why it is not converged; empty if it is."""
+    evaluations: int
+    effects: tuple[Effect, ...]
+    """As fitted."""
+
+    @property
+    def error(self) -> float:
+        """RMS in floors on the recordings that it was fitted to."""
+        return rms(self.residuals)
+
+    @property
+    def effective_rows(self) -> float:
+        """Rows that neighbours do not already imply: n / (1 + 2 Σ ρ_k) of the residuals' autocorrelation."""
+        return effective_rows(self.residuals)
+
+    def covariance(self) -> np.ndarray:
+        """(p, p) of the coordinates, with as many rows as are independent. Directions that the data leave open are huge."""
+        n, p = self.jacobian.shape
+        variance = float(self.residuals @ self.residuals) / max(n - p, 1) * n / self.effective_rows
+        return variance * np.linalg.pinv(self.jacobian.T @ self.jacobian, rcond=1e-14, hermitian=True)
+
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """Parameter → 95 % interval in its unit, cut at its bounds."""
+        spread = 1.96 * np.sqrt(np.diag(self.covariance()))
+        middle = [f.coordinate(self.values[f.name]) for f in self.frees]
+        with np.errstate(over="ignore"):
+            return {
+                f.name: (f.value(min(m - s, 700.0)), f.value(min(m + s, 700.0)))
+                for f, m, s in zip(self.frees, middle, spread, strict=True)
+            }
+
+
+def rms(residuals: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(residuals)))) if len(residuals) else float("nan")
+
+
+def effective_rows(residuals: np.ndarray) -> float:
+    """Number of independent rows among n whose neighbours are alike, at least 10."""
+    n = len(residuals)
+    centred = residuals - residuals.mean()
+    power = float(centred @ centred)
+    if n < 20 or power == 0.0:
+        return float(max(n, 1))
+    reach = n // 2
+    correlation = fftconvolve(centred, centred[::-1])[n - 1 : n - 1 + reach] / power
+    small = np.flatnonzero(correlation < 0.05)
+    end = int(small[0]) if len(small) else reach
+    return max(10.0, n / (1.0 + 2.0 * float(correlation[1:end].sum())))
+
+
+def residuals(
+    problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
+) -> np.ndarray:
+    """(T, C) simulation − measurement in floors; NaN where nothing was measured."""
+    left = (problem.simulate(base, effects, recording) - recording.measured) / recording.floor
+    left[~np.isfinite(left) & np.isfinite(recording.measured)] = FAR
+    return np.clip(left, -FAR, FAR)
+
+
+def stacked(
+    problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+) -> np.ndarray:
+    """(n,) residuals of all recordings, without what was not measured."""
+    rows = [residuals(problem, base, effects, r) for r in recordings]
+    return np.concatenate([left[np.isfinite(left)] for left in rows])
+
+
+def fit(
+    problem: Problem, recordings: Sequence[Recording], names: Sequence[str], start: Mapping[str, float], most: int = 40
+) -> Fit:
+    """Fit the numbers of a hypothesis, all at once.
+
+    Args:
+        start: numbers to start from; those left out start at their own.
+        most: steps of the solver.
+    """
+    candidates = chosen(problem, names)
+    frees = (*problem.base, *(f for c in candidates for f in c.frees))
+    low = np.array([f.coordinate(f.low) for f in frees])
+    high = np.array([f.coordinate(f.high) for f in frees])
+    first = np.array([f.coordinate(start.get(f.name, f.start)) for f in frees])
+    inside = 1e-6 * (high - low)
+    first = np.clip(first, low + inside, high - inside)
+    evaluations = 0
+
+    def at(coordinates: np.ndarray) -> tuple[Values, list[Effect]]:
+        values = {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}
+        return values, problem.prepare(values, [c.make(values) for c in candidates], recordings)
+
+    def left(coordinates: np.ndarray) -> np.ndarray:
+        nonlocal evaluations
+        evaluations += 1
+        values, effects = at(coordinates)
+        return stacked(problem, values, effects, recordings)
+
+    def slopes(coordinates: np.ndarray) -> np.ndarray:
+        here = left(coordinates)
+        columns = np.empty((len(here), len(frees)))
+        for k in range(len(frees)):
+            there = coordinates.copy()
+            step = _STEP if coordinates[k] + _STEP <= high[k] else -_STEP
+            there[k] += step
+            columns[:, k] = (left(there) - here) / step
+        return columns
+
+    if len(frees) == 0:
+        values, effects = at(first)
+        here = left(first)
+        return Fit(tuple(names), values, here, np.empty((len(here), 0)), (), (), "", evaluations, tuple(effects))
+    found = least_squares(left, first, jac=slopes, bounds=(low, high), max_nfev=most, ftol=1e-5, xtol=1e-6, gtol=1e-9)  # pyright: ignore[reportArgumentType]
+    values, effects = at(found.x)
+    near = np.minimum(found.x - low, high - found.x) < _AT_BOUND * (high - low)
+    return Fit(
+        names=tuple(names),
+        values=values,
+        residuals=found.fun,
+        jacobian=found.jac,
+        frees=frees,
+        at_bound=tuple(f.name for f, is_near in zip(frees, near, strict=True) if is_near),
+        trouble="" if found.status > 0 else f"not converged: still improving after {most} steps",
+        evaluations=evaluations,
+        effects=tuple(effects),
+    )
+
+
+def best_fit(
+    problem: Problem,
+    recordings: Sequence[Recording],
+    names: Sequence[str],
+    starts: Sequence[Mapping[str, float]],
+    most: int = 40,
+) -> Fit:
+    """The best of the fits from several starts."""
+    return min((fit(problem, recordings, names, start, most) for start in starts), key=lambda f: f.error)

@@ -1,0 +1,147 @@
+"""What the search works on: a part of the robot with numbers that are always fitted, recordings of it, and effects it may have.
+
+Letters in shapes: T rows, C channels of a recording (position and effort of a joint; taxels of a pad).
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects.effect import Effect, Parameter
+
+Values = dict[str, float]
+"""``kp`` or ``coulomb_friction.torque_nm`` → number in the unit of that parameter."""
+_SMALLEST = 1e-3
+"""A strength that fades to 0 is searched, on a logarithmic scale, down to this share of its typical value."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Free:
+    """A number that is fitted."""
+
+    name: str
+    unit: str
+    start: float
+    low: float
+    high: float
+    log: bool = False
+    """Searched on a logarithmic scale; both bounds are above 0."""
+    scale: float = 1.0
+    """Of a linear one: a change that matters."""
+
+    def coordinate(self, value: float) -> float:
+        """Where the search stands: of order 1 for a change that matters."""
+        value = min(max(value, self.low), self.high)
+        return math.log(value) if self.log else value / self.scale
+
+    def value(self, coordinate: float) -> float:
+        raw = math.exp(coordinate) if self.log else coordinate * self.scale
+        return min(max(raw, self.low), self.high)
+
+
+def free(p: Parameter, effect: str) -> Free:
+    """How a parameter of an effect is searched: those that cannot change sign on a logarithmic scale."""
+    one_sided = p.low > 0 or (p.low == 0 and p.absent in (None, 0.0))
+    low = max(p.low, _SMALLEST * p.typical) if one_sided else p.low
+    shift = abs(p.typical - p.absent) if p.absent is not None and math.isfinite(p.absent) else 0.0
+    scale = shift or 0.1 * (p.high - p.low)
+    return Free(
+        name=f"{effect}.{p.name}", unit=p.unit, start=p.typical, low=low, high=p.high, log=one_sided, scale=scale
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """An effect that the part may have."""
+
+    cls: type[Effect]
+    frees: tuple[Free, ...]
+    starts: tuple[Values, ...]
+    """Where searches start; what a start leaves out is at its typical value."""
+    selectors: Mapping[str, Any]
+    """What of the robot it acts on: arm, joints, pads."""
+    num_maps: int = 0
+    """Numbers besides ``frees`` that the data decide (one for each taxel of a map): they count as parameters, too."""
+
+    @property
+    def name(self) -> str:
+        return self.cls.name
+
+    @property
+    def num_parameters(self) -> int:
+        return len(self.frees) + self.num_maps
+
+    def make(self, values: Mapping[str, float]) -> Effect:
+        """The effect with the parameters in ``values``, whose keys are full names."""
+        numbers: dict[str, Any] = {f.name.split(".", 1)[1]: values[f.name] for f in self.frees}
+        return self.cls(**self.selectors, **numbers)
+
+
+def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) -> Candidate:
+    """An effect as its class describes it, for a search over recordings with the facts ``seen`` (``Effect.starts``)."""
+    frees = tuple(free(p, cls.name) for p in cls.parameters())
+    starts = tuple({f"{cls.name}.{k}": v for k, v in start.items()} for start in cls.starts(seen))
+    return Candidate(cls=cls, frees=frees, starts=starts, selectors=selectors)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """One measurement as the search sees it."""
+
+    name: str
+    time_s: np.ndarray
+    """(T,)."""
+    measured: np.ndarray
+    """(T, C); NaN where there is nothing."""
+    floor: np.ndarray
+    """(C,) noise floor of each channel, in its unit: residuals are counted in it."""
+    channels: tuple[str, ...]
+    """Name and unit of each channel, e.g. "left_joint5 [rad]"."""
+    data: Any = field(repr=False)
+    """What the problem needs to simulate it."""
+
+    def __post_init__(self) -> None:
+        if self.measured.shape != (len(self.time_s), len(self.channels)) or self.floor.shape != (len(self.channels),):
+            raise TaccorlError(
+                f"recording {self.name}: measured is {self.measured.shape} and floor {self.floor.shape} for "
+                f"{len(self.time_s)} rows of {len(self.channels)} channels"
+            )
+        if not (np.isfinite(self.floor).all() and (self.floor > 0).all()):
+            raise TaccorlError(f"recording {self.name}: a noise floor of {self.floor} cannot be counted in")
+
+
+class Problem(Protocol):
+    """A part of the robot: one joint, or the pads."""
+
+    base: tuple[Free, ...]
+    candidates: dict[str, Candidate]
+
+    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+        """(T, C) what the twin would have measured, in the units of ``recording.measured``."""
+        ...
+
+    def prepare(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    ) -> list[Effect]:
+        """``effects`` with what is estimated in closed form from the fit recordings (maps of taxels) filled in."""
+        ...
+
+
+Progress = Callable[[str], None]
+"""Called with what is being done."""
+
+
+def chosen(problem: Problem, names: Sequence[str]) -> list[Candidate]:
+    """Candidates by name.
+
+    Raises:
+        TaccorlError: an effect that is no candidate of this problem.
+    """
+    for name in names:
+        if name not in problem.candidates:
+            raise TaccorlError(f"no effect {name!r} for this part; {nearest(name, problem.candidates)}")
+    return [problem.candidates[name] for name in names]

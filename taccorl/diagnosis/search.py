@@ -1,0 +1,431 @@
+"""Which physical effect is missing: fit, screen, refit, judge on held-out recordings, accept or say that it is something else.
+
+    1. The numbers that are always fitted are fitted to the fit recordings.
+    2. While the held-out error is above ``stop_at`` noise floors:
+       a. every effect is probed once (``screen``); the likeliest are refitted together with all numbers;
+       b. they are ranked by their error on the held-out recordings;
+       c. the best is accepted if it takes away enough of what lies above the floor, more than chance and more than its
+          parameters explain (BIC). Those that do as well are its ties, and the simplest of them is taken;
+       d. else the search ends with "something else".
+    3. Effects that others have made superfluous go; each is tried against its ties once more, now that the others are in.
+    4. The test recordings, which no choice has seen, give the final figures.
+
+Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from taccorl.diagnosis.evidence import bic_gain, block_squares, standard_score
+from taccorl.diagnosis.fit import Fit, best_fit, rms, stacked
+from taccorl.diagnosis.problem import Problem, Progress, Recording, Values, chosen
+from taccorl.diagnosis.screen import Probe, probe
+from taccorl.sim.effects.effect import Effect
+
+Status = Literal["nothing_missing", "at_floor", "something_else", "too_many"]
+WORDS: dict[Status, str] = {
+    "nothing_missing": "nothing is missing: the error is at the noise floor",
+    "at_floor": "at the noise floor",
+    "something_else": "something else: structure remains that no known effect explains",
+    "too_many": "stopped: as many effects as were allowed, and not at the noise floor",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """When an effect is believed. The values of research/discrepancy.md §4.1, checked in docs/diagnosis.md."""
+
+    stop_at: float = 1.25
+    """Held-out error in noise floors at which nothing more is looked for."""
+    min_gain: float = 0.10
+    """Of the held-out error squared that lies above the floor, an effect must take away so much,"""
+    min_score: float = 2.0
+    """by so many standard errors between blocks,"""
+    sure_gain: float = 0.5
+    """or so much of it: rare events (a limit that is reached twice) never get a great score,"""
+    min_bic: float = 10.0
+    """and lower the Bayesian information criterion by so much."""
+    tie_share: float = 0.05
+    """Effects that take away as much but for this share are ties; so are,"""
+    wide_tie_share: float = 0.2
+    """up to this share, those whose blocks do not differ by ``min_score``."""
+    max_effects: int = 4
+    num_refitted: int = 12
+    """Effects that are refitted after the screening: the true one was among the first 12 in every case (research §4.4)."""
+    steps: int = 30
+    """Of a refit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """One effect in one round: what speaks for it."""
+
+    name: str
+    values: Values
+    explained: float
+    """Share of the residual that its probe explained, before any refit."""
+    fit_error: float
+    held_out_error: float
+    """RMS in floors, after refitting everything."""
+    gain: float
+    """Share of the held-out squared error above the floor that goes away."""
+    score: float
+    """That gain over its standard error between half-second blocks."""
+    bic: float
+    at_bound: tuple[str, ...]
+    trouble: str
+    verdict: str
+    """In words: accepted, tied with, too little, no more than chance …"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Round:
+    """One search for one more effect."""
+
+    evidence: tuple[Evidence, ...]
+    """Best first."""
+    not_refitted: tuple[str, ...]
+    added: str | None
+    ties: tuple[str, ...]
+    """Effects that explain as much as the added one, without it."""
+    held_out_error: float
+    """Afterwards."""
+    fit_error: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """What is missing, how sure that is, and what cannot be told."""
+
+    status: Status
+    effects: tuple[Effect, ...]
+    """To be added to the twin, with intervals and evidence."""
+    present: tuple[str, ...]
+    """Those of ``effects`` that the twin had from the beginning."""
+    base: Values
+    """The always fitted numbers, refitted with the effects."""
+    start: Values
+    """The same before anything was added."""
+    intervals: dict[str, tuple[float, float]]
+    rounds: tuple[Round, ...]
+    rivals: dict[str, tuple[str, ...]]
+    """Added effect → effects that do as well in its place: these recordings do not tell which it is."""
+    twins: dict[str, dict[str, str]]
+    """Added effect → its near-twins by nature and what would tell them apart."""
+    removed: tuple[str, ...]
+    """Accepted and later found superfluous."""
+    swapped: tuple[tuple[str, str], ...]
+    errors: dict[str, dict[str, float]]
+    """``before`` (with the start numbers as given), ``fitted`` (numbers fitted, no effect) and ``after`` → fit, held_out, test
+    in floors. Test recordings were not looked at for any choice."""
+    steps: tuple[tuple[str, float], ...]
+    """(what was added, held-out error in floors) for the waterfall."""
+    at_bound: tuple[str, ...]
+    trouble: str
+    evaluations: int
+    cpu_s: float
+    before: Fit = field(repr=False)
+    after: Fit = field(repr=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def words(self) -> str:
+        return WORDS[self.status]
+
+
+def diagnose(
+    problem: Problem,
+    fit_to: Sequence[Recording],
+    held_out: Sequence[Recording],
+    test: Sequence[Recording] = (),
+    *,
+    start: Mapping[str, float] | None = None,
+    present: Sequence[str] = (),
+    without: Sequence[str] = (),
+    config: SearchConfig | None = None,
+    progress: Progress = lambda _: None,
+) -> Diagnosis:
+    """Search for the effects that are missing.
+
+    Args:
+        start: numbers to start from.
+        present: effects that the twin has already: they are refitted and stay.
+        without: effects that are not considered.
+    """
+    search = _Search(problem, fit_to, held_out, config or SearchConfig(), progress)
+    return search.run(test, dict(start or {}), tuple(present), without)
+
+
+class _Search:
+    def __init__(
+        self,
+        problem: Problem,
+        fit_to: Sequence[Recording],
+        held_out: Sequence[Recording],
+        config: SearchConfig,
+        progress: Progress,
+    ) -> None:
+        self.problem, self.fit_to, self.held_out = problem, list(fit_to), list(held_out)
+        self.config, self.progress = config, progress
+        self.evaluations = 0
+        self.removed: list[str] = []
+        self.swapped: list[tuple[str, str]] = []
+
+    def run(
+        self, test: Sequence[Recording], start: Values, present: tuple[str, ...], without: Sequence[str]
+    ) -> Diagnosis:
+        began = time.process_time()
+        c = self.config
+        self.present = present
+        there = chosen(self.problem, present)
+        given = {f.name: start.get(f.name, f.start) for f in (*self.problem.base, *(f for x in there for f in x.frees))}
+        self.progress("fitting the numbers that are always fitted")
+        first = model = self._fitted(present, [given], most=60)
+        names = [name for name in self.problem.candidates if name not in without]
+        rounds: list[Round] = []
+        while self.error(model) > c.stop_at and len(model.names) - len(present) < c.max_effects:
+            found, better = self._round(model, names)
+            rounds.append(found)
+            if better is None:
+                break
+            model = better
+        steps = [("", self.error(first)), *((r.added, r.held_out_error) for r in rounds if r.added)]
+        model = self._without_superfluous(model)
+        model, rivals = self._against_ties(model, rounds)
+        return Diagnosis(
+            status=self._status(model),
+            effects=tuple(self._described(model, first)),
+            present=present,
+            base={f.name: model.values[f.name] for f in self.problem.base},
+            start=given,
+            intervals=model.intervals(),
+            rounds=tuple(rounds),
+            rivals=rivals,
+            twins={n: dict(self.problem.candidates[n].cls.near_twins) for n in model.names if n not in present},
+            removed=tuple(self.removed),
+            swapped=tuple(self.swapped),
+            errors={
+                "before": self._errors(given, [x.make(given) for x in there], test),
+                "fitted": self._errors(first.values, first.effects, test),
+                "after": self._errors(model.values, model.effects, test),
+            },
+            steps=tuple(steps),
+            at_bound=model.at_bound,
+            trouble=model.trouble,
+            evaluations=self.evaluations,
+            cpu_s=time.process_time() - began,
+            before=first,
+            after=model,
+        )
+
+    # one more effect -------------------------------------------------------------------------------------------------
+
+    def _round(self, parent: Fit, names: Sequence[str]) -> tuple[Round, Fit | None]:
+        c = self.config
+        free = [name for name in names if name not in parent.names]
+        self.progress(f"probing {len(free)} effects")
+        probes = probe(self.problem, self.fit_to, parent, chosen(self.problem, free))
+        self.evaluations += len(probes)
+        best: dict[str, list[Probe]] = {}
+        for p in sorted(probes, key=lambda p: -p.explained):
+            best.setdefault(p.name, []).append(p)
+        order = sorted(best, key=lambda name: -best[name][0].explained)
+        before = block_squares(self.problem, parent, self.held_out)
+        rows = []
+        for name in order[: c.num_refitted]:
+            self.progress(f"refitting with {name}")
+            rows.append(_Row(self, parent, before, self._child(parent, best[name]), best[name][0]))
+        rows.sort(key=lambda row: row.squares.mean())
+        if not rows:
+            return self._told(parent, rows, order, None, []), None
+        refused = rows[0].refused()
+        if refused:
+            return self._told(parent, rows, order, None, []), None
+        tied = [row for row in rows if row is rows[0] or self._tie(row, rows[0], before)]
+        pick = min(tied, key=lambda row: (row.num_parameters, row.squares.mean()))
+        if pick.refused() or pick.squares.mean() - rows[0].squares.mean() > 0.02 * (
+            before.mean() - rows[0].squares.mean()
+        ):
+            pick = rows[0]
+        return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
+
+    def _child(self, parent: Fit, probes: list[Probe]) -> Fit:
+        """``parent`` with one effect more, from its best starts; never worse than ``parent``, which it contains."""
+        name = probes[0].name
+        frees = self.problem.candidates[name].frees
+        likely = [p for p in probes[:2] if p.explained >= 0.5 * probes[0].explained]
+        starts = [parent.values | _scaled(p, frees) for p in likely]
+        model = self._fitted((*parent.names, name), starts, self.config.steps)
+        if model.error > 1.001 * parent.error:  # stuck: from where the effect is hardly there
+            faint = {f.name: f.start for f in frees} | {frees[0].name: frees[0].low if frees[0].log else 0.0}
+            model = min(
+                (model, self._fitted((*parent.names, name), [parent.values | faint], self.config.steps)),
+                key=lambda m: m.error,
+            )
+        return model
+
+    def _tie(self, row: "_Row", best: "_Row", before: np.ndarray) -> bool:
+        """Whether held-out recordings do not tell the two apart."""
+        lost = float(row.squares.mean() - best.squares.mean())
+        won = float(before.mean() - best.squares.mean())
+        c = self.config
+        close = lost < c.tie_share * won
+        unclear = lost < c.wide_tie_share * won and standard_score(row.squares - best.squares) < c.min_score
+        return close or unclear
+
+    def _told(
+        self, parent: Fit, rows: "list[_Row]", order: list[str], pick: "_Row | None", ties: "list[_Row]"
+    ) -> Round:
+        def verdict(row: "_Row") -> str:
+            if row is pick:
+                return "added"
+            if row in ties:
+                return f"tied with {pick.name}" if pick else ""
+            return row.refused() or (f"explains less than {pick.name}" if pick else "")
+
+        after = pick.model if pick else parent
+        return Round(
+            evidence=tuple(row.evidence(verdict(row)) for row in rows),
+            not_refitted=tuple(order[len(rows) :]),
+            added=pick.name if pick else None,
+            ties=tuple(row.name for row in ties),
+            held_out_error=self.error(after),
+            fit_error=after.error,
+        )
+
+    # are they all needed, and are they the right ones? ---------------------------------------------------------------
+
+    def _without_superfluous(self, model: Fit) -> Fit:
+        added = [name for name in model.names if name not in self.present]
+        for name in added[:-1]:
+            rest = tuple(other for other in model.names if other != name)
+            smaller = self._fitted(rest, [model.values], self.config.steps)
+            worse = block_squares(self.problem, smaller, self.held_out) - block_squares(
+                self.problem, model, self.held_out
+            )
+            if standard_score(worse) < self.config.min_score or worse.mean() < 0.02 * (1.0 + self.error(model) ** 2):
+                self.removed.append(name)
+                model = smaller
+        return model
+
+    def _against_ties(self, model: Fit, rounds: Sequence[Round]) -> tuple[Fit, dict[str, tuple[str, ...]]]:
+        """Each effect against its ties, with the others in place: the better one stays, those that do as well are rivals."""
+        ties = {r.added: r.ties for r in rounds if r.added}
+        rivals: dict[str, tuple[str, ...]] = {}
+        for name in model.names:
+            here = block_squares(self.problem, model, self.held_out)
+            found = []
+            for other in (t for t in ties.get(name, ()) if t not in model.names):
+                self.progress(f"trying {other} in place of {name}")
+                others = tuple(other if n == name else n for n in model.names)
+                starts = [model.values | start for start in self.problem.candidates[other].starts]
+                swapped = self._fitted(others, starts, self.config.steps)
+                found.append((other, swapped, block_squares(self.problem, swapped, self.held_out)))
+            found.sort(key=lambda item: item[2].mean())
+            kept = name
+            if found:
+                other, swapped, squares = found[0]
+                better = here - squares
+                fewer = len(swapped.frees) <= len(model.frees) + 1
+                if fewer and better.mean() > 0.03 * here.mean() and standard_score(better) > 1.5:
+                    self.swapped.append((name, other))
+                    found[0] = (name, model, here)
+                    model, here, kept = swapped, squares, other
+            as_good = [
+                o
+                for o, _, squares in found
+                if squares.mean() < 1.5 * here.mean() and standard_score(squares - here) < self.config.min_score
+            ]
+            if as_good:
+                rivals[kept] = tuple(as_good)
+        return model, rivals
+
+    # helpers ---------------------------------------------------------------------------------------------------------
+
+    def _fitted(self, names: Sequence[str], starts: Sequence[Mapping[str, float]], most: int) -> Fit:
+        model = best_fit(self.problem, self.fit_to, names, starts, most)
+        self.evaluations += model.evaluations
+        return model
+
+    def error(self, model: Fit) -> float:
+        """RMS on the held-out recordings, in floors."""
+        return rms(stacked(self.problem, model.values, model.effects, self.held_out))
+
+    def _errors(self, values: Values, effects: Sequence[Effect], test: Sequence[Recording]) -> dict[str, float]:
+        uses = {"fit": self.fit_to, "held_out": self.held_out, "test": list(test)}
+        return {use: rms(stacked(self.problem, values, effects, recs)) for use, recs in uses.items() if recs}
+
+    def _status(self, model: Fit) -> Status:
+        if self.error(model) <= self.config.stop_at:
+            return "at_floor" if len(model.names) > len(self.present) else "nothing_missing"
+        full = len(model.names) - len(self.present) >= self.config.max_effects
+        return "too_many" if full else "something_else"
+
+    def _described(self, model: Fit, first: Fit) -> list[Effect]:
+        """Effects with their intervals and why they are believed."""
+        intervals = model.intervals()
+        before, after = self.error(first), self.error(model)
+        for effect in model.effects:
+            prefix = f"{effect.name}."
+            effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}
+            effect.evidence = (
+                f"held-out error {before:.2f} to {after:.2f} noise floors with {', '.join(model.names)}; recordings "
+                f"{', '.join(r.name for r in self.held_out)}"
+            )
+        return list(model.effects)
+
+
+class _Row:
+    """One refitted effect beside its parent, on the held-out recordings."""
+
+    def __init__(self, search: _Search, parent: Fit, before: np.ndarray, model: Fit, seen: Probe) -> None:
+        self.name, self.model, self.seen, self._config = model.names[-1], model, seen, search.config
+        self.squares = block_squares(search.problem, model, search.held_out)
+        self.held_out_error = search.error(model)
+        better = before - self.squares
+        self.gain = float(better.mean()) / max(float(before.mean()) - 1.0, 1e-12)
+        self.score = standard_score(better)
+        self.num_parameters = search.problem.candidates[self.name].num_parameters
+        self.bic = bic_gain(parent, model, self.num_parameters)
+
+    def refused(self) -> str:
+        """Why it is not believed; empty if it is."""
+        c = self._config
+        if self.gain < c.min_gain:
+            return f"takes away {max(self.gain, 0.0):.0%} of what lies above the floor, less than {c.min_gain:.0%}"
+        if self.score < c.min_score and self.gain < c.sure_gain:
+            return f"no more than chance: {self.score:.1f} standard errors"
+        if self.bic < c.min_bic:
+            return f"does not pay for its parameters: ΔBIC {self.bic:.0f}"
+        return ""
+
+    def evidence(self, verdict: str) -> Evidence:
+        own = f"{self.name}."
+        return Evidence(
+            name=self.name,
+            values={k: v for k, v in self.model.values.items() if k.startswith(own)},
+            explained=self.seen.explained,
+            fit_error=self.model.error,
+            held_out_error=self.held_out_error,
+            gain=self.gain,
+            score=self.score,
+            bic=self.bic,
+            at_bound=tuple(name for name in self.model.at_bound if name.startswith(own)),
+            trouble=self.model.trouble,
+            verdict=verdict,
+        )
+
+
+def _scaled(seen: Probe, frees: Sequence) -> Values:
+    """The probe's start with its strength multiplied as the score test suggests."""
+    values = {f.name: f.start for f in frees} | seen.start
+    if frees and frees[0].log and seen.multiple > 0:
+        values[frees[0].name] *= min(max(seen.multiple, 0.2), 5.0)
+    return values

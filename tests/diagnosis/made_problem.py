@@ -1,0 +1,143 @@
+"""A problem whose answers can be written down: a measurement is a sum of known signals, each effect adds one of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.diagnosis.problem import Candidate, Free, Recording, candidate
+from taccorl.sim.effects.effect import Effect, parameter
+
+RATE_HZ = 200.0
+
+
+@dataclass(kw_only=True)
+class Added(Effect):
+    """strength × signal; ``signal`` of the subclass."""
+
+    layer: ClassVar = "robot"
+
+    @classmethod
+    def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
+        raise NotImplementedError
+
+    def acts_on(self) -> list[str]:
+        return ["it"]
+
+
+def _strength(low: float = 0.0) -> float:
+    return parameter(unit="1", symbol="s", absent=0.0, low=low, high=50.0, typical=1.0, source="made up")
+
+
+@dataclass(kw_only=True)
+class Ripple(Added):
+    name: ClassVar = "ripple"
+    strength: float = _strength()
+
+    @classmethod
+    def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
+        return np.sin(40.0 * t + seed)
+
+
+@dataclass(kw_only=True)
+class Bump(Added):
+    """In the first second only: its share of all blocks is small."""
+
+    name: ClassVar = "bump"
+    strength: float = _strength()
+
+    @classmethod
+    def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
+        return np.exp(-(((t - 0.6) / 0.1) ** 2))
+
+
+@dataclass(kw_only=True)
+class Square(Added):
+    """Of either sign."""
+
+    name: ClassVar = "square"
+    strength: float = _strength(low=-50.0)
+
+    @classmethod
+    def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
+        return drive(t, seed) ** 2
+
+
+@dataclass(kw_only=True)
+class Squire(Square):
+    """The same but for a thousandth: nothing tells them apart. It needs a number more."""
+
+    name: ClassVar = "squire"
+    strength: float = _strength(low=-50.0)
+    idle: float = parameter(unit="1", symbol="i", absent=None, low=0.5, high=2.0, typical=1.0, source="made up")
+
+    @classmethod
+    def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
+        return Square.signal(t, seed) + 0.001 * np.sin(7.0 * t)
+
+
+@dataclass(kw_only=True)
+class Hidden(Added):
+    """As what the gain does: no recording shows it."""
+
+    name: ClassVar = "hidden"
+    strength: float = _strength()
+
+    @classmethod
+    def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
+        return drive(t, seed)
+
+
+def drive(t: np.ndarray, seed: int) -> np.ndarray:
+    """What is commanded."""
+    return np.sin((1.0 + 0.1 * seed) * t) + 0.3 * np.sin(2.7 * t + seed)
+
+
+class MadeProblem:
+    """measured = gain × drive + offset + effects."""
+
+    base = (
+        Free(name="gain", unit="1", start=1.0, low=0.01, high=100.0, log=True),
+        Free(name="offset", unit="1", start=0.0, low=-10.0, high=10.0),
+    )
+
+    def __init__(self, *classes: type[Added]) -> None:
+        self.candidates: dict[str, Candidate] = {cls.name: candidate(cls, {}) for cls in classes}
+
+    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+        t, seed = recording.time_s, recording.data
+        total = base["gain"] * drive(t, seed) + base["offset"]
+        for effect in effects:
+            assert isinstance(effect, Added)
+            total = total + vars(effect)["strength"] * effect.signal(t, seed)
+        return total[:, None]
+
+    def prepare(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    ) -> list[Effect]:
+        return list(effects)
+
+
+def record(
+    seed: int,
+    *effects: Added,
+    gain: float = 3.0,
+    offset: float = 0.4,
+    noise: float = 0.1,
+    seconds: float = 10.0,
+    extra: np.ndarray | float = 0.0,
+) -> Recording:
+    t = np.arange(0.0, seconds, 1.0 / RATE_HZ)
+    rng = np.random.default_rng(1000 + seed)
+    total = gain * drive(t, seed) + offset + extra + noise * rng.standard_normal(len(t))
+    for effect in effects:
+        total = total + vars(effect)["strength"] * effect.signal(t, seed)
+    return Recording(
+        name=f"made {seed}",
+        time_s=t,
+        measured=total[:, None],
+        floor=np.array([noise]),
+        channels=("it [1]",),
+        data=seed,
+    )
