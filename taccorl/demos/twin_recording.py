@@ -107,10 +107,13 @@ class TwinScene:
         if camera not in self._renderers:
             self._renderers[camera] = Renderer(self.story.sim.model, (camera,), *self.size)
         rows, columns = self.size
+        sim = self.story.sim
+        age_s = sim.effects.picture_age_s(camera)
+        config = next(c for c in sim.config.cameras if c.name == camera)
         noise = sensor_noise(rows, columns)
         for when, k in zip(time_s.tolist(), frame_ids.tolist(), strict=True):
-            self.story.data_at(when, self._data)
-            picture = self._renderers[camera].render([self._data])[0, 0, :, :, ::-1]
+            self.story.data_at(when - age_s, self._data)
+            picture = sim.effects.picture(self._renderers[camera].render([self._data])[0], config)[0, :, :, ::-1]
             piece = noise[k * 7 % 32 :, k * 13 % 32 :][:rows, :columns]
             yield np.clip(picture.astype(np.int16) + piece - 9, 0, 255).astype(np.uint8)
 

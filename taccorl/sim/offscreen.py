@@ -89,6 +89,25 @@ class Canvas:
         mujoco.mjv_updateScene(model, data, self._option, None, view.camera, seen, self._scene)
         mujoco.mjr_render(mujoco.MjrRect(0, 0, view.window.columns, view.window.rows), self._scene, self._mjr)
 
+    def labels(self, model: mujoco.MjModel, data: mujoco.MjData, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """What each pixel of a view's window shows: number of the geom, −1 for none, and depth [m] along the optical axis."""
+        flags, rows, columns = self._scene.flags.copy(), view.window.rows, view.window.columns
+        self._scene.flags[[int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]] = 1
+        try:
+            self._draw_view(model, data, view)
+        finally:
+            self._scene.flags[:] = flags
+        color, depth = np.empty((rows, columns, 3), np.uint8), np.empty((rows, columns), np.float32)
+        self._mjr.readDepthMap = int(mujoco.mjtDepthMap.mjDEPTH_ZEROFAR)  # reversed, as it is kept: nothing is lost
+        mujoco.mjr_readPixels(color, depth, mujoco.MjrRect(0, 0, columns, rows), self._mjr)
+        shown = self._scene.geoms[: self._scene.ngeom]
+        geom_of = np.full(len(shown) + 1, -1, np.int32)
+        geom_of[[geom.segid + 1 for geom in shown]] = [geom.objid for geom in shown]
+        number = color.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16], np.int32)
+        near, far = (float(z) * model.stat.extent for z in (model.vis.map.znear, model.vis.map.zfar))
+        depth_m = near * far / (near + depth.astype(float) * (far - near))
+        return geom_of[number[::-1]], depth_m[::-1]
+
     def _sheet_for(self, num_views: int) -> "_Sheet":
         """One that holds ``num_views``, or as many of them as one sheet may."""
         across = min(num_views, self._most[1])

@@ -6,7 +6,7 @@ same bytes whether drawn alone or with others; another OpenGL driver may round p
 """
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Self
 
 import mujoco
@@ -16,6 +16,8 @@ from mujoco.batch import Batch
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.cameras import letterbox_window
 from taccorl.sim.offscreen import Canvas, View
+
+Place = Callable[[int, mujoco.MjData], None]
 
 
 class Renderer:
@@ -63,23 +65,46 @@ class Renderer:
         datas = list(datas)
         return self._draw([(data.model, data) for data in datas], len(datas))
 
-    def render_batch(self, batch: Batch, ids: Sequence[int] | np.ndarray | None = None) -> np.ndarray:
+    def render_batch(
+        self, batch: Batch, ids: Sequence[int] | np.ndarray | None = None, place: Place | None = None
+    ) -> np.ndarray:
         """Pictures of the batch's simulations ``ids`` (numbers or a mask; None: all), of their current states.
 
         Per-simulation model fields (colours, lights, cameras) are drawn as they are. Shapes, errors: ``render``.
+
+        Args:
+            place: called with a simulation's number and a copy of its data, whose positions it may change before it is drawn.
         """
         chosen = np.arange(batch.nsim) if ids is None else np.asarray(ids)
         if chosen.dtype == bool:
             chosen = np.flatnonzero(chosen)
-        return self._draw(self._states(batch, chosen), len(chosen))
+        return self._draw(self._states(batch, chosen, place), len(chosen))
 
-    def _states(self, batch: Batch, ids: np.ndarray) -> Iterator[tuple[mujoco.MjModel, mujoco.MjData]]:
+    def labels(self, data: mujoco.MjData) -> list[tuple[np.ndarray, np.ndarray]]:
+        """For each camera: number of the geom that each pixel shows (rows, columns) int32, −1 for none and in the bars, and
+        its depth [m] along the optical axis, infinite there. State and errors: ``render``."""
+        canvas, found = self._canvas(), []
+        with canvas.current():
+            for view in self._views:
+                geoms, depth_m = np.full(self._shape, -1, np.int32), np.full(self._shape, np.inf)
+                window = view.window
+                inside = np.s_[window.top : window.top + window.rows, window.left : window.left + window.columns]
+                geoms[inside], depth = canvas.labels(data.model, data, view)
+                depth_m[inside] = np.where(geoms[inside] >= 0, depth, np.inf)
+                found.append((geoms, depth_m))
+        return found
+
+    def _states(
+        self, batch: Batch, ids: np.ndarray, place: Place | None
+    ) -> Iterator[tuple[mujoco.MjModel, mujoco.MjData]]:
         if self._scratch is None or self._scratch[0] is not batch:
             self._scratch = (batch, batch.get_model(0), batch.get_data(0))
         _, model, data = self._scratch
         for sim in ids.tolist():
             batch.get_model(sim, model)
             batch.get_data(sim, data)
+            if place:
+                place(sim, data)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)  # for cameras and lights that follow a centre of mass
             mujoco.mj_camlight(model, data)

@@ -7,7 +7,8 @@ import numpy as np
 from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects.added import AddedEffects
+from taccorl.sim.effects.added import PAST_POSITIONS, PAST_TIME_S, AddedEffects
+from taccorl.sim.effects.camera_past import place_past
 from taccorl.sim.pad import PadArray
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.robot import PADS
@@ -41,6 +42,10 @@ class SeenScene:
         """Numbers in a stored state; ``Simulation`` knows."""
         raise NotImplementedError
 
+    def row_memory(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """What effects remember in stored states; ``Simulation`` knows."""
+        raise NotImplementedError
+
     def proprioception(self) -> np.ndarray:
         """(N, 14) joint angles [rad] and gripper openings [m] as the encoders report them, in the order of actions."""
         return self.effects.encoder(self.arrays["sensordata"][:, self._encoders])
@@ -67,8 +72,16 @@ class SeenScene:
     ) -> dict[str, np.ndarray]:
         """Camera → (n, rows, columns, 3) uint8 RGB of simulations ``ids`` (all by default), letterboxed as in a dataset."""
         names = tuple(cameras or (camera.name for camera in self.config.cameras))
-        pictures = self._renderer(names, size).render_batch(self.batch, ids)
-        return {name: pictures[:, k] for k, name in enumerate(names)}
+        found, past = {}, self.effects.past
+        for age_s, same in self._by_age(names):
+
+            def late(sim: int, data: mujoco.MjData, age_s: float = age_s) -> None:
+                if past:
+                    place_past(data, past.positions[sim], past.time_s[sim], age_s)
+
+            pictures = self._renderer(same, size).render_batch(self.batch, ids, late if age_s else None)
+            found |= {name: pictures[:, k] for k, name in enumerate(same)}
+        return {name: self._given(name, found[name]) for name in names}
 
     def render_states(
         self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
@@ -86,14 +99,29 @@ class SeenScene:
                 f"render_states: wanted are rows (T, {self.row_size}) of state_rows, found {states.shape}"
             )
         data = mujoco.MjData(self.model)
-        renderer = self._renderer(tuple(cameras), size)
-        for physics in states[:, 1 : 1 + self.batch.nstate]:
-            mujoco.mj_setState(self.model, data, physics, mujoco.mjtState.mjSTATE_INTEGRATION)
-            mujoco.mj_kinematics(self.model, data)
-            mujoco.mj_comPos(self.model, data)
-            mujoco.mj_camlight(self.model, data)
-            pictures = renderer.render([data])[0]
-            yield dict(zip(cameras, pictures, strict=True))
+        ages = self._by_age(tuple(cameras))
+        memory = self.row_memory(states) if self.effects.past else {}
+        for k, physics in enumerate(states[:, 1 : 1 + self.batch.nstate]):
+            found = {}
+            for age_s, same in ages:
+                mujoco.mj_setState(self.model, data, physics, mujoco.mjtState.mjSTATE_INTEGRATION)
+                if age_s:
+                    place_past(data, memory[PAST_POSITIONS][k], memory[PAST_TIME_S][k], age_s)
+                mujoco.mj_kinematics(self.model, data)
+                mujoco.mj_comPos(self.model, data)
+                mujoco.mj_camlight(self.model, data)
+                found |= dict(zip(same, self._renderer(same, size).render([data])[0], strict=True))
+            yield {name: self._given(name, found[name][None])[0] for name in cameras}
+
+    def _by_age(self, cameras: tuple[str, ...]) -> list[tuple[float, tuple[str, ...]]]:
+        """(how late their pictures are, cameras): all at once where none is late."""
+        ages = {name: self.effects.picture_age_s(name) for name in cameras}
+        return [(age, tuple(n for n in cameras if ages[n] == age)) for age in dict.fromkeys(ages.values())]
+
+    def _given(self, camera: str, pictures: np.ndarray) -> np.ndarray:
+        """What a camera gives of pictures (n, rows, columns, 3) that were drawn of it."""
+        config = next(c for c in self.config.cameras if c.name == camera)
+        return self.effects.picture(pictures, config)
 
     def require_cameras(self, names: Sequence[str]) -> None:
         """The twin has these cameras.

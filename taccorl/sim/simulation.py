@@ -29,6 +29,7 @@ SUB_COMMANDS = 5
 """Targets go to their new value in a straight line over a control step, at 150 Hz: a robot's driver does not jump either."""
 _UNSTABLE = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL)]
 _UNSTABLE += [int(mujoco.mjtWarning.mjWARN_BADQACC)]
+_ENCODER_ROUNDS = 12  # of a scale 10 % off: 1e-12 rad remain
 _BOUND = ("qpos", "qvel", "ctrl", "time", "xpos", "xmat", "cvel", "subtree_com", "site_xpos", "site_xmat", "geom_xpos")
 _BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat", "actuator_force")
 
@@ -97,7 +98,7 @@ class Simulation(SeenScene):
         self.arrays = {name: self.batch.bind(name) for name in _BOUND}
         self.judge = Judge(task, num_sims, CONTROL_HZ)
         self.pads = PadArray(self.model, PADS)
-        self.effects = AddedEffects(self.config.effects, self.arrays["time"])
+        self.effects = AddedEffects(self.config.effects, self.arrays["time"], self.batch)
         self.sensor = self.config.sensor.build(PADS, [self.effects])
         self.seeds = np.full(num_sims, -1, dtype=np.int64)
         self.draws: list[dict[str, np.ndarray]] = [{} for _ in range(num_sims)]
@@ -148,7 +149,6 @@ class Simulation(SeenScene):
             self._place(int(i), int(seed))
         self.batch.set_const(ids)
         self._settle(ids)
-        self.batch.forward(ids)
         self.diverged[ids] = self.clipped[ids] = False
         self.judge.reset(ids, self)
 
@@ -157,6 +157,8 @@ class Simulation(SeenScene):
         self.targets[ids] = self.arrays["ctrl"][ids][:, self.action_actuators]
         self.effects.reset(ids, self.targets)
         fill_histories(self.batch, ids)
+        self.batch.forward(ids)
+        self.effects.feel(ids, 0.0)
 
     def _place(self, i: int, seed: int) -> None:
         """Write the scene of ``seed`` into simulation ``i``: its model's random fields and its state."""
@@ -174,7 +176,8 @@ class Simulation(SeenScene):
             home = np.array(self.task.home_rad[arm])
             qpos[i, self._joint_qpos[arm]] = home
             # The arm rests T_ref / K_p away from its target, so that it stands still where it stands.
-            rest = np.array(self.config.controller.torque_ff_nm) / np.array(self.config.controller.kp_nm_per_rad)
+            controller = self.config.controller_of(arm)
+            rest = np.array(controller.torque_ff_nm) / np.array(controller.kp_nm_per_rad)
             self.arrays["ctrl"][i, [self.model.actuator(f"{arm}_{j}").id for j in JOINTS]] = home - rest
             self.arrays["ctrl"][i, self.model.actuator(f"{arm}_gripper").id] = ACTION_HIGH[6]
         qpos[i, self._fingers] = FINGER_STROKE_M
@@ -182,17 +185,23 @@ class Simulation(SeenScene):
     def place_arms(self, joints: np.ndarray, targets: np.ndarray) -> None:
         """Put the arms of every simulation at rest at ``joints`` (14,) [rad, m] with ``targets`` (14,) in force."""
         qpos, qvel = self.arrays["qpos"], self.arrays["qvel"]
-        joints = joints - (self.effects.encoder(joints[None])[0] - joints)  # where they are when they report ``joints``
+        joints = self._true(joints)
         for a, arm in enumerate(ARMS):
             qpos[:, self._joint_qpos[arm]] = joints[7 * a : 7 * a + 6]
             qpos[:, self._fingers[2 * a : 2 * a + 2]] = joints[7 * a + 6] / 2
         qvel[:] = 0.0
         self.arrays["ctrl"][:, self.action_actuators] = targets
         self._settle(np.arange(self.num_sims))
-        self.batch.forward()
+
+    def _true(self, reported: np.ndarray) -> np.ndarray:
+        """Where joints and grippers (14,) are when their encoders report ``reported``: fixed point, encoders are nearly right."""
+        true = reported
+        for _ in range(_ENCODER_ROUNDS):
+            true = true + (reported - self.effects.encoder(true[None])[0])
+        return true
 
     def _write_model(self, i: int, scene: Reset) -> None:
-        self._friction[i, self._part_geoms, 0] = scene.friction
+        self._friction[i, self._part_geoms, 0] = self.effects.friction(scene.friction)
         for name, (mass, inertia) in self._mass.items():
             body, change = self._bodies[name], scene.mass_change_kg.get(name, 0.0)
             self._body_mass[i, body] = mass + change
@@ -223,19 +232,23 @@ class Simulation(SeenScene):
         total = len(commands) * num_steps
         arrive = self._send(commands, num_steps, ids)
         done = 0
-        for end in sorted({*range(num_steps, total + 1, num_steps), *watched}):
+        step_by_step = 1 if self.effects.rewrites else num_steps
+        for end in sorted({*range(step_by_step, total + 1, step_by_step), *watched}):
             self.arrays["ctrl"][stepped[:, None], self.action_actuators] = arrive[done // num_steps][stepped]
             stages = mujoco.mjtStage
-            stage = (
-                stages.mjSTAGE_ACC if end == total else stages.mjSTAGE_VEL if end in watched else stages.mjSTAGE_NONE
-            )
+            all_of_it = end == total or self.effects.rewrites
+            stage = stages.mjSTAGE_ACC if all_of_it else stages.mjSTAGE_VEL if end in watched else stages.mjSTAGE_NONE
             self.batch.step(ids, nstep=end - done, stage=stage)
             done = end
             ids = self._sound(ids)
+            if self.effects.rewrites:
+                self.effects.feel(stepped if ids is None else ids, self.config.physics.timestep_s)
             if watch and end in watched:
                 watch.see(end)
         if self.effects.remember_touch:
             self.effects.scan(self.sensor.reading(*self.pads.touch(self.batch), None))
+        if self.effects.past:
+            self.effects.past.keep()
 
     def _sound(self, ids: np.ndarray | None) -> np.ndarray | None:
         """Those of ``ids`` that have not diverged. A simulation of NaNs would cost twenty times a sound one's time."""
@@ -326,9 +339,9 @@ class Simulation(SeenScene):
             self._place(int(i), int(seed))
         self.batch.set_const(ids)
         self.batch.state[ids] = snapshot.physics
+        self.effects.restore(snapshot.memory, ids)
         self.batch.forward(ids)
         self.batch.state[ids] = snapshot.physics  # forward() has written its own warm start
-        self.effects.restore(snapshot.memory, ids)
         self.targets[ids] = snapshot.memory["targets"]
         self.judge.restore(snapshot.judge, ids, self)
         self.diverged[ids] = self.clipped[ids] = False
@@ -362,15 +375,19 @@ class Simulation(SeenScene):
                 f"{self.row_size} numbers each; they are another task's or of a twin with other effects"
             )
         seeds = checked_seeds(seeds).reshape(-1)
-        now = self.snapshot(ids)
-        scene, physics, rest = np.split(rows, [1, 1 + self.batch.nstate], axis=1)
-        memory, at = {}, 0
-        for name in sorted(now.memory):
-            size = now.memory[name][0].size
-            memory[name] = rest[:, at : at + size].reshape(now.memory[name].shape).astype(now.memory[name].dtype)
-            at += size
-        self.restore(Snapshot(physics, now.judge, seeds, memory, scene[:, 0]), ids)
+        judge = self.judge.snapshot(ids)
+        scene, physics, _ = np.split(rows, [1, 1 + self.batch.nstate], axis=1)
+        self.restore(Snapshot(physics, judge, seeds, self.row_memory(rows), scene[:, 0]), ids)
         self.judge.reset(ids, self)
+
+    def row_memory(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """``Snapshot.memory`` of stored rows (n, row_size)."""
+        now, memory, at = self.snapshot(np.array([0])).memory, {}, 1 + self.batch.nstate
+        for name in sorted(now):
+            one = now[name][0]
+            memory[name] = rows[:, at : at + one.size].reshape(len(rows), *one.shape).astype(one.dtype)
+            at += one.size
+        return memory
 
 
 def checked_seeds(seeds: int | Sequence[int] | np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import mujoco
 
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.cameras import CameraConfig, add_cameras, bench_cameras
 from taccorl.sim.controller import ControllerConfig, add_actuators
 from taccorl.sim.effects.added import edit_model
@@ -47,11 +47,22 @@ class TwinConfig:
 
     robot: RobotConfig = field(default_factory=RobotConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
+    arm_controllers: dict[str, ControllerConfig] = field(default_factory=dict)
+    """``left`` or ``right`` → gains of an arm that are not those of ``controller``."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     cameras: list[CameraConfig] = field(default_factory=lambda: list(bench_cameras()))
     sensor: SensorConfig = field(default_factory=FlexiTacConfig)
     effects: list[Effect] = field(default_factory=list)
     """What the robot has beyond the above; in any order."""
+
+    def __post_init__(self) -> None:
+        for arm in self.arm_controllers:
+            if arm not in ARMS:
+                raise TaccorlError(f"arm_controllers: no arm {arm!r}; {nearest(arm, ARMS)}")
+
+    def controller_of(self, arm: str) -> ControllerConfig:
+        """Gains of one arm."""
+        return self.arm_controllers.get(arm, self.controller)
 
 
 def empty_bench(config: TwinConfig) -> mujoco.MjSpec:
@@ -78,7 +89,7 @@ def empty_bench(config: TwinConfig) -> mujoco.MjSpec:
     for arm in ARMS:
         add_arm(spec, arm, config.robot)
     for arm in ARMS:
-        add_actuators(spec, arm, config.robot, config.controller)
+        add_actuators(spec, arm, config.robot, config.controller_of(arm))
     return spec
 
 

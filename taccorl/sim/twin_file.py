@@ -17,6 +17,7 @@
 """
 
 import dataclasses
+import hashlib
 import math
 import typing
 from collections.abc import Iterator
@@ -80,6 +81,11 @@ def twin_text(config: TwinConfig) -> str:
         content["sensor"] = _plugin_differences("type", sensors, config.sensor, type(nominal.sensor))
     content["effects"] = [_plugin_differences("effect", effects, effect) for effect in config.effects]
     return _HEADER + yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+
+
+def twin_digest(config: TwinConfig) -> str:
+    """16 hexadecimal digits that two twins share only if they are the same."""
+    return hashlib.sha256(twin_text(config).encode()).hexdigest()[:16]
 
 
 def save_twin(config: TwinConfig, path: Path) -> None:

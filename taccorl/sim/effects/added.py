@@ -5,12 +5,19 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
+from taccorl.sim.cameras import CameraConfig, letterbox_window
+from taccorl.sim.effects.camera_past import PastScene
 from taccorl.sim.effects.effect import LAYERS, Effect, Memory
+from taccorl.sim.effects.live_model import LiveModel
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
+
+
+PAST_POSITIONS, PAST_TIME_S = "pictures/positions", "pictures/time_s"  # of ``PastScene``, in a snapshot
 
 
 class AddedEffects:
@@ -21,23 +28,50 @@ class AddedEffects:
 
     Args:
         time_s: (N,) the simulations' clocks, live.
+        batch: the simulations' physics; without it nothing is felt or rewritten.
     """
 
-    def __init__(self, effects: Sequence[Effect], time_s: np.ndarray) -> None:
+    def __init__(self, effects: Sequence[Effect], time_s: np.ndarray, batch: Batch | None = None) -> None:
         self.present = present(effects)
+        rewritten = sorted({name for effect in self.present for name in effect.rewrites})
+        self.rewrites = bool(rewritten)
+        """Whether the model changes from physics step to physics step."""
+        self._live = LiveModel(batch, rewritten) if batch and self.present else None
         self._time_s = time_s
         self._scanned_s = np.array(time_s)
         self._start = [effect.memory(len(time_s)) for effect in self.present]
         self._memory: list[Memory] = [{k: v.copy() for k, v in rows.items()} for rows in self._start]
-        touch = [k for k, effect in enumerate(self.present) if effect.layer != "robot"]
+        touch = [k for k, effect in enumerate(self.present) if effect.layer not in ("robot", "camera")]
         self.remember_touch = any(self._start[k] for k in touch)
         """Whether a reading depends on earlier ones: then each step must scan the pads, whether somebody looks or not."""
+        oldest_s = sum(effect.picture_age_s() for effect in self.present)
+        self.past = PastScene(batch, oldest_s) if batch and oldest_s > 0 else None
+        """Where everything was, if a camera shows it; ``Simulation.advance`` keeps it up."""
 
     def command(self, targets: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         """What reaches the controllers of targets (N, 14) that stand for ``dt_s`` (N,)."""
         for effect, memory in zip(self.present, self._memory, strict=True):
             targets = effect.command(targets, memory, dt_s)
         return targets
+
+    def feel(self, ids: np.ndarray, dt_s: float) -> None:
+        """Look at ``ids`` after a physics step of ``dt_s``, or after a reset (0), and write the model of the next step."""
+        if self._live:
+            for effect, memory in zip(self.present, self._memory, strict=True):
+                effect.feel(self._live, memory, ids, dt_s)
+            self._rewrite()
+
+    def _rewrite(self) -> None:
+        if self._live and self.rewrites:
+            self._live.make_nominal()
+            for effect, memory in zip(self.present, self._memory, strict=True):
+                effect.rewrite(self._live, memory)
+
+    def friction(self, friction: float) -> float:
+        """Sliding friction of parts where the scene's is ``friction``."""
+        for effect in self.present:
+            friction = effect.friction(friction)
+        return friction
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
         """What is reported of joints and grippers (N, 14)."""
@@ -60,6 +94,25 @@ class AddedEffects:
             reading = effect.reading(reading, memory, now, now - self._scanned_s)
         return reading
 
+    def picture_age_s(self, camera: str) -> float:
+        """How long ago it was what a camera shows."""
+        return sum(effect.picture_age_s() for effect in self.present if camera in effect.acts_on())
+
+    def picture(self, pictures: np.ndarray, camera: CameraConfig) -> np.ndarray:
+        """What ``camera`` gives of pictures (n, rows, columns, 3) uint8 RGB as they are drawn, letterboxed."""
+        acting = [e for e in self.present if camera.name in e.acts_on() and type(e).picture is not Effect.picture]
+        if not acting:
+            return pictures
+        window = letterbox_window(camera.recording_size, pictures.shape[1:3])
+        inside = np.s_[window.top : window.top + window.rows, window.left : window.left + window.columns]
+        pictures = pictures.copy()
+        for picture in pictures:
+            values = picture[inside].astype(np.float32)
+            for effect in acting:
+                values = effect.picture(values, window.columns / camera.recording_size[1])
+            picture[inside] = np.clip(np.round(values), 0, 255)
+        return pictures
+
     def reset(self, ids: np.ndarray, targets: np.ndarray) -> None:
         """Forget what ``ids`` have been through; of the ``targets`` (N, 14) theirs have stood for ever."""
         for memory, start in zip(self._memory, self._start, strict=True):
@@ -67,6 +120,9 @@ class AddedEffects:
                 values[ids] = start[name][ids]
         self.command(targets, np.zeros(len(targets)))
         self._scanned_s[ids] = self._time_s[ids]
+        if self.past:
+            self.past.reset(ids)
+        self._rewrite()
 
     def snapshot(self, ids: np.ndarray) -> Memory:
         """Rows of ``ids``: ``"0/taxel_creep/crept"`` and the like, and when the pads were scanned last."""
@@ -86,6 +142,7 @@ class AddedEffects:
             )
         for key, values in named.items():
             values[ids] = rows[key]
+        self._rewrite()
 
     def _named(self) -> Memory:
         named = {
@@ -93,7 +150,10 @@ class AddedEffects:
             for k, (effect, memory) in enumerate(zip(self.present, self._memory, strict=True))
             for name, values in memory.items()
         }
-        return named | {"pads/scanned_s": self._scanned_s}
+        named |= {"pads/scanned_s": self._scanned_s}
+        if self.past:
+            named |= {PAST_POSITIONS: self.past.positions, PAST_TIME_S: self.past.time_s}
+        return named
 
 
 def present(effects: Sequence[Effect]) -> list[Effect]:

@@ -18,6 +18,20 @@ class Armature(JointEffect):
     """(M + ΔJ) q̈: what a rotor adds behind its gear, J_rotor · ratio². Grows with the square of the frequency."""
 
     name: ClassVar = "armature"
+    equation: ClassVar = "(M + ΔJ) q̈"
+    in_words: ClassVar = (
+        "The motor's rotor turns with the joint, as fast as the gear makes it. The controller has to accelerate it "
+        "as well."
+    )
+    at_a_policy: ClassVar = "Quick corrections come late and overshoot; slow motion is as before."
+    to_record: ClassVar = "A chirp up to 3 Hz or more; with efforts, or again with a known payload on the hand."
+    near_twins: ClassVar = {
+        "torque_scale": (
+            "Without efforts, more inertia is less torque for all of it; weight tells: move slowly between poses, or "
+            "load the hand."
+        ),
+        "kp": "All gains together scale like 1 / J; efforts or a known payload fix their size.",
+    }
     added_kgm2: float = parameter(
         unit="kg·m²",
         symbol="ΔJ",
@@ -27,6 +41,9 @@ class Armature(JointEffect):
         typical=0.05,
         source="a choice; 0.007–0.020 on a Unitree Go2, research/discrepancy.md §4.6",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"added_inertia": self.added_kgm2}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):

@@ -23,6 +23,25 @@ class Backlash(JointEffect):
     """
 
     name: ClassVar = "backlash"
+    equation: ClassVar = "|q_link − q_motor| ≤ w; no torque passes in between"
+    in_words: ClassVar = (
+        "The gear has play: the link can be turned a little by hand while the motor stands. Weight lays it against "
+        "one side."
+    )
+    at_a_policy: ClassVar = (
+        "The hand is where the encoder says only to within the play, and jumps where the weight changes sides."
+    )
+    to_record: ClassVar = "Chirps of less than 1°, and slow motion through poses where the weight changes sides."
+    near_twins: ClassVar = {
+        "joint_compliance": (
+            "The link moves against the motor in both; play does so all at once and without resonance: record small "
+            "motions about two poses."
+        ),
+        "error_deadband": (
+            "Both let the joint hang within a band; weight moves it there under the encoder's eyes only with a dead "
+            "band."
+        ),
+    }
     play_rad: float = parameter(
         unit="rad",
         symbol="2w",
@@ -32,6 +51,9 @@ class Backlash(JointEffect):
         typical=0.005,
         source="a choice",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"backlash": self.play_rad}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for motor in self.chosen(spec):

@@ -19,6 +19,18 @@ class BaselineDrift(TouchEffect):
 
     name: ClassVar = "baseline_drift"
     layer: ClassVar = "baseline"
+    equation: ClassVar = "r = f + b t"
+    in_words: ClassVar = (
+        "What the pads read without contact wanders away from the zero taken at the start: warmth, and rubber "
+        "that settles."
+    )
+    at_a_policy: ClassVar = "After minutes it feels contact that is not there, or misses the one that is."
+    to_record: ClassVar = "5 s without contact at the beginning and at the end of a long recording."
+    near_twins: ClassVar = {
+        "taxel_creep": (
+            "In one long hold both rise slowly; drift goes on without contact. Record 5 s of nothing before and after."
+        ),
+    }
     rate_per_min: float = parameter(
         unit="1/min",
         symbol="b",

@@ -23,6 +23,26 @@ class CommandDelay(JointEffect):
     """
 
     name: ClassVar = "command_delay"
+    equation: ClassVar = "τ = K_p (q*(t − d) − q) − K_d q̇ + T_ref"
+    in_words: ClassVar = (
+        "Commands reach the drive late: bus, driver, interpolation. The drive's own loop is not delayed."
+    )
+    at_a_policy: ClassVar = (
+        "Everything happens d later than it was trained for; near contact that is d times the speed too deep."
+    )
+    to_record: ClassVar = "A chirp up to 3 Hz or more, and steps: the joint stands still for d after each."
+    near_twins: ClassVar = {
+        "torque_lag": "A small phase in either; the one within the loop grows with the gains: record at twice the gain.",
+        "command_lag": (
+            "Slow motion is late by the same time in both; steps tell: a delay stands still, a lag begins at once."
+        ),
+        "sensor_delay": (
+            "A report that is late by d looks the same while nothing is touched; efforts, pads or a camera on the same"
+            " clock tell which it is."
+        ),
+        "velocity_feedforward": "It takes K_d / K_p off the lag as a delay adds to it; steps and 2× gain tell.",
+        "joint_compliance": "A small phase in either; a delay leaves no resonance: small, fast chirp.",
+    }
     possible: ClassVar = (*JOINTS, "gripper")
     delay_s: float = parameter(
         unit="s",
@@ -33,6 +53,9 @@ class CommandDelay(JointEffect):
         typical=0.02,
         source="a choice; 0.8–4 ms on a Unitree Go2, research/discrepancy.md §4.6",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"command_delay": self.delay_s}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():

@@ -19,6 +19,22 @@ class CommandLag(JointEffect):
     """
 
     name: ClassVar = "command_lag"
+    equation: ClassVar = "ṙ = (q* − r) / T; τ = K_p (r − q) − K_d q̇ + T_ref"
+    in_words: ClassVar = "The drive smooths its targets with a low-pass before it follows them."
+    at_a_policy: ClassVar = "Corners of a path are cut, and a contact is felt long after the command that made it."
+    to_record: ClassVar = (
+        "Steps, and a chirp up to 3 Hz or more; pressing against a known spring shows that the joint itself is stiff."
+    )
+    near_twins: ClassVar = {
+        "torque_lag": "Three poles either way while nobody knows the gains: state them, or the same motion at twice the gain.",
+        "sensor_delay": "Slow motion is late by the same time in both; steps tell: a delay stands still, a lag begins at once.",
+        "command_delay": (
+            "Slow motion is late by the same time in both; steps tell: a delay stands still, a lag begins at once."
+        ),
+        "slew_limit": "Both round corners; a lag does so at any size: the same motion at half the amplitude.",
+        "joint_compliance": "A small phase in either; a small, fast chirp shows the resonance of a spring.",
+        "kp": "Soft gains with much K_d lag like this in free motion; a held load tells stiffness from smoothing.",
+    }
     possible: ClassVar = (*JOINTS, "gripper")
     time_constant_s: float = parameter(
         unit="s",
@@ -29,6 +45,9 @@ class CommandLag(JointEffect):
         typical=0.05,
         source="a choice",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"command_lag": self.time_constant_s}
 
     def memory(self, num_sims: int) -> Memory:
         return {"target": np.full((num_sims, len(CHANNELS)), np.nan)}

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 
 from taccorl.sim.effects import effects
+from taccorl.sim.effects.dry_friction import add_dry_friction
 from taccorl.sim.effects.effect import JointEffect, parameter
 
 if TYPE_CHECKING:
@@ -15,13 +16,30 @@ if TYPE_CHECKING:
 @effects.register("coulomb_friction")
 @dataclass(kw_only=True)
 class CoulombFriction(JointEffect):
-    """τ = −F sign(q̇); at rest any τ with |τ| ≤ F. The joint stops up to F / K_p before its target, on the side it comes from.
-
-    MuJoCo's friction loss is soft. With its defaults it damps instead of holding: by 11 N·m·s/rad on joint 5, and a joint within
-    F / K_p of its target creeps there in a second. With the settings below it creeps at 4e-6 rad/s.
-    """
+    """τ = −F sign(q̇); at rest any τ with |τ| ≤ F. The joint stops up to F / K_p before its target, on the side it comes from."""
 
     name: ClassVar = "coulomb_friction"
+    equation: ClassVar = "τ = −F sign(q̇); at rest |τ| ≤ F"
+    in_words: ClassVar = (
+        "Dry friction of gear and bearings: the same torque against the motion at any speed, and the joint sticks at"
+        " rest."
+    )
+    at_a_policy: ClassVar = (
+        "The arm stops short of each target by up to F / K_p, on the side that it comes from, and small corrections "
+        "do nothing."
+    )
+    to_record: ClassVar = "A slow triangle over the range at two speeds."
+    near_twins: ClassVar = {
+        "asymmetric_friction": (
+            "Coulomb's friction and a constant torque are identical to it, on every recording: pick either."
+        ),
+        "load_friction": "Alike while the load is the same; move slowly where the arm reaches out and where it hangs.",
+        "stribeck_friction": "Alike but at the slowest; hold, then creep at 0.01 rad/s.",
+        "error_deadband": (
+            "Both stop short of the target; a dead band gives way to a push, friction holds: efforts, or twice the "
+            "gain."
+        ),
+    }
     torque_nm: float = parameter(
         unit="N·m",
         symbol="F",
@@ -32,8 +50,9 @@ class CoulombFriction(JointEffect):
         source="0.2–0.8 N·m on a Unitree Go2, research/discrepancy.md §4.6; 0.3 in Menagerie’s PiPER",
     )
 
+    def drive(self) -> dict[str, float]:
+        return {"coulomb": self.torque_nm}
+
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
-            joint.frictionloss += self.torque_nm
-            joint.solref_friction = [0.002, 1.0]
-            joint.solimp_friction = [0.9999, 0.9999, 0.001, 0.5, 2.0]
+            add_dry_friction(joint, self.torque_nm)

@@ -18,6 +18,13 @@ class DeadTaxels(BoardEffect):
 
     name: ClassVar = "dead_taxels"
     layer: ClassVar = "taxel"
+    equation: ClassVar = "r_i = 0 for a share s of the taxels"
+    in_words: ClassVar = "Some taxels never read anything: a broken trace or a cold solder joint."
+    at_a_policy: ClassVar = "A hole in the contact looks like an edge or a smaller part."
+    to_record: ClassVar = "Presses that cover every taxel: a flat plate, or a rod rolled over the pad."
+    near_twins: ClassVar = {
+        "taxel_gain_map": "The same thing, as it was measured on one board; this one draws other boards like it.",
+    }
     share: float = parameter(
         unit="1",
         symbol="s",

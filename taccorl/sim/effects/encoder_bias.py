@@ -22,6 +22,25 @@ class EncoderBias(JointEffect):
     """
 
     name: ClassVar = "encoder_bias"
+    equation: ClassVar = "y = q + b; τ = K_p (q* − y) − K_d q̇ + T_ref"
+    in_words: ClassVar = (
+        "The joint's zero is off: the arm reports an angle that is wrong by a constant, and goes to wrong places on "
+        "purpose."
+    )
+    at_a_policy: ClassVar = (
+        "The hand is off by b times its reach while proprioception says that all is well; pictures disagree with it."
+    )
+    to_record: ClassVar = (
+        "A camera on the hand, or touching a known point from both sides: joint data alone hardly show it."
+    )
+    near_twins: ClassVar = {
+        "torque_ff": (
+            "A constant torque moves the angle by T_ref / K_p, a bias moves what it is called; twice the gain halves "
+            "the first."
+        ),
+        "encoder_scale": "A wrong scale is a bias that grows with the angle; go to both ends of the range.",
+        "encoder_eccentricity": "Over a part of a turn a wave is a bias; go over the whole range.",
+    }
     bias_rad: float = parameter(
         unit="rad",
         symbol="b",
@@ -31,6 +50,9 @@ class EncoderBias(JointEffect):
         typical=0.01,
         source="a choice: half a degree from zeroing an arm by hand",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"encoder_bias": self.bias_rad}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():

@@ -21,6 +21,22 @@ class GravityMismatch(ArmEffect):
     """
 
     name: ClassVar = "gravity_mismatch"
+    equation: ClassVar = "τ_comp = s c g(q)"
+    in_words: ClassVar = (
+        "The controller carries the arm's weight with masses that are not the arm's: it hangs, or rises, where it "
+        "reaches out."
+    )
+    at_a_policy: ClassVar = "The hand is too low or too high by millimetres, by more the further it reaches."
+    to_record: ClassVar = "A wide, slow triangle, or holds in several poses; efforts settle it."
+    near_twins: ClassVar = {
+        "payload": (
+            "Weight that is not carried in both; a payload weighs most on the wrist and has inertia: holds in several "
+            "poses."
+        ),
+        "torque_scale": "A weak drive carries less as well; it also follows fast motion worse: chirp and efforts.",
+        "cable_spring": "Over a small range both are a slope in the angle; turn the base, which weight does not load.",
+        "torque_ff": "The constant part of a weight hides in T_ref; poses far from each other separate them.",
+    }
     share: float = parameter(
         unit="1",
         symbol="s",
@@ -30,6 +46,9 @@ class GravityMismatch(ArmEffect):
         typical=0.9,
         source="the two published mass sets of this arm: 3.6 and 2.2 kg moving (taccorl/sim/robot.py)",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"gravity_carried": self.share}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for arm in self.arms():

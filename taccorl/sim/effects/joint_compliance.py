@@ -23,6 +23,25 @@ class JointCompliance(JointEffect):
     """
 
     name: ClassVar = "joint_compliance"
+    equation: ClassVar = "q_link − q_motor = c τ; damping κ / c"
+    in_words: ClassVar = (
+        "The gear between motor and link gives way like a spring. The encoder on the motor does not see it."
+    )
+    at_a_policy: ClassVar = (
+        "The hand sags and swings after fast motion while the reported angles are where they should be."
+    )
+    to_record: ClassVar = "A small chirp up to 10 Hz shows the resonance; a known payload shows the sag in a camera."
+    near_twins: ClassVar = {
+        "torque_lag": (
+            "A small phase within the loop in both; only a spring resonates: small chirp beyond 5 Hz at twice the gain."
+        ),
+        "command_delay": "A small phase in either; a delay leaves no resonance: small, fast chirp.",
+        "command_lag": "A small phase in either; a small, fast chirp shows the resonance of a spring.",
+        "backlash": (
+            "The link moves against the motor in both; play does so all at once and without resonance: record small "
+            "motions about two poses."
+        ),
+    }
     compliance_rad_per_nm: float = parameter(
         unit="rad/(N·m)",
         symbol="c",
@@ -41,6 +60,9 @@ class JointCompliance(JointEffect):
         typical=0.002,
         source="a choice: lightly damped",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"compliance": self.compliance_rad_per_nm, "compliance_damping": self.damping_s}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for motor in self.chosen(spec):

@@ -23,6 +23,19 @@ class PadCompliance(TouchEffect):
 
     name: ClassVar = "pad_compliance"
     layer: ClassVar = "robot"
+    equation: ClassVar = "N = k K δ"
+    in_words: ClassVar = "The pads' rubber gives way more, or less, than the model says under the same force."
+    at_a_policy: ClassVar = "The same command leaves another grip force and another opening; parts slip or are crushed."
+    to_record: ClassVar = "Presses at three commanded forces with gripper effort and opening recorded."
+    near_twins: ClassVar = {
+        "k_n": (
+            "A sensor's gain does the same to readings; only how far the fingers close tells them apart: record the "
+            "opening."
+        ),
+        "contact_compliance": (
+            "Both let the fingers close further; a part's own contact changes with its mass. Press two parts."
+        ),
+    }
     stiffness_factor: float = parameter(
         unit="1",
         symbol="k",

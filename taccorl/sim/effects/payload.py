@@ -23,6 +23,18 @@ class Payload(ArmEffect):
     """
 
     name: ClassVar = "payload"
+    equation: ClassVar = "τ_j = −m g ∂z_c/∂q_j on every joint, and m's inertia"
+    in_words: ClassVar = (
+        "Something heavy is fixed to the hand that nobody told the controller of: a tool, a sensor, a camera."
+    )
+    at_a_policy: ClassVar = "The arm sags when it reaches out, and parts are met too low."
+    to_record: ClassVar = "Holds in several poses and a slow triangle of shoulder and elbow; efforts settle the mass."
+    near_twins: ClassVar = {
+        "gravity_mismatch": (
+            "Weight that is not carried in both; a payload weighs most on the wrist and has inertia: holds in several "
+            "poses."
+        ),
+    }
     mass_kg: float = parameter(
         unit="kg",
         symbol="m",
@@ -59,6 +71,9 @@ class Payload(ArmEffect):
         typical=0.1,
         source="a choice: between flange and pads (TCP at 0.168)",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         inertia = 0.4 * self.mass_kg * _RADIUS_M**2

@@ -20,6 +20,22 @@ class SensorDelay(JointEffect):
     """y(t) = q(t − d): the arm moves as before, the report lags. Its controller sits in the drive and sees q at once."""
 
     name: ClassVar = "sensor_delay"
+    equation: ClassVar = "y(t) = q(t − d)"
+    in_words: ClassVar = (
+        "Angles are reported late: a slow bus or a driver that buffers. The motion itself is as before."
+    )
+    at_a_policy: ClassVar = (
+        "It sees the arm where it was; together with pictures, which have another delay, the state contradicts itself."
+    )
+    to_record: ClassVar = "Fast motion with a camera, pads or efforts on the same clock."
+    near_twins: ClassVar = {
+        "torque_lag": "A small phase in either; the one within the loop grows with the gains: record at twice the gain.",
+        "command_lag": "Slow motion is late by the same time in both; steps tell: a delay stands still, a lag begins at once.",
+        "command_delay": (
+            "A command that is late by d looks the same while nothing is touched; efforts, pads or a camera on the "
+            "same clock tell which it is."
+        ),
+    }
     possible: ClassVar = (*JOINTS, "gripper")
     delay_s: float = parameter(
         unit="s",
@@ -30,6 +46,9 @@ class SensorDelay(JointEffect):
         typical=0.02,
         source="a choice: some cycles of the 200 Hz report",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"encoder_delay": self.delay_s}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 
 from taccorl.sim.effects import effects
+from taccorl.sim.effects.dry_friction import add_passive_torque
 from taccorl.sim.effects.effect import JointEffect, parameter
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 _BRISTLE_DAMPING_S = 0.001  # over their stiffness: they settle in a physics step
-_NO_INPUT = 16  # mjINPUT_NONE of mjtype.h, for which Python has no name
 
 
 @effects.register("stribeck_friction")
@@ -25,6 +25,18 @@ class StribeckFriction(JointEffect):
     """
 
     name: ClassVar = "stribeck_friction"
+    equation: ClassVar = "|τ| = F (1 + s exp(−(q̇ / v_s)²))"
+    in_words: ClassVar = (
+        "Friction that is greatest at rest and falls once the joint moves, as in greased gears: the joint sticks and"
+        " slips."
+    )
+    at_a_policy: ClassVar = (
+        "Fine motion comes in jumps, and a joint that has stood still needs a larger command to start."
+    )
+    to_record: ClassVar = "Long holds, then creeping at 0.01 rad/s, in both directions."
+    near_twins: ClassVar = {
+        "coulomb_friction": "Alike but at the slowest; hold, then creep at 0.01 rad/s.",
+    }
     torque_nm: float = parameter(
         unit="N·m",
         symbol="F",
@@ -62,14 +74,17 @@ class StribeckFriction(JointEffect):
         source="a choice; stiffness of the bristles is F (1 + s) / x_p",
     )
 
+    def drive(self) -> dict[str, float]:
+        return {
+            "stribeck_torque": self.torque_nm,
+            "stribeck_share": self.stiction_share,
+            "stribeck_speed": self.stribeck_rad_per_s,
+            "presliding": self.presliding_rad,
+        }
+
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         most_nm = self.torque_nm * (1.0 + self.stiction_share)
         stiffness = most_nm / self.presliding_rad
         for name in self.acts_on():
-            friction = spec.add_actuator(name=f"{name}_stribeck", trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
-            friction.set_to_dcmotor(
-                motorconst=[0.0, 0.0],
-                resistance=1.0,
-                lugre=[stiffness, _BRISTLE_DAMPING_S * stiffness, self.torque_nm, most_nm, self.stribeck_rad_per_s],
-                ctrlspec=_NO_INPUT,
-            )
+            lugre = [stiffness, _BRISTLE_DAMPING_S * stiffness, self.torque_nm, most_nm, self.stribeck_rad_per_s]
+            add_passive_torque(spec, name, "stribeck", lugre=lugre)

@@ -1,18 +1,21 @@
 """Creep: under a load that stays, a taxel’s reading goes on changing."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numba
 import numpy as np
 
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
+from taccorl.sim.effects.effect import Memory, parameter
+from taccorl.sim.effects.touch_memory import RememberingEffect
 from taccorl.sim.robot import PAD_TAXELS
 
 
 @effects.register("taxel_creep")
 @dataclass(kw_only=True)
-class TaxelCreep(TouchEffect):
+class TaxelCreep(RememberingEffect):
     """r = f + a m with ṁ = (f − m) / τ: at once f, at length (1 + a) f; after release a m remains for a while.
 
     Standard linear solid. a < 0 is relaxation: the reading sinks under a load that stays; what falls below 0 is cut off.
@@ -22,6 +25,23 @@ class TaxelCreep(TouchEffect):
 
     name: ClassVar = "taxel_creep"
     layer: ClassVar = "material"
+    equation: ClassVar = "r = f + a m, ṁ = (f − m) / τ"
+    in_words: ClassVar = (
+        "Under a load that stays, the reading goes on rising or sinking for seconds: rubber and foils flow."
+    )
+    at_a_policy: ClassVar = "A grasp that is held feels as if it tightened or slipped, and the policy answers to that."
+    to_record: ClassVar = "A press that is held for 4 s or longer, and 5 s of nothing after its release."
+    near_twins: ClassVar = {
+        "taxel_hysteresis": (
+            "Both read more on the way out; creep goes on in a hold and fades after. Record a hold of 4 s."
+        ),
+        "touch_lag": (
+            "Creep with a short time constant rises late, too, but only by a share; record holds of some seconds."
+        ),
+        "baseline_drift": (
+            "In one long hold both rise slowly; drift goes on without contact. Record 5 s of nothing before and after."
+        ),
+    }
     share: float = parameter(
         unit="1",
         symbol="a",
@@ -44,10 +64,31 @@ class TaxelCreep(TouchEffect):
     def memory(self, num_sims: int) -> Memory:
         return {"crept": np.zeros((num_sims, len(self.pads), *PAD_TAXELS), np.float32)}
 
-    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        own, crept = reading[:, self.slots], memory["crept"]
-        reached = -np.expm1(-dt_s / self.time_constant_s)
-        crept += (own - crept) * reached[:, None, None, None].astype(np.float32)
-        reading = reading.copy()
-        reading[:, self.slots] = np.maximum(own + self.share * crept, 0)
-        return reading
+    def scans(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+        seen = np.empty(own.shape, own.dtype)  # in order, so that its flat form is a view
+        reached = -np.expm1(-dt_s / self.time_constant_s).astype(own.dtype)
+        crept = memory["crept"].reshape(own.shape[1], -1)
+        flat = (*own.shape[:2], -1)
+        _creep(own.reshape(flat), reached, np.float32(self.share), crept, seen.reshape(flat))
+        return seen
+
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """Rising quickly, rising slowly, sinking."""
+        return [
+            {"share": 0.3, "time_constant_s": 0.3},
+            {"share": 0.3, "time_constant_s": 3.0},
+            {"share": -0.3, "time_constant_s": 1.0},
+        ]
+
+
+@numba.njit(cache=True)
+def _creep(
+    own: np.ndarray, reached: np.ndarray, share: float | np.float32, crept: np.ndarray, seen: np.ndarray
+) -> None:
+    """``crept`` (N, K) goes the share ``reached`` (S, N) of its way to ``own`` (S, N, K) in every scan."""
+    for s in range(own.shape[0]):
+        for n in range(own.shape[1]):
+            for k in range(own.shape[2]):
+                crept[n, k] += (own[s, n, k] - crept[n, k]) * reached[s, n]
+                seen[s, n, k] = max(own[s, n, k] + share * crept[n, k], np.float32(0))

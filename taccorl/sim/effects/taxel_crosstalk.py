@@ -19,6 +19,15 @@ class TaxelCrosstalk(TouchEffect):
 
     name: ClassVar = "taxel_crosstalk"
     layer: ClassVar = "spread"
+    equation: ClassVar = "r = f + c/4 Σ (f_neighbour − f)"
+    in_words: ClassVar = "The picture of touch is blurred: covers carry load sideways, and neighbours share wires."
+    at_a_policy: ClassVar = "Edges are soft and small parts look wide, so it aligns them less exactly."
+    to_record: ClassVar = "A ball pressed lightly: few taxels, with the rim of the patch in view."
+    near_twins: ClassVar = {
+        "taxel_ghosting": (
+            "Within a patch both fill up its rim; the taxels far away in its rows and columns tell: record whole pads."
+        ),
+    }
     share: float = parameter(
         unit="1",
         symbol="c",

@@ -17,6 +17,15 @@ class TaxelGainSpread(BoardEffect):
 
     name: ClassVar = "taxel_gain_spread"
     layer: ClassVar = "taxel"
+    equation: ClassVar = "r_i = g_i f_i, ln g_i ~ N(0, s²)"
+    in_words: ClassVar = "No two taxels read the same under the same pressure: foils and solder joints differ."
+    at_a_policy: ClassVar = "Textures appear on plain contacts and differ from board to board."
+    to_record: ClassVar = (
+        "Presses that cover every taxel at several depths: a flat plate, or a rod rolled over the pad."
+    )
+    near_twins: ClassVar = {
+        "taxel_gain_map": "The same thing, as it was measured on one board; this one draws other boards like it.",
+    }
     log_std: float = parameter(
         unit="1",
         symbol="s",

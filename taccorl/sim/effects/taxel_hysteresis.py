@@ -3,16 +3,18 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numba
 import numpy as np
 
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
+from taccorl.sim.effects.effect import Memory, parameter
+from taccorl.sim.effects.touch_memory import RememberingEffect
 from taccorl.sim.robot import PAD_TAXELS
 
 
 @effects.register("taxel_hysteresis")
 @dataclass(kw_only=True)
-class TaxelHysteresis(TouchEffect):
+class TaxelHysteresis(RememberingEffect):
     """r stays while (1 − h) f ≤ r ≤ (1 + h) f, and is carried along at these ends: Prandtl's play, its width in proportion to f.
 
     Loading reads (1 − h) f, unloading (1 + h) f, and nothing is left without contact.
@@ -20,6 +22,20 @@ class TaxelHysteresis(TouchEffect):
 
     name: ClassVar = "taxel_hysteresis"
     layer: ClassVar = "material"
+    equation: ClassVar = "(1 − h) f ≤ r ≤ (1 + h) f, carried along at its ends"
+    in_words: ClassVar = (
+        "At the same depth a taxel reads more on the way out than on the way in, however slowly: rubber and foils "
+        "stick."
+    )
+    at_a_policy: ClassVar = "It feels a firm grasp long after the fingers have begun to open."
+    to_record: ClassVar = "Slow presses in and out with small to-and-fro in between."
+    near_twins: ClassVar = {
+        "taxel_creep": (
+            "Both read more on the way out; hysteresis does so at any speed and stands still in a hold. Record a hold "
+            "of 4 s."
+        ),
+        "k_n": "While only pressing in, (1 − h) f is a smaller k_n; record the release as well.",
+    }
     half_width: float = parameter(
         unit="1",
         symbol="h",
@@ -33,9 +49,22 @@ class TaxelHysteresis(TouchEffect):
     def memory(self, num_sims: int) -> Memory:
         return {"held": np.zeros((num_sims, len(self.pads), *PAD_TAXELS), np.float32)}
 
-    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        own, held = reading[:, self.slots], memory["held"]
-        np.clip(held, (1.0 - self.half_width) * own, (1.0 + self.half_width) * own, out=held)
-        reading = reading.copy()
-        reading[:, self.slots] = held
-        return reading
+    def scans(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+        seen = np.empty(own.shape, own.dtype)  # in order, so that its flat form is a view
+        flat = (*own.shape[:2], -1)
+        held = memory["held"].reshape(own.shape[1], -1)
+        low, high = np.float32(1.0 - self.half_width), np.float32(1.0 + self.half_width)
+        _carry_along(own.reshape(flat), low, high, held, seen.reshape(flat))
+        return seen
+
+
+@numba.njit(cache=True)
+def _carry_along(
+    own: np.ndarray, low: float | np.float32, high: float | np.float32, held: np.ndarray, seen: np.ndarray
+) -> None:
+    """``held`` (N, K) is kept between ``low`` and ``high`` times ``own`` (S, N, K) in every scan."""
+    for s in range(own.shape[0]):
+        for n in range(own.shape[1]):
+            for k in range(own.shape[2]):
+                held[n, k] = min(max(held[n, k], low * own[s, n, k]), high * own[s, n, k])
+                seen[s, n, k] = held[n, k]

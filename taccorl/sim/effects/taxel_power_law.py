@@ -1,5 +1,6 @@
 """Power law: a taxel’s reading is not in proportion to what presses on it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -19,6 +20,21 @@ class TaxelPowerLaw(TouchEffect):
 
     name: ClassVar = "taxel_power_law"
     layer: ClassVar = "material"
+    equation: ClassVar = "r = f₀ (f / f₀)^p"
+    in_words: ClassVar = (
+        "A taxel's reading is not in proportion to the pressure: foils flatten out, soft covers stiffen."
+    )
+    at_a_policy: ClassVar = (
+        "Light touches read too much and firm ones too little, or the reverse, so grip forces come out wrong."
+    )
+    to_record: ClassVar = "Presses and holds at three depths, a light one included."
+    near_twins: ClassVar = {
+        "taxel_saturation": (
+            "Both bend the same way over a narrow range of depth; press to three depths, a light one included."
+        ),
+        "taxel_threshold": "p > 1 also hides light touches; press to three depths.",
+        "k_n": "At one depth it is another k_n; press to three depths.",
+    }
     exponent: float = parameter(
         unit="1",
         symbol="p",
@@ -37,6 +53,11 @@ class TaxelPowerLaw(TouchEffect):
         typical=1.0,
         source="a choice: where the linear law was calibrated; a reading of 1 is 75 counts",
     )
+
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """Steeper and flatter. The reference is no start: another one is another k_n."""
+        return [{"exponent": 1.4}, {"exponent": 0.75}]
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         own = reading[:, self.slots]

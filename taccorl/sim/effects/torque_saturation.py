@@ -1,6 +1,7 @@
 """Torque saturation: the drive gives no more than so much."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -22,6 +23,18 @@ class TorqueSaturation(JointEffect):
     """
 
     name: ClassVar = "torque_saturation"
+    equation: ClassVar = "|τ_motor| ≤ τ_max"
+    in_words: ClassVar = (
+        "The drive's current is limited: beyond a torque nothing more comes, whatever the controller asks for."
+    )
+    at_a_policy: ClassVar = "Fast motions and heavy parts are late and low, while everything gentle is as trained."
+    to_record: ClassVar = "Steps that are large enough to reach the limit; a gentle chirp does not show it."
+    near_twins: ClassVar = {
+        "torque_scale": (
+            "At the peaks both give less; a limit leaves small motion alone: the same chirp at half the amplitude."
+        ),
+        "slew_limit": "Both cut fast, large motion; a torque limit moves with the load: repeat with a payload.",
+    }
     torque_max_nm: float = parameter(
         unit="N·m",
         symbol="τ_max",
@@ -31,6 +44,16 @@ class TorqueSaturation(JointEffect):
         typical=8.0,
         source="torque range of the MIT mode, ±8 N·m by default (research/mujoco.md §2)",
     )
+
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """From 55 to 97 % of the most that is asked for."""
+        limit = cls.parameters()[0]
+        shares = (0.55, 0.75, 0.88, 0.97)
+        return [{limit.name: min(max(s * seen["peak_torque_nm"], limit.low), limit.high)} for s in shares]
+
+    def drive(self) -> dict[str, float]:
+        return {"torque_max": self.torque_max_nm}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):

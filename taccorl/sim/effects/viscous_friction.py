@@ -21,6 +21,17 @@ class ViscousFriction(JointEffect):
     """
 
     name: ClassVar = "viscous_friction"
+    equation: ClassVar = "τ = −b q̇"
+    in_words: ClassVar = "Grease: a torque against the motion in proportion to its speed."
+    at_a_policy: ClassVar = "The arm lags a little more behind fast commands."
+    to_record: ClassVar = "The same chirp at twice the commanded gain, or efforts: positions at one gain never show it."
+    near_twins: ClassVar = {
+        "kd": (
+            "This b adds to K_d and does nothing else, on every recording at one gain; twice the gain, or efforts, separate"
+            " them."
+        ),
+        "quadratic_drag": "At one speed both are a damping; two speeds that differ by 3 or more separate them.",
+    }
     damping_nms_per_rad: float = parameter(
         unit="N·m·s/rad",
         symbol="b",
@@ -30,6 +41,9 @@ class ViscousFriction(JointEffect):
         typical=1.0,
         source="a choice; 0.15 on a Unitree Go2, research/discrepancy.md §4.6",
     )
+
+    def drive(self) -> dict[str, float]:
+        return {"viscous": self.damping_nms_per_rad}
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):

@@ -9,20 +9,27 @@ import numpy as np
 import pytest
 from press_bench import perform, start
 
+from taccorl.alignment.joint_kernel import Drive, simulate
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import Effect, JointEffect, Memory, TouchEffect, parameter
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, Memory, TouchEffect, parameter
 
+BASE = ("kp", "kd", "torque_ff", "k_n", "k_d")
+"""Numbers that are always fitted."""
 SEEN = ("reported", "hands", "reading")
 UNITS = {
+    "_nms2_per_rad2": "N·m·s²/rad²",
     "_nms_per_rad": "N·m·s/rad",
+    "_nm_per_rad": "N·m/rad",
     "_rad_per_nm": "rad/(N·m)",
     "_rad_per_s": "rad/s",
+    "_per_s": "1/s",
     "_per_min": "1/min",
     "_kgm2": "kg·m²",
     "_nm": "N·m",
     "_kg": "kg",
+    "_px": "px",
     "_rad": "rad",
     "_m": "m",
     "_s": "s",
@@ -76,7 +83,8 @@ def test_an_absent_effect_leaves_the_run_bit_identical(name: str) -> None:
             np.testing.assert_array_equal(seen[kind], values, err_msg=f"{name} {variant}: {kind}")
 
 
-@pytest.mark.parametrize("name", list(effects))
+# What cameras show fades out in test_camera_effects.py.
+@pytest.mark.parametrize("name", [name for name in effects if effects.get(name).layer != "camera"])
 def test_an_effect_fades_out_towards_its_absent_value(name: str) -> None:
     check_fades_out(effects.get(name))
 
@@ -130,6 +138,59 @@ def test_parameters_are_described(name: str) -> None:
         outside = p.high + 0.01 * (p.high - p.low)
         with pytest.raises(TaccorlError, match=rf"{name}: {p.name} is .* outside of .*{p.high:g}"):
             make_effect(name, **{p.name: outside})
+
+
+@pytest.mark.parametrize("name", list(effects))
+def test_an_effect_says_what_it_is_and_what_it_may_be_mistaken_for(name: str) -> None:
+    cls = effects.get(name)
+    assert len(cls.equation) > 5
+    for prose in (cls.in_words, cls.at_a_policy, cls.to_record, *cls.near_twins.values()):
+        assert len(prose) > 20
+        assert prose.endswith("."), prose
+    for other in cls.near_twins:
+        assert other != name
+        assert other in BASE or name in effects.get(other).near_twins, f"{name}: {other} does not name it"
+
+
+@pytest.mark.parametrize("name", list(effects))
+def test_a_search_starts_within_bounds_with_the_effect_there(name: str) -> None:
+    cls = effects.get(name)
+    for peak_torque, peak_speed, span in ((3.0, 0.6, 0.7), (0.0, 0.0, 0.0), (1e4, 1e4, 6.0)):
+        seen = {"peak_torque_nm": peak_torque, "peak_speed_rad_per_s": peak_speed, "span_rad": span, "duration_s": 10.0}
+        starts = cls.starts(seen)
+        assert 1 <= len(starts) <= 130
+        for values in starts:
+            assert values.keys() <= {p.name for p in cls.parameters()}
+            assert not make_effect(name, **typical(cls) | values).is_absent
+
+
+@pytest.mark.parametrize("name", [name for name in effects if effects.get(name).layer == "robot"])
+def test_the_one_joint_model_takes_every_number_that_an_effect_gives_it(name: str) -> None:
+    """An absent effect's numbers do nothing there, and its typical ones do something; of bodies MuJoCo tells."""
+    cls = effects.get(name)
+    drive, absent = cls(**typical(cls)).drive(), cls().drive()
+    if not drive or absent is None:
+        assert drive is None or issubclass(cls, ArmEffect), f"{name} changes a body; only an arm has some"
+        return
+    unknown = [key for key in drive if key not in Drive._fields]
+    assert not unknown
+    assert all(isinstance(value, float) for value in drive.values())
+    np.testing.assert_array_equal(one_joint(**absent), one_joint())
+    assert np.abs(one_joint(**drive) - one_joint()).max() > 1e-6
+
+
+def one_joint(**numbers: float) -> np.ndarray:
+    """(200,) rad: a second of a joint with a part of its weight that is sent by ± 0.4 rad and takes 12 N·m, a row each 5 ms."""
+    drive = Drive(kp=151.0, kd=17.0, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)._replace(
+        **numbers
+    )
+    target = 0.5 + 0.4 * np.sin(2 * np.pi * 3.0 * np.arange(200) / 200)
+    return simulate(drive, target, np.zeros(200), 0.5, 6, 1, 1 / 1200)[0]
+
+
+def test_the_catalogue_is_as_wide_as_was_asked_for() -> None:
+    of_arms = [name for name in effects if issubclass(effects.get(name), ArmEffect)]
+    assert len(of_arms) >= 22, of_arms
 
 
 @dataclass(kw_only=True)

@@ -7,49 +7,15 @@ K_d damps so heavily that inertia does not show: a joint approaches its target b
 import mujoco
 import numpy as np
 import pytest
+from joint_bench import COLUMN, GRAVITY, KD, KP, STEP_S, TORQUE_FF, drive, on_joint5, static_torque_nm
 from press_bench import RIGHT_HOME, PressBench, start
 
 from taccorl.sim.actions import ACTION_NAMES
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM, ControllerConfig
+from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, ControllerConfig
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.effect import CHANNELS, Effect
+from taccorl.sim.effects.effect import CHANNELS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
-
-COLUMN = CHANNELS.index("right_joint5")
-KP, KD, TORQUE_FF = KP_NM_PER_RAD[4], KD_NMS_PER_RAD[4], TORQUE_FF_NM[4]
-STEP_S = TwinConfig().physics.timestep_s
-GRAVITY = 9.81
-
-
-def on_joint5(name: str, **values: float) -> Effect:
-    return make_effect(name, arm="right", joints=["joint5"], **values)
-
-
-def drive(sim: Simulation, seconds: float, offset=lambda t: 0.0, column: int = COLUMN) -> dict[str, np.ndarray]:
-    """Let one joint's target be its target at rest + ``offset(t)`` [rad]; what the joint does after each physics step.
-
-    Returns:
-        ``t`` [s], ``u`` target, ``q`` angle of the motor, ``v`` its velocity, ``reported``; each (T,).
-    """
-    rest = sim.targets.copy()
-    joint = sim.model.joint(CHANNELS[column])
-    rows = []
-    for k in range(round(seconds / STEP_S)):
-        targets = rest.copy()
-        targets[:, column] += offset(k * STEP_S)
-        sim.advance(targets[None], 1)
-        q, v = sim.arrays["qpos"][0, joint.qposadr[0]], sim.arrays["qvel"][0, joint.dofadr[0]]
-        rows.append(((k + 1) * STEP_S, targets[0, column], q, v, sim.proprioception()[0, column]))
-    return dict(zip(("t", "u", "q", "v", "reported"), np.array(rows).T, strict=True))
-
-
-def static_torque_nm(sim: Simulation, column: int = COLUMN) -> float:
-    """What it takes to hold a joint up against weight, compensation left out."""
-    model, data = sim.batch.get_model(0), sim.batch.get_data(0)
-    data.qvel[:] = 0.0
-    mujoco.mj_forward(model, data)
-    return float(data.qfrc_bias[model.joint(CHANNELS[column]).dofadr[0]])
 
 
 def test_columns_are_in_the_order_of_actions() -> None:

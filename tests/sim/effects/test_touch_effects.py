@@ -1,5 +1,7 @@
 """Each effect of the pads against its closed form, on readings written down here; pads in the order left_a … right_b."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from press_bench import BLOCK_M, perform, start
@@ -9,9 +11,11 @@ from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.added import AddedEffects
 from taccorl.sim.effects.dead_taxels import DeadTaxels
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
 from taccorl.sim.robot import PAD_TAXELS, PADS, RobotConfig
 from taccorl.sim.simulation import Watch
 from taccorl.sim.twin import TwinConfig, empty_bench
+from taccorl.sim.twin_file import load_twin, save_twin
 
 SHAPE = (1, len(PADS), *PAD_TAXELS)
 
@@ -76,8 +80,125 @@ def test_relaxation_sinks_under_a_load_that_stays_and_never_pulls() -> None:
     np.testing.assert_array_equal(pads.read(0.0, 0.01), 0.0)
 
 
+def test_saturation_halves_a_reading_at_its_limit_and_never_reaches_it() -> None:
+    pads = Pads(make_effect("taxel_saturation", limit=2.0))
+    np.testing.assert_allclose([pads.read(f)[1, 2, 3] for f in (0.0, 0.5, 2.0, 6.0)], [0.0, 0.4, 1.0, 1.5], rtol=1e-6)
+    assert pads.read(1e6).max() < 2.0
+
+
+def test_a_threshold_takes_off_its_height_and_hides_what_lies_below() -> None:
+    pads = Pads(make_effect("taxel_threshold", threshold=0.3))
+    np.testing.assert_allclose([pads.read(f)[0, 0, 0] for f in (0.0, 0.2, 0.3, 1.0)], [0.0, 0.0, 0.0, 0.7], atol=1e-6)
+
+
+def test_ghosting_adds_its_share_of_each_taxel_to_the_others_of_its_row_and_column() -> None:
+    pads = Pads(make_effect("taxel_ghosting", share=0.05))
+    field = np.zeros(SHAPE[1:], np.float32)
+    field[2, 10, 5], field[2, 10, 7] = 2.0, 1.0
+    seen = pads.read(field)[2]
+    expected = np.zeros(PAD_TAXELS)
+    expected[10] = 0.05 * 3.0  # both are in this row
+    expected[10, 5], expected[10, 7] = 2.0 + 0.05 * 1.0, 1.0 + 0.05 * 2.0
+    expected[:, 5] += 0.1 * (np.arange(32) != 10)
+    expected[:, 7] += 0.05 * (np.arange(32) != 10)
+    np.testing.assert_allclose(seen, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("scan_s", [0.01, 0.033])
+def test_a_lag_goes_its_way_with_its_time_constant_at_any_scan_rate(scan_s: float) -> None:
+    pads = Pads(make_effect("touch_lag", time_constant_s=0.1))
+    assert pads.read(0.0)[0, 0, 0] == 0.0
+    seen = np.array([pads.read(2.0, scan_s)[0, 0, 0] for _ in range(12)])
+    np.testing.assert_allclose(seen, 2.0 * (1 - np.exp(-scan_s * np.arange(1, 13) / 0.1)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("scan_s", "delay_s"), [(0.01, 0.025), (0.01, 0.2), (0.005, 0.04), (0.0333, 0.02)])
+def test_a_delay_reads_what_there_was(scan_s: float, delay_s: float) -> None:
+    """A reading that rises evenly is late by the delay, whatever the scan rate; before the first scan there was nothing."""
+    pads = Pads(make_effect("touch_delay", delay_s=delay_s))
+    time_s = scan_s * np.arange(1, 61)
+    seen = [pads.read(np.float32(3.0 * t), scan_s)[3, 31, 11] for t in time_s]
+    np.testing.assert_allclose(seen, 3.0 * np.maximum(time_s - delay_s, 0.0), atol=1e-5)
+
+
+def test_a_gain_map_is_of_the_taxels_it_names_and_a_share_of_it_fades_out() -> None:
+    gains = np.random.default_rng(0).uniform(0.0, 2.0, (2, *PAD_TAXELS))
+    gains[0, 3, 4] = 0.0
+    chosen = ["right_a", "left_b"]
+    effect = TaxelGainMap.of(gains, chosen)
+    seen = Pads(effect).read(bumps())
+    np.testing.assert_allclose(seen[2], gains[0] * bumps()[2], atol=1e-5)
+    np.testing.assert_allclose(seen[1], gains[1] * bumps()[1], atol=1e-5)
+    np.testing.assert_array_equal(seen[[0, 3]], bumps()[[0, 3]])
+    half = make_effect("taxel_gain_map", share=0.5, gains=[0.8])
+    np.testing.assert_allclose(Pads(half).read(2.0), 1.8, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [({"gains": [1.0] * 10}, "10 numbers.*1536 taxels"), ({"gains": [-1.0]}, "-1.0"), ({"gains": ["x"]}, "'x'")],
+)
+def test_a_map_that_fits_no_pads_is_refused(values: dict, message: str) -> None:
+    with pytest.raises(TaccorlError, match=rf"taxel_gain_map.*{message}"):
+        make_effect("taxel_gain_map", share=1.0, **values)
+
+
+def test_a_map_is_kept_in_the_twin_file(tmp_path: Path) -> None:
+    gains = np.random.default_rng(1).uniform(0.5, 1.5, (1, *PAD_TAXELS))
+    config = TwinConfig(effects=[TaxelGainMap.of(gains, ["left_a"])])
+    save_twin(config, tmp_path / "twin.yaml")
+    assert load_twin(tmp_path / "twin.yaml") == config
+
+
+@pytest.mark.parametrize("offset_m", [3e-4, -3e-4])
+def test_a_thicker_pad_touches_at_an_opening_that_is_greater_by_its_offset(offset_m: float) -> None:
+    """Each pad stands d further out: it feels what the nominal one feels at an opening that is 2 d less."""
+    effect = make_effect("depth_offset", offset_m=offset_m)
+
+    def pressed(opening_m: float, *effects: Effect) -> np.ndarray:
+        sim = start(*effects)
+        joints = sim.proprioception()[0].copy()
+        joints[6] = opening_m
+        sim.place_arms(joints, sim.targets[0])
+        return sim.pads.penetration(sim.batch).depth_m[0, :2]
+
+    opening_m = BLOCK_M - 8e-4
+    expected = pressed(opening_m - 2 * offset_m)
+    assert expected.max() == pytest.approx(4e-4 + offset_m, abs=2e-5)
+    np.testing.assert_allclose(pressed(opening_m, effect), expected, atol=1e-6)
+
+
+def test_a_shifted_pad_feels_with_each_taxel_what_the_next_one_would() -> None:
+    """Two millimetres are one taxel. Across the hand is +x on pad a and −x on pad b, which looks at it from the other side."""
+
+    def reading(*effects: Effect) -> np.ndarray:
+        sim = start(*effects)
+        joints = sim.proprioception()[0].copy()
+        joints[6] = BLOCK_M - 8e-4
+        sim.place_arms(joints, sim.targets[0])
+        return sim.pads.penetration(sim.batch).depth_m[0, :2].reshape(2, *PAD_TAXELS)
+
+    plain, shifted = reading(), reading(make_effect("pad_shift", across_m=2e-3, along_m=-4e-3))
+    assert plain.max() > 3e-4
+    np.testing.assert_allclose(shifted[0, 2:, :-1], plain[0, :-2, 1:], atol=1e-7)
+    np.testing.assert_allclose(shifted[1, 2:, 1:], plain[1, :-2, :-1], atol=1e-7)
+
+
+def test_a_softer_part_is_pressed_in_further_by_the_same_command() -> None:
+    opening = {}
+    for factor in (1.0, 0.02):
+        sim = start(make_effect("contact_compliance", stiffness_factor=factor))
+        targets = sim.targets.copy()
+        targets[0, 6] = BLOCK_M - 0.008
+        for _ in range(10):
+            sim.step(targets)
+        opening[factor] = sim.proprioception()[0, 6]
+    assert opening[0.02] < opening[1.0] - 1e-4
+
+
 def test_looking_between_scans_changes_nothing() -> None:
     effects = [make_effect("taxel_creep", share=0.3), make_effect("taxel_hysteresis", half_width=0.2)]
+    effects += [make_effect("touch_lag", time_constant_s=0.05), make_effect("touch_delay", delay_s=0.04)]
     watched, alone = Pads(*effects), Pads(*effects)
     for reading in (1.0, 2.0, 0.5, 0.0):
         watched.time_s += 0.01
@@ -152,12 +273,18 @@ def test_effects_act_from_the_material_outwards_whatever_their_order_in_the_file
         ("taxel_gain_spread", {"log_std": 0.2}),
         ("dead_taxels", {"share": 0.5}),
         ("baseline_drift", {"rate_per_min": 1.0}),
+        ("taxel_saturation", {"limit": 2.0}),
+        ("taxel_threshold", {"threshold": 0.5}),
+        ("taxel_ghosting", {"share": 0.05}),
+        ("taxel_gain_map", {"share": 0.5}),
+        ("touch_lag", {"time_constant_s": 0.3}),
+        ("touch_delay", {"delay_s": 0.2}),
     ],
 )
 def test_only_the_chosen_pads_change_and_do_so_as_they_would_among_all(name: str, values: dict[str, float]) -> None:
     some, everything = Pads(make_effect(name, pads=["right_a", "left_b"], **values)), Pads(make_effect(name, **values))
     for _ in range(2):
-        seen, full = some.read(bumps(), 0.5), everything.read(bumps(), 0.5)
+        seen, full = some.read(bumps(), 0.1), everything.read(bumps(), 0.1)
         np.testing.assert_array_equal(seen[[0, 3]], bumps()[[0, 3]])
         np.testing.assert_array_equal(seen[[1, 2]], full[[1, 2]])
         assert (full != bumps()).any()

@@ -1,0 +1,64 @@
+"""Asymmetric friction: dry friction that is greater in one direction than in the other."""
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.dry_friction import add_dry_friction, add_passive_torque
+from taccorl.sim.effects.effect import JointEffect, parameter
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+
+@effects.register("asymmetric_friction")
+@dataclass(kw_only=True)
+class AsymmetricFriction(JointEffect):
+    """τ = −F (1 + a sign q̇) sign q̇; at rest any τ with −F (1 + a) ≤ τ ≤ F (1 − a). With a > 0 moving up costs more.
+
+    That is −F sign q̇ − a F: Coulomb's friction and a constant torque, and so it is built. The torque is not the motor's: efforts
+    do not contain it.
+    """
+
+    name: ClassVar = "asymmetric_friction"
+    equation: ClassVar = "τ = −F (1 + a sign q̇) sign q̇"
+    in_words: ClassVar = (
+        "Dry friction that is greater one way than the other, as of worm gears, seals, or a gear worn on one flank."
+    )
+    at_a_policy: ClassVar = "The arm stops short of its targets by different amounts from either side."
+    to_record: ClassVar = "A slow triangle over the range, with efforts: they alone tell the constant part from T_ref."
+    near_twins: ClassVar = {
+        "coulomb_friction": "With T_ref fitted it is identical by algebra, on every recording: pick either.",
+        "torque_ff": "Its part a F is a constant torque; only efforts tell it from the controller's own.",
+    }
+    torque_nm: float = parameter(
+        unit="N·m",
+        symbol="F",
+        absent=0.0,
+        low=0.0,
+        high=20.0,
+        typical=0.4,
+        source="as coulomb_friction",
+    )
+    asymmetry: float = parameter(
+        unit="1",
+        symbol="a",
+        absent=None,
+        low=-0.9,
+        high=0.9,
+        typical=0.3,
+        source="a choice",
+    )
+
+    def drive(self) -> dict[str, float]:
+        return {"coulomb": self.torque_nm, "asymmetry": self.asymmetry}
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        for name, joint in zip(self.acts_on(), self.chosen(spec), strict=True):
+            add_dry_friction(joint, self.torque_nm)
+            # A cogging torque of no periods: its sine is 1 everywhere.
+            constant = [-self.asymmetry * self.torque_nm, 0.0, math.pi / 2]
+            add_passive_torque(spec, name, "asymmetry", cogging=constant)

@@ -1,0 +1,35 @@
+"""What effects of cameras have in common."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects.effect import Effect
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+
+@dataclass(kw_only=True)
+class CameraEffect(Effect):
+    """An effect of pictures: the same numbers for all cameras that are chosen. Cameras that differ get an entry each."""
+
+    layer: ClassVar = "camera"
+    cameras: list[str] = field(default_factory=lambda: ["front", "left_wrist", "right_wrist"])
+    """Names as in the twin's ``cameras``."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
+            raise TaccorlError(f"effect {self.name}: cameras are {self.cameras}; name at least one, each once")
+
+    def acts_on(self) -> list[str]:
+        return list(self.cameras)
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        known = [camera.name for camera in config.cameras]
+        for name in self.cameras:
+            if name not in known:
+                raise TaccorlError(f"effect {self.name}: the twin has no camera {name!r}; {nearest(name, known)}")

@@ -1,0 +1,86 @@
+"""Cogging: a torque that comes back many times a turn."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+import numpy as np
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.dry_friction import add_passive_torque
+from taccorl.sim.effects.effect import JointEffect, parameter
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+_MOST_PERIODS, _MOST_STARTS = 60.0, 32  # where a search for it ends; enough for a span of π
+
+
+@effects.register("cogging")
+@dataclass(kw_only=True)
+class Cogging(JointEffect):
+    """τ = +A sin(N q + φ), with N periods a turn of the joint: magnets and slots of the motor, teeth of the gear.
+
+    MuJoCo's cogging of a passive DC motor. Efforts do not contain it.
+    """
+
+    name: ClassVar = "cogging"
+    equation: ClassVar = "τ = A sin(N q + φ)"
+    in_words: ClassVar = (
+        "Magnets against slots, tooth after tooth: turned slowly by hand the joint clicks through the same places."
+    )
+    at_a_policy: ClassVar = (
+        "The hand trembles in slow motion, and rests a little off in a pattern over the joint's angle."
+    )
+    to_record: ClassVar = "One slow sweep over the whole range, there and back: the pattern stays where it is."
+    near_twins: ClassVar = {}
+    torque_nm: float = parameter(
+        unit="N·m",
+        symbol="A",
+        absent=0.0,
+        low=0.0,
+        high=5.0,
+        typical=0.3,
+        source="a choice: as much as friction",
+    )
+    periods: float = parameter(
+        unit="1",
+        symbol="N",
+        absent=None,
+        low=6.0,
+        high=200.0,
+        typical=24.0,
+        source="a choice: fewer are weight or a cable; of the joint's turn, so a gear's ratio times the motor's periods",
+    )
+    phase_rad: float = parameter(
+        unit="rad",
+        symbol="φ",
+        absent=None,
+        low=-math.tau,
+        high=math.tau,
+        typical=0.0,
+        source="a choice",
+    )
+
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """Sine and cosine of both signs, at periods half as far apart as a recording over ``span_rad`` can tell apart, from half
+        a wave on; a twentieth of the torque that the motor is asked for."""
+        apart = max(0.5 * math.pi / max(seen["span_rad"], 0.05), _MOST_PERIODS / _MOST_STARTS)
+        periods = np.arange(min(max(2 * apart, 6.0), _MOST_PERIODS), _MOST_PERIODS + 1e-9, apart)
+        torque_nm = float(np.clip(0.05 * seen["peak_torque_nm"], 1e-3, 5.0))
+        phases = (0.0, math.pi / 2, math.pi, -math.pi / 2)
+        return [{"torque_nm": torque_nm, "periods": float(n), "phase_rad": phase} for n in periods for phase in phases]
+
+    def drive(self) -> dict[str, float]:
+        return {
+            "cogging_torque": self.torque_nm,
+            "cogging_periods": self.periods,
+            "cogging_phase": self.phase_rad,
+        }
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        for name in self.acts_on():
+            add_passive_torque(spec, name, "cogging", cogging=[self.torque_nm, self.periods, self.phase_rad])

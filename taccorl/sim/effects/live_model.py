@@ -1,0 +1,94 @@
+"""Numbers of MuJoCo's model that effects change between two physics steps, each simulation its own."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+
+class LiveModel:
+    """What the hooks ``feel`` and ``rewrite`` of effects see and change of N simulations.
+
+    Args:
+        rewritten: fields of ``mujoco.MjModel`` that effects rewrite, or ``qfrc_applied`` of ``mujoco.MjData``.
+    """
+
+    def __init__(self, batch: Batch, rewritten: Sequence[str]) -> None:
+        self.model: mujoco.MjModel = batch.model
+        self._batch = batch
+        self._own = {}
+        self._nominal = {}
+        for name in rewritten:
+            applied = name == "qfrc_applied"
+            self._own[name] = batch.bind(name) if applied else batch.expand(name)
+            self._nominal[name] = 0.0 if applied else getattr(batch.model, name).copy()
+        self._seen: dict[str, np.ndarray] = {}
+        self._indices: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    def own(self, name: str) -> np.ndarray:
+        """(N, …) live: a rewritten field."""
+        return self._own[name]
+
+    def seen(self, name: str) -> np.ndarray:
+        """(N, …) live: a field of ``mujoco.MjData`` as it is after the newest physics step."""
+        if name not in self._seen:
+            self._seen[name] = self._batch.bind(name)
+            self._batch.forward()  # a field is zeros from its binding to the next step
+        return self._seen[name]
+
+    def make_nominal(self) -> None:
+        """Every rewritten field has the compiled model's values again."""
+        for name, values in self._own.items():
+            values[:] = self._nominal[name]
+
+    def dofs(self, joints: Sequence[str]) -> np.ndarray:
+        """Where the joints stand in ``qvel``, ``qfrc_bias``, ``dof_frictionloss``."""
+        return self._of(joints)[0]
+
+    def angles(self, joints: Sequence[str]) -> np.ndarray:
+        """Where the joints stand in ``qpos``."""
+        return self._of(joints)[1]
+
+    def actuators(self, joints: Sequence[str]) -> np.ndarray:
+        """The joints' motors."""
+        return self._of(joints)[2]
+
+    def _of(self, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        key = tuple(joints)
+        if key not in self._indices:
+            of = [self.model.joint(name) for name in key]
+            motors = np.array([self.model.actuator(name).id for name in key])
+            self._indices[key] = np.array([j.dofadr[0] for j in of]), np.array([j.qposadr[0] for j in of]), motors
+        return self._indices[key]
+
+    def integrates(self, joints: Sequence[str]) -> np.ndarray:
+        """(number of joints,) whether the motor is MuJoCo's PID actuator, whose ``gainprm`` is the integral's."""
+        return self.model.actuator_gaintype[self.actuators(joints)] == mujoco.mjtGain.mjGAIN_PID
+
+    def integrals(self, joints: Sequence[str]) -> np.ndarray:
+        """Where the motors that integrate keep their integrals in ``act``."""
+        return self.model.actuator_actadr[self.actuators(joints)[self.integrates(joints)]]
+
+    def error_rad(self, joints: Sequence[str]) -> np.ndarray:
+        """(N, number of joints) what the controllers see of q* − y, with the command that has arrived: it is read off the
+        motors' force. For effects that rewrite ``actuator_gainprm`` and ``actuator_biasprm``."""
+        motors, pid = self.actuators(joints), self.integrates(joints)
+        gain, bias = self.own("actuator_gainprm")[:, motors, 0], self.own("actuator_biasprm")[:, motors]
+        speed = self.model.actuator_gear[motors, 0] * self.seen("qvel")[:, self.dofs(joints)]
+        left = self.seen("actuator_force")[:, motors] - bias[..., 0] - bias[..., 2] * speed
+        left[:, pid] -= gain[:, pid] * self.seen("act")[:, self.integrals(joints)]
+        kp = np.where(pid, -bias[..., 1], gain)
+        return np.divide(left, kp, out=np.zeros_like(left), where=kp > 0)
+
+    def motor_torque_nm(self, joints: Sequence[str]) -> np.ndarray:
+        """(N, number of joints) what the motors give, with what carries the weight."""
+        dofs = self.dofs(joints)
+        torque = self.seen("qfrc_actuator")[:, dofs] + self.seen("qfrc_applied")[:, dofs]
+        apart = self.model.jnt_actgravcomp[self.model.dof_jntid[dofs]] == 0  # else it is in qfrc_actuator already
+        return torque + np.where(apart, self.seen("qfrc_gravcomp")[:, dofs], 0.0)
+
+    def scale_carried(self, joints: Sequence[str], carried_nm: np.ndarray, factor: np.ndarray | float) -> None:
+        """Let the motors carry ``factor`` times what they carry of the weight, of which MuJoCo gives ``carried_nm`` anyway."""
+        applied, dofs = self.own("qfrc_applied"), self.dofs(joints)
+        applied[:, dofs] = factor * (applied[:, dofs] + carried_nm) - carried_nm

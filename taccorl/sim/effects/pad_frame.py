@@ -1,0 +1,37 @@
+"""A pad that sits elsewhere on its finger than the model says: what moves the taxels' frame."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from taccorl.sim.effects.effect import TouchEffect
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+
+@dataclass(kw_only=True)
+class PadFrameEffect(TouchEffect):
+    """Base of effects that move the frame of a pad's taxels in the finger, and of the pad's box as far as it moves along.
+
+    The twin's model is edited; the matched contact replay (``taccorl.alignment.touch_model``), which has no model, asks for
+    ``offset_pad_m`` and looks the depths up there.
+    """
+
+    layer: ClassVar = "robot"
+
+    def offset_pad_m(self, pad: str) -> np.ndarray:
+        """(3,) by how much the taxels of ``pad`` move, in its frame: across, from palm to tip, out of the pad. Across runs along
+        x of the TCP on fingers a and against it on fingers b."""
+        raise NotImplementedError
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        for pad in self.pads:
+            offset, site = self.offset_pad_m(pad), spec.site(pad)
+            finger_from_pad = Rotation.from_quat(site.quat, scalar_first=True)
+            site.pos += finger_from_pad.apply(offset)
+            # The box's body has the finger's orientation. A film glued on askew does not take its backing along.
+            spec.geom(pad).pos += finger_from_pad.apply([0.0, 0.0, offset[2]])

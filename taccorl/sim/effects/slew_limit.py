@@ -1,0 +1,66 @@
+"""Slew limit: the drive moves its target no faster than so."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import CHANNELS, JointEffect, Memory, parameter
+
+
+@effects.register("slew_limit")
+@dataclass(kw_only=True)
+class SlewLimit(JointEffect):
+    """|ṙ| ≤ v_max, and the controller works on r: r moves towards q* by at most v_max Δt until the next sending.
+
+    r has its value at the end of that Δt, as in ``command_lag``: r_k = r_{k−1} + clip(q*_k − r_{k−1}, ± v_max Δt). It comes after
+    ``command_lag`` and before ``velocity_feedforward`` and ``command_delay``.
+    """
+
+    name: ClassVar = "slew_limit"
+    equation: ClassVar = "|ṙ| ≤ v_max; τ = K_p (r − q) − K_d q̇ + T_ref"
+    in_words: ClassVar = (
+        "A speed limit in the drive's firmware: faster commands are followed at that speed and no faster."
+    )
+    at_a_policy: ClassVar = "Fast moves arrive late, and tops of fast swings are cut off; gentle motion is as trained."
+    to_record: ClassVar = "A chirp or steps that are faster than the limit, and the same at half the amplitude."
+    near_twins: ClassVar = {
+        "command_lag": "Both round corners; a lag does so at any size: the same motion at half the amplitude.",
+        "torque_saturation": "Both cut fast, large motion; a torque limit moves with the load: repeat with a payload.",
+    }
+    speed_rad_per_s: float = parameter(
+        unit="rad/s",
+        symbol="v_max",
+        absent=math.inf,
+        low=0.05,
+        high=20.0,
+        typical=0.5,
+        source="a choice",
+    )
+
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """From 35 to 98 % of the fastest that was asked for."""
+        low, high = cls.parameters()[0].low, cls.parameters()[0].high
+        return [
+            {"speed_rad_per_s": min(max(s * seen["peak_speed_rad_per_s"], low), high)}
+            for s in (0.35, 0.6, 0.8, 0.92, 0.98)
+        ]
+
+    def drive(self) -> dict[str, float]:
+        return {"slew_rate": self.speed_rad_per_s}
+
+    def memory(self, num_sims: int) -> Memory:
+        return {"target": np.full((num_sims, len(CHANNELS)), np.nan)}
+
+    def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+        limited = memory["target"]
+        limited[:] = np.where(np.isnan(limited), targets, limited)  # after a reset: the target at rest
+        reach = (self.speed_rad_per_s * dt_s)[:, None]
+        limited += np.clip(targets - limited, -reach, reach)
+        targets = targets.copy()
+        targets[:, self.columns] = limited[:, self.columns]
+        return targets

@@ -1,0 +1,75 @@
+"""Gain map: each taxel's own gain, as it was measured; dead taxels are those of gain 0."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
+from taccorl.sim.robot import PAD_TAXELS
+
+
+@effects.register("taxel_gain_map")
+@dataclass(kw_only=True)
+class TaxelGainMap(TouchEffect):
+    """r_i = (1 + s (g_i − 1)) f_i: known gains of these boards, where ``taxel_gain_spread`` draws those of boards like them."""
+
+    name: ClassVar = "taxel_gain_map"
+    layer: ClassVar = "taxel"
+    equation: ClassVar = "r_i = g_i f_i"
+    in_words: ClassVar = (
+        "Under the same pressure some taxels always read more than others, and some nothing: foils and solder "
+        "joints differ."
+    )
+    at_a_policy: ClassVar = "Textures appear on plain contacts; a dead taxel looks like an edge."
+    to_record: ClassVar = (
+        "Presses that cover every taxel at several depths: a flat plate, or a rod rolled over the pad."
+    )
+    near_twins: ClassVar = {
+        "taxel_gain_spread": (
+            "The same thing, drawn for boards that were not measured; the map is for the board that was."
+        ),
+        "dead_taxels": "The same thing, drawn for boards that were not measured; in the map they have gain 0.",
+        "pad_shift": "At one place of contact a slope of gains looks like a shift; press at several places.",
+    }
+    share: float = parameter(
+        unit="1",
+        symbol="s",
+        absent=0.0,
+        low=0.0,
+        high=1.0,
+        typical=1.0,
+        source="1 is the map as it was measured; less fades it out",
+    )
+    gains: list[float] = field(default_factory=lambda: [0.0])
+    """g_i: 384 for each pad, row after row from palm to tip, pad after pad; or one for all of them. 0, as it is by default, is a
+    pad that is not connected."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expected = len(self.pads) * math.prod(PAD_TAXELS)
+        if len(self.gains) not in (1, expected):
+            raise TaccorlError(
+                f"effect {self.name}: gains are {len(self.gains)} numbers; pads {', '.join(self.pads)} have {expected} taxels: "
+                "give that many, or one for all"
+            )
+        bad = [g for g in self.gains if isinstance(g, bool) or not isinstance(g, int | float | np.number)]
+        bad += [g for g in self.gains if not bad and not 0 <= g < math.inf]
+        if bad:
+            raise TaccorlError(f"effect {self.name}: gains hold {bad[0]!r}; each is a number of 0 or more")
+        self.gains = [float(g) for g in self.gains]
+
+    @classmethod
+    def of(cls, gains: np.ndarray, pads: Sequence[str]) -> "TaxelGainMap":
+        """The map of gains (P, 32, 12), rounded to six digits: fine enough to be fitted with, short enough to be read."""
+        return cls(share=1.0, pads=list(pads), gains=np.round(np.asarray(gains, float), 6).reshape(-1).tolist())
+
+    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        gains = np.broadcast_to(self.gains, len(self.pads) * math.prod(PAD_TAXELS)).reshape(-1, *PAD_TAXELS)
+        reading = reading.copy()
+        reading[:, self.slots] *= (1.0 + self.share * (gains - 1.0)).astype(reading.dtype)
+        return reading

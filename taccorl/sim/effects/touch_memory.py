@@ -1,0 +1,33 @@
+"""Touch effects whose reading depends on earlier ones: one scan in the simulation, a whole recording in a replay."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.sim.effects.effect import Memory, TouchEffect
+
+
+@dataclass(kw_only=True)
+class RememberingEffect(TouchEffect):
+    """Base of effects with a memory: they say what many scans in a row come out as, and one scan is a row of one.
+
+    Thousands of calls for a recording become one (``taccorl.alignment.touch_model``), by the same code as in the simulation. An
+    effect with a memory that is not of this class works as well, scan by scan.
+    """
+
+    @abstractmethod
+    def scans(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+        """What the chosen pads P read in S scans one after the other, a new array (S, N, P, R, C) of the same type.
+
+        Args:
+            own: (S, N, P, R, C) what ideal ones would read.
+            memory: arrays (N, …) as before the first scan; left as after the last.
+            dt_s: (S, N) since the scan before.
+        """
+
+    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+        own = reading[:, self.slots]
+        reading = reading.copy()
+        reading[:, self.slots] = self.scans(own[None], memory, dt_s[None])[0]
+        return reading

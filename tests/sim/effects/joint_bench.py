@@ -1,0 +1,63 @@
+"""One joint of the press bench's free arm, driven about its rest: joint 5 of the right arm unless said otherwise.
+
+At rest at home everything is in balance: the controller's targets stand T_ref / K_p below the angles, and weight is carried.
+"""
+
+import mujoco
+import numpy as np
+from press_bench import PressBench
+
+from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.effect import CHANNELS, Effect
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.twin import TwinConfig
+
+COLUMN = CHANNELS.index("right_joint5")
+KP, KD, TORQUE_FF = KP_NM_PER_RAD[4], KD_NMS_PER_RAD[4], TORQUE_FF_NM[4]
+STEP_S = TwinConfig().physics.timestep_s
+GRAVITY = 9.81
+
+
+def on_joint5(name: str, **values: float) -> Effect:
+    return make_effect(name, arm="right", joints=["joint5"], **values)
+
+
+def drive(sim: Simulation, seconds: float, offset=lambda t: 0.0, column: int = COLUMN) -> dict[str, np.ndarray]:
+    """Let one joint's target be its target at rest + ``offset(t)`` [rad]; what the joint does after each physics step.
+
+    Returns:
+        ``t`` [s], ``u`` target, ``q`` angle of the motor, ``v`` its velocity, ``reported``; each (T,).
+    """
+    rest = sim.targets.copy()
+    joint = sim.model.joint(CHANNELS[column])
+    rows = []
+    for k in range(round(seconds / STEP_S)):
+        targets = rest.copy()
+        targets[:, column] += offset(k * STEP_S)
+        sim.advance(targets[None], 1)
+        q, v = sim.arrays["qpos"][0, joint.qposadr[0]], sim.arrays["qvel"][0, joint.dofadr[0]]
+        rows.append(((k + 1) * STEP_S, targets[0, column], q, v, sim.proprioception()[0, column]))
+    return dict(zip(("t", "u", "q", "v", "reported"), np.array(rows).T, strict=True))
+
+
+def static_torque_nm(sim: Simulation, column: int = COLUMN) -> float:
+    """What it takes to hold a joint up against weight, compensation left out."""
+    model, data = sim.batch.get_model(0), sim.batch.get_data(0)
+    data.qvel[:] = 0.0
+    mujoco.mj_forward(model, data)
+    return float(data.qfrc_bias[model.joint(CHANNELS[column]).dofadr[0]])
+
+
+def asked_nm(motion: dict[str, np.ndarray]) -> np.ndarray:
+    """(T,) what a controller without effects would ask for: K_p (u − q) − K_d q̇ + T_ref."""
+    return KP * (motion["u"] - motion["q"]) - KD * motion["v"] + TORQUE_FF
+
+
+def without_feedforward(*effects: Effect) -> Simulation:
+    """As ``press_bench.start`` at home, but T_ref of joint 5 is 0: it rests at its target."""
+    config = TwinConfig(effects=list(effects))
+    config.controller.torque_ff_nm[4] = 0.0
+    sim = Simulation(PressBench(), config)
+    sim.reset([0])
+    return sim
