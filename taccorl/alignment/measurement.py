@@ -81,6 +81,8 @@ class Measurement:
     """Signal → gain that was commanded [N·m/rad, N/m], where somebody wrote it down."""
     kd: dict[str, float] = field(default_factory=dict)
     """Signal → [N·m·s/rad, N·s/m]."""
+    gain_scale: dict[str, float] = field(default_factory=dict)
+    """Signal → factor of both gains over the other recordings', where no more than that is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
     """Arm → known mass in its gripper."""
     time_error_s: float = 0.0

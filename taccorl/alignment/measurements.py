@@ -44,6 +44,8 @@ class RecordingNote:
     """Signal → commanded gain [N·m/rad, N/m]."""
     kd: dict[str, float] = field(default_factory=dict)
     """Signal → [N·m·s/rad, N·s/m]."""
+    gain_scale: dict[str, float] = field(default_factory=dict)
+    """Signal → factor of both gains over the other recordings', where no more than that is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
     """Arm → mass held."""
     effort_scale: dict[str, float] = field(default_factory=dict)
@@ -201,7 +203,7 @@ def _load_index(folder: Path) -> MeasurementIndex:
     document = Document(MeasurementIndex, path)
     index = document.value
     for name, note in index.recordings.items():
-        for key in ("kp", "kd", "payload_kg"):
+        for key in ("kp", "kd", "gain_scale", "payload_kg"):
             bad = next((s for s, v in getattr(note, key).items() if v < 0), None)
             if bad:
                 raise document.error(f"recordings/{name}/{key}/{bad}", f"{getattr(note, key)[bad]:g} is below 0")
@@ -249,6 +251,7 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
                 repeat_of=note.repeat_of or m.repeat_of,
                 kp=m.kp | note.kp,
                 kd=m.kd | note.kd,
+                gain_scale=m.gain_scale | note.gain_scale,
                 payload_kg=m.payload_kg | note.payload_kg,
                 effort=m.effort * scale,
             )

@@ -45,6 +45,8 @@ BANDWIDTH_FACTOR = 5.0
 """The smooth must follow so many times the motion's highest frequency: at a fifth it misses 2 · 10⁻⁵ of the motion."""
 MOTION_POWER = 0.99
 """Share of the motion's power below its highest frequency."""
+OTHER_START = 5.0
+"""Two recordings of one motion that differ by so many times what they usually do began at different places."""
 MOVING = 1e-3
 """rad, m: a command that stays within this is no motion whose bandwidth could matter."""
 NUMBER = 2.0**-24
@@ -198,7 +200,16 @@ class _Blocks:
 def _repeat_blocks(first: Measurement, second: Measurement, kind: Kind) -> _Blocks:
     laid = overlay(first, second)
     rows = _block_rows(first.rate_hz)
-    return _Blocks(_mean_squares(laid.difference[kind], rows) / laid.noise_gain, rows, float(rows))
+    squares = _mean_squares(laid.difference[kind], rows) / laid.noise_gain
+    return _Blocks(_without_beginning(squares), rows, float(rows))
+
+
+def _without_beginning(squares: np.ndarray) -> np.ndarray:
+    """(B, J) with NaN at first, while the two differ ``OTHER_START`` times as much as later: a joint with dry friction rests
+    elsewhere each time, until it is moved. That is no noise: the twin begins where the recording began."""
+    usual = OTHER_START**2 * np.median(squares, axis=0)
+    still_off = np.logical_and.accumulate(squares > usual, axis=0)
+    return np.where(still_off, np.nan, squares)
 
 
 def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:

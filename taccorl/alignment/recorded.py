@@ -154,7 +154,7 @@ class _Notes:
     instruction: str
     repeat_of: str | None
     numbers: dict[str, dict[str, float]]
-    """``kp``, ``kd`` (signal → number) and ``payload_kg`` (arm → number), each as JSON."""
+    """``kp``, ``kd``, ``gain_scale`` (signal → number) and ``payload_kg`` (arm → number), each as JSON."""
 
     @classmethod
     def of(cls, recording: Recording, spec: RecordingSpec) -> "_Notes":
@@ -164,7 +164,7 @@ class _Notes:
             texts = [t.removeprefix("start:") for t in texts if t.startswith("start:")]
         told = next((t.strip() for t in texts if t.strip()), written.get("instruction", spec.instruction.text or ""))
         numbers: dict[str, dict[str, float]] = {}
-        for key in ("kp", "kd", "payload_kg"):
+        for key in ("kp", "kd", "gain_scale", "payload_kg"):
             try:
                 numbers[key] = {str(k): float(v) for k, v in json.loads(written.get(key, "{}")).items()}
             except (ValueError, TypeError, AttributeError) as error:
@@ -268,6 +268,7 @@ class _Rows:
             repeat_of=notes.repeat_of,
             kp=notes.numbers["kp"],
             kd=notes.numbers["kd"],
+            gain_scale=notes.numbers["gain_scale"],
             payload_kg=notes.numbers["payload_kg"],
             time_error_s=self.period_ns / NS_PER_S if no_clock else 0.0,
             timing=tuple(self._timing(c, key) for key in (STATE, ACTION) for c in self.spec.features[key].channels),

@@ -218,3 +218,21 @@ def test_step_of_readings_is_found_and_noise_has_none():
     assert find_quantum(np.full(100, 1.5)) == 0.0
     assert find_quantum(np.array([0.0, 0.1] * 50)) == pytest.approx(0.1)
     assert sum(find_quantum(np.random.default_rng(k).normal(size=500)) > 0 for k in range(50)) == 0
+
+
+def test_a_joint_that_began_elsewhere_does_not_raise_the_floor_but_one_that_slips_later_does(motion):
+    """Dry friction lets a joint rest 10 mrad away until it is moved for the first time."""
+    rng = np.random.default_rng(5)
+    first, second = (measured(*motion, rng, NOISE, name=name) for name in "ab")
+    again = dataclasses.replace(second, repeat_of="a")
+    plain = noise_floor([first, again])["left_joint1"].value
+    j = first.column("left_joint1")
+    rows = round(3.0 * first.rate_hz)
+    elsewhere = again.measured.copy()
+    elsewhere[:rows, j] += 0.01
+    assert noise_floor([first, dataclasses.replace(again, measured=elsewhere)])["left_joint1"].value == pytest.approx(
+        plain, rel=0.2
+    )
+    slipped = again.measured.copy()
+    slipped[-rows:, j] += 0.01
+    assert noise_floor([first, dataclasses.replace(again, measured=slipped)])["left_joint1"].value > 3 * plain

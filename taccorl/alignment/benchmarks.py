@@ -1,0 +1,234 @@
+"""Figures of the one-joint model and of controller identification. ``make bench ONLY=joint_model`` and ``ONLY=controller_sysid``.
+
+The rival of identification is ``mujoco.sysid`` on the same recording. Its extra packages are not among ours; where they are not
+installed (``pip install mujoco[sysid]``) its column stays empty.
+"""
+
+import contextlib
+import dataclasses
+import io
+import math
+import time
+from collections.abc import Callable, Iterator
+from statistics import median
+
+import mujoco
+import numpy as np
+
+from taccorl.alignment import arm_bench
+from taccorl.alignment.controller import PAPER_BOUNDS, REFERENCE, identify_controller
+from taccorl.alignment.joint_model import Gains, JointModel
+from taccorl.alignment.joint_motion import JointMotion, joint_motion
+from taccorl.alignment.measurement import Measurement
+from taccorl.benchmark import Row, benchmark, spread
+from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.controller import ControllerConfig
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.effect import Effect, JointEffect
+from taccorl.sim.robot import JOINTS
+from taccorl.sim.tasks.bench import Bench
+from taccorl.sim.twin import TwinConfig
+
+NOISE_RAD = 2e-4
+SECONDS = 10.0
+RATE_HZ = 200.0
+
+
+def sweep(signal: str, config: TwinConfig) -> tuple[JointMotion, np.ndarray]:
+    """The paper's sweep, 0.1 to 2 Hz in 10 s, answered by MuJoCo with the gains of ``config``, as its joint sees it.
+
+    Returns:
+        the motion, and (T,) what MuJoCo says without noise.
+    """
+    time_s = np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ
+    home = np.array([*Bench().home_rad["left"], 0.06, *Bench().home_rad["right"], 0.06])
+    target, column = np.tile(home, (len(time_s), 1)), ACTION_NAMES.index(signal)
+    phase = 2 * np.pi * (0.1 * time_s + 1.9 * time_s**2 / (2 * SECONDS))
+    target[:, column] += 0.25 * np.clip((time_s - 0.5) / 0.5, 0, 1) * np.sin(phase)
+    gains = JointModel(config, signal).gains
+    measured = target.copy()
+    measured[:, column] += gains.torque_ff / gains.kp
+    m = Measurement(name=f"simulated sweep of {signal}", time_s=time_s, target=target, measured=measured)
+    true = in_mujoco(joint_motion(m, config, signal), signal, gains, config)
+    measured[:, column] = true + NOISE_RAD * np.random.default_rng(column).normal(size=len(time_s))
+    return joint_motion(m, config, signal), true
+
+
+def in_mujoco(
+    motion: JointMotion, signal: str, gains: Gains, config: TwinConfig, present: tuple[Effect, ...] = ()
+) -> np.ndarray:
+    """(T,) the joint's answer by MuJoCo's own steps."""
+    hold = round(1 / (RATE_HZ * config.physics.timestep_s))
+    return arm_bench.run(
+        config,
+        signal,
+        motion.target,
+        hold,
+        np.zeros(len(motion.target) * hold),
+        gains=gains,
+        start=motion.start,
+        pose=motion.pose,
+        payload_kg=0.0,
+        effects=arm_bench.of_joint(present, signal),
+    )[0]
+
+
+def _cpu_ms(work: Callable[[], object], repeats: int) -> list[float]:
+    work()
+    times = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        work()
+        times.append((time.process_time() - begin) * 1e3)
+    return times
+
+
+@benchmark("joint_model")
+def joint_model() -> Iterator[Row]:
+    """Cost of one simulated recording, and how far it is from MuJoCo."""
+    config, signal = TwinConfig(), "left_joint2"
+    model = JointModel(config, signal)
+    motion, _ = sweep(signal, config)
+    gains = model.gains._replace(torque_ff=0.0)  # in balance at its target
+    motion = dataclasses.replace(motion, start=float(motion.target[0]))
+    known: list[Effect] = []
+    for name in effects:
+        cls = effects.get(name)
+        if issubclass(cls, JointEffect) and "joint2" in cls.possible:
+            effect = make_effect(name, **{p.name: p.typical for p in cls.parameters()})
+            known += [effect] * (effect.drive() is not None)
+    plain = _cpu_ms(lambda: model.simulate(motion, gains), 20)
+    rival = _cpu_ms(lambda: in_mujoco(motion, signal, gains, config), 5)
+    yield Row(
+        name="one joint, 10 s at 200 Hz, 12 000 physics steps, CPU",
+        value=median(plain),
+        unit="ms",
+        goal="≤ 1.5",
+        rival="MuJoCo, the arm with this joint alone",
+        rival_value=median(rival),
+        n=len(plain),
+        spread=spread(plain),
+    )
+    costs = [median(_cpu_ms(lambda effect=effect: model.simulate(motion, gains, [effect]), 5)) for effect in known]
+    yield Row(
+        name=f"the same with the most expensive of {len(known)} effects of joints, CPU",
+        value=max(costs),
+        unit="ms",
+        goal="≤ 1.5",
+        n=len(costs),
+        spread=spread(costs),
+    )
+    away = [
+        float(
+            np.abs(model.simulate(motion, gains, [e]).reported - in_mujoco(motion, signal, gains, config, (e,))).max()
+        )
+        for e in known
+    ]
+    yield Row(
+        name=f"largest difference from MuJoCo in 10 s, any of {len(known)} effects at its typical strength",
+        value=max(away) * 1e6,
+        unit="µrad",
+        goal="≤ 10",
+        n=len(away),
+        spread=spread(away) * 1e6,
+    )
+
+
+@benchmark("controller_sysid")
+def controller_sysid() -> Iterator[Row]:
+    """The paper's identification of all six joints from one simulated 10 s sweep each, with 0.2 mrad of noise."""
+    config = TwinConfig()
+    unknowing = TwinConfig(
+        controller=ControllerConfig(
+            kp_nm_per_rad=[REFERENCE.kp] * 6, kd_nms_per_rad=[REFERENCE.kd] * 6, torque_ff_nm=[REFERENCE.torque_ff] * 6
+        )
+    )
+    cost, ratio, rival_cost, rival_ratio, spsa_ratio, spsa_cost = ([] for _ in range(6))
+    for joint in JOINTS:
+        signal = f"left_{joint}"
+        truth = JointModel(config, signal).gains
+        motion, _ = sweep(signal, config)
+        model = JointModel(unknowing, signal)
+        identify_controller([motion], model)  # compiled now
+        fit = identify_controller([motion], model)
+        cost.append(fit.cpu_s)
+        ratio.append(_ratio_error(fit.gains, truth))
+        fit = identify_controller([motion], model, method="spsa")
+        spsa_cost.append(fit.cpu_s)
+        spsa_ratio.append(_ratio_error(fit.gains, truth))
+        begin = time.process_time()
+        found = _mujoco_sysid(motion, signal, unknowing)
+        if found is not None:
+            rival_cost.append(time.process_time() - begin)
+            rival_ratio.append(_ratio_error(found, truth))
+    rival = "mujoco.sysid, its scipy optimiser" if rival_cost else "mujoco.sysid is not installed"
+    yield Row(
+        name="controller of one joint from a 10 s sweep, CPU",
+        value=median(cost),
+        unit="s",
+        goal="≤ 3",
+        rival=rival,
+        rival_value=median(rival_cost) if rival_cost else None,
+        n=len(cost),
+        spread=spread(cost),
+    )
+    yield Row(
+        name="K_d / K_p off by, worst of six joints",
+        value=max(ratio),
+        unit="%",
+        goal="≤ 1",
+        rival=rival,
+        rival_value=max(rival_ratio) if rival_ratio else None,
+        n=len(ratio),
+        spread=spread(ratio),
+    )
+    yield Row(
+        name="K_d / K_p off by, worst of six joints, SPSA with the paper's constants",
+        value=max(spsa_ratio),
+        unit="%",
+        rival=f"CPU-s of one joint: {median(spsa_cost):.2f}",
+        n=len(spsa_ratio),
+        spread=spread(spsa_ratio),
+    )
+
+
+def _ratio_error(found: Gains, truth: Gains) -> float:
+    """Of K_d / K_p, in percent."""
+    return 100.0 * abs(found.kd / found.kp / (truth.kd / truth.kp) - 1.0)
+
+
+def _mujoco_sysid(motion: JointMotion, signal: str, config: TwinConfig) -> Gains | None:
+    """The same three numbers by MuJoCo's own tool, from the same start within the same bounds; None if it is not installed."""
+    try:
+        from mujoco import sysid
+
+        parameters = sysid.ParameterDict()
+    except (ImportError, AttributeError):
+        return None
+    arm, joint = arm_bench.split_signal(signal)
+    spec = arm_bench.arm_spec(config, arm, motion.pose, [joint])
+
+    def write(spec: mujoco.MjSpec, parameter) -> None:
+        kp, kd, torque_ff = math.exp(parameter.value[0]), math.exp(parameter.value[1]), parameter.value[2]
+        motor = spec.actuator(signal)
+        motor.gainprm[0], motor.biasprm[:3] = kp, [torque_ff, -kp, -kd]
+
+    low, high = np.array([PAPER_BOUNDS[name] for name in ("kp", "kd", "torque_ff")]).T
+    logs = np.array([True, True, False])
+    into = [np.where(logs, np.log(np.where(logs, ends, 1.0)), ends) for ends in (np.array(REFERENCE), low, high)]
+    parameters.add(sysid.Parameter("eta", *into, modifier=write))
+    model, step_s = spec.compile(), config.physics.timestep_s
+    hold = round(1 / (RATE_HZ * step_s))
+    command = np.repeat(motion.target, hold)[:, None]
+    control = sysid.TimeSeries.from_control_names(np.arange(len(command)) * step_s, command, model)
+    # It stamps what was before a step with the time after it.
+    measured = sysid.TimeSeries.from_names(
+        motion.time_s + step_s, motion.measured[:, None], model, names=[f"{signal}_pos"]
+    )
+    begin = sysid.create_initial_state(model, np.array([motion.start]), np.zeros(1))
+    sequence = sysid.ModelSequences("arm", spec, "sweep", begin, control, measured)
+    residual = sysid.build_residual_fn(models_sequences=[sequence])
+    with contextlib.redirect_stdout(io.StringIO()):
+        found, _ = sysid.optimize(initial_params=parameters, residual_fn=residual, optimizer="scipy", verbose=False)
+    kp, kd, torque_ff = found["eta"].value
+    return Gains(math.exp(kp), math.exp(kd), float(torque_ff))

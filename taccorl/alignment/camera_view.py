@@ -1,0 +1,164 @@
+"""One camera of the twin with the arms placed where the joints say: what calibration holds against a picture.
+
+Frames: *mount* is the body that carries the camera (``CameraConfig.body``: the world, or link 6 of an arm), *camera* is MuJoCo's
+(x right, y up, looking along −z). A pose is a vector (6,) = (ω, t) [rad, m] off the nominal mount, as ``CameraOffset``:
+R = R₀·exp(ω), p = p₀ + R₀·t. Pixels as in ``taccorl.sim.cameras``. Only arms and table are there: where parts are, no joint says.
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.cameras import CameraConfig, CameraOffset, Window, add_cameras, letterbox_window, offset_pose
+from taccorl.sim.effects.added import AddedEffects, present
+from taccorl.sim.rendering import Renderer, style
+from taccorl.sim.robot import ARMS, FINGERS, JOINTS
+from taccorl.sim.twin import TwinConfig, empty_bench
+
+_BAR = 24  # counts: JPEG and video leave black bars this dark
+
+
+class TwinView:
+    """The twin's camera ``name`` in pictures of ``size`` (rows, columns), which may be letterboxed as ingest does it.
+
+    Free it with ``close`` or use it in a ``with``.
+
+    Raises:
+        TaccorlError: the twin has no such camera.
+    """
+
+    def __init__(self, config: TwinConfig, name: str, size: tuple[int, int]) -> None:
+        cameras = {camera.name: camera for camera in config.cameras}
+        if name not in cameras:
+            raise TaccorlError(f"camera {name!r} is not in the twin; {nearest(name, cameras)}")
+        self.camera: CameraConfig = cameras[name]
+        self.size = size
+        self.window: Window = letterbox_window(self.camera.recording_size, size)
+        self.intrinsics = self.camera.recorded_intrinsics().scaled(self.window.rows, self.window.columns)
+        """Of the picture without its bars."""
+        spec = empty_bench(config)
+        add_cameras(spec, [self.camera])
+        style(spec)
+        for effect in present(config.effects):
+            if effect.layer == "camera" and name in effect.acts_on():
+                effect.edit(spec, dataclasses.replace(config, cameras=[self.camera]))
+        self.model = spec.compile()
+        self.model.cam_resolution[0] = 1  # not said: the view fills its frame, there are no bars
+        self.data = mujoco.MjData(self.model)
+        self._encoder = AddedEffects(config.effects, self.data.time * np.ones(1)).encoder
+        self._joints = [self._qpos(f"{arm}_{joint}") for arm in ARMS for joint in JOINTS]
+        self._fingers = [[self._qpos(f"{arm}_finger_{finger}") for finger in FINGERS] for arm in ARMS]
+        bare = dataclasses.replace(self.camera, offset=CameraOffset())
+        self._nominal = bare.pose()
+        turn = Rotation.from_quat(self.model.cam_quat[0], scalar_first=True).as_matrix()
+        self.start = self.offset_of(self.model.cam_pos[0].copy(), turn)
+        """(6,) where the twin has it: its offset, and what effects add to it."""
+        self.robot = np.array([self.model.body(i).name.startswith(ARMS) for i in range(self.model.nbody)])
+        """(bodies,) bool: of an arm."""
+        self._renderers: dict[tuple[int, int], Renderer] = {}
+
+    def pose(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Position (3,) [m] and mount-from-camera (3, 3) of a pose (6,)."""
+        position, quat = offset_pose(*self._nominal, as_offset(offset))
+        return position, Rotation.from_quat(quat, scalar_first=True).as_matrix()
+
+    def offset_of(self, position: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """The pose (6,) that is at ``position`` (3,) [m] with mount-from-camera ``turn`` (3, 3)."""
+        nominal = Rotation.from_quat(self._nominal[1], scalar_first=True).inv()
+        turned = (nominal * Rotation.from_matrix(turn)).as_rotvec()
+        return np.r_[turned, nominal.apply(position - self._nominal[0])]
+
+    def place(self, joints: np.ndarray) -> None:
+        """Arms and fingers where ``joints`` (14,) [rad, m] are reported: effects on the encoders are taken off again."""
+        joints = joints - (self._encoder(joints[None])[0] - joints)
+        arms = joints.reshape(2, 7)
+        self.data.qpos[self._joints] = arms[:, :6].ravel()
+        self.data.qpos[self._fingers] = arms[:, 6:] / 2
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+
+    def labels(self, joints: np.ndarray, offset: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Body (rows, columns) int that each pixel shows, 0 for what is no arm, and its depth [m] along the optical axis."""
+        self._turn(joints, offset)
+        geoms, depth_m = self._renderer(rows, columns).labels(self.data)[0]
+        bodies = np.where(geoms >= 0, self.model.geom_bodyid[geoms], 0)
+        return np.where(self.robot[bodies], bodies, 0), depth_m
+
+    def picture(self, joints: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """What the twin's camera sees, without bars, (rows, columns, 3) uint8 RGB."""
+        self._turn(joints, offset)
+        return self._renderer(self.window.rows, self.window.columns).render([self.data])[0, 0]
+
+    def in_mount(self, joints: np.ndarray, body: str, point_m: np.ndarray) -> np.ndarray:
+        """A point (3,) of a body's frame in the mount's frame, for joints (14,).
+
+        Raises:
+            TaccorlError: no such body.
+        """
+        names = [self.model.body(i).name for i in range(self.model.nbody)]
+        if body not in names:
+            raise TaccorlError(f"no body {body!r} in the twin; {nearest(body, names)}")
+        self.place(joints)
+        its, mount = self.data.body(body), self.data.body(self.camera.body)
+        world = its.xpos + its.xmat.reshape(3, 3) @ point_m
+        return mount.xmat.reshape(3, 3).T @ (world - mount.xpos)
+
+    def inside(self, pictures: np.ndarray) -> np.ndarray:
+        """The pictures (F, rows, columns, 3) without their black bars.
+
+        Raises:
+            TaccorlError: another size, or there is something where bars should be.
+        """
+        if pictures.shape[1:] != (*self.size, 3) or pictures.dtype != np.uint8:
+            raise TaccorlError(
+                f"camera {self.camera.name}: pictures are {pictures.dtype} {pictures.shape[1:]}, wanted are uint8 "
+                f"({self.size[0]}, {self.size[1]}, 3)"
+            )
+        w = self.window
+        cut = np.s_[:, w.top : w.top + w.rows, w.left : w.left + w.columns]
+        bars = np.ones(self.size, dtype=bool)
+        bars[cut[1:]] = False
+        # Video blurs over the edge of a bar by a pixel or two.
+        bars = bars & np.roll(bars, 2, 0) & np.roll(bars, -2, 0) & np.roll(bars, 2, 1) & np.roll(bars, -2, 1)
+        if bars.any() and np.percentile(pictures[:, bars], 95) > _BAR:
+            stream = self.camera.recording_size
+            raise TaccorlError(
+                f"camera {self.camera.name}: pictures of {self.size[0]}×{self.size[1]} are no stream of "
+                f"{stream[0]}×{stream[1]} with black bars: there is light where the bars would be. Set the camera's "
+                "recording_size in the twin to what the robot records (rows, columns), with the intrinsics of that stream"
+            )
+        return pictures[cut]
+
+    def close(self) -> None:
+        """Free OpenGL contexts."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+
+    def __enter__(self) -> "TwinView":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _turn(self, joints: np.ndarray, offset: np.ndarray) -> None:
+        self.model.cam_pos[0], self.model.cam_quat[0] = offset_pose(*self._nominal, as_offset(offset))
+        self.place(joints)
+        mujoco.mj_camlight(self.model, self.data)
+
+    def _qpos(self, joint: str) -> int:
+        return int(self.model.joint(joint).qposadr[0])
+
+    def _renderer(self, rows: int, columns: int) -> Renderer:
+        if (rows, columns) not in self._renderers:
+            self._renderers[rows, columns] = Renderer(self.model, [self.camera.name], rows, columns)
+        return self._renderers[rows, columns]
+
+
+def as_offset(offset: np.ndarray) -> CameraOffset:
+    """(6,) = (ω, t) as what a ``CameraConfig`` holds."""
+    x, y, z, right, up, back = offset.tolist()
+    return CameraOffset(rotation_rad=(x, y, z), translation_m=(right, up, back))

@@ -1,0 +1,318 @@
+"""How deep each taxel was in a known object while a measurement was made: geometry alone, no dynamics (paper App. B.2).
+
+The fingers stand where their opening was measured, the object where it is known to be, so a taxel's depth δ and its rate δ̇
+follow, at the instants at which the board scanned it. Where the object is thicker than the opening, the difference is what the
+pads were pressed in by: a sprung pad of the twin yields by as much, so its taxels read the same depth (``taccorl.sim.pad``).
+
+An object is fixed to the hand (``tcp``: a jig on the gripper, or a part that stays in its grasp) or to the bench (``world``);
+then the arm's measured joints count as well, and 0.2 mrad of theirs are 0.1 mm here.
+
+Letters in shapes: T frames, P pads, R × C taxels, I instants of a scan, S rows of the measurement.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
+
+from taccorl.alignment.felt_solids import shapes_in_object
+from taccorl.alignment.measurement import Measurement
+from taccorl.data.spec import SensorSpec, find_spec, load_sensor_spec
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.robot import (
+    ARMS,
+    FINGERS,
+    JOINTS,
+    PAD_LENGTH_M,
+    PAD_TAXELS,
+    PAD_WIDTH_M,
+    PADS,
+    TAXEL_PITCH_M,
+    TCP_FROM_LINK6_M,
+    RobotConfig,
+    link_poses,
+)
+from taccorl.sim.sensors import as_wire
+from taccorl.sim.sensors.flexitac import scan_instants_s
+from taccorl.sim.shapes import Capsule, Cylinder, Solid
+from taccorl.sim.signed_distance import Shapes
+from taccorl.sim.twin import TwinConfig
+
+SMOOTH_S, SMOOTH_ORDER = 0.045, 3
+"""Savitzky–Golay window of openings and joints: 9 rows at 200 Hz. An opening's noise of 10 µm becomes 6 µm and 0.5 mm/s."""
+_STEP_S = 5e-4  # of central differences of the pads' poses, along splines through the smoothed rows
+_KEPT = 4  # depths of a motion with its pads moved: what a fit asks for again and again
+_NEAR_M = 1e-3  # a pad that never comes so near to the object takes no part
+
+
+@dataclass(frozen=True, kw_only=True)
+class PressedObject:
+    """What the fingers of one arm press, and where it is. TCP frame: middle between the pads, z = approach, fingers close
+    along y; finger a is on the side of +y."""
+
+    solids: Sequence[Solid]
+    """In the object's own frame; those that do not touch are passed over."""
+    arm: str
+    pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """(4, 4) object's frame in the TCP's, or in the world [m]."""
+    frame: Literal["tcp", "world"] = "tcp"
+
+    def __post_init__(self) -> None:
+        if self.arm not in ARMS:
+            raise TaccorlError(f"pressed object: no arm {self.arm!r}; {nearest(self.arm, ARMS)}")
+        if self.frame not in ("tcp", "world"):
+            raise TaccorlError(f"pressed object: frame {self.frame!r} is neither 'tcp' nor 'world'")
+        pose = np.asarray(self.pose, float)
+        if pose.shape != (4, 4) or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6):
+            raise TaccorlError(f"pressed object: its pose is no (4, 4) rotation and translation: {pose.tolist()}")
+        if not any(solid.touches for solid in self.solids):
+            raise TaccorlError("pressed object: it has no solid that touches anything")
+
+
+def indenter(
+    shape: Literal["sphere", "rod"],
+    radius_m: float,
+    arm: str,
+    *,
+    length_m: float = 0.03,
+    position_m: Sequence[float] = (0.0, 0.0, 0.0),
+    rpy_rad: Sequence[float] = (0.0, 0.0, 0.0),
+    frame: Literal["tcp", "world"] = "tcp",
+) -> PressedObject:
+    """A sphere, or a rod with flat ends along its own z, with its middle at ``position_m``.
+
+    Args:
+        length_m: of a rod.
+        rpy_rad: fixed-axis roll, pitch, yaw; (0, π/2, 0) lays a rod across the pads.
+
+    Raises:
+        TaccorlError: another shape, or a size that is not above 0.
+    """
+    if shape not in ("sphere", "rod"):
+        raise TaccorlError(f"indenter: no shape {shape!r}; {nearest(shape, ('sphere', 'rod'))}")
+    if not (0 < radius_m < math.inf and 0 < length_m < math.inf):
+        raise TaccorlError(f"indenter: radius_m {radius_m} and length_m {length_m} must be above 0")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", rpy_rad).as_matrix(), position_m
+    solid = (
+        Capsule(radius_m=radius_m, half_height_m=0.0)
+        if shape == "sphere"
+        else Cylinder(radius_m=radius_m, half_height_m=length_m / 2)
+    )
+    return PressedObject(solids=[solid], arm=arm, pose=pose, frame=frame)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TouchMotion:
+    """Where the taxels were in the object, frame by frame, and what the pads sent. Made by ``touch_motion``."""
+
+    measurement: Measurement = field(repr=False)
+    """That it was made from."""
+    pads: tuple[str, ...]
+    """Those that came near, in the order of ``PADS``."""
+    time_s: np.ndarray
+    """(T, P) stamps on the measurement's clock: ends of scans."""
+    measured: np.ndarray
+    """(T, P, R, C) int16 counts above baseline."""
+    baseline: np.ndarray
+    """(P, R, C) counts at rest."""
+    object_from_pad: np.ndarray
+    """(T, P, I, 3, 4) at the instants at which the taxels of ``groups`` were read."""
+    velocity: np.ndarray
+    """(T, P, I, 3, 4) its time derivative."""
+    groups: np.ndarray
+    """(I, G) flat numbers of the taxels that are read at one instant."""
+    shapes: tuple[Shapes, ...]
+    clearance_m: np.ndarray
+    """(T, P, I) the object is at least so far out of the plane of the taxels; below 0 it may reach through."""
+
+    @property
+    def name(self) -> str:
+        return self.measurement.name
+
+    _known: dict[tuple, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
+
+    def depth(self, offsets_m: tuple[tuple[float, float, float], ...] = ()) -> tuple[np.ndarray, np.ndarray]:
+        """δ [m] and δ̇ [m/s], each (T, P, R, C) float32 and 0 where nothing touches.
+
+        Args:
+            offsets_m: per pad, in its own frame, by how much its taxels lie elsewhere than on a nominal finger.
+        """
+        if offsets_m not in self._known:
+            while len(self._known) >= _KEPT:
+                del self._known[next(iter(self._known))]
+            self._known[offsets_m] = self._depth(offsets_m)
+        return self._known[offsets_m]
+
+    def _depth(self, offsets_m: tuple[tuple[float, float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
+        offset = np.array(offsets_m or [(0.0, 0.0, 0.0)] * len(self.pads))
+        xyz = np.append(_TAXEL_XY.reshape(-1, 2), np.zeros((_TAXEL_XY.size // 2, 1)), axis=1)
+        # Taxels of a group lie in a line: what is common to them goes into the position, what differs into the grid.
+        first = xyz[self.groups[:, 0]]
+        along = xyz[self.groups[0]] - first[0]
+        grid = np.stack([along[:, 0], along[:, 1], np.ones(len(along))])
+        start = np.append(first + offset[:, None], np.ones((len(offset), len(first), 1)), axis=2)  # (P, I, 4)
+        position = self.object_from_pad[..., [0, 1, 3]].copy()
+        velocity = self.velocity[..., [0, 1, 3]].copy()
+        position[..., 2] = np.einsum("tpixk,pik->tpix", self.object_from_pad, start)
+        velocity[..., 2] = np.einsum("tpixk,pik->tpix", self.velocity, start)
+        num_frames, num_pads = position.shape[:2]
+        close = self.clearance_m < offset[:, None, 2]
+        flat = position[close], velocity[close]
+        felt_m, felt_mps = np.zeros((2, len(flat[0]), grid.shape[1]), np.float32)
+        for kind in self.shapes:
+            for number in range(len(kind.geoms)):
+                felt = kind.feel(np.full(len(felt_m), number), *flat, grid)
+                deeper = felt.depth_m > felt_m
+                np.copyto(felt_m, felt.depth_m, where=deeper)
+                np.copyto(felt_mps, felt.depth_rate_mps, where=deeper)
+        depth, rate = np.zeros((2, *close.shape, grid.shape[1]), np.float32)
+        depth[close], rate[close] = felt_m, felt_mps
+        taxels = np.zeros((2, num_frames, num_pads, math.prod(PAD_TAXELS)), np.float32)
+        taxels[..., self.groups] = np.stack([depth, rate])
+        taxels.flags.writeable = False
+        depth_m, rate_mps = taxels.reshape(2, num_frames, num_pads, *PAD_TAXELS)
+        return depth_m, rate_mps
+
+    def near(self, margin_m: float) -> np.ndarray:
+        """(T, P, R, C) bool: a taxel that lay ``margin_m`` further out would touch."""
+        return self.depth(((0.0, 0.0, margin_m),) * len(self.pads))[0] > 0
+
+    def undisturbed(self, margin_m: float = 3e-4, after_s: float = 1.0) -> np.ndarray:
+        """(T, P) bool: nothing is near the pad, and nothing touched it in the last ``after_s``."""
+        near = self.near(margin_m).any(axis=(2, 3))
+        last = np.where(near, self.time_s, -np.inf)
+        return self.time_s - np.maximum.accumulate(last, axis=0) > after_s
+
+
+def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
+    """The matched contact replay of a measurement: rows with the gripper's opening, and frames of the pads.
+
+    Args:
+        config: for the robot's mounts and the sensor's scan.
+
+    Raises:
+        TaccorlError: no frames of the pads, no opening or joints measured, or the object never came near a pad.
+    """
+    if measurement.touch is None:
+        raise TaccorlError(f"{measurement.name}: it holds no frames of the pads; record them, or leave this one out")
+    spec = load_sensor_spec(find_spec(config.sensor.spec if hasattr(config.sensor, "spec") else "flexitac_v2"))  # pyright: ignore[reportAttributeAccessIssue]
+    instants_s, groups = _scan_groups(spec)
+    slots = [PADS.index(f"{pressed.arm}_{finger}") for finger in FINGERS]
+    stamps = measurement.touch.time_s
+    covered = (stamps[:, slots] + instants_s[0] >= measurement.time_s[0]) & (stamps[:, slots] <= measurement.time_s[-1])
+    frames = covered.all(axis=1)
+    if frames.sum() < 10:
+        raise TaccorlError(
+            f"{measurement.name}: {frames.sum()} of {len(frames)} frames of the pads lie between its first and its last row; "
+            "check the clocks of pads and joints"
+        )
+    stamps = stamps[frames][:, slots]
+    moving = _Fingers(measurement, config.robot, pressed)
+    times = stamps[:, :, None] + instants_s
+    pose, later, earlier = (moving.object_from_pad(times + shift) for shift in (0.0, _STEP_S, -_STEP_S))
+    shapes, corners_m = shapes_in_object(pressed.solids)
+    whole = (-1, len(PADS), *PAD_TAXELS)
+    motion = TouchMotion(
+        measurement=measurement,
+        pads=tuple(PADS[s] for s in slots),
+        time_s=stamps,
+        measured=measurement.touch.counts.reshape(whole)[frames][:, slots],
+        baseline=measurement.touch.baseline.reshape(whole)[0, slots],
+        object_from_pad=pose,
+        velocity=(later - earlier) / (2 * _STEP_S),
+        groups=groups,
+        shapes=tuple(shapes),
+        clearance_m=((corners_m - pose[..., None, :, 3]) @ pose[..., :, 2, None])[..., 0].min(axis=-1),
+    )
+    comes_near = motion.near(_NEAR_M).any(axis=(0, 2, 3))
+    if not comes_near.any():
+        raise TaccorlError(
+            f"{measurement.name}: the object never comes within {_NEAR_M * 1e3:g} mm of the pads of the {pressed.arm} arm, whose "
+            f"opening is at least {np.nanmin(moving.opening_m) * 1e3:.2f} mm; check its size, its pose and the frame it is in"
+        )
+    return _only(motion, np.flatnonzero(comes_near))
+
+
+def _only(motion: TouchMotion, pads: np.ndarray) -> TouchMotion:
+    arrays = {
+        name: np.ascontiguousarray(getattr(motion, name)[:, pads])
+        for name in ("time_s", "measured", "object_from_pad", "velocity", "clearance_m")
+    }
+    return TouchMotion(
+        measurement=motion.measurement,
+        pads=tuple(motion.pads[p] for p in pads),
+        baseline=motion.baseline[pads],
+        groups=motion.groups,
+        shapes=motion.shapes,
+        **arrays,
+    )
+
+
+def _taxel_xy() -> np.ndarray:
+    """(R, C, 2) m in the pad's frame, as ``PadArray`` has them."""
+    rows, columns = PAD_TAXELS
+    x = (np.arange(columns) + 0.5) * TAXEL_PITCH_M - PAD_WIDTH_M / 2
+    y = (np.arange(rows) + 0.5) * TAXEL_PITCH_M - PAD_LENGTH_M / 2
+    return np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=2)
+
+
+_TAXEL_XY = _taxel_xy()
+
+
+def _scan_groups(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Instants (I,) before the stamp [s], and the taxels (I, G) that the board reads at each."""
+    number = np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
+    return scan_instants_s(spec), as_wire(number, spec).copy()
+
+
+class _Fingers:
+    """Poses of both pads of an arm in the object's frame, at any time of a measurement."""
+
+    def __init__(self, measurement: Measurement, robot: RobotConfig, pressed: PressedObject) -> None:
+        names = [f"{pressed.arm}_gripper"]
+        if pressed.frame == "world":
+            names += [f"{pressed.arm}_{joint}" for joint in JOINTS]
+        rows = measurement.measured[:, [measurement.column(name) for name in names]]
+        there = np.isfinite(rows).all(axis=1)
+        if there.mean() < 0.5:
+            raise TaccorlError(
+                f"{measurement.name}: {', '.join(names)} were measured in {there.mean():.0%} of its rows; depths need them"
+            )
+        window = max(SMOOTH_ORDER + 2, round(SMOOTH_S * measurement.rate_hz)) // 2 * 2 + 1
+        if there.sum() < window:
+            raise TaccorlError(f"{measurement.name}: {there.sum()} measured rows are too few; {window} are needed")
+        time_s = measurement.time_s
+        even = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in rows.T])
+        self._rows = CubicSpline(time_s, savgol_filter(even, window, SMOOTH_ORDER, axis=0))
+        self._pressed, self._robot = pressed, robot
+        self._arm_side = 0.5 if pressed.arm == "left" else -0.5
+        self.opening_m = even[:, 0]
+
+    def object_from_pad(self, time_s: np.ndarray) -> np.ndarray:
+        """(T, 2, I, 3, 4) at times (T, 2, I): finger a, then finger b."""
+        rows = self._rows(time_s)
+        tcp_from_pad = np.zeros((*time_s.shape, 3, 4))
+        for f, side in enumerate((1.0, -1.0)):
+            z, y = np.array([0.0, -side, 0.0]), np.array([0.0, 0.0, 1.0])
+            tcp_from_pad[:, f, :, :, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+            tcp_from_pad[:, f, :, 1, 3] = side * rows[:, f, :, 0] / 2
+        object_from_frame = np.linalg.inv(self._pressed.pose)
+        if self._pressed.frame == "tcp":
+            return _compose(object_from_frame, tcp_from_pad)
+        tcp = link_poses(rows[..., 1:])[..., 5, :, :]
+        tcp[..., :3, 3] += TCP_FROM_LINK6_M * tcp[..., :3, 2]
+        tcp[..., :3, 3] += [0.0, self._arm_side * self._robot.mount_spacing_m, self._robot.mount_height_m]
+        return _compose(object_from_frame @ tcp, tcp_from_pad)
+
+
+def _compose(a_from_b: np.ndarray, b_from_c: np.ndarray) -> np.ndarray:
+    """(..., 4, 4) and (..., 3, 4) → (..., 3, 4)."""
+    composed = a_from_b[..., :3, :3] @ b_from_c
+    composed[..., 3] += a_from_b[..., :3, 3]
+    return composed
