@@ -35,7 +35,12 @@ def standard_score(differences: np.ndarray) -> float:
 
 def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     """How far the Bayesian information criterion falls from ``parent`` to ``child``: 10 is strong evidence (Kass and
-    Raftery 1995). Rows count as often as they are independent."""
-    rows = parent.effective_rows
-    ratio = float(parent.residuals @ parent.residuals) / max(float(child.residuals @ child.residuals), 1e-300)
-    return float(rows * np.log(ratio) - more_parameters * np.log(rows))
+    Raftery 1995).
+
+    The noise is known: residuals are in floors, and what ``child`` leaves above one floor counts as noise, too. Rows count as
+    often as those of ``child`` are independent.
+    """
+    rows = child.effective_rows
+    noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))
+    fallen = float(parent.residuals @ parent.residuals - child.residuals @ child.residuals) / noise
+    return fallen * rows / len(child.residuals) - more_parameters * float(np.log(rows))

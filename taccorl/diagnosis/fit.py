@@ -13,7 +13,7 @@ from scipy.signal import fftconvolve
 from taccorl.diagnosis.problem import Free, Problem, Recording, Values, chosen
 from taccorl.sim.effects.effect import Effect
 
-FAR = 1e3
+FAR = 1e5
 """Residual in floors where a simulation ended in NaN, and the most that one row counts."""
 _STEP = 1e-3
 """Of finite differences, in coordinates of order 1."""
@@ -60,11 +60,7 @@ class Fit:
         """Parameter → 95 % interval in its unit, cut at its bounds."""
         spread = 1.96 * np.sqrt(np.diag(self.covariance()))
         middle = [f.coordinate(self.values[f.name]) for f in self.frees]
-        with np.errstate(over="ignore"):
-            return {
-                f.name: (f.value(min(m - s, 700.0)), f.value(min(m + s, 700.0)))
-                for f, m, s in zip(self.frees, middle, spread, strict=True)
-            }
+        return {f.name: (f.value(m - s), f.value(m + s)) for f, m, s in zip(self.frees, middle, spread, strict=True)}
 
 
 def rms(residuals: np.ndarray) -> float:
@@ -119,16 +115,19 @@ def fit(
     inside = 1e-6 * (high - low)
     first = np.clip(first, low + inside, high - inside)
     evaluations = 0
+    newest: tuple[bytes, np.ndarray] = b"", first
 
     def at(coordinates: np.ndarray) -> tuple[Values, list[Effect]]:
         values = {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}
         return values, problem.prepare(values, [c.make(values) for c in candidates], recordings)
 
     def left(coordinates: np.ndarray) -> np.ndarray:
-        nonlocal evaluations
-        evaluations += 1
-        values, effects = at(coordinates)
-        return stacked(problem, values, effects, recordings)
+        nonlocal evaluations, newest
+        if coordinates.tobytes() != newest[0]:
+            evaluations += 1
+            values, effects = at(coordinates)
+            newest = coordinates.tobytes(), stacked(problem, values, effects, recordings)
+        return newest[1]
 
     def slopes(coordinates: np.ndarray) -> np.ndarray:
         here = left(coordinates)

@@ -3,6 +3,7 @@
 Letters in shapes: T rows, C channels of a recording (position and effort of a joint; taxels of a pad).
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ import numpy as np
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect, Parameter
 
+_MOST = 700.0  # exp of it is the largest number there is
 Values = dict[str, float]
 """``kp`` or ``coulomb_friction.torque_nm`` → number in the unit of that parameter."""
 _SMALLEST = 1e-3
@@ -39,7 +41,7 @@ class Free:
         return math.log(value) if self.log else value / self.scale
 
     def value(self, coordinate: float) -> float:
-        raw = math.exp(coordinate) if self.log else coordinate * self.scale
+        raw = math.exp(min(coordinate, _MOST)) if self.log else coordinate * self.scale
         return min(max(raw, self.low), self.high)
 
 
@@ -124,11 +126,30 @@ class Problem(Protocol):
         """(T, C) what the twin would have measured, in the units of ``recording.measured``."""
         ...
 
+    def learn(self, values: Mapping[str, float]) -> None:
+        """The always fitted numbers have been fitted: where searches for effects start may hang on them."""
+        ...
+
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
         """``effects`` with what is estimated in closed form from the fit recordings (maps of taxels) filled in."""
         ...
+
+
+def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[list[Recording], list[Recording]]:
+    """Where no recording is held out: the first ``share`` of the rows of each for fitting, the others for judging.
+
+    Both are simulated from the beginning, where the robot was at rest.
+    """
+    early, late = [], []
+    for r in recordings:
+        cut = round(share * len(r.time_s))
+        first, last = r.measured.copy(), r.measured.copy()
+        first[cut:], last[:cut] = np.nan, np.nan
+        early.append(dataclasses.replace(r, measured=first))
+        late.append(dataclasses.replace(r, measured=last))
+    return early, late
 
 
 Progress = Callable[[str], None]

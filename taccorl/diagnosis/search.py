@@ -22,11 +22,13 @@ import numpy as np
 
 from taccorl.diagnosis.evidence import bic_gain, block_squares, standard_score
 from taccorl.diagnosis.fit import Fit, best_fit, rms, stacked
-from taccorl.diagnosis.problem import Problem, Progress, Recording, Values, chosen
+from taccorl.diagnosis.problem import Free, Problem, Progress, Recording, Values, chosen
 from taccorl.diagnosis.screen import Probe, probe
 from taccorl.sim.effects.effect import Effect
 
 Status = Literal["nothing_missing", "at_floor", "something_else", "too_many"]
+BESIDE = (0.9, 0.97, 1.03, 1.1)
+"""Factors to an effect's numbers from which it is fitted once more."""
 WORDS: dict[Status, str] = {
     "nothing_missing": "nothing is missing: the error is at the noise floor",
     "at_floor": "at the noise floor",
@@ -50,14 +52,34 @@ class SearchConfig:
     min_bic: float = 10.0
     """and lower the Bayesian information criterion by so much."""
     tie_share: float = 0.05
-    """Effects that take away as much but for this share are ties; so are,"""
+    """Effects that take away as much but for this share are ties,"""
+    tie_rise: float = 0.25
+    """if what they leave is greater by no more than this share (of squares: 12 % of the error); so are,"""
     wide_tie_share: float = 0.2
     """up to this share, those whose blocks do not differ by ``min_score``."""
+    simpler: float = 1.1
+    """Of ties the one with the fewest parameters is taken if what it leaves, squared, is at most so many times the least."""
     max_effects: int = 4
     num_refitted: int = 12
     """Effects that are refitted after the screening: the true one was among the first 12 in every case (research §4.4)."""
+    first_steps: int = 5
+    """Of the refits that find out which of them are worth more;"""
+    num_finished: int = 4
+    """so many are refitted to the end, from several starts, so are"""
+    num_likely: int = 3
+    """so many that the screening put first, and those whose error is within"""
+    near_best: float = 1.3
+    """times the best."""
     steps: int = 30
-    """Of a refit."""
+    """Of a refit to the end."""
+
+    def too_little(self, gain: float, score: float) -> str:
+        """Why an effect that takes away so much is not believed; empty if it is."""
+        if gain < self.min_gain:
+            return f"takes away {max(gain, 0.0):.0%} of what lies above the floor, less than {self.min_gain:.0%}"
+        if score < self.min_score and gain < self.sure_gain:
+            return f"no more than chance: {score:.1f} standard errors"
+        return ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +88,9 @@ class Evidence:
 
     name: str
     values: Values
+    """The effect's own."""
+    base: Values
+    """All other numbers, refitted with it."""
     explained: float
     """Share of the residual that its probe explained, before any refit."""
     fit_error: float
@@ -186,8 +211,10 @@ class _Search:
         self.present = present
         there = chosen(self.problem, present)
         given = {f.name: start.get(f.name, f.start) for f in (*self.problem.base, *(f for x in there for f in x.frees))}
+        self.given = given
         self.progress("fitting the numbers that are always fitted")
         first = model = self._fitted(present, [given], most=60)
+        self.problem.learn(first.values)
         names = [name for name in self.problem.candidates if name not in without]
         rounds: list[Round] = []
         while self.error(model) > c.stop_at and len(model.names) - len(present) < c.max_effects:
@@ -238,10 +265,23 @@ class _Search:
             best.setdefault(p.name, []).append(p)
         order = sorted(best, key=lambda name: -best[name][0].explained)
         before = block_squares(self.problem, parent, self.held_out)
+        self.progress("refitting with the likeliest")
+        starts = {
+            name: [parent.values | _scaled(p, self._frees(name)) for p in self._likely(best[name])] for name in order
+        }
+        short = {
+            name: self._fitted((*parent.names, name), starts[name][:1], c.first_steps)
+            for name in order[: c.num_refitted]
+        }
+        by_error = sorted(short, key=lambda name: short[name].error)
         rows = []
-        for name in order[: c.num_refitted]:
-            self.progress(f"refitting with {name}")
-            rows.append(_Row(self, parent, before, self._child(parent, best[name]), best[name][0]))
+        for place, name in enumerate(by_error):
+            model = short[name]
+            likely = place < c.num_finished or name in order[: c.num_likely]
+            if likely or model.error <= c.near_best * short[by_error[0]].error:
+                self.progress(f"refitting with {name}")
+                model = self._child(parent, name, [model.values, *starts[name][1:]])
+            rows.append(_Row(self, parent, before, model, best[name][0]))
         rows.sort(key=lambda row: row.squares.mean())
         if not rows:
             return self._told(parent, rows, order, None, []), None
@@ -250,35 +290,56 @@ class _Search:
             return self._told(parent, rows, order, None, []), None
         tied = [row for row in rows if row is rows[0] or self._tie(row, rows[0], before)]
         pick = min(tied, key=lambda row: (row.num_parameters, row.squares.mean()))
-        if pick.refused() or pick.squares.mean() - rows[0].squares.mean() > 0.02 * (
-            before.mean() - rows[0].squares.mean()
-        ):
+        if pick.refused() or not self._as_good(pick, rows[0]):
             pick = rows[0]
+        pick.model = self._polished(pick.model)
         return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
 
-    def _child(self, parent: Fit, probes: list[Probe]) -> Fit:
-        """``parent`` with one effect more, from its best starts; never worse than ``parent``, which it contains."""
-        name = probes[0].name
-        frees = self.problem.candidates[name].frees
-        likely = [p for p in probes[:2] if p.explained >= 0.5 * probes[0].explained]
-        starts = [parent.values | _scaled(p, frees) for p in likely]
+    def _likely(self, probes: list[Probe]) -> list[Probe]:
+        """The best start, and others that explain half as much."""
+        return [p for p in probes[:3] if p.explained >= 0.5 * probes[0].explained]
+
+    def _frees(self, name: str) -> tuple[Free, ...]:
+        return self.problem.candidates[name].frees
+
+    def _child(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
+        """``parent`` with one effect more; never worse than ``parent``, which it contains."""
+        frees = self._frees(name)
         model = self._fitted((*parent.names, name), starts, self.config.steps)
+        more = []
         if model.error > 1.001 * parent.error:  # stuck: from where the effect is hardly there
             faint = {f.name: f.start for f in frees} | {frees[0].name: frees[0].low if frees[0].log else 0.0}
-            model = min(
-                (model, self._fitted((*parent.names, name), [parent.values | faint], self.config.steps)),
-                key=lambda m: m.error,
-            )
+            more.append(parent.values | faint)
+        if (
+            model.error > self.config.stop_at
+        ):  # the numbers may have gone far to make up for the effect: from where they began
+            more.append(starts[0] | self.given)
+        if more:
+            model = min((model, self._fitted((*parent.names, name), more, self.config.steps)), key=lambda m: m.error)
         return model
+
+    def _polished(self, model: Fit) -> Fit:
+        """The same hypothesis from a little beside where it ended: what one effect's fit has left over, the next must not find.
+        Limits and dry friction have no smooth way to their best values."""
+        if self.error(model) <= self.config.stop_at:
+            return model
+        own = [f for f in self._frees(model.names[-1]) if f.log]
+        beside = [model.values | {f.name: model.values[f.name] * factor} for f in own for factor in BESIDE]
+        again = self._fitted(model.names, [model.values, *beside], self.config.steps)
+        return min((model, again), key=lambda m: m.error)
 
     def _tie(self, row: "_Row", best: "_Row", before: np.ndarray) -> bool:
         """Whether held-out recordings do not tell the two apart."""
         lost = float(row.squares.mean() - best.squares.mean())
         won = float(before.mean() - best.squares.mean())
         c = self.config
-        close = lost < c.tie_share * won
+        close = lost < c.tie_share * won and lost < c.tie_rise * float(best.squares.mean())
         unclear = lost < c.wide_tie_share * won and standard_score(row.squares - best.squares) < c.min_score
         return close or unclear
+
+    def _as_good(self, row: "_Row", best: "_Row") -> bool:
+        """Whether a simpler effect may stand for the best one."""
+        return float(row.squares.mean()) <= self.config.simpler * float(best.squares.mean())
 
     def _told(
         self, parent: Fit, rows: "list[_Row]", order: list[str], pick: "_Row | None", ties: "list[_Row]"
@@ -303,14 +364,13 @@ class _Search:
     # are they all needed, and are they the right ones? ---------------------------------------------------------------
 
     def _without_superfluous(self, model: Fit) -> Fit:
-        added = [name for name in model.names if name not in self.present]
-        for name in added[:-1]:
+        """Effects that would not be accepted if they were to be added now go again."""
+        for name in [n for n in model.names if n not in self.present][:-1]:
             rest = tuple(other for other in model.names if other != name)
             smaller = self._fitted(rest, [model.values], self.config.steps)
-            worse = block_squares(self.problem, smaller, self.held_out) - block_squares(
-                self.problem, model, self.held_out
-            )
-            if standard_score(worse) < self.config.min_score or worse.mean() < 0.02 * (1.0 + self.error(model) ** 2):
+            before = block_squares(self.problem, smaller, self.held_out)
+            better = before - block_squares(self.problem, model, self.held_out)
+            if self.config.too_little(gain_of(better, before), standard_score(better)):
                 self.removed.append(name)
                 model = smaller
         return model
@@ -382,6 +442,11 @@ class _Search:
         return list(model.effects)
 
 
+def gain_of(better: np.ndarray, before: np.ndarray) -> float:
+    """Share of the held-out squared error above the floor that goes away: (B,) how much better, (B,) before."""
+    return float(better.mean()) / max(float(before.mean()) - 1.0, 1e-12)
+
+
 class _Row:
     """One refitted effect beside its parent, on the held-out recordings."""
 
@@ -390,7 +455,7 @@ class _Row:
         self.squares = block_squares(search.problem, model, search.held_out)
         self.held_out_error = search.error(model)
         better = before - self.squares
-        self.gain = float(better.mean()) / max(float(before.mean()) - 1.0, 1e-12)
+        self.gain = gain_of(better, before)
         self.score = standard_score(better)
         self.num_parameters = search.problem.candidates[self.name].num_parameters
         self.bic = bic_gain(parent, model, self.num_parameters)
@@ -398,10 +463,9 @@ class _Row:
     def refused(self) -> str:
         """Why it is not believed; empty if it is."""
         c = self._config
-        if self.gain < c.min_gain:
-            return f"takes away {max(self.gain, 0.0):.0%} of what lies above the floor, less than {c.min_gain:.0%}"
-        if self.score < c.min_score and self.gain < c.sure_gain:
-            return f"no more than chance: {self.score:.1f} standard errors"
+        little = c.too_little(self.gain, self.score)
+        if little:
+            return little
         if self.bic < c.min_bic:
             return f"does not pay for its parameters: ΔBIC {self.bic:.0f}"
         return ""
@@ -411,6 +475,7 @@ class _Row:
         return Evidence(
             name=self.name,
             values={k: v for k, v in self.model.values.items() if k.startswith(own)},
+            base={k: v for k, v in self.model.values.items() if not k.startswith(own)},
             explained=self.seen.explained,
             fit_error=self.model.error,
             held_out_error=self.held_out_error,
@@ -423,9 +488,9 @@ class _Row:
         )
 
 
-def _scaled(seen: Probe, frees: Sequence) -> Values:
+def _scaled(seen: Probe, frees: Sequence[Free]) -> Values:
     """The probe's start with its strength multiplied as the score test suggests."""
     values = {f.name: f.start for f in frees} | seen.start
     if frees and frees[0].log and seen.multiple > 0:
-        values[frees[0].name] *= min(max(seen.multiple, 0.2), 5.0)
+        values[frees[0].name] *= min(max(seen.multiple, 0.1), 10.0)
     return values

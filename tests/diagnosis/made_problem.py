@@ -113,6 +113,9 @@ class MadeProblem:
             total = total + vars(effect)["strength"] * effect.signal(t, seed)
         return total[:, None]
 
+    def learn(self, values: Mapping[str, float]) -> None:
+        pass
+
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:

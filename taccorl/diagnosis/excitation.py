@@ -1,0 +1,224 @@
+"""Which motion to record next: the one on which two rival explanations stay furthest apart, however the other is refitted.
+
+T-optimal design (Atkinson and Fedorov 1975): for rivals A and B and a motion, A predicts what would be measured; B with all its
+numbers is fitted to that; what it cannot follow, in noise floors, is the discrimination, in the worse of both directions. Below
+about one floor the recording would not tell them apart. Recordings that are there already are part of both fits.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.alignment import arm_bench
+from taccorl.alignment.joint_model import JointModel, joint_motion
+from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.measurements import Measurements
+from taccorl.diagnosis.fit import fit, rms, stacked
+from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
+from taccorl.diagnosis.joints import moves
+from taccorl.diagnosis.motions import LIBRARY, OPENING_M, POSES, RATE_HZ, TORQUE_NM, Motion, Room, joint_number
+from taccorl.diagnosis.problem import Recording, Values, chosen
+from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.sim.twin import TwinConfig
+
+TELLS = 1.25
+"""Discrimination in floors from which a recording tells two rivals apart: √(1 + 1.25²) = 1.6 times the floor."""
+SAME = 0.25
+"""Below this many floors on every motion two effects are one."""
+STEPS = 12
+"""Of a refit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """A motion that could be recorded."""
+
+    motion: Motion
+    target: np.ndarray
+    """(T,) rad at 200 Hz."""
+    peak_torque_nm: float
+    """That the motor would need, as the twin says."""
+    discrimination: dict[str, float]
+    """"a | b" → floors that stay between the two after a refit."""
+
+    @property
+    def worst(self) -> float:
+        """Over all pairs of rivals."""
+        return min(self.discrimination.values(), default=0.0)
+
+    @property
+    def mean(self) -> float:
+        return float(np.mean(list(self.discrimination.values()))) if self.discrimination else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Motions that could be recorded of one joint, best first."""
+
+    signal: str
+    rivals: tuple[str, ...]
+    floor_rad: float
+    planned: tuple[Planned, ...]
+    refused: dict[str, str]
+    """Motion → why it must not be recorded."""
+
+    @property
+    def hopeless(self) -> tuple[str, ...]:
+        """Pairs that no motion here tells apart for sure."""
+        pairs = self.planned[0].discrimination if self.planned else {}
+        return tuple(pair for pair in pairs if max(p.discrimination[pair] for p in self.planned) < TELLS)
+
+
+def plan(
+    config: TwinConfig,
+    signal: str,
+    rivals: Sequence[str],
+    *,
+    pose: np.ndarray,
+    floor_rad: float,
+    measurements: Measurements | None = None,
+    fitted: Mapping[str, Values] | None = None,
+    gains: GainsAre = "auto",
+    done: Callable[[str], None] = lambda _: None,
+) -> Plan:
+    """Score every motion of the library.
+
+    Args:
+        rivals: two effects or more.
+        pose: (7,) rad, m: where the arm stands, the joint in the middle of its motions.
+        floor_rad: noise floor of the angle.
+        measurements: recordings that are there already.
+        fitted: effect → all numbers of the twin with it, where it has been fitted; else it is typical of its kind.
+
+    Raises:
+        TaccorlError: less than two rivals, or the joint has no room to move.
+    """
+    if len(set(rivals)) < 2:
+        raise TaccorlError(
+            f"excite: give two effects or more that are to be told apart, not {', '.join(rivals) or 'none'}"
+        )
+    room = room_of(config, signal, pose)
+    planned, refused = [], {}
+    for motion in LIBRARY:
+        target = motion.target(room)
+        peak = _peak_torque(config, signal, pose, motion, target)
+        limit = TORQUE_NM[joint_number(signal) - 1]
+        column = ACTION_NAMES.index(signal)
+        if target.min() < ACTION_LOW[column] or target.max() > ACTION_HIGH[column]:
+            refused[motion.name] = f"goes to {target.min():.2f} … {target.max():.2f} rad, beyond the joint's limits"
+        elif peak > limit:
+            refused[motion.name] = f"needs {peak:.1f} N·m of {limit:g}"
+        else:
+            apart = _apart(config, signal, rivals, pose, motion, target, floor_rad, measurements, fitted or {}, gains)
+            planned.append(Planned(motion=motion, target=target, peak_torque_nm=peak, discrimination=apart))
+        done(motion.name)
+    planned.sort(key=lambda p: (-p.worst, -p.mean))
+    return Plan(signal=signal, rivals=tuple(rivals), floor_rad=floor_rad, planned=tuple(planned), refused=refused)
+
+
+def room_of(config: TwinConfig, signal: str, pose: np.ndarray) -> Room:
+    """How far the joint may go about ``pose`` (7,)."""
+    number = joint_number(signal)
+    body = arm_bench.rigid(config, signal, pose, 0.0, [])
+    middle = float(pose[number - 1])
+    weight = body.gravity_sin * math.sin(middle) + body.gravity_cos * math.cos(middle)
+    return Room.of(number, middle, body.inertia, weight)
+
+
+def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
+    """(7,) where the arm stands while this joint is swept: as in the recordings that sweep it, else as ``motions.POSES``."""
+    arm, number = signal.split("_", 1)[0], joint_number(signal)
+    swept = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
+    if not swept:
+        return np.array([*POSES[number - 1], OPENING_M])
+    first = ACTION_NAMES.index(f"{arm}_joint1")
+    return swept[0].target[0, first : first + 7].copy()
+
+
+def imagined(
+    config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray, floor_rad: float
+) -> Measurement:
+    """What the twin itself would measure on a motion, with noise: a stand-in for a recording that is not made yet."""
+    j = ACTION_NAMES.index(signal)
+    arm = signal.split("_", 1)[0]
+    first = ACTION_NAMES.index(f"{arm}_joint1")
+    targets = np.zeros((len(target), len(ACTION_NAMES)))
+    targets[:, first : first + 7] = pose
+    targets[:, j] = target
+    k = joint_number(signal) - 1
+    control = config.controller_of(arm)
+    m = Measurement(
+        name=motion.name,
+        time_s=np.arange(len(target)) / RATE_HZ,
+        target=targets,
+        measured=targets.copy(),
+        kp={signal: control.kp_nm_per_rad[k] * motion.gain},
+        kd={signal: control.kd_nms_per_rad[k] * motion.gain},
+        payload_kg={arm: motion.payload_kg} if motion.payload_kg else {},
+        origin="imagined: the twin's own answer",
+    )
+    model = JointModel(config, signal)
+    answer = model.simulate(joint_motion(m, config, signal), model.gains)
+    noise = floor_rad * np.random.default_rng(0).standard_normal(len(target))
+    m.measured[:, j] = answer.reported + noise
+    return m
+
+
+def _peak_torque(config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray) -> float:
+    m = imagined(config, signal, pose, motion, target, 0.0)
+    model = JointModel(config, signal)
+    return float(np.abs(model.simulate(joint_motion(m, config, signal), model.gains).effort).max())
+
+
+def _apart(
+    config: TwinConfig,
+    signal: str,
+    rivals: Sequence[str],
+    pose: np.ndarray,
+    motion: Motion,
+    target: np.ndarray,
+    floor_rad: float,
+    measurements: Measurements | None,
+    fitted: Mapping[str, Values],
+    gains: GainsAre,
+) -> dict[str, float]:
+    """Pair → floors between the two on this motion."""
+    new = imagined(config, signal, pose, motion, target, floor_rad)
+    known = measurements.fit if measurements is not None else ()
+    problem = JointProblem(config, signal, Measurements((*known, new)), gains=gains, effort=False)
+    numbers = {
+        c.name: problem.start
+        | {f.name: f.start for f in c.frees}
+        | c.starts[len(c.starts) // 2]
+        | fitted.get(c.name, {})
+        for c in chosen(problem, rivals)
+    }
+    answers = {}
+    for c in chosen(problem, rivals):
+        effects = [*_present(problem), c.make(numbers[c.name])]
+        answers[c.name] = [_said(problem, r, numbers[c.name], effects, floor_rad) for r in problem.fit]
+    apart = {}
+    for a, b in itertools.combinations(rivals, 2):
+        ways = []
+        for truth, other in ((a, b), (b, a)):
+            model = fit(problem, answers[truth], (*problem.present, other), numbers[other], STEPS)
+            ways.append(rms(stacked(problem, model.values, model.effects, answers[truth][-1:])))
+        apart[f"{a} | {b}"] = min(ways)
+    return apart
+
+
+def _present(problem: JointProblem) -> list:
+    return [problem.candidates[name].make(problem.start) for name in problem.present]
+
+
+def _said(
+    problem: JointProblem, recording: Recording, values: Values, effects: Sequence, floor_rad: float
+) -> Recording:
+    """The recording as these numbers explain it, without noise."""
+    measured = problem.simulate(values, effects, recording)
+    return dataclasses.replace(recording, measured=measured, floor=np.array([floor_rad]))

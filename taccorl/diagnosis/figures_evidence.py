@@ -1,0 +1,134 @@
+"""Figures of a diagnosis: the error falling effect by effect, who was taken for whom, and how small an effect is still found."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FormatStrFormatter
+from scipy.stats import binomtest
+
+from taccorl.diagnosis.figure_style import AFTER, BEFORE, FLOOR, legend, new_figure, tidy
+
+
+@dataclass(frozen=True)
+class Step:
+    """The twin after one more effect."""
+
+    label: str
+    error: float
+    """Held-out RMSE in noise floors."""
+    interval: tuple[float, float] | None = None
+    """95 %."""
+
+
+def waterfall(steps: Sequence[Step], origins: Sequence[str], title: str, goal: float = 1.25) -> Figure:
+    """Held-out error after each added effect, down to the noise floor.
+
+    Args:
+        steps: the twin as it was first, then one for each effect.
+        goal: floors at which a search stops.
+    """
+    figure = new_figure(max(6.0, 2.2 + 1.15 * len(steps)), 4.4, title, origins)
+    axes = figure.subplots()
+    axes.axhspan(0, 1.0, color=FLOOR, alpha=0.5, lw=0, label="noise floor (1.0)")
+    axes.axhline(goal, color="#64748b", lw=1.0, ls="--", label=f"at the floor: ≤ {goal:g}")
+    for k, step in enumerate(steps):
+        last = k == len(steps) - 1
+        before = steps[k - 1].error if k else 0.0
+        if k == 0:
+            axes.bar(k, step.error, color=BEFORE, width=0.62)
+        else:
+            low, high = sorted((before, step.error))
+            axes.bar(k, high - low, bottom=low, color="#0f766e" if step.error < before else "#b91c1c", width=0.62)
+            axes.plot([k - 1.31 + 1.0 - 0.38, k + 0.31], [before, before], color="#9ca3af", lw=0.8)
+        if last and k:
+            axes.plot([k - 0.31, k + 0.31], [step.error] * 2, color=AFTER, lw=3)
+        if step.interval is not None:
+            axes.plot([k, k], list(step.interval), color="#111111", lw=1.2)
+        change = f"\n{step.error / before - 1:+.0%}" if k and before > 0 else ""
+        top = max(before, step.error, step.interval[1] if step.interval else 0.0)
+        axes.annotate(
+            f"{step.error:.3g}{change}", (k, top), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=8
+        )
+    labels = [s.label if k == 0 else f"+ {s.label}" for k, s in enumerate(steps)]
+    axes.set_xticks(range(len(steps)), labels, rotation=20, ha="right", fontsize=8)
+    axes.set_ylabel("held-out RMSE / noise floor", fontsize=8)
+    axes.set_ylim(0, 1.22 * max(max(s.error, *(s.interval or (0.0,))) for s in steps))
+    tidy(axes)
+    axes.grid(axis="x", visible=False)
+    legend(axes)
+    return figure
+
+
+def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[str], title: str) -> Figure:
+    """Hidden effect × what was named. Rows add up to the number of seeds.
+
+    Args:
+        counts: hidden → named → number of seeds; names that are not hidden ones ("nothing", "something else") come last.
+    """
+    hidden = list(counts)
+    named = [*hidden, *dict.fromkeys(n for row in counts.values() for n in row if n not in counts)]
+    named = [n for n in named if n in hidden or any(row.get(n) for row in counts.values())]
+    table = np.array([[counts[h].get(n, 0) for n in named] for h in hidden], dtype=float)
+    share = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
+    figure = new_figure(3.4 + 0.42 * len(named), 3.0 + 0.32 * len(hidden), title, origins)
+    axes = figure.subplots()
+    image = axes.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    for i, j in zip(*np.nonzero(table), strict=True):
+        color = "white" if share[i, j] > 0.6 else "#111111"
+        axes.text(j, i, f"{table[i, j]:.0f}", ha="center", va="center", fontsize=7.5, color=color)
+        if hidden[i] == named[j]:
+            axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, ec="#0f766e", lw=1.4))
+    axes.set_xticks(range(len(named)), named, rotation=60, ha="right", fontsize=7.5)
+    seeds = table.sum(axis=1)
+    axes.set_yticks(
+        range(len(hidden)), [f"{h} (n = {n:.0f})" for h, n in zip(hidden, seeds, strict=True)], fontsize=7.5
+    )
+    axes.set_xlabel("named", fontsize=8)
+    axes.set_ylabel("hidden", fontsize=8)
+    bar = figure.colorbar(image, ax=axes, pad=0.02)
+    bar.set_label("share of seeds", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    return figure
+
+
+@dataclass(frozen=True)
+class Detection:
+    """How often one effect was found at one strength."""
+
+    signal_to_noise: float
+    """RMS that the effect leaves after all else was refitted / noise floor."""
+    found: int
+    n: int
+
+
+def detection_curve(points: Mapping[str, Sequence[Detection]], origins: Sequence[str], title: str) -> Figure:
+    """Share of seeds in which the effect was found over signal-to-noise, with 95 % Wilson intervals; one line an effect."""
+    figure = new_figure(8.0, 4.8, title, origins)
+    axes = figure.subplots()
+    colors = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b7280", "#111111")
+    styles = ("-", "--", ":")
+    for k, (name, own) in enumerate(points.items()):
+        own = sorted(own, key=lambda d: d.signal_to_noise)
+        x = [d.signal_to_noise for d in own]
+        share = [d.found / d.n for d in own]
+        ends = [binomtest(d.found, d.n).proportion_ci(method="wilson") for d in own]
+        color, style = colors[k % len(colors)], styles[k // len(colors) % len(styles)]
+        axes.plot(
+            x, share, color=color, ls=style, marker="o", ms=3.5, lw=1.3, label=f"{name} (n = {sum(d.n for d in own)})"
+        )
+        if len(points) <= 4:
+            axes.fill_between(x, [e.low for e in ends], [e.high for e in ends], color=color, alpha=0.15, lw=0)
+    axes.axvline(1.0, color=FLOOR, lw=2.5, label="noise floor")
+    axes.axhline(0.5, color="#64748b", lw=0.9, ls="--")
+    axes.set_xscale("log")
+    for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        which(FormatStrFormatter("%g"))
+    axes.set_ylim(-0.02, 1.05)
+    axes.set_xlabel("signal of the effect / noise floor", fontsize=8)
+    axes.set_ylabel("share of seeds in which it is found", fontsize=8)
+    tidy(axes)
+    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure

@@ -1,0 +1,104 @@
+"""Figures of touch: histogram of readings and maps side by side, as the paper has them (App. B.2)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from taccorl.diagnosis.comparison import FELT_FLOORS, TouchTrace
+from taccorl.diagnosis.figure_style import AFTER, BEFORE, FLOOR, MEASURED, legend, new_figure, tidy
+from taccorl.diagnosis.figures import TWINS, ratio_map
+from taccorl.diagnosis.localise import Cell
+from taccorl.diagnosis.localise_touch import PHASES
+
+BINS = 48
+
+
+def touch_histogram(
+    before: Sequence[TouchTrace], after: Sequence[TouchTrace] = (), names: tuple[str, str] = TWINS
+) -> Figure:
+    """How often each reading comes, of taxels that read more than four noise floors."""
+    figure = new_figure(8.0, 4.0, f"readings of active taxels, {len(before)} recordings", _origins(before))
+    axes = figure.subplots()
+    least = FELT_FLOORS * float(np.median(before[0].floor))
+    series = [(np.concatenate([t.measured.ravel() for t in before]), MEASURED, "measured")]
+    series += [(np.concatenate([t.replayed.ravel() for t in before]), BEFORE, names[0])]
+    series += [(np.concatenate([t.replayed.ravel() for t in after]), AFTER, names[1])] if after else []
+    top = max(float(values.max()) for values, _, _ in series)
+    edges = np.linspace(least, max(top, least + 1), BINS).tolist()
+    axes.axvspan(0, least, color=FLOOR, alpha=0.45, lw=0, label=f"{FELT_FLOORS:g} × noise floor ({least:.2g} counts)")
+    for values, color, name in series:
+        active = values[values > least]
+        label = f"{name}: n = {len(active)}, mean {active.mean() if len(active) else 0:.3g}"
+        axes.hist(active, edges, histtype="step", color=color, lw=1.4, label=label)
+    axes.set_yscale("log")
+    axes.set_xlim(0, edges[-1])
+    axes.set_xlabel("counts above baseline", fontsize=8)
+    axes.set_ylabel("taxel readings", fontsize=8)
+    tidy(axes)
+    legend(axes, 2)
+    return figure
+
+
+def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
+    """The pads at the frame of the strongest touch: measured, twin, and RMS residual of every taxel over time."""
+    frame = int(np.argmax(before.measured.sum(axis=(1, 2, 3))))
+    rows = [("measured", before.measured[frame]), (names[0], before.replayed[frame])]
+    left = [(f"RMS residual, {names[0]}", before)]
+    if after is not None:
+        rows.append((names[1], after.replayed[frame]))
+        left.append((f"RMS residual, {names[1]}", after))
+    maps = rows + [(name, np.sqrt(np.mean(t.residual**2, axis=0))) for name, t in left]
+    tops = [max(float(v.max()) for _, v in part) for part in (maps[: len(rows)], maps[len(rows) :])]
+    where = f"{before.recording} ({before.use.replace('_', '-')}), strongest touch at {before.time_s[frame, 0]:.2f} s"
+    size_in = (1.7 * len(maps) + 0.8, 1.2 + 2.6 * len(before.pads))
+    figure = new_figure(*size_in, f"counts above baseline: {where}", [before.origin])
+    axes = figure.subplots(len(before.pads), len(maps), squeeze=False)
+    for j, (name, values) in enumerate(maps):
+        residual = j >= len(rows)
+        top = max(tops[residual], 1.0)
+        for p, pad in enumerate(before.pads):
+            axis = axes[p, j]
+            cmap = "magma" if residual else "turbo"
+            image = axis.imshow(values[p], cmap=cmap, vmin=0, vmax=top, aspect="equal")
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if p == 0:
+                axis.set_title(name, fontsize=7.5)
+            if j == 0:
+                axis.set_ylabel(pad, fontsize=8)
+        if j in (len(rows) - 1, len(maps) - 1):
+            bar = figure.colorbar(image, ax=axes[:, j].tolist(), shrink=0.5, pad=0.02)
+            bar.ax.tick_params(labelsize=7)
+            noise = f"noise floor {np.median(before.floor):.2g}"
+            bar.set_label("counts" if not residual else f"counts, RMS ({noise})", fontsize=7.5)
+    return figure
+
+
+def touch_over_time(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
+    """Sum over each pad: loading, hold, unloading, and what remains after release."""
+    title = f"sum of each pad: {before.recording} ({before.use.replace('_', '-')})"
+    figure = new_figure(10.0, 1.4 + 1.7 * len(before.pads), title, [before.origin])
+    axes = figure.subplots(len(before.pads), 1, sharex=True, squeeze=False)[:, 0]
+    for p, pad in enumerate(before.pads):
+        sums = [(before.measured, MEASURED, "measured"), (before.replayed, BEFORE, names[0])]
+        sums += [(after.replayed, AFTER, names[1])] if after is not None else []
+        floor = 2 * float(np.sqrt((before.floor[p] ** 2).sum()))
+        axes[p].axhspan(-floor, floor, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor ± {floor:.3g}")
+        for values, color, name in sums:
+            axes[p].plot(before.time_s[:, p], values[:, p].sum(axis=(1, 2)), color=color, lw=1.1, label=name)
+        axes[p].set_ylabel(f"{pad}\n[counts]", fontsize=8)
+        tidy(axes[p])
+    legend(axes[0])
+    axes[-1].set_xlabel("time [s]", fontsize=8)
+    return figure
+
+
+def touch_heat_map_figure(cells: Sequence[Cell], origins: Sequence[str]) -> Figure:
+    """Pad × phase: RMSE over the noise floor. An empty cell: too few frames."""
+    title = "pads: where the twin is off"
+    return ratio_map(cells, [name for name in PHASES if any(c.regime == name for c in cells)], origins, title)
+
+
+def _origins(traces: Sequence[TouchTrace]) -> list[str]:
+    return list(dict.fromkeys(t.origin for t in traces))

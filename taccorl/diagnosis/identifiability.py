@@ -1,0 +1,72 @@
+"""Before any fit: which effects these recordings would show at all, and which they cannot tell apart.
+
+Every effect is probed at a typical strength on the twin as it is. What the always fitted numbers can take up is no trace of it.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.diagnosis.fit import Fit, fit
+from taccorl.diagnosis.problem import Problem, Recording, Values
+from taccorl.diagnosis.screen import alike, probe
+
+VISIBLE = 0.75
+"""RMS of a signature in floors: √(1 + 0.75²) = 1.25, the error above which the search looks for an effect."""
+ALIKE = 0.98
+"""|cos| of two signatures above which recordings do not tell two effects apart (research/discrepancy.md §4.5)."""
+RIDGE = 0.999
+"""|correlation| of two fitted numbers above which only a combination of them is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identifiability:
+    """What a set of recordings can tell, whatever they will turn out to say."""
+
+    visible: dict[str, float]
+    """Effect → RMS of what it would leave at a typical strength, in floors."""
+    pairs: tuple[tuple[str, str, float], ...]
+    """(one, other, |cos|) of visible effects that these recordings do not tell apart, most alike first."""
+    ridges: tuple[tuple[str, str, float], ...]
+    """(one, other, correlation) of always fitted numbers of which only a combination is known."""
+
+    @property
+    def invisible(self) -> tuple[str, ...]:
+        return tuple(name for name, size in self.visible.items() if size < VISIBLE)
+
+
+def identifiability(
+    problem: Problem, recordings: Sequence[Recording], start: Values, present: Sequence[str] = ()
+) -> Identifiability:
+    """Look at the twin with the numbers ``start`` and the effects ``present``; nothing is fitted."""
+    here = fit(problem, recordings, present, start, most=1)
+    typical = [
+        dataclasses.replace(c, starts=(c.starts[len(c.starts) // 2],))
+        for name, c in problem.candidates.items()
+        if name not in present
+    ]
+    probes = probe(problem, recordings, here, typical)
+    shown = [p for p in probes if p.visible >= VISIBLE]
+    pairs = [(a.name, b.name, alike(a, b)) for k, a in enumerate(shown) for b in shown[k + 1 :]]
+    return Identifiability(
+        visible={p.name: p.visible for p in probes},
+        pairs=tuple(sorted((p for p in pairs if p[2] > ALIKE), key=lambda p: -p[2])),
+        ridges=tuple(_ridges(here)),
+    )
+
+
+def _ridges(model: Fit) -> list[tuple[str, str, float]]:
+    spread = model.covariance()
+    size = np.sqrt(np.diag(spread))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = spread / np.outer(size, size)
+    names = [f.name for f in model.frees]
+    pairs = [
+        (names[i], names[j], float(correlation[i, j]))
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(correlation[i, j]) > RIDGE
+    ]
+    return sorted(pairs, key=lambda p: -abs(p[2]))

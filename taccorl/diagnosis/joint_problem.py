@@ -1,0 +1,178 @@
+"""One joint as a problem for the search: its controller's numbers, the effects it may have, its recordings.
+
+Channels are the angle, and the motor's effort where every recording has it. Commanded gains that the recordings state stay fixed:
+free ones hide missing physics (on a real leg they gave K_p 116 for a commanded 20; research/discrepancy.md §0).
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from taccorl.alignment.joint_model import Gains, JointModel, JointMotion, joint_motion
+from taccorl.alignment.measurement import Measurement, unit_of
+from taccorl.alignment.measurements import Measurements, motions
+from taccorl.alignment.noise_floor import SignalFloor, noise_floor
+from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects as registry
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
+from taccorl.sim.twin import TwinConfig
+
+GainsAre = Literal["auto", "commanded", "fitted"]
+"""``auto``: commanded where every recording states K_p and K_d."""
+# Paper App. B.1.
+KP = Free(name="kp", unit="N·m/rad", start=500.0, low=10.0, high=1e5, log=True)
+KD = Free(name="kd", unit="N·m·s/rad", start=50.0, low=1.0, high=1e3, log=True)
+TORQUE_FF = Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0)
+"""The paper's bounds are ± 8 N·m; at such a bound an effect has to make up for the rest (a stiff joint off by 10 mrad has 18)."""
+WIDER = 100.0
+"""Softly driven joints have gains far below the paper's bounds, which are for whole position drives: both bounds are wider by
+this factor, downwards."""
+_GAIN_LIKE = ("torque_scale",)
+"""No candidates where gains are fitted: those take it up, and what it does to the carried weight is ``gravity_mismatch``."""
+EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
+"""Reported effort over torque: PiPER firmware differs in it."""
+
+
+class JointProblem:
+    """A joint of the twin ``config`` and recordings of it.
+
+    Args:
+        signal: ``left_joint5``.
+        gains: whether commanded gains are believed.
+        effort: whether the motor's effort is a second channel where every recording has it.
+
+    Raises:
+        TaccorlError: no such joint, gains that are to be believed and are not stated, recordings that cannot be used.
+    """
+
+    def __init__(
+        self,
+        config: TwinConfig,
+        signal: str,
+        measurements: Measurements,
+        *,
+        gains: GainsAre = "auto",
+        effort: bool = True,
+    ) -> None:
+        everything = measurements.all
+        stated = all(signal in m.kp and signal in m.kd for m in everything)
+        if gains == "commanded" and not stated:
+            silent = next(m.name for m in everything if signal not in m.kp or signal not in m.kd)
+            raise TaccorlError(
+                f"{silent}: the commanded gains of {signal} are not stated; write kp and kd into its measurements.yaml, "
+                "or fit them (gains=fitted)"
+            )
+        self.signal, self.commanded = signal, gains != "fitted" and stated
+        own = [e for e in config.effects if isinstance(e, ArmEffect) and _acts_on(e, signal)]
+        self.present = tuple(effect.name for effect in own)
+        others = [e for e in config.effects if not any(e is mine for mine in own)]
+        self.model = JointModel(dataclasses.replace(config, effects=others), signal)
+        self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
+        self.floors = floors_of(everything, signal, effort=self.effort)
+        """Pooled over all recordings; one whose motion was repeated is judged by its own."""
+        root = motions(everything)
+        repeated = [r for r in root.values() if sum(other == r for other in root.values()) > 1]
+        groups = {r: [m for m in everything if root[m.name] == r] for r in repeated}
+        self._own_floors = {r: floors_of(group, signal, effort=self.effort) for r, group in groups.items()}
+        self._motion = root
+        self.base = self._base()
+        self.fit, self.held_out, self.test = (
+            [self._recording(m, config) for m in side]
+            for side in (measurements.fit, measurements.held_out, measurements.test)
+        )
+        self.candidates: dict[str, Candidate] = {}
+        self.learn(self.model.gains._asdict())
+        self.start: Values = self.model.gains._asdict() | {
+            f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
+        }
+
+    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+        """(T, C) angle [rad], and effort [N·m] as the driver would report it."""
+        answer = self.model.simulate(recording.data, self._gains(base), effects)
+        if not self.effort:
+            return answer.reported[:, None]
+        return np.column_stack([answer.reported, base.get("effort_scale", 1.0) * answer.effort])
+
+    def learn(self, values: Mapping[str, float]) -> None:
+        """Starts of searches hang on the torques that the motor would give with these gains."""
+        seen = self._seen(values)
+        for name in registry:
+            where = selectors(registry.get(name), self.signal)
+            if where is not None and (self.commanded or name not in _GAIN_LIKE):
+                self.candidates[name] = candidate(registry.get(name), seen, **where)
+
+    def prepare(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    ) -> list[Effect]:
+        """Joints have no maps."""
+        return list(effects)
+
+    def _gains(self, values: Mapping[str, float]) -> Gains:
+        return self.model.gains._replace(**{name: values[name] for name in Gains._fields if name in values})
+
+    def _base(self) -> tuple[Free, ...]:
+        kp, kd, torque_ff = self.model.gains
+        offset = dataclasses.replace(TORQUE_FF, start=torque_ff)
+        if self.commanded:
+            return (offset, EFFORT_SCALE) if self.effort else (offset,)
+        return (
+            dataclasses.replace(KP, start=kp, low=KP.low / WIDER),
+            dataclasses.replace(KD, start=kd, low=KD.low / WIDER),
+            offset,
+        )
+
+    def _recording(self, m: Measurement, config: TwinConfig) -> Recording:
+        motion = joint_motion(m, config, self.signal)
+        columns = [motion.measured, motion.effort] if self.effort else [motion.measured]
+        names = [f"{self.signal} [{unit_of(self.signal)}]", f"{self.signal} effort [N·m]"]
+        return Recording(
+            name=m.name,
+            time_s=motion.time_s,
+            measured=np.column_stack(columns),
+            floor=np.array([f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]),
+            channels=tuple(names[: len(columns)]),
+            data=motion,
+        )
+
+    def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""
+        motions: list[JointMotion] = [r.data for r in self.fit]
+        efforts = [self.model.simulate(m, self._gains(values)).effort for m in motions]
+        speeds = np.concatenate([np.abs(np.gradient(m.target, 1.0 / m.rate_hz)) for m in motions])
+        angles = np.concatenate([m.target for m in motions])
+        return {
+            "peak_torque_nm": max(float(np.abs(e).max()) for e in efforts),
+            "peak_speed_rad_per_s": float(speeds.max()),
+            "span_rad": float(np.ptp(angles)),
+            "duration_s": max(float(m.time_s[-1]) for m in motions),
+        }
+
+
+def _acts_on(effect: ArmEffect, signal: str) -> bool:
+    return signal in effect.acts_on() or signal.split("_", 1)[0] in effect.acts_on()
+
+
+def selectors(cls: type[Effect], signal: str) -> dict[str, Any] | None:
+    """What a class must be told so that it acts on this joint only; None for effects of something else."""
+    arm, joint = signal.split("_", 1)
+    if issubclass(cls, JointEffect):
+        return {"arm": arm, "joints": [joint]} if joint in cls.possible else None
+    return {"arm": arm} if issubclass(cls, ArmEffect) else None
+
+
+def floors_of(measurements: Sequence[Measurement], signal: str, *, effort: bool) -> list[SignalFloor]:
+    """Noise floor of the angle, and of the effort.
+
+    Raises:
+        TaccorlError: never measured.
+    """
+    found = []
+    for kind in ("position", "effort")[: 1 + effort]:
+        floors = noise_floor(measurements, kind)
+        if signal not in floors:
+            raise TaccorlError(f"{signal}: its {kind} was not measured in any recording")
+        found.append(floors[signal])
+    return found

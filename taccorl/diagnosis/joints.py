@@ -1,0 +1,177 @@
+"""Every joint that the recordings move, each diagnosed by itself, and the twin that comes out of it."""
+
+import copy
+import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+import numpy as np
+
+from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.noise_floor import SignalFloor
+from taccorl.diagnosis.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
+from taccorl.diagnosis.problem import split_rows
+from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, TouchEffect
+from taccorl.sim.robot import ARMS, JOINTS
+from taccorl.sim.twin import TwinConfig
+
+MOVES_RAD = 2e-3
+"""A joint whose target moves by more is swept."""
+SIGNALS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in JOINTS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFinding:
+    """What was found out about one joint."""
+
+    signal: str
+    diagnosis: Diagnosis
+    can_tell: Identifiability
+    """What its recordings can show and tell apart, whatever they say."""
+    floors: tuple[SignalFloor, ...]
+    """Of the angle, and of the effort if that was used."""
+    commanded: bool
+    """Gains are the commanded ones; else they were fitted."""
+    recordings: dict[str, tuple[str, ...]]
+    """fit, held_out, test → names."""
+    rows_split: bool
+    """No recording was held out: rows at the end of each were."""
+
+
+def swept_joints(measurements: Measurements) -> tuple[str, ...]:
+    """Joints that at least one fit recording moves."""
+    return tuple(s for s in SIGNALS if any(moves(m, s) for m in measurements.fit))
+
+
+def moves(m: Measurement, signal: str) -> bool:
+    """Whether the recording commands the joint to move."""
+    return signal in m.signals and float(np.ptp(m.target[:, m.column(signal)])) > MOVES_RAD
+
+
+def diagnose_joint(
+    config: TwinConfig,
+    signal: str,
+    measurements: Measurements,
+    *,
+    gains: GainsAre = "auto",
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+) -> JointFinding:
+    """Search for what is missing at one joint, in the recordings that move it.
+
+    Raises:
+        TaccorlError: none of the fit recordings moves it.
+    """
+    sides = [
+        tuple(m for m in side if moves(m, signal))
+        for side in (measurements.fit, measurements.held_out, measurements.test)
+    ]
+    if not sides[0]:
+        raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
+    own = dataclasses.replace(measurements, fit=sides[0], held_out=sides[1], test=sides[2])
+    problem = JointProblem(config, signal, own, gains=gains)
+    fit_to, held_out = (problem.fit, problem.held_out) if problem.held_out else split_rows(problem.fit)
+    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
+    found = diagnose(
+        problem,
+        fit_to,
+        held_out,
+        problem.test,
+        start=problem.start,
+        present=problem.present,
+        without=without,
+        config=search,
+    )
+    return JointFinding(
+        signal=signal,
+        diagnosis=found,
+        can_tell=can_tell,
+        floors=tuple(problem.floors),
+        commanded=problem.commanded,
+        recordings={
+            use: tuple(m.name for m in side) for use, side in zip(("fit", "held_out", "test"), sides, strict=True)
+        },
+        rows_split=not problem.held_out,
+    )
+
+
+def diagnose_joints(
+    config: TwinConfig,
+    signals: Sequence[str],
+    measurements: Measurements,
+    *,
+    gains: GainsAre = "auto",
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+    workers: int = 1,
+    done: Callable[[str], None] = lambda _: None,
+) -> list[JointFinding]:
+    """Several joints, ``workers`` at a time; the same for any number of them.
+
+    Args:
+        done: called with each joint that is finished.
+    """
+    if workers <= 1 or len(signals) <= 1:
+        found = []
+        for signal in signals:
+            found.append(diagnose_joint(config, signal, measurements, gains=gains, search=search, without=without))
+            done(signal)
+        return found
+    with ProcessPoolExecutor(min(workers, len(signals)), mp_context=get_context("spawn")) as pool:
+        jobs = {
+            pool.submit(
+                diagnose_joint, config, signal, measurements, gains=gains, search=search, without=without
+            ): signal
+            for signal in signals
+        }
+        for job in as_completed(jobs):
+            job.result()
+            done(jobs[job])
+        return [job.result() for job in jobs]
+
+
+def mended(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig:
+    """``config`` with the effects that were found, and with the numbers that were fitted beside them."""
+    new = copy.deepcopy(config)
+    for finding in findings:
+        set_numbers(new, finding.signal, finding.diagnosis.base)
+        for effect in finding.diagnosis.effects:
+            add_effect(new, effect)
+    return new
+
+
+def set_numbers(config: TwinConfig, signal: str, base: dict[str, float]) -> None:
+    """Write fitted gains into one arm of ``config``."""
+    arm, joint = signal.split("_", 1)
+    control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
+    k = JOINTS.index(joint)
+    fields = {"kp": control.kp_nm_per_rad, "kd": control.kd_nms_per_rad, "torque_ff": control.torque_ff_nm}
+    for name, values in fields.items():
+        if name in base:
+            values[k] = float(base[name])
+
+
+def add_effect(config: TwinConfig, effect: Effect) -> None:
+    """Put an effect into ``config``; what an entry of the same name does to the same joints or pads, it replaces."""
+    kept: list[Effect] = []
+    for other in config.effects:
+        shared = set(other.acts_on()) & set(effect.acts_on()) if other.name == effect.name else set()
+        kept += _elsewhere(other, shared) if shared else [other]
+    config.effects = [*kept, effect]
+
+
+def _elsewhere(effect: Effect, taken: set[str]) -> list[Effect]:
+    """Entries that do what ``effect`` does, but not to ``taken``."""
+    rest = [thing for thing in effect.acts_on() if thing not in taken]
+    if isinstance(effect, JointEffect):
+        arms = {arm: [t.removeprefix(f"{arm}_") for t in rest if t.startswith(f"{arm}_")] for arm in ARMS}
+        return [dataclasses.replace(effect, arm=arm, joints=joints) for arm, joints in arms.items() if joints]
+    if isinstance(effect, ArmEffect):
+        return [dataclasses.replace(effect, arm=arm) for arm in rest]
+    return [dataclasses.replace(effect, pads=rest)] if isinstance(effect, TouchEffect) and rest else []

@@ -1,0 +1,117 @@
+"""A measurement's commands through the twin: joint by joint, or the whole of it. Row k is the twin at the time of row k.
+
+Letters in shapes: T rows.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from taccorl.alignment.joint_model import JointModel, joint_motion
+from taccorl.alignment.measurement import Measurement
+from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.sim.effects import make_effect
+from taccorl.sim.replay import replay
+from taccorl.sim.robot import ARMS, JOINTS
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks.bench import Bench
+from taccorl.sim.twin import TwinConfig
+
+CONTACT_COUNTS = 30.0
+"""A taxel beyond this is contact: λ_f = 0.4 (paper Table 3) at the data spec's 75 counts for 1."""
+START_S = 0.1
+"""Where the joints were at the start is the mean of so long a rest: one reading's noise would be a swing of the twin."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What the twin did."""
+
+    measurement: Measurement
+    """As it was replayed: all 14 signals, at an even rate that is a whole number of physics steps."""
+    way: Literal["joint", "twin"]
+    reported: np.ndarray
+    """(T, 14) rad, m; NaN for signals that were not replayed."""
+    effort: np.ndarray
+    """(T, 14) N·m, N that the motors give at the time of each row; NaN where not known."""
+
+
+def replay_joints(config: TwinConfig, m: Measurement, signals: Sequence[str]) -> Response:
+    """Each of ``signals`` alone, the others as they were measured; gains and payloads as the recording knows them."""
+    m = evened(m, config)
+    reported, effort = np.full((2, m.num_rows, len(ACTION_NAMES)), np.nan)
+    for signal in signals:
+        model, j = JointModel(config, signal), m.column(signal)
+        done = model.simulate(joint_motion(m, config, signal), model.gains)
+        reported[:, j], effort[:, j] = done.reported, done.effort
+    return Response(m, "joint", reported, effort)
+
+
+def replay_whole(config: TwinConfig, m: Measurement) -> Response:
+    """The whole twin on the empty bench, from where the robot stood.
+
+    Raises:
+        TaccorlError: the twin diverged.
+    """
+    m = evened(m, config)
+    sim = Simulation(Bench(), _as_recorded(config, m))
+    sim.reset([0])
+    done = replay(sim, m.target, m.rate_hz, _start(m))
+    if sim.diverged[0] or not np.isfinite(done.reported).all():
+        raise TaccorlError(f"{m.name}: the twin diverged in its replay; look at its gains and effects")
+    # ``Replay.effort`` is at the end of each command's stretch: the time of the next row.
+    effort = np.concatenate([np.full((1, len(ACTION_NAMES)), np.nan), done.effort[:-1]])
+    return Response(m, "twin", done.reported, effort)
+
+
+def _as_recorded(config: TwinConfig, m: Measurement) -> TwinConfig:
+    """With the gains that were commanded and the masses that were held, where the recording knows them."""
+    controllers = {}
+    for arm in ARMS:
+        control = config.controller_of(arm)
+        for key, known in (("kp_nm_per_rad", m.kp), ("kd_nms_per_rad", m.kd)):
+            values = [
+                known.get(f"{arm}_{joint}", value) for joint, value in zip(JOINTS, getattr(control, key), strict=True)
+            ]
+            control = dataclasses.replace(control, **{key: values})
+        controllers[arm] = control
+    held = [make_effect("payload", arm=arm, mass_kg=mass) for arm, mass in m.payload_kg.items() if mass > 0]
+    return dataclasses.replace(config, arm_controllers=controllers, effects=[*config.effects, *held])
+
+
+def evened(m: Measurement, config: TwinConfig) -> Measurement:
+    """At the nearest even rate that is a whole number of physics steps: 200 Hz for 199.97 Hz.
+
+    Raises:
+        TaccorlError: faster than the physics.
+    """
+    physics_hz = 1.0 / config.physics.timestep_s
+    if m.rate_hz > 1.25 * physics_hz:
+        raise TaccorlError(f"{m.name}: {m.rate_hz:g} rows a second, the twin steps {physics_hz:g} times a second")
+    rate_hz = physics_hz / max(1, round(physics_hz / m.rate_hz))
+    even = abs(m.rate_hz - rate_hz) < 1e-3 and np.ptp(np.diff(m.time_s)) < 1e-6
+    return m if even else m.resampled(rate_hz)
+
+
+def _start(m: Measurement) -> np.ndarray:
+    """(14,) measured at rest before the first command moves; the first target where nothing was measured."""
+    changed = np.flatnonzero(np.any(m.target != m.target[0], axis=1))
+    rest = min(changed[0] if len(changed) else m.num_rows, round(START_S * m.rate_hz))
+    rows = m.measured[: max(rest, 1)]
+    seen = np.isfinite(rows).any(axis=0)
+    start = m.target[0].copy()
+    start[seen] = np.nanmean(rows[:, seen], axis=0)
+    return np.clip(start, ACTION_LOW, ACTION_HIGH)
+
+
+def in_contact(m: Measurement) -> np.ndarray:
+    """(T, 2) bool: a pad of the left, right arm is in contact at the time of each row; False without pads."""
+    if m.touch is None:
+        return np.zeros((m.num_rows, 2), dtype=bool)
+    beyond = np.asarray((m.touch.counts.reshape(len(m.touch.counts), 4, -1) > CONTACT_COUNTS).any(axis=2))
+    felt = [np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5 for p in range(4)]
+    return np.stack([felt[0] | felt[1], felt[2] | felt[3]], axis=1)

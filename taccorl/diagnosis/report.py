@@ -1,0 +1,165 @@
+"""A comparison, and what was diagnosed from it, as one page that needs no other file, with the same in JSON beside it.
+
+``report.html`` is for people, ``report.json`` holds every number of it. An earlier report of ours is replaced, and the caller is
+told so; any other file of that name is left alone.
+"""
+
+import dataclasses
+import datetime
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import taccorl
+from taccorl.data.finding import Finding
+from taccorl.diagnosis.along import curves
+from taccorl.diagnosis.comparison import Comparison
+from taccorl.diagnosis.identifiability import Identifiability
+from taccorl.diagnosis.localise import WHERE_NOT_WHY, Cell, heat_map
+from taccorl.diagnosis.localise_touch import touch_heat_map
+from taccorl.diagnosis.search import Diagnosis
+from taccorl.errors import TaccorlError
+
+PAGE, NUMBERS = "report.html", "report.json"
+GENERATOR = "taccorl report"
+HEAD_BYTES = 2048
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What a page tells."""
+
+    title: str
+    comparison: Comparison
+    """Of the twin as it was."""
+    after: Comparison | None = None
+    """Of the mended twin, or of another one, on the same recordings."""
+    diagnoses: Mapping[str, Diagnosis] = field(default_factory=dict)
+    """Part ("left_joint5", "pads") → what was found there."""
+    can_tell: Mapping[str, Identifiability] = field(default_factory=dict)
+    """Part → what its recordings can tell, whatever they say."""
+    findings: Mapping[str, Sequence[Finding]] = field(default_factory=dict)
+    """Recording → what the checks before said."""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    """Caption → PNG, such as the camera's overlay before and after."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """The command, the twin's file, digests: what was this made from?"""
+
+    @property
+    def origins(self) -> tuple[str, ...]:
+        return self.comparison.origins
+
+    def cells(self) -> list[Cell]:
+        """Where the twin as it was is off: positions, efforts, pads."""
+        c = self.comparison
+        return [*heat_map(c, "position"), *heat_map(c, "effort"), *touch_heat_map(c.touches)]
+
+
+@dataclass(frozen=True)
+class Written:
+    """Files of a report."""
+
+    page: Path
+    numbers: Path
+    replaced: str
+    """When the report was made that stood there before; empty if there was none."""
+
+
+def check_folder(folder: Path) -> str:
+    """May a report be written there? Returns when the one was made that it will replace; empty if there is none.
+
+    Raises:
+        TaccorlError: a file of its name that is not ours, or no folder can be there.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise TaccorlError(f"{folder}: is a file; give a folder for the report")
+    for name in (PAGE, NUMBERS):
+        path = folder / name
+        if path.exists() and GENERATOR not in _head(path):
+            raise TaccorlError(f"{path}: is there already and not a report of ours; give another folder, or remove it")
+    page = folder / PAGE
+    if not page.exists():
+        return ""
+    when = datetime.datetime.fromtimestamp(page.stat().st_mtime).astimezone()
+    return when.strftime("%Y-%m-%d %H:%M")
+
+
+def _head(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return file.read(HEAD_BYTES).decode("utf-8", "replace")
+
+
+def write_report(report: Report, folder: Path) -> Written:
+    """``report.html`` and ``report.json`` in ``folder``, which is made if it is not there.
+
+    Raises:
+        TaccorlError: as ``check_folder``, or the folder cannot be written to.
+    """
+    from taccorl.diagnosis.report_page import page  # matplotlib only where something is drawn
+
+    replaced = check_folder(folder)
+    texts = {NUMBERS: json.dumps(as_json(report), indent=1, ensure_ascii=False) + "\n", PAGE: page(report)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            part = folder / f".{name}.part"
+            part.write_text(text, encoding="utf-8")
+            part.replace(folder / name)
+    except OSError as error:
+        raise TaccorlError(f"{folder}: the report cannot be written: {error}") from error
+    return Written(folder / PAGE, folder / NUMBERS, replaced)
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """Every number of the page."""
+    c, after = report.comparison, report.after
+    return {
+        "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
+        "title": report.title,
+        "data": list(report.origins),
+        "provenance": dict(report.provenance),
+        "twin": {"name": c.twin, "effects": list(c.effects)},
+        "mended_twin": None if after is None else {"name": after.twin, "effects": list(after.effects)},
+        "recordings": c.split,
+        "findings": {name: [_plain(f) for f in found] for name, found in report.findings.items()},
+        "scores": [_scored(s) for s in c.scores()],
+        "scores_after": [] if after is None else [_scored(s) for s in after.scores()],
+        "where": {"note": WHERE_NOT_WHY, "cells": [_plain(cell) for cell in report.cells()]},
+        "along": [_plain(curve) for signal, kind in c.signals for curve in curves(c, signal, kind)],
+        "diagnoses": {part: _diagnosis(d) for part, d in report.diagnoses.items()},
+        "can_tell": {part: _plain(found) for part, found in report.can_tell.items()},
+        "not_compared": list(c.left_out),
+    }
+
+
+def _scored(score: Any) -> dict[str, Any]:
+    return _plain(score) | {"ratio": score.ratio}
+
+
+def _diagnosis(d: Diagnosis) -> dict[str, Any]:
+    """Without the fits, whose residuals are as long as the recordings."""
+    kept = {f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in ("before", "after", "effects")}
+    effects = [{"effect": e.name} | _plain(e) for e in d.effects]
+    return _plain(kept) | {"words": d.words, "effects": effects}
+
+
+def _plain(value: Any) -> Any:
+    """What JSON knows; a number that is none is null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

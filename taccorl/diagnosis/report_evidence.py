@@ -1,0 +1,158 @@
+"""The part of a page that says which effect is missing, with what evidence, and what cannot be told apart."""
+
+import html
+from collections.abc import Sequence
+
+from taccorl.diagnosis.figure_style import data_uri, png
+from taccorl.diagnosis.figures_evidence import Step, waterfall
+from taccorl.diagnosis.identifiability import Identifiability
+from taccorl.diagnosis.report_html import figure, note, table
+from taccorl.diagnosis.search import Diagnosis, Evidence, Round
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import Effect
+
+ALWAYS_FITTED = "numbers refitted, no effect"
+
+
+def diagnosis_section(part: str, d: Diagnosis, can_tell: Identifiability | None, origins: Sequence[str]) -> str:
+    """Verdict, waterfall, evidence of each round, and the effects in words."""
+    found = [e for e in d.effects if e.name not in d.present]
+    named = ", ".join(e.name for e in found) or "nothing was added"
+    parts = [
+        f"<h2>{html.escape(part)}: {html.escape(named)}</h2>",
+        f'<div class="verdict">{html.escape(d.words)}. {_errors(d)}</div>',
+    ]
+    if d.trouble:
+        parts.append(note(f"The last fit: {d.trouble}."))
+    if d.at_bound:
+        parts.append(note(f"At the end of its range: {', '.join(d.at_bound)}. Its value says little."))
+    drawn = waterfall(_steps(d), origins, f"{part}: held-out error, effect by effect")
+    parts.append(figure(data_uri(png(drawn)), "held-out error over the noise floor; down is better"))
+    parts += [_effect(d, e) for e in found]
+    parts.append(_numbers(d))
+    for k, r in enumerate(d.rounds, start=1):
+        parts += [f"<h3>Evidence, round {k}</h3>", _evidence(r)]
+    if d.rounds:
+        parts.append(
+            note(
+                "gain: share of the held-out squared error above the floor that goes away after everything was refitted. z: that "
+                "gain over its standard error between half-second blocks. ΔBIC: above 10 it pays for its parameters."
+            )
+        )
+    for name in d.removed:
+        parts.append(note(f"{name} was accepted and later removed: the others made it superfluous."))
+    for old, new in d.swapped:
+        parts.append(note(f"{new} took the place of {old} once the others were in."))
+    if can_tell is not None:
+        parts += ["<h3>What these recordings can tell</h3>", _can_tell(can_tell)]
+    return "\n".join(parts)
+
+
+def _can_tell(found: Identifiability) -> str:
+    """Before any fit, at typical strengths."""
+    lines = [f"{a} and {b}: their traces are alike (|cos| {cos:.3f})" for a, b, cos in found.pairs]
+    lines += [
+        f"{a} and {b}: only a combination of the two numbers is known (correlation {r:+.4f})"
+        for a, b, r in found.ridges
+    ]
+    if found.invisible:
+        lines.append(f"would hardly show at a typical strength: {', '.join(found.invisible)}")
+    items = "".join(
+        f"<li>{html.escape(line)}</li>" for line in lines or ["every effect would show, and none looks like another"]
+    )
+    return f"<ul>{items}</ul>"
+
+
+def _errors(d: Diagnosis) -> str:
+    lines = []
+    for use, words in (("held_out", "held-out"), ("test", "test, which no choice has seen")):
+        before, after = d.errors["before"].get(use), d.errors["after"].get(use)
+        if before is not None and after is not None:
+            lines.append(f"{words}: {before:.3g} → {after:.3g} × floor ({after / before - 1:+.0%})")
+    return "Error: " + "; ".join(lines)
+
+
+def _steps(d: Diagnosis) -> list[Step]:
+    first = [Step("twin as it was", d.errors["before"]["held_out"])]
+    steps = first + [Step(name or ALWAYS_FITTED, error) for name, error in d.steps]
+    if d.removed or d.swapped:
+        steps.append(Step("superfluous ones removed, ties tried again", d.errors["after"]["held_out"]))
+    return steps
+
+
+def _numbers(d: Diagnosis) -> str:
+    """The always fitted ones and those of the effects, with intervals."""
+    rows = []
+    values = d.base | {f"{e.name}.{p.name}": getattr(e, p.name) for e in d.effects for p in e.parameters()}
+    for name, value in values.items():
+        low, high = d.intervals.get(name, (None, None))
+        ends = "" if low is None else f"{low:.4g} … {high:.4g}"
+        start = f"{d.start[name]:.4g}" if name in d.start else ""
+        rows.append([html.escape(name), start, f"{value:.4g}", ends])
+    return table(("number", "before", "fitted", "95 %"), rows, numbers=range(1, 4))
+
+
+def _effect(d: Diagnosis, e: Effect) -> str:
+    """What it is, on a robot and for a policy, and who looks like it."""
+    cls = type(e)
+    values = [f"{p.symbol} = {getattr(e, p.name):.4g} {p.unit}" for p in e.parameters()]
+    rows = [
+        ["equation", f"<code>{html.escape(cls.equation)}</code>"],
+        ["here", html.escape(", ".join(values))],
+        ["what this is", html.escape(cls.in_words)],
+        ["what it does to a policy", html.escape(cls.at_a_policy)],
+        ["what shows it best", html.escape(cls.to_record)],
+    ]
+    if e.name in d.rivals:
+        words = f"{', '.join(d.rivals[e.name])}: these recordings do not tell which it is"
+        rows.append(["<b>does as well</b>", f"<b>{html.escape(words)}</b>"])
+    for other, why in d.twins.get(e.name, {}).items():
+        rows.append([f"near-twin {html.escape(other)}", html.escape(why)])
+    return f"<h3>{html.escape(e.name)}</h3>" + table((), rows)
+
+
+def _evidence(r: Round) -> str:
+    heads = ("effect", "equation", "held-out × floor", "gain", "z", "ΔBIC", "fitted", "at bound", "verdict")
+    rows, classes = [], []
+    for e in r.evidence:
+        cls = _class(e.name)
+        values = ", ".join(f"{k.split('.', 1)[1]} {v:.4g}" for k, v in e.values.items())
+        verdict = "; ".join(part for part in (e.verdict, e.trouble) if part)
+        rows.append(
+            [
+                html.escape(e.name) + (_in_words(cls) if cls else ""),
+                f"<code>{html.escape(cls.equation)}</code>" if cls else "",
+                f"{e.held_out_error:.3g}",
+                f"{round(e.gain, 2) + 0.0:.0%}",
+                f"{e.score:.1f}",
+                f"{e.bic:.0f}",
+                html.escape(values),
+                html.escape(", ".join(name.split(".", 1)[1] for name in e.at_bound)),
+                html.escape(verdict),
+            ]
+        )
+        classes.append(_row_class(e, r))
+    text = table(heads, rows, numbers=range(2, 6), classes=classes)
+    if r.not_refitted:
+        text += note(f"Screened out by their first probe: {', '.join(r.not_refitted)}.")
+    return text
+
+
+def _in_words(cls: type[Effect]) -> str:
+    """What a row is about, to be opened."""
+    lines = [cls.in_words, f"A policy trained without it: {cls.at_a_policy}"]
+    lines += [f"near-twin {other}: {why}" for other, why in cls.near_twins.items()]
+    return f"<details class=small><summary>what is it?</summary>{'<br>'.join(html.escape(line) for line in lines)}</details>"
+
+
+def _row_class(e: Evidence, r: Round) -> str:
+    return "added" if e.name == r.added else "tie" if e.name in r.ties else ""
+
+
+def _class(name: str) -> type[Effect] | None:
+    """None: an effect of a problem outside the registry, such as a one-axis drive's own."""
+    try:
+        return effects.get(name)
+    except TaccorlError:
+        return None

@@ -1,0 +1,109 @@
+"""Recordings of a surrogate robot, in memory: what the drivers would have logged, with noise, quantisation and metadata.
+
+Letters in shapes: T rows, J 14 signals.
+"""
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.measurements import Measurements, split
+from taccorl.diagnosis.motions import DESIGNS, HELD_OUT, OPENING_M, RATE_HZ, REST_POSE, TEST, Motion
+from taccorl.diagnosis.surrogate.cases import Case
+from taccorl.diagnosis.surrogate.plant import COMMAND_MS
+from taccorl.diagnosis.surrogate.robot import NOISE_RAD, QUANTUM_RAD
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.controller import KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.sim.robot import ARMS
+
+ORIGIN = "surrogate robot, simulated; not a robot"
+SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
+EFFORT_NOISE_SHARE, EFFORT_NOISE_NM, EFFORT_QUANTUM_NM = 0.01, 0.005, 1e-3
+"""Noise of efforts, a choice: share of the largest in the recording, and at least. PiPER reports steps of 1 mN·m."""
+OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
+_GRIPPERS = [6, 13]
+
+
+def recordings(case: Case, design: str | None = None) -> Measurements:
+    """All recordings of one robot: those of the design for fitting, and others held out and for the test.
+
+    Args:
+        design: ``chirp`` (the paper's 10 s sweep, twice) or ``pack`` (with triangle, steps, small chirp, 2× gain, payload);
+            the case's by default.
+
+    Raises:
+        TaccorlError: no such design.
+    """
+    design = case.design if design is None else design
+    if design not in DESIGNS:
+        raise TaccorlError(f"surrogate: no design {design!r}; {nearest(design, DESIGNS)}")
+    uses: dict[str, Sequence[Motion]] = {"fit": DESIGNS[design], "held_out": HELD_OUT, "test": TEST}
+    made = [record(case, motion) for motions in uses.values() for motion in motions]
+    return split(made, held_out=[m.name for m in HELD_OUT], test=[m.name for m in TEST])
+
+
+def record(case: Case, motion: Motion) -> Measurement:
+    """One recording. The same case and motion give the same numbers, bit for bit."""
+    rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(motion.name.encode())])
+    robot = case.robot
+    run = robot.run(motion, case.room, rng)
+    first = 7 * robot.arm
+    own = slice(first, first + 6)
+    num_rows = len(run.angle) // COMMAND_MS
+    target = np.tile([*REST_POSE, OPENING_M] * 2, (num_rows, 1))
+    target[:, own] = robot.pose
+    target[:, first + robot.joint] = motion.target(case.room)
+    measured, velocity, effort = target.copy(), np.zeros_like(target), np.zeros_like(target)
+    rest = [k for k in range(14) if k not in _GRIPPERS and not first <= k < first + 6]
+    # The other arm rests where its T_ref turns it; its weight is carried.
+    measured[:, rest] += np.array(TORQUE_FF_NM) / np.array(KP_NM_PER_RAD)
+    measured[:, own] = robot.reported(run)
+    velocity[:, own], effort[:, own] = run.velocity[::COMMAND_MS], run.effort[::COMMAND_MS]
+    kp, kd = commanded(case, motion)
+    return Measurement(
+        name=motion.name,
+        time_s=np.arange(num_rows) / RATE_HZ,
+        target=_rounded(target, QUANTUM_RAD, OPENING_QUANTUM_M),
+        measured=_rounded(_noisy(rng, measured, NOISE_RAD, OPENING_NOISE_M), QUANTUM_RAD, OPENING_QUANTUM_M),
+        velocity=_rounded(_noisy(rng, velocity, SPEED_NOISE_RAD_PER_S, 0.0), SPEED_QUANTUM_RAD_PER_S, 1e-3),
+        effort=_rounded(_noisy(rng, effort, _effort_noise(effort), 0.0), EFFORT_QUANTUM_NM, 1e-3),
+        origin=f"{ORIGIN}; {case.signal} under test",
+        instruction=f"sweep of {case.signal}: {motion.name}",
+        repeat_of=motion.repeat_of,
+        payload_kg={ARMS[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
+        kp=kp,
+        kd=kd,
+    )
+
+
+def commanded(case: Case, motion: Motion) -> tuple[dict[str, float], dict[str, float]]:
+    """Signal → K_p and K_d that were commanded, as far as somebody wrote them down.
+
+    Gains that are known are written down for every recording. Where they are not, the user commands what the twin has, and the
+    drive makes something else of it, by the same factor each time: only the recording with another gain says so.
+    """
+    if not case.gains_known and motion.gain == 1.0:
+        return {}, {}
+    control, joint = case.twin.controller, case.robot.joint
+    kp, kd = control.kp_nm_per_rad[joint], control.kd_nms_per_rad[joint]
+    return {case.signal: kp * motion.gain}, {case.signal: kd * motion.gain}
+
+
+def _noisy(rng: np.random.Generator, values: np.ndarray, joints: float | np.ndarray, grippers: float) -> np.ndarray:
+    size = np.broadcast_to(np.asarray(joints, dtype=float), (14,)).copy()
+    size[_GRIPPERS] = grippers
+    return values + size * rng.standard_normal(values.shape)
+
+
+def _effort_noise(effort: np.ndarray) -> np.ndarray:
+    """(14,) N·m."""
+    return np.maximum(EFFORT_NOISE_SHARE * np.abs(effort).max(axis=0), EFFORT_NOISE_NM)
+
+
+def _rounded(values: np.ndarray, joints: float, grippers: float) -> np.ndarray:
+    """To the drivers' steps, of joints and of grippers."""
+    step = np.full(14, joints)
+    step[_GRIPPERS] = grippers
+    return np.round(values / step) * step

@@ -1,0 +1,194 @@
+"""What may be hidden in the surrogate's pads: the registry's effects by its names and numbers, computed here in other ways.
+
+Letters in shapes: M milliseconds, K taxels that the object comes near, T frames, R × C taxels of a pad.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from taccorl.errors import TaccorlError, nearest
+
+Values = dict[str, float]
+MILLISECOND = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchKind:
+    """One kind of hidden effect."""
+
+    severity: tuple[float, float]
+    """From hardly there to the most that a pad could have."""
+    values: Callable[[float, np.random.Generator], Values]
+    """Severity and a board's dice → the registry's numbers. The same dice give the same shape."""
+    stage: str
+    """place (depths are taken elsewhere), material (each taxel at 1 kHz), spread (whole frames), board (gains), baseline."""
+    registered: bool = True
+
+
+def touch_kind(name: str) -> TouchKind:
+    """Raises:
+    TaccorlError: nothing of that name can be hidden.
+    """
+    if name not in TOUCH_KINDS:
+        raise TaccorlError(f"surrogate pads: no hidden effect {name!r}; {nearest(name, TOUCH_KINDS)}")
+    return TOUCH_KINDS[name]
+
+
+def _one(parameter: str) -> Callable[[float, np.random.Generator], Values]:
+    return lambda s, rng: {parameter: s}
+
+
+def _signed(parameter: str, absent: float = 0.0) -> Callable[[float, np.random.Generator], Values]:
+    return lambda s, rng: {parameter: absent + float(rng.choice([-1.0, 1.0])) * s}
+
+
+def _creep(s: float, rng: np.random.Generator) -> Values:
+    sign = float(rng.choice([-1.0, 1.0]))
+    return {"share": max(sign * s, -0.8), "time_constant_s": float(np.exp(rng.uniform(np.log(0.3), np.log(4.0))))}
+
+
+def _power(s: float, rng: np.random.Generator) -> Values:
+    return {"exponent": float((1.0 + s) ** rng.choice([-1.0, 1.0]))}
+
+
+def _shift(s: float, rng: np.random.Generator) -> Values:
+    angle = rng.uniform(0, 2 * np.pi)
+    return {"across_m": float(s * np.cos(angle)), "along_m": float(s * np.sin(angle))}
+
+
+TOUCH_KINDS: dict[str, TouchKind] = {
+    "depth_offset": TouchKind(severity=(5e-6, 6e-4), values=_signed("offset_m"), stage="place"),
+    "pad_shift": TouchKind(severity=(3e-5, 4e-3), values=_shift, stage="place"),
+    "taxel_power_law": TouchKind(severity=(0.02, 1.5), values=_power, stage="material"),
+    "taxel_saturation": TouchKind(severity=(0.01, 3.0), values=lambda s, rng: {"limit": 1.0 / s}, stage="material"),
+    "taxel_threshold": TouchKind(severity=(0.01, 0.6), values=_one("threshold"), stage="material"),
+    "taxel_hysteresis": TouchKind(severity=(0.01, 0.45), values=_one("half_width"), stage="material"),
+    "taxel_creep": TouchKind(severity=(0.02, 1.0), values=_creep, stage="material"),
+    "touch_delay": TouchKind(severity=(1e-3, 0.15), values=_one("delay_s"), stage="material"),
+    "touch_lag": TouchKind(severity=(1e-3, 0.3), values=_one("time_constant_s"), stage="material"),
+    "taxel_crosstalk": TouchKind(severity=(0.01, 0.7), values=_one("share"), stage="spread"),
+    "taxel_ghosting": TouchKind(severity=(1e-3, 0.15), values=_one("share"), stage="spread"),
+    "taxel_gain_spread": TouchKind(severity=(0.02, 0.6), values=_one("log_std"), stage="board"),
+    "dead_taxels": TouchKind(severity=(0.02, 0.4), values=_one("share"), stage="board"),
+    "baseline_drift": TouchKind(severity=(0.01, 2.0), values=_signed("rate_per_min"), stage="baseline"),
+    # outside the registry: a film that softens with speed, and gains that fall as the board warms up
+    "rate_softening": TouchKind(severity=(1.0, 400.0), values=_one("per_mps"), stage="material", registered=False),
+    "warming_gain": TouchKind(severity=(0.05, 3.0), values=_one("fall_per_min"), stage="baseline", registered=False),
+}
+"""Name → kind."""
+REGISTERED_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if k.registered)
+
+
+def material(name: str, values: Values, reading: np.ndarray, rate_mps: np.ndarray) -> np.ndarray:
+    """Readings (M, K), one taxel after the other, as the pad's material and its driver make them; times are milliseconds."""
+    match name:
+        case "taxel_power_law":
+            return np.exp(values["exponent"] * np.log(np.maximum(reading, 1e-12))) * (reading > 0)
+        case "taxel_saturation":  # supply voltage over two resistors in a row, of which one falls with pressure
+            fixed, pressed = 1.0, values["limit"] / np.maximum(reading, 1e-9)
+            return values["limit"] * fixed / (fixed + pressed) * (reading > 0)
+        case "taxel_threshold":
+            return np.where(reading > values["threshold"], reading - values["threshold"], 0.0)
+        case "taxel_hysteresis":
+            return _bouc_wen(reading, np.log1p(-values["half_width"]), np.log1p(values["half_width"]))
+        case "taxel_creep":
+            return _chain(reading, values["share"], values["time_constant_s"])
+        case "touch_delay":
+            at = np.arange(len(reading)) - values["delay_s"] / MILLISECOND
+            before = np.clip(np.floor(at).astype(int), 0, len(reading) - 1)
+            after, share = np.minimum(before + 1, len(reading) - 1), np.clip(at - before, 0.0, 1.0)[:, None]
+            return reading[before] * (1 - share) + reading[after] * share
+        case "touch_lag":
+            return _follow(reading, MILLISECOND / values["time_constant_s"])
+        case "rate_softening":
+            return reading / (1.0 + values["per_mps"] * np.abs(rate_mps))
+    raise AssertionError(name)
+
+
+@numba.njit(cache=True)
+def _bouc_wen(reading, low, high):
+    """ρ = ln(r / f) follows dρ = −dln f (1 − (ρ / end)⁴) on the way to its end ``low`` (loading) or ``high`` (unloading)."""
+    out = np.zeros_like(reading)
+    for k in range(reading.shape[1]):
+        rho, before = low, 0.0
+        for m in range(reading.shape[0]):
+            f = reading[m, k]
+            if f <= 0.0:
+                rho, before = low, 0.0
+                continue
+            if before > 0.0:
+                way = np.log(f / before)
+                parts = int(abs(way) / (0.1 * (high - low))) + 1
+                for _ in range(parts):
+                    end = low if way > 0.0 else high
+                    share = rho / end if rho * end > 0.0 else 0.0
+                    rho -= way / parts * (1.0 - min(share, 1.0) ** 4)
+                    rho = min(max(rho, low), high)
+            before = f
+            out[m, k] = f * np.exp(rho)
+    return out
+
+
+@numba.njit(cache=True)
+def _chain(reading, share, time_constant_s):
+    """Two springs with dampers in a row, of 0.8 and 1.25 times the time constant; Heun's steps."""
+    out = np.empty_like(reading)
+    fast, slow = 1e-3 / (0.8 * time_constant_s), 1e-3 / (1.25 * time_constant_s)
+    for k in range(reading.shape[1]):
+        one, two, before = 0.0, 0.0, 0.0
+        for m in range(reading.shape[0]):
+            f = reading[m, k]
+            middle = 0.5 * (f + before)
+            one += fast * (middle - one) * (1.0 - 0.5 * fast)
+            two += slow * (middle - two) * (1.0 - 0.5 * slow)
+            before = f
+            out[m, k] = max(f + 0.5 * share * (one + two), 0.0)
+    return out
+
+
+@numba.njit(cache=True)
+def _follow(reading, rate):
+    """First order, the trapezoidal rule."""
+    out = np.empty_like(reading)
+    keep = (1.0 - 0.5 * rate) / (1.0 + 0.5 * rate)
+    for k in range(reading.shape[1]):
+        smooth, before = 0.0, 0.0
+        for m in range(reading.shape[0]):
+            f = reading[m, k]
+            smooth = keep * smooth + (1.0 - keep) * 0.5 * (f + before)
+            before = f
+            out[m, k] = smooth
+    return out
+
+
+def spread(name: str, values: Values, frames: np.ndarray) -> np.ndarray:
+    """Frames (T, R, C) of one pad after what the wires and the cover share out."""
+    match name:
+        case "taxel_crosstalk":  # along rows, then along columns: corners get a little as well
+            for axis in (1, 2):
+                frames = frames + 0.25 * values["share"] * np.diff(_edged(np.diff(frames, axis=axis), axis), axis=axis)
+            return frames
+        case "taxel_ghosting":
+            wires = np.einsum("trc->tr", frames)[:, :, None] + np.einsum("trc->tc", frames)[:, None, :]
+            return (1.0 - 2.0 * values["share"]) * frames + values["share"] * wires
+    raise AssertionError(name)
+
+
+def _edged(flow: np.ndarray, axis: int) -> np.ndarray:
+    """Nothing flows over the edges."""
+    ends = [(0, 0)] * flow.ndim
+    ends[axis] = (1, 1)
+    return np.pad(flow, ends)
+
+
+def board(name: str, values: Values, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """(R, C) gains of one pad's taxels."""
+    match name:
+        case "taxel_gain_spread":
+            return np.exp(values["log_std"] * rng.standard_normal(shape))
+        case "dead_taxels":
+            return (rng.random(shape) >= values["share"]).astype(float)
+    raise AssertionError(name)

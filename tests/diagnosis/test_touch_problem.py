@@ -1,0 +1,195 @@
+"""Planted effects of the pads, computed apart from the twin's own: the search finds them; nothing is found where nothing is."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "alignment"))  # made_press
+from made_press import K_D, K_N, Law, ball_at, plain, press
+
+from taccorl.alignment.touch_motion import TouchMotion, touch_motion
+from taccorl.diagnosis.fit import fit
+from taccorl.diagnosis.problem import Problem, split_rows
+from taccorl.diagnosis.screen import probe
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.touch_problem import TouchProblem
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.twin import TwinConfig
+
+CONFIG = TwinConfig()
+PLACES = ((0.001, 0.003), (-0.004, -0.012))
+GAINS = np.exp(0.25 * np.random.default_rng(5).standard_normal((2, 32, 12)))
+GAINS[0, 16, 6] = GAINS[1, 17, 5] = 0.0
+
+
+def _followed(f: np.ndarray, time_constant_s: float) -> np.ndarray:
+    """A low-pass in ten Euler steps a frame, its input in straight lines."""
+    state, seen, before = np.zeros_like(f[0]), np.empty_like(f), f[0]
+    for k, now in enumerate(f):
+        for j in range(10):
+            state = state + (before + (now - before) * (j + 1) / 10 - state) * 0.001 / time_constant_s
+        seen[k], before = state, now
+    return seen
+
+
+def _play(f: np.ndarray, half: float) -> np.ndarray:
+    state, seen = np.zeros_like(f[0]), np.empty_like(f)
+    for k, now in enumerate(f):
+        state = np.clip(state, (1 - half) * now, (1 + half) * now)
+        seen[k] = state
+    return seen
+
+
+def _neighbours(f: np.ndarray) -> np.ndarray:
+    g = np.pad(f, ((0, 0), (0, 0), (1, 1), (1, 1)), mode="edge")
+    return g[:, :, 2:, 1:-1] + g[:, :, :-2, 1:-1] + g[:, :, 1:-1, 2:] + g[:, :, 1:-1, :-2]
+
+
+def _crossed(f: np.ndarray) -> np.ndarray:
+    return f.sum(axis=2, keepdims=True) + f.sum(axis=3, keepdims=True) - 2 * f
+
+
+def _hertz(depth: np.ndarray, rate: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    """Power law of depth alone: damping is not bent with it, as the twin's would be."""
+    return np.where(depth > 0, np.maximum(K_N * 1e-3 * (depth / 1e-3) ** 1.4 + K_D * rate, 0.0), 0.0)
+
+
+PLANTED: dict[str, Law] = {
+    "taxel_saturation": lambda d, r, t: plain(d, r, t) / (1 + plain(d, r, t) / 2.0),
+    "taxel_power_law": _hertz,
+    "taxel_threshold": lambda d, r, t: np.maximum(plain(d, r, t) - 0.12, 0),
+    "taxel_creep": lambda d, r, t: plain(d, r, t) + 0.25 * _followed(plain(d, r, t), 0.8),
+    "touch_lag": lambda d, r, t: _followed(plain(d, r, t), 0.04),
+    "touch_delay": lambda d, r, t: (np.roll(plain(d, r, t), 2, axis=0) + np.roll(plain(d, r, t), 3, axis=0)) / 2,
+    "taxel_crosstalk": lambda d, r, t: 0.8 * plain(d, r, t) + 0.05 * _neighbours(plain(d, r, t)),
+    "taxel_ghosting": lambda d, r, t: plain(d, r, t) + 0.012 * _crossed(plain(d, r, t)),
+    "taxel_hysteresis": lambda d, r, t: _play(plain(d, r, t), 0.15),
+    "baseline_drift": lambda d, r, t: plain(d, r, t) + 0.008 * t[:, None, None, None],
+    "taxel_gain_map": lambda d, r, t: GAINS * plain(d, r, t),
+    "depth_offset": plain,
+    "pad_shift": plain,
+}
+
+
+def recorded(name: str, seed: int) -> TouchMotion:
+    x_m, z_m = PLACES[seed % 2]
+    made = press(seed, ball=ball_at(x_m, z_m), law=PLANTED.get(name, plain))
+    if name == "depth_offset":  # both pads 0.1 mm thicker: they reach so far into an opening that is 0.2 mm greater
+        made = dataclasses.replace(made, measured=made.measured + 2e-4)
+    if name == "pad_shift":  # the ball is taken to sit beside where it is
+        x_m, z_m = x_m + 6e-4, z_m - 4e-4
+    return touch_motion(made, CONFIG, ball_at(x_m, z_m))
+
+
+def problem(name: str, num: int = 2) -> tuple[TouchProblem, list]:
+    motions = [recorded(name, seed) for seed in range(num)]
+    made = TouchProblem(motions, CONFIG)
+    return made, [made.recording(motion) for motion in motions]
+
+
+@pytest.mark.parametrize("name", list(PLANTED))
+def test_the_planted_effect_explains_most_at_first_sight(name: str) -> None:
+    """Of all candidates the probe of the true one takes up most of what is left, or is among the first three."""
+    made, recordings = problem(name, 1)
+    base = fit(made, recordings, [], {})
+    assert base.error > 1.15
+    probes = probe(made, recordings, base, list(made.candidates.values()))
+    order = list(dict.fromkeys(p.name for p in sorted(probes, key=lambda p: -p.explained)))
+    assert name in order[:3], [(p.name, round(p.explained, 3)) for p in probes]
+
+
+def test_nothing_is_missing_where_nothing_is_and_the_base_is_recovered() -> None:
+    made, recordings = problem("none", 4)
+    found = diagnose(made, recordings[:2], recordings[2:])
+    assert found.names == ()
+    assert found.base["k_n"] == pytest.approx(K_N, rel=0.003)
+    assert found.base["k_d"] == pytest.approx(K_D, rel=0.03)
+    assert abs(found.base["zero_left_a"]) < 0.1
+    assert found.errors["fitted"]["held_out"] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(PLANTED))
+def test_the_planted_effect_is_added_and_the_error_falls_to_the_floor(name: str) -> None:
+    made, recordings = problem(name, 4)
+    found = diagnose(made, recordings[:2], recordings[2:])
+    assert name in found.names or name in found.rivals.get(found.names[0], ())
+    assert found.names[0] == name
+    assert found.errors["after"]["held_out"] < 1.25
+
+
+def test_a_gain_map_is_estimated_from_the_rows_that_are_fitted_to_and_dead_taxels_are_in_it() -> None:
+    made, recordings = problem("taxel_gain_map")
+    base = {f.name: f.start for f in made.base} | {"k_n": K_N, "k_d": K_D}
+    (effect,) = made.prepare(base, [made.candidates["taxel_gain_map"].make({})], recordings)
+    assert isinstance(effect, TaxelGainMap)
+    gains = np.reshape(effect.gains, GAINS.shape)
+    pressed = np.max([m.data.motion.depth()[0].max(axis=0) for m in recordings], axis=0) > 2e-4
+    assert pressed.sum() > 40
+    true = GAINS / np.median(GAINS[pressed])
+    assert np.abs(gains - true)[pressed].max() < 0.1
+    never = np.max([m.data.motion.near(1e-4).max(axis=0) for m in recordings], axis=0) == 0
+    np.testing.assert_array_equal(gains[never], 1.0)
+    early, _ = split_rows(recordings, 0.5)
+    (half,) = made.prepare(base, [made.candidates["taxel_gain_map"].make({})], early)
+    assert isinstance(half, TaxelGainMap)
+    assert half.gains != effect.gains
+
+
+def test_no_map_is_made_of_noise() -> None:
+    made, recordings = problem("none")
+    base = {f.name: f.start for f in made.base} | {"k_n": K_N, "k_d": K_D}
+    (effect,) = made.prepare(base, [made.candidates["taxel_gain_map"].make({})], recordings)
+    assert isinstance(effect, TaxelGainMap)
+    assert np.abs(np.array(effect.gains) - 1.0).max() < 0.02
+
+
+def test_what_the_pads_do_not_repeat_is_in_the_floor() -> None:
+    """A ball that sits 20 µm deeper the second time: K_N · 20 µm · 75 = 1.35 counts, RMS / √2 where it touches."""
+    first = press(0)
+    again = press(7, motion_seed=0, repeat_of="press_0", name="press_0_again")
+    offset = dataclasses.replace(press(7, motion_seed=0), measured=again.measured)
+    deeper = dataclasses.replace(again, touch=offset.touch)
+    ball = ball_at(*PLACES[0])
+    assert deeper.touch is not None
+    counts = deeper.touch.counts.reshape(-1, 4, 384).copy()
+    pressed = touch_motion(first, CONFIG, ball)
+    held = np.zeros((len(counts), 2, 384), bool)
+    held[: len(pressed.time_s)] = pressed.near(0.0).reshape(len(pressed.time_s), 2, -1)
+    counts[:, :2] += np.where(held, 3, 0).astype(np.int16)
+    deeper = dataclasses.replace(
+        deeper, touch=dataclasses.replace(deeper.touch, counts=counts.reshape(len(counts), -1))
+    )
+    motions = [touch_motion(m, CONFIG, ball) for m in (first, deeper)]
+    alone, both = TouchProblem(motions[:1], CONFIG), TouchProblem(motions, CONFIG)
+    share = motions[0].near(0.0).mean(axis=0)
+    often = share > 0.2
+    expected = np.sqrt(np.square(alone.floor_count) + share * 9 / 2)
+    np.testing.assert_allclose(both.floor_count[often], expected[often], rtol=0.2)
+    assert np.median(both.floor_count[often] / alone.floor_count[often]) > 1.3
+
+
+def test_an_effect_that_the_twin_has_is_refitted_where_it_acts_on_just_these_pads_and_else_stays() -> None:
+    motions = [recorded("none", 0)]
+    pads = ["left_a", "left_b"]
+    own = TouchProblem(motions, TwinConfig(effects=[make_effect("touch_lag", time_constant_s=0.02, pads=pads)]))
+    assert own.present == ("touch_lag",)
+    assert own.start["touch_lag.time_constant_s"] == 0.02
+    wide = TouchProblem(motions, TwinConfig(effects=[make_effect("touch_lag", time_constant_s=0.02)]))
+    assert wide.present == ()
+    assert "touch_lag" not in wide.candidates
+    assert "touch_delay" in wide.candidates
+
+
+def test_candidates_are_all_effects_that_a_matched_replay_can_show() -> None:
+    made: Problem
+    made, recordings = problem("none", 1)
+    assert set(made.candidates) >= set(PLANTED)
+    assert len(made.candidates) >= 12
+    assert not {"pad_compliance", "contact_compliance", "taxel_gain_spread", "dead_taxels"} & set(made.candidates)
+    assert [f.name for f in made.candidates["taxel_power_law"].frees] == ["taxel_power_law.exponent"]
+    assert recordings[0].measured.shape[1] <= 64
