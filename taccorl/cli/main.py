@@ -3,12 +3,18 @@
 import importlib
 import os
 import sys
+from collections.abc import Callable
 
 from taccorl.errors import TaccorlError, nearest
 
 VERBS = {
     "twin": {
-        "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them"
+        "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them",
+        "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
+        "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",
+        "add-effect": "the twin with one effect more, with the fitted values",
+        "excite": "which motion to record next, so that two effects can be told apart",
+        "surrogate": "recordings of a robot that is not there, with effects hidden in it",
     },
     "data": {
         "ingest": "recordings → LeRobot dataset with touch; `ingest inspect FILE` looks into one",
@@ -36,7 +42,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"taccorl: no verb {words[0]!r}; {nearest(words[0], known)}", file=sys.stderr)
         return 2
     try:
-        code = _list_verbs() if listing else importlib.import_module(f"taccorl.cli.{words[0]}").main(words[1:])
+        code = _list_verbs() if listing else _verb(words[0])(words[1:])
         sys.stdout.flush()  # a closed pipe shows here at the latest
         return code
     except TaccorlError as error:
@@ -54,12 +60,17 @@ def main(argv: list[str] | None = None) -> int:
         return 2
 
 
+def _verb(word: str) -> Callable[[list[str]], int]:
+    """``add-effect`` is in ``add_effect.py``."""
+    return importlib.import_module(f"taccorl.cli.{word.replace('-', '_')}").main
+
+
 def _list_verbs() -> int:
     print("usage: taccorl <verb> [what] [--option=value …]      taccorl <verb> --help\n")
     for group, verbs in VERBS.items():
         print(group)
         for verb, line in verbs.items():
-            print(f"  {verb:9s}{line}")
+            print(f"  {verb:12s}{line}")
     print("\ntraining and scoring are LeRobot's own commands: lerobot-train, lerobot-eval")
     return 0
 

@@ -39,8 +39,8 @@ def test_the_list_names_every_verb_and_needs_no_library() -> None:
     for group, verbs in VERBS.items():
         assert group in listing
         for verb, line in verbs.items():
-            assert f"  {verb:9s}{line}" in listing
-            assert callable(importlib.import_module(f"taccorl.cli.{verb}").main)
+            assert f"  {verb:12s}{line}" in listing
+            assert callable(importlib.import_module(f"taccorl.cli.{verb.replace('-', '_')}").main)
 
 
 @pytest.mark.parametrize("words", [["-h"], ["--help"], []])

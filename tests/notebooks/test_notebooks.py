@@ -14,7 +14,7 @@ def test_notebook_runs_and_every_plot_appears(path):
     notebook = nbformat.read(path, as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "stored outputs go stale: clear them"
     NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(FOLDER.parent)}}).execute()
-    plotting = [cell for cell in notebook.cells if "plt.show()" in cell.source]
+    plotting = [cell for cell in notebook.cells if "plt.show()" in cell.source or "display(" in cell.source]
     assert plotting
     for cell in plotting:
         assert any("image/png" in output.get("data", {}) for output in cell.outputs)

@@ -1,0 +1,223 @@
+"""``taccorl compare --twin=twin.yaml --measurements=sweeps/``: how far the twin is from measurements, and where.
+
+MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may say which
+are held out and which repeat one another. Every recording's commands run through the twin. What is wrong with the data is said
+first; with errors nothing is compared.
+
+    --against=other.yaml   another twin beside it: before and after
+    --out=DIR              report.html (one page, works anywhere) and report.json
+    --rerun=x.rrd          measured, replayed, residual and noise floor over time, for the Rerun program
+"""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from taccorl.cli.parse import parse
+from taccorl.errors import TaccorlError
+
+if TYPE_CHECKING:
+    from taccorl.alignment.measurements import Measurements
+    from taccorl.alignment.touch_motion import PressedObject
+    from taccorl.data.finding import Finding
+    from taccorl.diagnosis.comparison import Comparison, Score
+    from taccorl.sim.twin import TwinConfig
+
+
+@dataclass(kw_only=True)
+class PressedConfig:
+    """A ball or a rod between the fingers."""
+
+    shape: Literal["nothing", "sphere", "rod"] = "nothing"
+    """nothing: touch is not compared."""
+    radius_m: float = 0.012
+    length_m: float = 0.03
+    """Of a rod."""
+    arm: str = "left"
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Its middle: in the TCP's frame (middle between the pads, z = approach, fingers close along y), or in the world's."""
+    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Fixed-axis roll, pitch, yaw; [0, 1.5708, 0] lays a rod across the pads."""
+    frame: Literal["tcp", "world"] = "tcp"
+
+
+@dataclass(kw_only=True)
+class CompareConfig:
+    """How far the twin is from measurements, and where."""
+
+    measurements: Path
+    """A recording, table or dataset, or a folder of those."""
+    twin: Path | None = None
+    """twin.yaml; the nominal twin if not given."""
+    against: Path | None = None
+    """Another twin.yaml, shown beside the first."""
+    joints: list[str] = field(default_factory=list)
+    """Only these, such as left_joint5; all that were commanded to move if not given."""
+    spec: str | None = None
+    """Recording spec; needed where several shipped ones read the format."""
+    columns: Path | None = None
+    """Columns file of tables with other names or units than ours."""
+    held_out_every: int | None = None
+    """Every k-th motion is held out; else as measurements.yaml says."""
+    pressed: PressedConfig = field(default_factory=PressedConfig)
+    """What the fingers pressed in recordings with pads; then touch is compared, too."""
+    out: Path | None = None
+    """Folder for report.html and report.json. An earlier report is replaced, any other file left alone."""
+    rerun: Path | None = None
+    """Write a Rerun file (.rrd); replaces as `out` does."""
+
+
+def main(argv: list[str]) -> int:
+    """0: compared; 1: the measurements have errors, nothing was compared."""
+    config = parse(CompareConfig, argv, positional="measurements")
+    _check_outputs(config)
+    from taccorl.alignment.measurements import read_measurements
+    from taccorl.cli.measured import checked, name_of, print_findings, twin_of
+
+    twins = [
+        (name_of(path), twin_of(path)) for path in (config.twin, config.against)[: 1 + (config.against is not None)]
+    ]
+    measurements = read_measurements(
+        config.measurements, spec=config.spec, columns=config.columns, held_out_every=config.held_out_every
+    )
+    findings = checked(measurements, "not compared")
+    if findings is None:
+        return 1
+    comparisons = _compared(config, twins, measurements)
+    bad = [f for c in comparisons[:1] for found in c.clock.values() for f in found if f.severity == "error"]
+    print_findings({f"replay of {name}": list(found) for name, found in comparisons[0].clock.items() if found})
+    if bad:
+        print(
+            f"not compared: {len(bad)} errors of time stamps, see above; an offset of one row looks like missing physics"
+        )
+        return 1
+    score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
+    _write(config, comparisons, findings, twins, argv)
+    return 0
+
+
+def _check_outputs(config: CompareConfig) -> None:
+    """Before any work is done: is there a place for what was asked for?"""
+    if config.out is not None:
+        from taccorl.diagnosis.report import check_folder
+
+        check_folder(config.out)
+    if config.rerun is not None:
+        from taccorl.views.outputs import check_free
+
+        if config.rerun.suffix != ".rrd":
+            raise TaccorlError(f"--rerun={config.rerun}: must end in .rrd")
+        check_free(config.rerun)
+
+
+def _compared(
+    config: CompareConfig, twins: "Sequence[tuple[str, TwinConfig]]", measurements: "Measurements"
+) -> list["Comparison"]:
+    from taccorl.cli.tables import Bars
+    from taccorl.diagnosis.compare import compare
+    from taccorl.diagnosis.comparison import only
+
+    pressed = _pressed(config.pressed)
+    found = []
+    for name, twin in twins:
+        with Bars(len(measurements.all)) as bars:
+            found.append(
+                compare(
+                    twin,
+                    measurements,
+                    name=name,
+                    pressed=pressed,
+                    progress=lambda recording, done, total, name=name: bars.update(f"{name}: {recording}", done, total),
+                )
+            )
+    return [only(c, config.joints) for c in found] if config.joints else found
+
+
+def _pressed(config: PressedConfig) -> "PressedObject | None":
+    from taccorl.alignment.touch_motion import indenter
+
+    if config.shape == "nothing":
+        return None
+    return indenter(
+        config.shape,
+        config.radius_m,
+        config.arm,
+        length_m=config.length_m,
+        position_m=config.position_m,
+        rpy_rad=config.rpy_rad,
+        frame=config.frame,
+    )
+
+
+def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> None:
+    """One line a signal and use."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from taccorl.cli.tables import console
+    from taccorl.diagnosis.comparison import origin_words, shown
+    from taccorl.diagnosis.localise import heat_map, worst_regime
+
+    cells = [*heat_map(comparison, "position"), *heat_map(comparison, "effort")]
+    later = {(s.signal, s.kind, s.use): s for s in after.scores()} if after is not None else {}
+    table = Table(box=None, pad_edge=False)
+    heads = [f"RMSE {comparison.twin}", "× floor"]
+    heads += [f"RMSE {after.twin}", "× floor", "change"] if after is not None else []
+    for head in ("signal", "use", *heads, "NRMSE", "floor", "worst regime (where, not why)"):
+        table.add_column(
+            head, justify="left" if head in ("signal", "use") or "regime" in head else "right", overflow="fold"
+        )
+    for s in comparison.scores():
+        row = [Text(f"{s.signal} {s.kind}" if s.kind != "touch" else s.signal), s.use.replace("_", "-")]
+        row += _error_cells(s)
+        other = later.get((s.signal, s.kind, s.use))
+        if after is not None:
+            row += [*_error_cells(other), f"{other.rmse / s.rmse - 1:+.0%}"] if other is not None else [""] * 3
+        worst = worst_regime(cells, s.signal, s.kind)
+        floor = shown(s.floor, s.unit) + (" ≤" if s.lower_bound else "")
+        table.add_row(*row, f"{s.nrmse:.2%}", floor, f"{worst.regime} ({worst.ratio:.3g} × floor)" if worst else "")
+    out = console()
+    out.print(table)
+    if any(s.lower_bound for s in comparison.scores()):
+        out.print(Text("≤: no motion was recorded twice, so this floor is a lower bound", "dim"))
+    for line in comparison.left_out:
+        out.print(Text(f"not compared: {line}", "dim"), soft_wrap=True)
+    out.print(Text(origin_words(comparison.origins)), soft_wrap=True)
+
+
+def _error_cells(s: "Score") -> list:
+    from rich.text import Text
+
+    from taccorl.diagnosis.comparison import shown
+
+    return [shown(s.rmse, s.unit), Text(f"{s.ratio:.3g}", "green" if s.ratio <= 1.25 else "yellow")]
+
+
+def _write(
+    config: CompareConfig,
+    comparisons: "Sequence[Comparison]",
+    findings: dict[str, list["Finding"]],
+    twins: "Sequence[tuple[str, TwinConfig]]",
+    argv: Sequence[str],
+) -> None:
+    first, after = comparisons[0], comparisons[1] if len(comparisons) > 1 else None
+    if config.out is not None:
+        from taccorl.diagnosis.report import Report, write_report
+        from taccorl.sim.twin_file import twin_digest
+
+        provenance = {"command": shlex.join(["taccorl", "compare", *argv])}
+        for name, twin in twins:
+            provenance[f"{name}, SHA-256"] = twin_digest(twin)
+        clock = {name: [*findings.get(name, []), *found] for name, found in first.clock.items()}
+        title = f"{first.twin} beside {config.measurements.name}" + (f", and {after.twin}" if after else "")
+        report = Report(title=title, comparison=first, after=after, findings=clock, provenance=provenance)
+        written = write_report(report, config.out)
+        again = f" (replaced the report of {written.replaced})" if written.replaced else ""
+        print(f"wrote {written.page} and {written.numbers.name}{again}")
+    if config.rerun is not None:
+        from taccorl.views.compare_view import save_comparison
+
+        save_comparison(first, config.rerun, after)
+        print(f"wrote {config.rerun}: look at it with rerun {shlex.quote(str(config.rerun))}")

@@ -1,0 +1,70 @@
+"""What the verbs that look at measurements share: the twin they start from, and the checks before anything is concluded."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from taccorl.alignment.measurements import Measurements
+    from taccorl.data.finding import Finding
+    from taccorl.sim.twin import TwinConfig
+
+
+def twin_of(path: Path | None) -> "TwinConfig":
+    """The twin of a file; the nominal one without."""
+    from taccorl.sim.twin import TwinConfig
+    from taccorl.sim.twin_file import load_twin
+
+    return TwinConfig() if path is None else load_twin(path)
+
+
+def name_of(path: Path | None) -> str:
+    """How tables and pages call that twin."""
+    return "nominal twin" if path is None else path.stem
+
+
+def checked(measurements: "Measurements", verdict: str) -> dict[str, list["Finding"]] | None:
+    """What the checks of telemetry say, printed; None where they found errors, which ``verdict`` then says first."""
+    from taccorl.alignment.telemetry_checks import check_measurements
+
+    found = check_measurements(measurements.all)
+    print_findings(found)
+    for line in measurements.skipped:
+        print(f"not read: {line}")
+    wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
+    if wrong:
+        print(f"{verdict}: errors in {', '.join(wrong)}, each with what to record or mend instead, see above")
+        return None
+    return found
+
+
+def print_findings(found: dict[str, list["Finding"]]) -> None:
+    """Errors and warnings recording by recording, those alike in one line; a note that many have once."""
+    from rich.text import Text
+
+    from taccorl.cli.tables import console, findings_table
+
+    notes: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
+    for name, findings in found.items():
+        for f in findings:
+            if f.severity == "note":
+                notes.setdefault((f.check, f.feature), []).append((name, f))
+        worse: dict[str, list[Finding]] = {}
+        for f in findings:
+            if f.severity != "note":
+                worse.setdefault(f.check, []).append(f)
+        if worse:
+            findings_table(name, [_together(same) for same in worse.values()])
+    sound = [name for name, findings in found.items() if all(f.severity == "note" for f in findings)]
+    if sound:
+        findings_table(f"{len(sound)} recordings: {', '.join(sound)}", [])
+    for same in notes.values():
+        name, f = same[0]
+        others = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
+        console().print(Text("  note    ", "dim") + Text(f"{name}{others}: {f.check}: {f.text}"), soft_wrap=True)
+
+
+def _together(same: list["Finding"]) -> "Finding":
+    """The first of several alike, and where else it is so."""
+    others = [f.feature for f in same[1:]]
+    return dataclasses.replace(same[0], text=f"{same[0].text}. Also: {', '.join(others)}") if others else same[0]

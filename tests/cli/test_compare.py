@@ -1,0 +1,118 @@
+"""``taccorl compare`` as a user types it, on sweeps simulated by the twin with dry friction in one joint (not a robot's)."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taccorl.cli.main import main
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import save_twin
+
+sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
+from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``sweeps/``, ``twin.yaml`` without friction and ``mended.yaml`` with it."""
+    path = tmp_path_factory.mktemp("compare")
+    write_folder(path / "sweeps", sweeps(friction(), seconds=4.0))
+    save_twin(TwinConfig(), path / "twin.yaml")
+    save_twin(friction(), path / "mended.yaml")
+    return path
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Any:
+    def run(*words: Any) -> tuple[int, str]:
+        code = main(["compare", *map(str, words)])
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, shown.out + shown.err
+
+    return run
+
+
+def row(text: str, signal: str, use: str) -> list[str]:
+    """Words of one line of the table."""
+    return next(line.split() for line in text.splitlines() if line.startswith(signal) and use in line)
+
+
+def test_table_says_how_far_off_and_where(folder: Path, said: Any):
+    code, text = said(f"--twin={folder / 'twin.yaml'}", f"--measurements={folder / 'sweeps'}")
+    assert code == 0
+    words = row(text, f"{SIGNAL} position", "held-out")
+    error, unit, ratio = float(words[3]), words[4], float(words[5])
+    assert unit == "mrad" and 3.0 < error < 7.0  # F / K_p = 1 / 151 rad = 6.6 mrad at most
+    assert ratio == pytest.approx(error / 0.2, rel=0.1)  # made with 0.2 mrad of noise; the floor is from the repeat
+    assert "× floor)" in " ".join(words), "the worst regime"
+    assert row(text, f"{SIGNAL} effort", "fit")[4] == "N·m"
+    assert "ok" in text and "4 recordings" in text, "the checks come first"
+    assert text.index("4 recordings") < text.index("RMSE")
+    assert "data: origin not stated" in text  # a table cannot say
+
+
+def test_before_and_after_side_by_side_with_report_and_rerun_file(folder: Path, said: Any, tmp_path: Path):
+    out, rrd = tmp_path / "report", tmp_path / "x.rrd"
+    words = [folder / "sweeps", f"--twin={folder / 'twin.yaml'}", f"--against={folder / 'mended.yaml'}"]
+    code, text = said(*words, f"--out={out}", f"--rerun={rrd}")
+    assert code == 0
+    assert "RMSE mended" in text and "-9" in " ".join(row(text, f"{SIGNAL} position", "held-out"))
+    found = json.loads((out / "report.json").read_text())
+    before, after = (next(s for s in found[k] if s["use"] == "held_out") for k in ("scores", "scores_after"))
+    assert before["ratio"] > 10 and after["ratio"] < 1.2
+    assert found["provenance"]["command"].startswith("taccorl compare ")
+    assert found["recordings"]["held_out"] == ["sweep_2.csv"]
+    assert rrd.read_bytes()[:4] == b"RRF2"
+    code, text = said(*words, f"--out={out}")
+    assert code == 0 and "replaced the report of" in text
+
+
+def test_errors_of_the_data_stop_it_with_what_to_do(folder: Path, said: Any, tmp_path: Path):
+    good = sweeps(TwinConfig(), seconds=3.0)
+    m = good.fit[0]
+    early = {n: getattr(m, n)[:-3] for n in ("time_s", "target")} | {
+        n: getattr(m, n)[3:] for n in ("measured", "velocity", "effort")
+    }
+    write_folder(tmp_path / "early", dataclasses.replace(good, fit=(dataclasses.replace(m, **early),), held_out=()))
+    code, text = said(tmp_path / "early", f"--out={tmp_path / 'report'}")
+    assert code == 1
+    assert "before its command" in text and "latency_s" in text, "what is wrong, and the way out"
+    assert "not compared: errors in sweep_0.csv" in text
+    assert "RMSE" not in text and not (tmp_path / "report").exists()
+
+
+def test_only_the_joints_that_were_asked_for(folder: Path, said: Any):
+    code, text = said(folder / "sweeps", "--joints=[right_joint1]")
+    assert code == 2
+    assert "'right_joint1' was not compared" in text and SIGNAL in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{folder}/nothing"], "no such file or folder"),
+        (["{folder}/sweeps", "--twin={folder}/no.yaml"], "no.yaml"),
+        (["{folder}/sweeps", "--rerun={tmp}/x.png"], "must end in .rrd"),
+        (["{folder}/sweeps", "--out={folder}/twin.yaml"], "is a file; give a folder"),
+        (["{folder}/sweeps", "--pressed.shape=cube"], "cube"),
+        ([], "missing --measurements="),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_any_work(
+    words: list[str], message: str, folder: Path, said: Any, tmp_path: Path
+):
+    code, text = said(*[w.format(folder=folder, tmp=tmp_path) for w in words])
+    assert code == 2
+    assert message in text
+
+
+def test_somebody_else_s_page_is_left_alone(folder: Path, said: Any, tmp_path: Path):
+    (tmp_path / "report.html").write_text("mine")
+    code, text = said(folder / "sweeps", f"--out={tmp_path}")
+    assert code == 2 and "not a report of ours" in text
+    assert (tmp_path / "report.html").read_text() == "mine"
