@@ -6,7 +6,7 @@ export HF_HUB_OFFLINE := 1
 .PHONY: demo test test-slow lint bench pictures lock clean
 
 demo: .venv/.ready
-	@echo "demo: the twin demonstrates → recordings → dataset → checks → Rerun. Nothing here comes from a robot."
+	@echo "demo: the twin demonstrates → recordings → dataset → checks → Rerun; a hidden effect is found. Nothing here comes from a robot."
 	$(BIN)/python -m pipelines.demo
 
 test: .venv/.ready
@@ -30,6 +30,7 @@ bench: .venv/.ready
 pictures: .venv/.ready
 	$(BIN)/python -m pipelines.task_pictures
 	$(BIN)/python -m pipelines.effects_page
+	$(BIN)/python -m pipelines.mend_picture
 
 # Names and versions only: no addresses, no hashes.
 lock: .venv/.ready

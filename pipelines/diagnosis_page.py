@@ -61,6 +61,11 @@ def write_page(rows: list[dict]) -> None:
         lines.append(f"| … test error / floor afterwards (no choice has seen it) | | {spread(fell)} |")
         cost = [r["cpu_s"] for r in rows if r["study"] == "single" and r["design"] == design]
         lines.append(f"| … CPU-seconds of a diagnosis, median / 90th percentile | 15 | {spread(cost)} |")
+    pads = [r for r in rows if r["study"] == "touch" and material(r)]
+    lines.append(
+        f"| one hidden effect of the pads, press–hold–release: exact | 90 % | {_of(pads, exact_but_for_algebra)} |"
+    )
+    lines.append(f"| … held-out error / floor afterwards | 1.1 / 1.3 | {_after(pads)} |")
     none = [r for r in rows if r["study"] == "none"]
     lines.append(f"| no hidden effect: nothing added | 98 % | {share(sum(not r['found'] for r in none), len(none))} |")
     both = [r for r in rows if r["study"] == "pairs" and material(r)]
@@ -73,12 +78,16 @@ def write_page(rows: list[dict]) -> None:
     wrong = [r for r in gone if silently_wrong(r)]
     lines.append(f"| … a wrong effect at the floor without a word | ≤ 5 % | {share(len(wrong), len(gone))} |")
     lines.append("")
-    for design in ("pack", "chirp"):
-        own = [r for r in rows if r["study"] == "single" and r["design"] == design]
+    for design in ("pack", "chirp", "press"):
+        own = [r for r in rows if r["study"] in ("single", "touch") and r["design"] == design]
         if own:
             lines += _single(own, design)
     PAGE.write_text("\n".join(lines) + "\n", encoding="utf-8")
     print(PAGE)
+
+
+def _after(rows: list[dict]) -> str:
+    return spread([r["errors"]["after"]["held_out"] for r in rows if exact_but_for_algebra(r)])
 
 
 def _of(rows: list[dict], is_so: Callable[[dict], bool]) -> str:

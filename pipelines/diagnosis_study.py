@@ -12,6 +12,7 @@ from pathlib import Path
 from taccorl.cli.tables import Bars
 from taccorl.diagnosis import study
 from taccorl.diagnosis.surrogate.hidden import OUTSIDE, REGISTERED
+from taccorl.diagnosis.surrogate.touch_hidden import REGISTERED_TOUCH
 
 ROWS = Path("docs/diagnosis_study.jsonl")
 PAIRS = (
@@ -32,6 +33,7 @@ STUDIES = {
     "none": lambda n: study.nothing("chirp", range(1000, 1000 + 5 * n)),
     "removed": lambda n: study.removed("chirp", REGISTERED, range(2000, 2000 + n)),
     "outside": lambda n: study.removed("chirp", OUTSIDE, range(2000, 2000 + n)),
+    "touch": lambda n: study.touch(REGISTERED_TOUCH, range(1000, 1000 + n)),
     "pairs": lambda n: study.pairs("pack", PAIRS, range(3000, 3000 + n)),
 }
 
@@ -41,6 +43,10 @@ def read_rows() -> list[dict]:
     return [json.loads(line) for line in ROWS.read_text(encoding="utf-8").splitlines()] if ROWS.exists() else []
 
 
+def _run(job: study.Job) -> dict:
+    return study.run_touch(job) if job.study == "touch" else study.run(job)
+
+
 def main(words: list[str]) -> None:
     """Words: names of studies, and ``--seeds=20``."""
     seeds = next((int(w.partition("=")[2]) for w in words if w.startswith("--seeds=")), 20)
@@ -48,7 +54,7 @@ def main(words: list[str]) -> None:
     done = {row["key"] for row in read_rows()}
     jobs = [job for name in names for job in STUDIES[name](seeds) if job.key not in done]
     with Bars(len(jobs)) as bars, get_context("spawn").Pool(2) as pool, ROWS.open("a", encoding="utf-8") as file:
-        for count, row in enumerate(pool.imap_unordered(study.run, jobs), 1):
+        for count, row in enumerate(pool.imap_unordered(_run, jobs), 1):
             file.write(json.dumps(row, ensure_ascii=False) + "\n")
             file.flush()
             bars.update(row["key"], count, len(jobs))

@@ -15,7 +15,7 @@ from statistics import median
 import mujoco
 import numpy as np
 
-from taccorl.alignment import arm_bench
+from taccorl.alignment import arm_bench, camera_benchmarks  # noqa: F401, registers its rows
 from taccorl.alignment.controller import PAPER_BOUNDS, REFERENCE, identify_controller
 from taccorl.alignment.joint_model import Gains, JointModel
 from taccorl.alignment.joint_motion import JointMotion, joint_motion

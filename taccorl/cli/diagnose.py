@@ -76,7 +76,7 @@ def main(argv: list[str]) -> int:
         return 1
     before = compare(twin, measurements, name=name_of(config.twin))
     late = {name: list(found) for name, found in before.clock.items() if found}
-    print_findings(late)
+    print_findings({f"replay of {name}": found for name, found in late.items()})
     if any(f.severity == "error" for found in late.values() for f in found):
         print("not diagnosed: time stamps are off, see above; an offset of one row looks like missing physics")
         return 1

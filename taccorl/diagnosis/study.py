@@ -13,6 +13,8 @@ from taccorl.diagnosis.joint_problem import JointProblem
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
 from taccorl.diagnosis.surrogate.cases import draw_case
 from taccorl.diagnosis.surrogate.recordings import recordings
+from taccorl.diagnosis.surrogate.touch import draw_touch_case, touch_recordings
+from taccorl.diagnosis.touch_problem import TouchProblem
 from taccorl.sim.effects import effects as registry
 
 MATERIAL = 1.5
@@ -23,9 +25,12 @@ IDENTICAL = (
     frozenset({"coulomb_friction", "asymmetric_friction"}),
     frozenset({"command_delay", "sensor_delay"}),
     frozenset({"gravity_mismatch", "torque_scale"}),
+    frozenset({"taxel_gain_map", "taxel_gain_spread"}),
+    frozenset({"taxel_gain_map", "dead_taxels"}),
 )
 """The same motion from either once gains and T_ref are refitted: F (1 + a sign v) is Coulomb and a constant torque; a loop that
-hears late is one that tells late; all torques scaled are other gains and a wrongly carried weight."""
+hears late is one that tells late; all torques scaled are other gains and a wrongly carried weight; a map of gains holds spread
+and dead taxels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +81,29 @@ def run(job: Job) -> dict[str, Any]:
     }
 
 
+def run_touch(job: Job) -> dict[str, Any]:
+    """The same for pads of one arm that press known objects."""
+    began = time.process_time()
+    case = draw_touch_case(job.hidden, job.seed, strength=job.strength)
+    motions = touch_recordings(case).motions(case.twin)
+    recorded = time.process_time()
+    problem = TouchProblem([m for side in motions.values() for m in side], case.twin)
+    fit_to, held_out, test = ([problem.recording(m) for m in motions[use]] for use in ("fit", "held_out", "test"))
+    config = SearchConfig(max_effects=len(job.hidden) + 1)
+    found = diagnose(problem, fit_to, held_out, test, start=problem.start, without=job.without, config=config)
+    done = time.process_time()
+    return {
+        "key": job.key,
+        **dataclasses.asdict(job),
+        "signal": f"{case.arm} pads",
+        "left_floors": round(case.left_floors, 3),
+        **told(found),
+        "true": [{k: float(f"{v:.5g}") for k, v in h.values.items()} for h in case.hidden],
+        "recording_cpu_s": round(recorded - began, 2),
+        "cpu_s": round(done - recorded, 2),
+    }
+
+
 def told(found: Diagnosis) -> dict[str, Any]:
     """What a diagnosis says, in plain numbers."""
     ties = {r.added: list(r.ties) for r in found.rounds if r.added}
@@ -118,8 +146,9 @@ def exact_but_for_algebra(row: dict[str, Any]) -> bool:
     """As ``exact``, but that of effects which no position can ever tell apart either one will do."""
     if exact(row):
         return True
-    same = next((group for group in IDENTICAL if row["hidden"][0] in group), frozenset())
-    return len(row["hidden"]) == 1 and bool(row["found"]) and row["found"][0] in same
+    if len(row["hidden"]) != 1 or not row["found"]:
+        return False
+    return any({row["hidden"][0], row["found"][0]} <= group for group in IDENTICAL)
 
 
 def silently_wrong(row: dict[str, Any]) -> bool:
@@ -130,6 +159,11 @@ def silently_wrong(row: dict[str, Any]) -> bool:
 def single(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
     """One hidden effect each."""
     return [Job(study="single", hidden=(n,), seed=s, design=design) for s in seeds for n in names]
+
+
+def touch(names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
+    """One hidden effect of the pads each, press–hold–release."""
+    return [Job(study="touch", hidden=(n,), seed=s, design="press") for s in seeds for n in names]
 
 
 def nothing(design: str, seeds: Sequence[int]) -> list[Job]:

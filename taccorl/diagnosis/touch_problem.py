@@ -224,14 +224,15 @@ def _rows(frames: np.ndarray) -> np.ndarray:
 
 
 def _still_floor(motions: Sequence[TouchMotion]) -> np.ndarray:
-    """(P, R, C) counts: standard deviation of rows that nothing disturbs, about each recording's mean; at least rounding."""
+    """(P, R, C) counts: standard deviation of rows that nothing disturbs, from the differences of neighbours, because a zero
+    that drifts is no noise; at least rounding."""
     squares, freedom = np.zeros(motions[0].measured.shape[1:]), np.zeros((len(motions[0].pads), 1, 1))
     for motion in motions:
         rows, still = _rows(motion.measured), _rows(motion.undisturbed()) == 1.0
         for p in range(len(motion.pads)):
-            if (num := int(still[:, p].sum())) > 1:
-                squares[p] += num * rows[still[:, p], p].var(axis=0)
-                freedom[p] += num - 1
+            both = still[1:, p] & still[:-1, p]
+            squares[p] += np.square(np.diff(rows[:, p], axis=0)[both]).sum(axis=0) / 2
+            freedom[p] += int(both.sum())
     return np.maximum(np.sqrt(squares / np.maximum(freedom, 1)), 1 / math.sqrt(12))
 
 

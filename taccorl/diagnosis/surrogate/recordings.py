@@ -61,7 +61,6 @@ def record(case: Case, motion: Motion) -> Measurement:
     measured[:, rest] += np.array(TORQUE_FF_NM) / np.array(KP_NM_PER_RAD)
     measured[:, own] = robot.reported(run)
     velocity[:, own], effort[:, own] = run.velocity[::COMMAND_MS], run.effort[::COMMAND_MS]
-    kp, kd = commanded(case, motion)
     return Measurement(
         name=motion.name,
         time_s=np.arange(num_rows) / RATE_HZ,
@@ -73,22 +72,17 @@ def record(case: Case, motion: Motion) -> Measurement:
         instruction=f"sweep of {case.signal}: {motion.name}",
         repeat_of=motion.repeat_of,
         payload_kg={ARMS[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
-        kp=kp,
-        kd=kd,
+        **_stated(case, motion),
     )
 
 
-def commanded(case: Case, motion: Motion) -> tuple[dict[str, float], dict[str, float]]:
-    """Signal → K_p and K_d that were commanded, as far as somebody wrote them down.
-
-    Gains that are known are written down for every recording. Where they are not, the user commands what the twin has, and the
-    drive makes something else of it, by the same factor each time: only the recording with another gain says so.
-    """
-    if not case.gains_known and motion.gain == 1.0:
-        return {}, {}
+def _stated(case: Case, motion: Motion) -> dict[str, dict[str, float]]:
+    """What is written down of the gains: known ones in every recording, else only by what factor one is driven differently."""
+    if not case.gains_known:
+        return {"gain_scale": {case.signal: motion.gain}} if motion.gain != 1.0 else {}
     control, joint = case.twin.controller, case.robot.joint
-    kp, kd = control.kp_nm_per_rad[joint], control.kd_nms_per_rad[joint]
-    return {case.signal: kp * motion.gain}, {case.signal: kd * motion.gain}
+    gains = {"kp": control.kp_nm_per_rad[joint], "kd": control.kd_nms_per_rad[joint]}
+    return {name: {case.signal: gain * motion.gain} for name, gain in gains.items()}
 
 
 def _noisy(rng: np.random.Generator, values: np.ndarray, joints: float | np.ndarray, grippers: float) -> np.ndarray:

@@ -90,7 +90,7 @@ def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: 
         duration_s=story.duration_s, seed=seed, instruction=measurement.instruction, pad_gain_spread=0.0
     )
     label = {"origin": measurement.origin, "instruction": measurement.instruction, "repeat_of": repeat_of or ""}
-    label |= {key: json.dumps(getattr(measurement, key)) for key in ("kp", "kd", "payload_kg")}
+    label |= {key: json.dumps(getattr(measurement, key)) for key in ("kp", "kd", "gain_scale", "payload_kg")}
     publish(path, _Sweep(config, story, _Dark()), label)
 
 

@@ -1,0 +1,60 @@
+"""What a diagnosis costs. How often it is right is in docs/diagnosis.md (``python -m pipelines.diagnosis_study``)."""
+
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from statistics import median
+
+from taccorl.benchmark import Row, benchmark, spread
+from taccorl.diagnosis.study import Job, run
+from taccorl.diagnosis.surrogate.cases import draw_case
+from taccorl.diagnosis.surrogate.recordings import recordings
+
+HIDDEN = ("coulomb_friction", "backlash", "command_delay", "gravity_mismatch", "cogging")
+
+
+@benchmark("diagnosis")
+def diagnosis() -> Iterator[Row]:
+    """One joint from the paper's 10 s chirp, and a whole arm on two cores; recordings of surrogate robots."""
+    run(Job(study="warm-up", hidden=(), seed=0, design="chirp"))
+    jobs = [Job(study="cost", hidden=(name,), seed=400 + k, design="chirp") for k, name in enumerate(HIDDEN)]
+    costs = [float(run(job)["cpu_s"]) for job in jobs]
+    yield Row(
+        name="one joint, 10 s chirp twice and four held-out motions at 200 Hz, 26 candidates, gains unknown, surrogate",
+        value=median(costs),
+        unit="CPU-s",
+        goal="≤ 15",
+        n=len(costs),
+        spread=spread(costs),
+    )
+    walls = []
+    for seed in (410, 420):
+        arm = [(f"left_joint{joint}", seed + joint) for joint in range(1, 7)]
+        before = time.perf_counter()
+        with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+            made = sum(pool.map(_one_of_an_arm, arm))
+        walls.append(time.perf_counter() - before - made / 2)
+    yield Row(
+        name="a whole arm, a sweep of each joint, two processes, without making the recordings, surrogate",
+        value=median(walls),
+        unit="s (wall)",
+        goal="≤ 60",
+        n=len(walls),
+        spread=spread(walls),
+    )
+
+
+def _one_of_an_arm(job: tuple[str, int]) -> float:
+    """Diagnose one joint; seconds that its recordings took."""
+    from taccorl.diagnosis.joint_problem import JointProblem
+    from taccorl.diagnosis.search import diagnose
+
+    signal, seed = job
+    before = time.perf_counter()
+    case = draw_case(("coulomb_friction",), seed, signal=signal)
+    made = recordings(case, "chirp")
+    took = time.perf_counter() - before
+    problem = JointProblem(case.twin, signal, made, gains="fitted", effort=False)
+    diagnose(problem, problem.fit, problem.held_out, problem.test, start=problem.start)
+    return took

@@ -1,0 +1,58 @@
+"""Recordings of one joint that its own one-joint model made, with noise: cheap, and nothing in them is unknown. Not a robot."""
+
+import dataclasses
+
+import numpy as np
+
+from taccorl.alignment.joint_model import JointModel, joint_motion
+from taccorl.alignment.measurement import Measurement
+from taccorl.diagnosis.excitation import imagined, rest_pose, room_of
+from taccorl.diagnosis.motions import Motion
+from taccorl.sim.twin import TwinConfig
+
+SIGNAL = "left_joint5"
+NOISE_RAD = 2e-4
+NOISE_NM = 0.01
+
+
+def recorded(
+    config: TwinConfig,
+    motion: Motion,
+    seed: int,
+    *,
+    signal: str = SIGNAL,
+    stated: bool = True,
+    noise_rad: float = NOISE_RAD,
+    effort: bool = False,
+) -> Measurement:
+    """One motion of the library.
+
+    Args:
+        stated: its commanded gains are written down; else only by what factor they differ from the usual ones.
+        effort: it was recorded.
+    """
+    pose = rest_pose(signal, None)
+    m = imagined(config, signal, pose, motion, motion.target(room_of(config, signal, pose)), 0.0)
+    model = JointModel(config, signal)
+    seen = joint_motion(m, config, signal)
+    # A robot has been at rest for long: where K_p (q* − q) + T_ref = 0.
+    rest = dataclasses.replace(seen, start=seen.target[0] + model.gains.torque_ff / (motion.gain * model.gains.kp))
+    answer = model.simulate(rest, model.gains)
+    rng = np.random.default_rng([seed, 77])
+    j = m.column(signal)
+    measured = m.measured + noise_rad * rng.standard_normal(m.measured.shape)
+    measured[:, j] = answer.reported + noise_rad * rng.standard_normal(m.num_rows)
+    efforts = np.full(measured.shape, np.nan)
+    if effort:
+        efforts[:, j] = answer.effort + NOISE_NM * rng.standard_normal(m.num_rows)
+    gains = {} if stated else {"kp": {}, "kd": {}}
+    scale = {} if stated or motion.gain == 1.0 else {signal: motion.gain}
+    return dataclasses.replace(
+        m,
+        measured=measured,
+        effort=efforts,
+        gain_scale=scale,
+        repeat_of=motion.repeat_of,
+        origin="simulated by the joint model, not a robot",
+        **gains,
+    )

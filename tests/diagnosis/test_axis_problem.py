@@ -1,0 +1,186 @@
+"""Driven axes that are no joint of the robot: a slide whose friction is known here, and a real one (EMPS benchmark)."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.measurements import Measurements
+from taccorl.diagnosis.axis_problem import GAINS_WITHIN, AxisConfig, AxisProblem, load_axis
+from taccorl.diagnosis.problem import split_rows
+from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.errors import TaccorlError
+
+ROOT = Path(__file__).parents[2]
+EMPS = ROOT.parent / "shared" / "data" / "emps"
+MASS_KG, FRICTION_N, KP, KD = 100.0, 20.0, 1.37e6, 8560.0
+NOISE_M, NOISE_N = 2e-6, 0.5
+AXIS = AxisConfig(
+    name="drive", unit="m", inertia=80.0, kp=KP, kd=KD, force_unit_n=10.0, length_unit_m=0.25, timestep_s=1e-3
+)
+
+
+def simulated(name: str, amplitude_m: float, hz: float, seed: int, repeat_of: str | None = None) -> Measurement:
+    """A mass with dry friction on a slide, in N and m, at a tenth of a millisecond: equations of this test, not the twin's."""
+    rate_hz, parts = 1000, 10
+    time_s = np.arange(6 * rate_hz) / rate_hz
+    fade = np.clip(np.minimum(time_s - 0.5, 5.5 - time_s) / 0.5, 0, 1) ** 2
+    target = amplitude_m * fade * np.sin(2 * np.pi * hz * (time_s - 0.5))
+    dt_s, at, speed, goal = 1.0 / (rate_hz * parts), 0.0, 0.0, 0.0
+    stops = dt_s * FRICTION_N / MASS_KG  # speed that friction takes away in one step
+    rows = []
+    for following in target.tolist():
+        rows.append((at, KP * (goal - at) - KD * speed))  # as it is before the row's command acts
+        goal = following
+        for _ in range(parts):
+            free = speed + dt_s * (KP * (goal - at) - KD * speed) / MASS_KG
+            speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+            at += dt_s * speed
+    position, force = np.array(rows).T
+    rng = np.random.default_rng(seed)
+    return Measurement(
+        name=name,
+        time_s=time_s,
+        target=target[:, None],
+        measured=position[:, None] + NOISE_M * rng.standard_normal((len(target), 1)),
+        effort=force[:, None] + NOISE_N * rng.standard_normal((len(target), 1)),
+        signals=("drive",),
+        units=("m",),
+        repeat_of=repeat_of,
+        origin="simulated by the test, not a drive",
+    )
+
+
+@pytest.fixture(scope="module")
+def slide() -> Measurements:
+    fit = simulated("sine", 0.1, 0.6, 1), simulated("again", 0.1, 0.6, 2, repeat_of="sine")
+    return Measurements(fit, (simulated("held", 0.12, 0.45, 3),))
+
+
+@pytest.fixture(scope="module")
+def problem(slide: Measurements) -> AxisProblem:
+    return AxisProblem(AXIS, slide)
+
+
+def own_units(axis: AxisConfig, found: Diagnosis, name: str, unit: str) -> float:
+    return found.after.values[name] * axis.factor(unit)
+
+
+def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
+    found = diagnose(problem, problem.fit, problem.held_out, start=problem.start, config=SearchConfig(max_effects=1))
+    first = found.rounds[0]
+    assert "coulomb_friction" in (first.added, *first.ties)
+    assert found.errors["fitted"]["held_out"] > 5.0
+    assert found.errors["after"]["held_out"] < 0.4 * found.errors["fitted"]["held_out"]
+    best = next(e for e in first.evidence if e.name == "coulomb_friction")
+    friction_n = best.values["coulomb_friction.torque_nm"] * AXIS.factor("N·m")
+    assert friction_n == pytest.approx(FRICTION_N, rel=0.1)
+    assert best.base["inertia"] * AXIS.factor("kg·m²") == pytest.approx(MASS_KG, rel=0.05)
+
+
+def test_floors_are_those_of_the_noise_in_the_search_s_units(problem: AxisProblem):
+    assert problem.effort
+    assert problem.fit[0].floor * [0.25, 10.0] == pytest.approx([NOISE_M, NOISE_N], rel=0.1)
+    assert problem.fit[0].channels == ("drive [m]", "drive effort [N]")
+
+
+@pytest.mark.xfail(strict=True, reason="floors are in the search's units and their words say mm and N of the axis")
+def test_words_of_a_floor_are_in_the_axis_s_units(problem: AxisProblem):
+    """2 µm of noise, and not 8."""
+    assert float(problem.floors[0].words().split()[0]) == pytest.approx(1e3 * NOISE_M, rel=0.1)
+
+
+def test_units_of_the_search_and_of_the_axis():
+    """10 N and 0.25 m are 1: stiffness 40 N/m, damping 40 N·s/m, mass 40 kg."""
+    factors = {"N·m": 10.0, "rad": 0.25, "rad/s": 0.25, "N·m/rad": 40.0, "N·m·s/rad": 40.0, "kg·m²": 40.0}
+    factors |= {"N·m·s²/rad²": 160.0, "rad/(N·m)": 0.025, "s": 1.0, "1": 1.0, "1/s": 1.0}
+    assert {unit: AXIS.factor(unit) for unit in factors} == pytest.approx(factors)
+    words = {"N·m": "N", "rad": "m", "rad/s": "m/s", "N·m/rad": "N/m", "N·m·s/rad": "N·s/m", "kg·m²": "kg"}
+    words |= {"rad/(N·m)": "m/N", "s": "s"}
+    assert {unit: AXIS.unit_of(unit) for unit in words} == words
+    turning = dataclasses.replace(AXIS, unit="rad")
+    assert turning.unit_of("N·m/rad") == "N·m/rad"
+
+
+def test_an_answer_does_not_hang_on_the_search_s_units(slide: Measurements, problem: AxisProblem):
+    plain = AxisProblem(dataclasses.replace(AXIS, force_unit_n=1.0, length_unit_m=1.0), slide)
+    answers = []
+    for p in (problem, plain):
+        units = np.array([p.axis.length_unit_m, p.axis.force_unit_n])
+        answers.append(p.simulate(p.start, [], p.fit[0]) * units)
+    np.testing.assert_allclose(answers[0], answers[1], rtol=1e-9, atol=1e-9)
+    assert np.ptp(answers[0][:, 0]) == pytest.approx(0.2, rel=0.05)  # ± 0.1 m
+
+
+def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(slide: Measurements, problem: AxisProblem):
+    free = {f.name: f for f in problem.base}
+    assert list(free) == ["inertia", "torque_ff", "kp", "kd"]
+    assert free["kp"].high / free["kp"].start == pytest.approx(GAINS_WITHIN)
+    silent = tuple(dataclasses.replace(m, effort=np.full_like(m.effort, np.nan)) for m in slide.fit)
+    assert [f.name for f in AxisProblem(AXIS, Measurements(silent)).base] == ["inertia", "torque_ff"]
+
+
+def test_more_inertia_is_no_candidate_and_effects_of_the_arm_s_bodies_are_none(problem: AxisProblem):
+    assert "armature" not in problem.candidates and "payload" not in problem.candidates
+    assert {"coulomb_friction", "viscous_friction", "backlash"} <= set(problem.candidates)
+
+
+def test_recordings_in_another_unit_or_of_another_axis_are_refused(slide: Measurements):
+    turned = dataclasses.replace(slide.fit[0], units=("rad",))
+    with pytest.raises(TaccorlError, match="sine: drive is in rad, the axis's file says m"):
+        AxisProblem(AXIS, Measurements((turned,)))
+    with pytest.raises(TaccorlError, match=r"sine has no signal 'drvie'.*drive"):
+        AxisProblem(dataclasses.replace(AXIS, name="drvie"), Measurements(slide.fit[:1]))
+
+
+def test_a_file_of_an_axis_is_strict(tmp_path: Path):
+    good = (ROOT / "configs" / "diagnose" / "emps.yaml").read_text()
+    path = tmp_path / "axis.yaml"
+    for old, new, message in (
+        ("inertia: 80.0", "inertia: -1.0", "inertia"),
+        ("unit: m", "unit: feet", "feet"),
+        ("inertia: 80.0", "mass: 80.0", "mass"),
+    ):
+        path.write_text(good.replace(old, new))
+        with pytest.raises(TaccorlError, match=message):
+            load_axis(path)
+    path.write_text(good)
+    # the cascade's own numbers: g k_v k_p and g k_v
+    assert load_axis(path).kp == pytest.approx(35.15 * 243.45 * 160.18, rel=1e-4)
+    assert load_axis(path).kd == pytest.approx(35.15 * 243.45, rel=1e-4)
+
+
+# a real drive ----------------------------------------------------------------------------------------------------------
+
+
+def emps(name: str) -> Measurement:
+    data = scipy.io.loadmat(EMPS / f"{name}.mat")
+    return Measurement(
+        name=name,
+        time_s=data["t"][:, 0],
+        target=data["qg"],
+        measured=data["qm"],
+        effort=data["gtau"] * data["vir"],
+        signals=("drive",),
+        units=("m",),
+    ).resampled(1000.0)
+
+
+@pytest.mark.skipif(not EMPS.is_dir(), reason=f"the EMPS benchmark is not at {EMPS}; see nonlinearbenchmark.org")
+def test_a_real_drive_s_dry_friction_is_found_and_that_something_remains():
+    """Janot, Gautier and Brunot 2019 identify 95.1 kg, 20.4 N of dry friction, 203.5 N·s/m, offset −3.16 N."""
+    axis = load_axis(ROOT / "configs" / "diagnose" / "emps.yaml")
+    problem = AxisProblem(axis, Measurements((emps("DATA_EMPS"),)))
+    early, late = split_rows(problem.fit)
+    found = diagnose(problem, early, late, start=problem.start, config=SearchConfig(max_effects=1))
+    first = found.rounds[0]
+    assert first.added in ("coulomb_friction", "asymmetric_friction", "stribeck_friction")
+    assert "coulomb_friction" in (first.added, *first.ties)
+    assert found.errors["after"]["held_out"] <= 0.4 * found.errors["fitted"]["held_out"]
+    row = next(e for e in first.evidence if e.name == "coulomb_friction")
+    assert 15.0 < row.values["coulomb_friction.torque_nm"] * axis.factor("N·m") < 30.0
+    assert 85.0 < row.base["inertia"] * axis.factor("kg·m²") < 115.0
+    assert found.status != "at_floor", "one effect does not explain a real drive to the encoder's last step"
