@@ -111,6 +111,11 @@ class JointModel:
         reported, effort = simulate(drive, sent, motion.coupling_nm, motion.start, hold, parts, self.timestep_s)
         return JointResponse(reported, effort)
 
+    def carried_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
+        """(T,) what the motor gives besides its effort to carry the weight that it knows of, at ``angles`` (T,) rad."""
+        body = self._body(motion, [])
+        return body.compensation_sin * np.sin(angles) + body.compensation_cos * np.cos(angles)
+
     def _effects(self, effects: Sequence[Effect]) -> list[Effect]:
         if self._config is None:
             return [effect for effect in effects if not effect.is_absent]

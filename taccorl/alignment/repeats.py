@@ -44,6 +44,13 @@ def overlay(first: Measurement, second: Measurement) -> Overlay:
     """
     if first.signals != second.signals:
         raise TaccorlError(f"{second.name} and {first.name} hold different signals; one cannot repeat the other")
+    for what in ("kp", "kd", "gain_scale", "payload_kg"):
+        one, other = getattr(first, what), getattr(second, what)
+        if one != other:
+            raise TaccorlError(
+                f"{second.name} does not repeat {first.name}: {what} is {other or 'as usual'} there and {one or 'as usual'} "
+                "here; mend repeat_of"
+            )
     rate_hz = first.rate_hz
     a, b = first.resampled(rate_hz), second.resampled(rate_hz)
     scale = np.maximum(np.ptp(a.target, axis=0), 1e-9)

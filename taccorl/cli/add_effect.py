@@ -41,7 +41,7 @@ class AddEffectConfig:
 
 def main(argv: list[str]) -> int:
     """0: written."""
-    config = parse(AddEffectConfig, argv, positional="effect")
+    config = parse(AddEffectConfig, argv, positional="effect", prog="taccorl add-effect")
     out = _place(config)
     from taccorl.cli.measured import twin_of
     from taccorl.diagnosis.joints import add_effect, set_numbers
@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
         add_effect(twin, effect)
         _say(signal, effect, base)
     save_twin(twin, out)
-    print(f"wrote {out}; next: taccorl compare --twin={out} --measurements=…")
+    print(f"wrote {out}; next: taccorl compare --twin={out} --measurements=YOUR_SWEEPS")
     return 0
 
 
@@ -130,7 +130,12 @@ def _offer(name: str, part: str, diagnosis: dict[str, Any]) -> "tuple[Effect, di
             return make_effect(
                 **{"name": entry["effect"]} | {k: v for k, v in entry.items() if k != "effect"}
             ), diagnosis["base"]
-    rows = [e for r in diagnosis["rounds"][:1] for e in r["evidence"] if e["name"] == name]
+    first = diagnosis["rounds"][:1]
+    rows = [e for r in first for e in r["evidence"] if e["name"] == name]
+    if rows and name not in (first[0]["added"], *first[0]["ties"]):
+        raise TaccorlError(
+            f"{part}: the diagnosis refused {name}: {rows[0]['verdict']}; give --values={{…}} to add it all the same"
+        )
     chosen = selectors(effects.get(name), part) if "_joint" in part else {}
     if not rows or chosen is None:
         return None

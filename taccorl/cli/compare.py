@@ -74,7 +74,7 @@ def main(argv: list[str]) -> int:
     config = parse(CompareConfig, argv, positional="measurements")
     _check_outputs(config)
     from taccorl.alignment.measurements import read_measurements
-    from taccorl.cli.measured import checked, name_of, print_findings, twin_of
+    from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of
 
     twins = [
         (name_of(path), twin_of(path)) for path in (config.twin, config.against)[: 1 + (config.against is not None)]
@@ -86,11 +86,11 @@ def main(argv: list[str]) -> int:
     if findings is None:
         return 1
     comparisons = _compared(config, twins, measurements)
-    bad = [f for c in comparisons[:1] for found in c.clock.values() for f in found if f.severity == "error"]
-    print_findings({f"replay of {name}": list(found) for name, found in comparisons[0].clock.items() if found})
-    if bad:
+    late = {name: list(found) for name, found in comparisons[0].clock.items() if found}
+    print_findings({f"replay of {name}": found for name, found in late.items()})
+    if clock_is_off(late, len(measurements.all)):
         print(
-            f"not compared: {len(bad)} errors of time stamps, see above; an offset of one row looks like missing physics"
+            "not compared: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"
         )
         return 1
     score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
@@ -176,12 +176,16 @@ def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> 
         if after is not None:
             row += [*_error_cells(other), f"{other.rmse / s.rmse - 1:+.0%}"] if other is not None else [""] * 3
         worst = worst_regime(cells, s.signal, s.kind)
-        floor = shown(s.floor, s.unit) + (" ≤" if s.lower_bound else "")
+        floor = shown(s.floor, s.unit) + (" or more" if s.lower_bound else "")
         table.add_row(*row, f"{s.nrmse:.2%}", floor, f"{worst.regime} ({worst.ratio:.3g} × floor)" if worst else "")
     out = console()
     out.print(table)
     if any(s.lower_bound for s in comparison.scores()):
-        out.print(Text("≤: no motion was recorded twice, so this floor is a lower bound", "dim"))
+        out.print(
+            Text(
+                "or more: no recording is declared to repeat another (repeat_of), so this floor is a lower bound", "dim"
+            )
+        )
     for line in comparison.left_out:
         out.print(Text(f"not compared: {line}", "dim"), soft_wrap=True)
     out.print(Text(origin_words(comparison.origins)), soft_wrap=True)

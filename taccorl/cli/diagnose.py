@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 
+FAR_GAIN = 3.0
+"""Fitted gains that are so many times the twin's are doubted."""
+
+
 @dataclass(kw_only=True)
 class DiagnoseConfig:
     """Which physical effect the twin lacks, and with what evidence."""
@@ -59,7 +63,7 @@ def main(argv: list[str]) -> int:
 
     check_folder(config.out)
     from taccorl.alignment.measurements import read_measurements
-    from taccorl.cli.measured import checked, name_of, print_findings, twin_of
+    from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of
     from taccorl.diagnosis.compare import compare
     from taccorl.diagnosis.joints import diagnose_joints, mended, swept_joints
     from taccorl.diagnosis.search import SearchConfig
@@ -77,8 +81,10 @@ def main(argv: list[str]) -> int:
     before = compare(twin, measurements, name=name_of(config.twin))
     late = {name: list(found) for name, found in before.clock.items() if found}
     print_findings({f"replay of {name}": found for name, found in late.items()})
-    if any(f.severity == "error" for found in late.values() for f in found):
-        print("not diagnosed: time stamps are off, see above; an offset of one row looks like missing physics")
+    if clock_is_off(late, len(measurements.all)):
+        print(
+            "not diagnosed: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"
+        )
         return 1
     signals = joints_named(config.joints, swept_joints(measurements))
     search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
@@ -149,9 +155,10 @@ def print_finding(finding: "JointFinding") -> None:
     gains = "commanded gains" if finding.commanded else "gains fitted (not stated by the recordings)"
     judged = "the last rows of each" if finding.rows_split else ", ".join(finding.recordings["held_out"])
     out.print(f"  {gains}; judged on {judged}", highlight=False, soft_wrap=True)
-    if finding.can_tell.invisible:
-        words = ", ".join(_why_invisible(finding, name) for name in finding.can_tell.invisible)
-        out.print(Text(f"  these recordings cannot show: {words}", "dim"), soft_wrap=True)
+    hardly = [name for name in finding.can_tell.invisible if name not in d.names]
+    if hardly:
+        words = ", ".join(_why_invisible(finding, name) for name in hardly)
+        out.print(Text(f"  of a typical strength these recordings would not show: {words}", "dim"), soft_wrap=True)
     pairs = [f"{a} from {b}" for a, b, _ in finding.can_tell.pairs[:6]]
     if pairs:
         out.print(Text(f"  nor tell at once: {', '.join(pairs)}", "dim"), soft_wrap=True)
@@ -186,7 +193,15 @@ def verdict(finding: "JointFinding") -> list[str]:
     """In words: what is missing, what does as well, what remains, what to record."""
     d = finding.diagnosis
     errors = d.errors["fitted"]["held_out"], d.errors["after"]["held_out"]
-    lines = [f"  {d.words}; held-out error {errors[0]:.2f} → {errors[1]:.2f} × noise floor"]
+    added = [e.name for e in d.effects if e.name not in d.present]
+    told = [f"{d.errors['before']['held_out']:.2f} as it was", f"{errors[0]:.2f} with its numbers refitted"]
+    told += [f"{errors[1]:.2f} with {', '.join(added)}"] * bool(added)
+    what = "angles and efforts together" if len(finding.floors) > 1 else "angles"
+    lines = [f"  {d.words}", f"  held-out error in noise floors ({what}): {', '.join(told)}"]
+    for name in ("kp", "kd"):
+        ratio = d.base.get(name, 1.0) / d.start.get(name, 1.0) if name in d.base else 1.0
+        if not 1 / FAR_GAIN < ratio < FAR_GAIN:
+            lines.append(f"    {name} became {ratio:.3g} times the twin's: state the commanded gains, or doubt this")
     for effect in d.effects:
         if effect.name in d.present:
             continue
@@ -199,7 +214,10 @@ def verdict(finding: "JointFinding") -> list[str]:
             lines.append(f"    {effect.in_words}")
         rivals = d.rivals.get(effect.name, ())
         if rivals:
-            lines.append(f"    cannot be told from {', '.join(rivals)} by these recordings")
+            lines.append(
+                f"    cannot be told from {', '.join(rivals)} by these recordings, so it may as well be that; what to record:"
+            )
+            lines.append(f"      taccorl excite {finding.signal} --effects={','.join((effect.name, *rivals))} …")
         for twin, why in d.twins.get(effect.name, {}).items():
             lines.append(f"    near-twin {twin}: {why}")
     if d.status == "something_else" and d.rounds:

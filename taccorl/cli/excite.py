@@ -8,7 +8,7 @@ Writes a recording plan: plan.yaml, and for each motion a table of targets at 20
 import csv
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
@@ -31,6 +31,8 @@ class ExciteConfig:
     """Recordings that are there already."""
     diagnosis: Path = Path("diagnosis")
     """Folder of a diagnosis: its fitted numbers, and its rivals where no effects are given."""
+    gains: Literal["auto", "commanded", "fitted"] = "auto"
+    """``fitted``: nobody knows the gains, which then take up more."""
     floor_rad: float = 2e-4
     """Noise floor of the angle; that of the recordings where there are any."""
     num: int = 3
@@ -50,6 +52,7 @@ def main(argv: list[str]) -> int:
     from taccorl.cli.tables import Bars
     from taccorl.diagnosis.excitation import plan, rest_pose
     from taccorl.diagnosis.motions import LIBRARY, joint_number
+    from taccorl.diagnosis.replays import BENCH_REST
 
     joint_number(config.joint)
     twin = twin_of(config.twin)
@@ -57,7 +60,10 @@ def main(argv: list[str]) -> int:
     measurements = None if config.measurements is None else read_measurements(config.measurements)
     floor_rad = config.floor_rad
     if measurements is not None:
-        floor_rad = noise_floor(measurements.all)[config.joint].value
+        swept = [m for m in measurements.all if config.joint in m.signals]
+        if not swept:
+            raise TaccorlError(f"{config.measurements}: no recording has {config.joint}")
+        floor_rad = noise_floor([m.on_robot(BENCH_REST) for m in swept])[config.joint].value
     with Bars(len(LIBRARY)) as bars:
         count = 0
 
@@ -73,6 +79,7 @@ def main(argv: list[str]) -> int:
             pose=rest_pose(config.joint, measurements),
             floor_rad=floor_rad,
             measurements=measurements,
+            gains=config.gains,
             fitted=fitted,
             done=done,
         )
@@ -128,9 +135,9 @@ def _table(found: "Plan") -> None:
     for name, why in found.refused.items():
         out.print(f"not {name}: {why}")
     for pair in found.hopeless:
-        best = max(p.discrimination[pair] for p in found.planned)
+        best = found.best(pair)
         same = (
-            "on this robot they are the same thing, pick either"
+            "from angles they are the same thing, pick either, or record efforts"
             if best < SAME
             else "no single motion tells them apart for sure"
         )

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from taccorl.alignment.measurement import Measurement
     from taccorl.alignment.measurements import Measurements
     from taccorl.data.finding import Finding
     from taccorl.sim.twin import TwinConfig
@@ -28,6 +29,7 @@ def checked(measurements: "Measurements", verdict: str) -> dict[str, list["Findi
     from taccorl.alignment.telemetry_checks import check_measurements
 
     found = check_measurements(measurements.all)
+    found = {m.name: [*found.get(m.name, []), *_pose_unknown(m)] for m in measurements.all}
     print_findings(found)
     for line in measurements.skipped:
         print(f"not read: {line}")
@@ -35,6 +37,30 @@ def checked(measurements: "Measurements", verdict: str) -> dict[str, list["Findi
     if wrong:
         print(f"{verdict}: errors in {', '.join(wrong)}, each with what to record or mend instead, see above")
         return None
+    return found
+
+
+def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
+    """Whether most recordings say that their time stamps are shifted; one that does alone may lack physics or other gains."""
+    shifted = [name for name, found in late.items() if any(f.severity == "error" for f in found)]
+    return 2 * len(shifted) > num_recordings
+
+
+def _pose_unknown(m: "Measurement") -> list["Finding"]:
+    """A table without an arm's other joints: inertia and weight are then those of the bench's pose."""
+    from taccorl.data.finding import Finding
+    from taccorl.sim.robot import ARMS, JOINTS
+
+    found = []
+    for arm in ARMS:
+        there = [j for j in JOINTS if f"{arm}_{j}" in m.signals]
+        if there and len(there) < len(JOINTS):
+            lacking = ", ".join(f"{arm}_{j}" for j in JOINTS if j not in there)
+            text = (
+                f"it lacks {lacking}: they are taken to stand as on the bench, and inertia and weight of what moves follow from "
+                "that; add their columns, constant ones will do"
+            )
+            found.append(Finding("pose_unknown", "warning", f"{arm} arm", text))
     return found
 
 

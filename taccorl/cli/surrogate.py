@@ -20,7 +20,7 @@ class SurrogateConfig:
     secret: int | None = None
     """Seed of the robot, at least 0: which joint, which gains, what is hidden and how strong."""
     out: Path | None = None
-    """Folder; outputs/surrogate_SECRET if not given. A surrogate that lies there is replaced."""
+    """Folder; outputs/surrogate_SECRET if not given. It must not be there yet."""
     effects: list[str] | None = None
     """What is hidden, instead of what the seed draws; [] for nothing."""
     signal: str | None = None
@@ -56,6 +56,8 @@ def main(argv: list[str]) -> int:
         design=config.design,
     )
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
+    if out.exists():
+        raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
     made = write_recordings(case, out)
     print(f"{len(made.all)} recordings of {case.signal} in {out / SWEEPS}: a simulated robot, not a real one")
     print(f"next: taccorl compare --twin={out / TWIN} --measurements={out / SWEEPS}")

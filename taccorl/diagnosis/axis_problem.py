@@ -113,7 +113,9 @@ class AxisProblem:
         everything = [m for side in sides for m in side]
         self.effort = all(m.has_effort()[m.column(axis.name)] for m in everything)
         kinds = ("position", "effort") if self.effort else ("position",)
-        self.floors = [noise_floor(everything, kind)[axis.name] for kind in kinds]
+        own = measurements.all
+        self.floors = [noise_floor(own, kind)[axis.name] for kind in kinds]
+        """In the axis's units."""
         inertia = axis.inertia * stiffness
         self.base = (
             Free(name="inertia", unit="kg·m²", start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True),
@@ -177,7 +179,8 @@ class AxisProblem:
             name=m.name,
             time_s=motion.time_s,
             measured=np.column_stack(columns),
-            floor=np.array([floor.value for floor in self.floors]),
+            floor=np.array([f.value for f in self.floors])
+            / [self.axis.length_unit_m, self.axis.force_unit_n][: 1 + self.effort],
             channels=channels[: 1 + self.effort],
             data=motion,
         )

@@ -19,10 +19,9 @@ from taccorl.alignment.touch_model import TouchModel
 from taccorl.alignment.touch_motion import PressedObject, touch_motion
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison import USES, Comparison, Kind, TouchTrace, Trace
-from taccorl.diagnosis.replays import Response, in_contact, replay_joints, replay_whole
+from taccorl.diagnosis.replays import BENCH_REST, Response, in_contact, replay_joints, replay_whole
 from taccorl.errors import TaccorlError
 from taccorl.sim.robot import ARMS, PAD_TAXELS, PADS
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 
@@ -45,8 +44,9 @@ def compare(
     Raises:
         TaccorlError: a signal that the robot does not have, or recordings with nothing to compare.
     """
-    rest = np.concatenate([[*Bench.home_rad[arm], 0.0] for arm in ("left", "right")])
-    uses: list[tuple[Use, Measurement]] = [(use, m.on_robot(rest)) for use in USES for m in getattr(measurements, use)]
+    uses: list[tuple[Use, Measurement]] = [
+        (use, m.on_robot(BENCH_REST)) for use in USES for m in getattr(measurements, use)
+    ]
     every = [m for _, m in uses]
     floors: dict[Kind, dict[str, SignalFloor]] = {kind: noise_floor(every, kind) for kind in ("position", "effort")}
     traces: list[Trace] = []

@@ -24,6 +24,7 @@ from taccorl.diagnosis.motions import LIBRARY, OPENING_M, POSES, RATE_HZ, TORQUE
 from taccorl.diagnosis.problem import Recording, Values, chosen
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.sim.robot import JOINTS
 from taccorl.sim.twin import TwinConfig
 
 TELLS = 1.25
@@ -70,8 +71,12 @@ class Plan:
     @property
     def hopeless(self) -> tuple[str, ...]:
         """Pairs that no motion here tells apart for sure."""
-        pairs = self.planned[0].discrimination if self.planned else {}
-        return tuple(pair for pair in pairs if max(p.discrimination[pair] for p in self.planned) < TELLS)
+        pairs = [f"{a} | {b}" for a, b in itertools.combinations(self.rivals, 2)]
+        return tuple(pair for pair in pairs if self.best(pair) < TELLS)
+
+    def best(self, pair: str) -> float:
+        """Floors between the two on the motion that keeps them furthest apart; 0 without any motion."""
+        return max((p.discrimination[pair] for p in self.planned), default=0.0)
 
 
 def plan(
@@ -96,13 +101,17 @@ def plan(
         fitted: effect → all numbers of the twin with it, where it has been fitted; else it is typical of its kind.
 
     Raises:
-        TaccorlError: less than two rivals, or the joint has no room to move.
+        TaccorlError: less than two rivals, or the joint has no room to move about its pose.
     """
     if len(set(rivals)) < 2:
         raise TaccorlError(
             f"excite: give two effects or more that are to be told apart, not {', '.join(rivals) or 'none'}"
         )
     room = room_of(config, signal, pose)
+    if min(room.wide_rad, room.sweep_rad) <= 0:
+        raise TaccorlError(
+            f"excite: {signal} stands at {room.middle_rad:.3f} rad, at its limit; give it room to both sides"
+        )
     planned, refused = [], {}
     for motion in LIBRARY:
         target = motion.target(room)
@@ -134,10 +143,11 @@ def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
     """(7,) where the arm stands while this joint is swept: as in the recordings that sweep it, else as ``motions.POSES``."""
     arm, number = signal.split("_", 1)[0], joint_number(signal)
     swept = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
-    if not swept:
-        return np.array([*POSES[number - 1], OPENING_M])
-    first = ACTION_NAMES.index(f"{arm}_joint1")
-    return swept[0].target[0, first : first + 7].copy()
+    pose = np.array([*POSES[number - 1], OPENING_M])
+    for k, name in enumerate([f"{arm}_{joint}" for joint in (*JOINTS, "gripper")]):
+        if swept and name in swept[0].signals:
+            pose[k] = swept[0].target[0, swept[0].column(name)]
+    return pose
 
 
 def imagined(
@@ -162,6 +172,7 @@ def imagined(
         payload_kg={arm: motion.payload_kg} if motion.payload_kg else {},
         origin="imagined: the twin's own answer",
     )
+    m.measured[:, j] += control.torque_ff_nm[k] / (control.kp_nm_per_rad[k] * motion.gain)  # where it rests
     model = JointModel(config, signal)
     answer = model.simulate(joint_motion(m, config, signal), model.gains)
     noise = floor_rad * np.random.default_rng(0).standard_normal(len(target))
@@ -189,7 +200,8 @@ def _apart(
 ) -> dict[str, float]:
     """Pair → floors between the two on this motion."""
     new = imagined(config, signal, pose, motion, target, floor_rad)
-    known = measurements.fit if measurements is not None else ()
+    known = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
+    known = [m if m.signals == ACTION_NAMES else m.on_robot(new.target[0]) for m in known]
     problem = JointProblem(config, signal, Measurements((*known, new)), gains=gains, effort=False)
     numbers = {
         c.name: problem.start

@@ -15,6 +15,8 @@ from taccorl.sim.effects.effect import Effect
 
 FAR = 1e5
 """Residual in floors where a simulation ended in NaN, and the most that one row counts."""
+BLOCK_ROWS, MANY_BLOCKS = 100, 20
+"""Rows whose residuals may pull together: half a second at 200 Hz; so many blocks say by how much."""
 _STEP = 1e-3
 """Of finite differences, in coordinates of order 1."""
 _AT_BOUND = 1e-3
@@ -51,10 +53,18 @@ class Fit:
         return effective_rows(self.residuals)
 
     def covariance(self) -> np.ndarray:
-        """(p, p) of the coordinates, with as many rows as are independent. Directions that the data leave open are huge."""
+        """(p, p) of the coordinates, with as many rows as are independent; wider where whole blocks of rows pull to one side, as
+        they do where the model is not quite right (sandwich estimate). Directions that the data leave open are huge."""
         n, p = self.jacobian.shape
+        inverse = np.linalg.pinv(self.jacobian.T @ self.jacobian, rcond=1e-14, hermitian=True)
         variance = float(self.residuals @ self.residuals) / max(n - p, 1) * n / self.effective_rows
-        return variance * np.linalg.pinv(self.jacobian.T @ self.jacobian, rcond=1e-14, hermitian=True)
+        plain = variance * inverse
+        if n < MANY_BLOCKS * BLOCK_ROWS:
+            return plain
+        pulls = np.add.reduceat(self.jacobian * self.residuals[:, None], np.arange(0, n, BLOCK_ROWS), axis=0)
+        sandwich = np.diag(inverse @ (pulls.T @ pulls) @ inverse)
+        wider = np.sqrt(np.maximum(sandwich / np.maximum(np.diag(plain), 1e-300), 1.0))
+        return plain * np.outer(wider, wider)
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Parameter → 95 % interval in its unit, cut at its bounds."""

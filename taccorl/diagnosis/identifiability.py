@@ -1,6 +1,6 @@
-"""Before any fit: which effects these recordings would show at all, and which they cannot tell apart.
+"""Before any effect is fitted: which effects these recordings would show at all, and which they cannot tell apart.
 
-Every effect is probed at a typical strength on the twin as it is. What the always fitted numbers can take up is no trace of it.
+Every effect is probed at a typical strength, beside the always fitted numbers; what those can take up is no trace of it.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from taccorl.diagnosis.screen import alike, probe
 
 VISIBLE = 0.75
 """RMS of a signature in floors: √(1 + 0.75²) = 1.25, the error above which the search looks for an effect."""
-ALIKE = 0.98
+ALIKE = 0.95
 """|cos| of two signatures above which recordings do not tell two effects apart (research/discrepancy.md §4.5)."""
 RIDGE = 0.999
 """|correlation| of two fitted numbers above which only a combination of them is known."""
@@ -40,8 +40,9 @@ class Identifiability:
 def identifiability(
     problem: Problem, recordings: Sequence[Recording], start: Values, present: Sequence[str] = ()
 ) -> Identifiability:
-    """Look at the twin with the numbers ``start`` and the effects ``present``; nothing is fitted."""
-    here = fit(problem, recordings, present, start, most=1)
+    """Fit the numbers that are always fitted, from ``start``, with the effects ``present``, and look around."""
+    here = fit(problem, recordings, present, start)
+    problem.learn(here.values)
     typical = [
         dataclasses.replace(c, starts=(c.starts[len(c.starts) // 2],))
         for name, c in problem.candidates.items()

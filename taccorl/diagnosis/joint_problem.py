@@ -15,7 +15,9 @@ from taccorl.alignment.measurement import Measurement, unit_of
 from taccorl.alignment.measurements import Measurements, motions
 from taccorl.alignment.noise_floor import SignalFloor, noise_floor
 from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
+from taccorl.diagnosis.replays import BENCH_REST
 from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.twin import TwinConfig
@@ -57,6 +59,8 @@ class JointProblem:
         gains: GainsAre = "auto",
         effort: bool = True,
     ) -> None:
+        on_robot = {use: tuple(map(_on_robot, getattr(measurements, use))) for use in ("fit", "held_out", "test")}
+        measurements = dataclasses.replace(measurements, **on_robot)
         everything = measurements.all
         stated = all(signal in m.kp and signal in m.kd for m in everything)
         if gains == "commanded" and not stated:
@@ -140,15 +144,22 @@ class JointProblem:
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""
         motions: list[JointMotion] = [r.data for r in self.fit]
-        efforts = [self.model.simulate(m, self._gains(values)).effort for m in motions]
+        answers = [self.model.simulate(m, self._gains(values)) for m in motions]
+        weights = [self.model.carried_nm(m, a.reported) for m, a in zip(motions, answers, strict=True)]
         speeds = np.concatenate([np.abs(np.gradient(m.target, 1.0 / m.rate_hz)) for m in motions])
         angles = np.concatenate([m.target for m in motions])
         return {
-            "peak_torque_nm": max(float(np.abs(e).max()) for e in efforts),
+            "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
+            "peak_motor_nm": max(float(np.abs(a.effort + w).max()) for a, w in zip(answers, weights, strict=True)),
             "peak_speed_rad_per_s": float(speeds.max()),
             "span_rad": float(np.ptp(angles)),
             "duration_s": max(float(m.time_s[-1]) for m in motions),
         }
+
+
+def _on_robot(m: Measurement) -> Measurement:
+    """With all 14 signals: joints that a table lacks rest where the bench has them."""
+    return m if m.signals == ACTION_NAMES else m.on_robot(BENCH_REST)
 
 
 def _acts_on(effect: ArmEffect, signal: str) -> bool:

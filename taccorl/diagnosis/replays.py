@@ -40,6 +40,10 @@ class Response:
     """(T, 14) N·m, N that the motors give at the time of each row; NaN where not known."""
 
 
+BENCH_REST = np.concatenate([[*Bench.home_rad[arm], 0.0] for arm in ("left", "right")])
+"""(14,) where joints are that a table does not tell."""
+
+
 def replay_joints(config: TwinConfig, m: Measurement, signals: Sequence[str]) -> Response:
     """Each of ``signals`` alone, the others as they were measured; gains and payloads as the recording knows them."""
     m = evened(m, config)

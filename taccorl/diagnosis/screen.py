@@ -73,7 +73,7 @@ def probe(
                 continue
             along = -float(signature @ left)
             best = along / own
-            reach = FAR_OFF if _can_fade(c) else 2.0
+            reach = FAR_OFF if can_fade(c) else 2.0
             within = min(max(best, 1.0 / reach), reach)
             share = (
                 (2.0 * within * along - within * within * own) / power
@@ -101,7 +101,7 @@ def _signature(
 def _weaker(c: Candidate, start: Values, share: float) -> Values | None:
     """The start with so much less of the effect; None for one that is absent at infinity, or hardly there already."""
     strength = _strength(c)
-    if strength.absent is None or not _can_fade(c):
+    if strength.absent is None or not can_fade(c):
         return None
     name = f"{c.name}.{strength.name}"
     free = next(f for f in c.frees if f.name == name)
@@ -114,7 +114,7 @@ def _strength(c: Candidate) -> Parameter:
     return next(p for p in c.cls.parameters() if p.absent is not None)
 
 
-def _can_fade(c: Candidate) -> bool:
+def can_fade(c: Candidate) -> bool:
     """Whether there is ever less of it between its start and nothing."""
     absent = _strength(c).absent
     return bool(c.frees) and absent is not None and bool(np.isfinite(absent))

@@ -22,17 +22,18 @@ import numpy as np
 
 from taccorl.diagnosis.evidence import bic_gain, block_squares, standard_score
 from taccorl.diagnosis.fit import Fit, best_fit, rms, stacked
-from taccorl.diagnosis.problem import Free, Problem, Progress, Recording, Values, chosen
-from taccorl.diagnosis.screen import Probe, probe
+from taccorl.diagnosis.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
+from taccorl.diagnosis.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
 
-Status = Literal["nothing_missing", "at_floor", "something_else", "too_many"]
+Status = Literal["nothing_missing", "at_floor", "something_else", "too_many", "not_converged"]
 BESIDE = (0.9, 0.97, 1.03, 1.1)
 """Factors to an effect's numbers from which it is fitted once more."""
 WORDS: dict[Status, str] = {
     "nothing_missing": "nothing is missing: the error is at the noise floor",
     "at_floor": "at the noise floor",
     "something_else": "something else: structure remains that no known effect explains",
+    "not_converged": "not converged: the numbers were still moving, so nothing follows from the error",
     "too_many": "stopped: as many effects as were allowed, and not at the noise floor",
 }
 
@@ -267,7 +268,8 @@ class _Search:
         before = block_squares(self.problem, parent, self.held_out)
         self.progress("refitting with the likeliest")
         starts = {
-            name: [parent.values | _scaled(p, self._frees(name)) for p in self._likely(best[name])] for name in order
+            name: [parent.values | _scaled(p, self.problem.candidates[name]) for p in self._likely(best[name])]
+            for name in order
         }
         short = {
             name: self._fitted((*parent.names, name), starts[name][:1], c.first_steps)
@@ -423,6 +425,8 @@ class _Search:
         return {use: rms(stacked(self.problem, values, effects, recs)) for use, recs in uses.items() if recs}
 
     def _status(self, model: Fit) -> Status:
+        if model.trouble:
+            return "not_converged"
         if self.error(model) <= self.config.stop_at:
             return "at_floor" if len(model.names) > len(self.present) else "nothing_missing"
         full = len(model.names) - len(self.present) >= self.config.max_effects
@@ -488,9 +492,9 @@ class _Row:
         )
 
 
-def _scaled(seen: Probe, frees: Sequence[Free]) -> Values:
+def _scaled(seen: Probe, c: Candidate) -> Values:
     """The probe's start with its strength multiplied as the score test suggests."""
-    values = {f.name: f.start for f in frees} | seen.start
-    if frees and frees[0].log and seen.multiple > 0:
-        values[frees[0].name] *= min(max(seen.multiple, 0.1), 10.0)
+    values = {f.name: f.start for f in c.frees} | seen.start
+    if can_fade(c) and c.frees[0].log and seen.multiple > 0:
+        values[c.frees[0].name] *= min(max(seen.multiple, 0.1), 10.0)
     return values

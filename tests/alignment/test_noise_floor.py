@@ -10,7 +10,7 @@ from made_sweep import ARMS_JOINTS, RATE_HZ, answer, chirp, measured, rested, sh
 from taccorl.alignment.measurement import Measurement, Touch
 from taccorl.alignment.noise_floor import motion_hz, noise_floor, rest_stretches, touch_floor
 from taccorl.alignment.quantisation import find_quantum
-from taccorl.alignment.repeats import overlay
+from taccorl.alignment.repeats import overlay, repeats
 from taccorl.errors import TaccorlError
 
 NOISE = 2e-4
@@ -236,3 +236,15 @@ def test_a_joint_that_began_elsewhere_does_not_raise_the_floor_but_one_that_slip
     slipped = again.measured.copy()
     slipped[-rows:, j] += 0.01
     assert noise_floor([first, dataclasses.replace(again, measured=slipped)])["left_joint1"].value > 3 * plain
+
+
+@pytest.mark.parametrize(
+    "changed", [{"kp": {"left_joint1": 80.0}}, {"gain_scale": {"left_joint1": 2.0}}, {"payload_kg": {"left": 0.3}}]
+)
+def test_the_same_commands_with_other_gains_or_a_payload_are_no_repeat(motion, changed):
+    first, second = (measured(*motion, np.random.default_rng(k), NOISE, name=name) for k, name in enumerate("ab"))
+    assert repeats(first, second)
+    other = dataclasses.replace(second, **changed)
+    assert not repeats(first, other)
+    with pytest.raises(TaccorlError, match=f"b does not repeat a: {next(iter(changed))}"):
+        noise_floor([first, dataclasses.replace(other, repeat_of="a")])

@@ -12,7 +12,7 @@ from taccorl.sim.twin import TwinConfig
 
 SIGNAL = "left_joint5"
 NOISE_RAD = 2e-4
-NOISE_NM = 0.01
+NOISE_NM = 0.05
 
 
 def recorded(
@@ -44,6 +44,7 @@ def recorded(
     measured[:, j] = answer.reported + noise_rad * rng.standard_normal(m.num_rows)
     efforts = np.full(measured.shape, np.nan)
     if effort:
+        efforts[:] = 0.0  # others: reported, and nothing in it
         efforts[:, j] = answer.effort + NOISE_NM * rng.standard_normal(m.num_rows)
     gains = {} if stated else {"kp": {}, "kd": {}}
     scale = {} if stated or motion.gain == 1.0 else {signal: motion.gain}

@@ -16,8 +16,8 @@ from taccorl.errors import TaccorlError
 
 ROOT = Path(__file__).parents[2]
 EMPS = ROOT.parent / "shared" / "data" / "emps"
-MASS_KG, FRICTION_N, KP, KD = 100.0, 20.0, 1.37e6, 8560.0
-NOISE_M, NOISE_N = 2e-6, 0.5
+MASS_KG, FRICTION_N, KP, KD = 100.0, 20.0, 4e4, 2800.0
+NOISE_M, NOISE_N = 2e-5, 2.0
 AXIS = AxisConfig(
     name="drive", unit="m", inertia=80.0, kp=KP, kd=KD, force_unit_n=10.0, length_unit_m=0.25, timestep_s=1e-3
 )
@@ -27,8 +27,8 @@ def simulated(name: str, amplitude_m: float, hz: float, seed: int, repeat_of: st
     """A mass with dry friction on a slide, in N and m, at a tenth of a millisecond: equations of this test, not the twin's."""
     rate_hz, parts = 1000, 10
     time_s = np.arange(6 * rate_hz) / rate_hz
-    fade = np.clip(np.minimum(time_s - 0.5, 5.5 - time_s) / 0.5, 0, 1) ** 2
-    target = amplitude_m * fade * np.sin(2 * np.pi * hz * (time_s - 0.5))
+    fade = np.clip(np.minimum(time_s - 0.5, 5.5 - time_s) / 0.5, 0, 1)
+    target = amplitude_m * fade**2 * (3 - 2 * fade) * np.sin(2 * np.pi * hz * (time_s - 0.5))
     dt_s, at, speed, goal = 1.0 / (rate_hz * parts), 0.0, 0.0, 0.0
     stops = dt_s * FRICTION_N / MASS_KG  # speed that friction takes away in one step
     rows = []
@@ -77,8 +77,8 @@ def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
     assert found.errors["after"]["held_out"] < 0.4 * found.errors["fitted"]["held_out"]
     best = next(e for e in first.evidence if e.name == "coulomb_friction")
     friction_n = best.values["coulomb_friction.torque_nm"] * AXIS.factor("N·m")
-    assert friction_n == pytest.approx(FRICTION_N, rel=0.1)
-    assert best.base["inertia"] * AXIS.factor("kg·m²") == pytest.approx(MASS_KG, rel=0.05)
+    assert friction_n == pytest.approx(FRICTION_N, rel=0.2)  # the model's steps of 1 ms cost some
+    assert best.base["inertia"] * AXIS.factor("kg·m²") == pytest.approx(MASS_KG, rel=0.1)
 
 
 def test_floors_are_those_of_the_noise_in_the_search_s_units(problem: AxisProblem):
@@ -87,9 +87,8 @@ def test_floors_are_those_of_the_noise_in_the_search_s_units(problem: AxisProble
     assert problem.fit[0].channels == ("drive [m]", "drive effort [N]")
 
 
-@pytest.mark.xfail(strict=True, reason="floors are in the search's units and their words say mm and N of the axis")
 def test_words_of_a_floor_are_in_the_axis_s_units(problem: AxisProblem):
-    """2 µm of noise, and not 8."""
+    """0.02 mm of noise, and not 0.08."""
     assert float(problem.floors[0].words().split()[0]) == pytest.approx(1e3 * NOISE_M, rel=0.1)
 
 
@@ -115,7 +114,9 @@ def test_an_answer_does_not_hang_on_the_search_s_units(slide: Measurements, prob
     assert np.ptp(answers[0][:, 0]) == pytest.approx(0.2, rel=0.05)  # ± 0.1 m
 
 
-def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(slide: Measurements, problem: AxisProblem):
+def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(
+    slide: Measurements, problem: AxisProblem
+):
     free = {f.name: f for f in problem.base}
     assert list(free) == ["inertia", "torque_ff", "kp", "kd"]
     assert free["kp"].high / free["kp"].start == pytest.approx(GAINS_WITHIN)

@@ -154,7 +154,8 @@ def test_the_model_beneath_lacks_what_the_problem_adds_so_that_nothing_acts_twic
     once = problem.candidates["coulomb_friction"].make(problem.start)
     whole = JointProblem(TwinConfig(effects=[friction(0.8)]), SIGNAL, Measurements(chirps), effort=False)
     np.testing.assert_array_equal(
-        problem.simulate(problem.start, [once], r), whole.model.simulate(r.data, whole.model.gains, [once]).reported[:, None]
+        problem.simulate(problem.start, [once], r),
+        whole.model.simulate(r.data, whole.model.gains, [once]).reported[:, None],
     )
     assert np.abs(problem.simulate(problem.start, [once], r) - bare.simulate(bare.start, [], r)).max() > 1e-3
 
@@ -209,15 +210,3 @@ def test_effort_that_one_recording_lacks_is_not_used(chirps):
     assert not problem.effort
     assert problem.fit[0].measured.shape[1] == 1
     assert names(problem) == ["torque_ff"]
-
-
-def test_with_fitted_gains_effort_tells_their_size(chirps):
-    """Positions alone leave K_p and K_d on a ridge; the torque that was given says where on it."""
-    with_effort = JointProblem(NOMINAL, SIGNAL, Measurements(chirps), gains="fitted")
-    without = JointProblem(NOMINAL, SIGNAL, Measurements(chirps), gains="fitted", effort=False)
-    width = {}
-    for problem in (with_effort, without):
-        low, high = fit(problem, problem.fit, (), problem.start).intervals()["kp"]
-        width[problem] = high / low - 1.0
-    assert names(with_effort) == ["kp", "kd", "torque_ff"]
-    assert width[with_effort] < 0.5 * width[without]

@@ -69,7 +69,12 @@ def test_a_joint_is_swept_if_a_fit_recording_commands_it_to_move():
 
 def test_a_signal_that_a_recording_lacks_does_not_move_in_it():
     m = Measurement(
-        name="drive", time_s=np.arange(3.0), target=np.eye(3)[:, :1], measured=np.eye(3)[:, :1], signals=("drive",), units=("m",)
+        name="drive",
+        time_s=np.arange(3.0),
+        target=np.eye(3)[:, :1],
+        measured=np.eye(3)[:, :1],
+        signals=("drive",),
+        units=("m",),
     )
     assert not moves(m, SIGNAL)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, record
 
+from taccorl.diagnosis import search
 from taccorl.diagnosis.search import diagnose
 from taccorl.errors import TaccorlError
 
@@ -106,3 +107,13 @@ def test_an_unknown_effect_is_refused_with_the_nearest_name():
     fit, held_out, _ = made()
     with pytest.raises(TaccorlError, match=r"no effect 'riple' for this part.*ripple"):
         diagnose(MadeProblem(Ripple), fit, held_out, present=["riple"])
+
+
+def test_a_fit_that_has_not_converged_is_no_proof_that_nothing_is_missing(monkeypatch):
+    """With one step of the solver the error may be low by luck; the status must not rest on it."""
+    plain = search.best_fit
+    monkeypatch.setattr(search, "best_fit", lambda p, r, n, s, most: plain(p, r, n, [{"gain": 3.0, "offset": 0.39}], 1))
+    found = diagnose(MadeProblem(), [record(0)], [record(1)])
+    assert found.errors["after"]["held_out"] < 1.25
+    assert found.trouble
+    assert found.status == "not_converged"

@@ -61,6 +61,7 @@ def record(case: Case, motion: Motion) -> Measurement:
     measured[:, rest] += np.array(TORQUE_FF_NM) / np.array(KP_NM_PER_RAD)
     measured[:, own] = robot.reported(run)
     velocity[:, own], effort[:, own] = run.velocity[::COMMAND_MS], run.effort[::COMMAND_MS]
+    stated = _stated(case, motion)
     return Measurement(
         name=motion.name,
         time_s=np.arange(num_rows) / RATE_HZ,
@@ -72,7 +73,9 @@ def record(case: Case, motion: Motion) -> Measurement:
         instruction=f"sweep of {case.signal}: {motion.name}",
         repeat_of=motion.repeat_of,
         payload_kg={ARMS[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
-        **_stated(case, motion),
+        kp=stated.get("kp", {}),
+        kd=stated.get("kd", {}),
+        gain_scale=stated.get("gain_scale", {}),
     )
 
 

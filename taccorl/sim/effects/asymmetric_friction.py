@@ -31,7 +31,7 @@ class AsymmetricFriction(JointEffect):
     at_a_policy: ClassVar = "The arm stops short of its targets by different amounts from either side."
     to_record: ClassVar = "A slow triangle over the range, with efforts: they alone tell the constant part from T_ref."
     near_twins: ClassVar = {
-        "coulomb_friction": "With T_ref fitted it is identical by algebra, on every recording: pick either.",
+        "coulomb_friction": "From angles alone, T_ref fitted, it is identical by algebra: pick either; efforts can tell.",
         "torque_ff": "Its part a F is a constant torque; only efforts tell it from the controller's own.",
     }
     torque_nm: float = parameter(

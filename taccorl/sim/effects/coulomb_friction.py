@@ -31,7 +31,7 @@ class CoulombFriction(JointEffect):
     to_record: ClassVar = "A slow triangle over the range at two speeds."
     near_twins: ClassVar = {
         "asymmetric_friction": (
-            "Coulomb's friction and a constant torque are identical to it, on every recording: pick either."
+            "From angles alone Coulomb's friction and a constant torque are identical to it: pick either; efforts can tell."
         ),
         "load_friction": "Alike while the load is the same; move slowly where the arm reaches out and where it hangs.",
         "stribeck_friction": "Alike but at the slowest; hold, then creep at 0.01 rad/s.",

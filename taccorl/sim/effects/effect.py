@@ -157,9 +157,14 @@ class Effect:
 
         Args:
             seen: facts of the recordings that the parameters may hang on. Of joints: ``peak_torque_nm`` that the twin's
-                controller asks for, ``peak_speed_rad_per_s`` of the targets, ``span_rad``, ``duration_s``.
+                controller asks for, ``peak_motor_nm`` with the weight that is carried, ``peak_speed_rad_per_s`` of the targets,
+                ``span_rad``, ``duration_s``.
         """
-        strength = next(p for p in cls.parameters() if p.absent is not None)
+        strength = next((p for p in cls.parameters() if p.absent is not None), None)
+        if strength is None:
+            raise TaccorlError(
+                f"effect {cls.name}: none of its parameters has an absent value; one must ({cls.__module__})"
+            )
         if strength.absent is None or not math.isfinite(strength.absent):
             return [{}]
         shift = strength.typical - strength.absent

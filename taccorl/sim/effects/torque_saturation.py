@@ -49,8 +49,9 @@ class TorqueSaturation(JointEffect):
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """From 55 to 97 % of the most that is asked for."""
         limit = cls.parameters()[0]
+        peak_nm = seen.get("peak_motor_nm", seen["peak_torque_nm"])
         shares = (0.55, 0.75, 0.88, 0.97)
-        return [{limit.name: min(max(s * seen["peak_torque_nm"], limit.low), limit.high)} for s in shares]
+        return [{limit.name: min(max(s * peak_nm, limit.low), limit.high)} for s in shares]
 
     def drive(self) -> dict[str, float]:
         return {"torque_max": self.torque_max_nm}

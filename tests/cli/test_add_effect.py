@@ -1,0 +1,178 @@
+"""``taccorl add-effect`` as a user types it, with a diagnosis of sweeps that the twin itself made (not a robot's)."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from taccorl.alignment.measurements import Measurements
+from taccorl.cli.main import main
+from taccorl.diagnosis.motions import AGAIN, CHIRP, HELD_OUT
+from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import load_twin, save_twin
+
+sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
+from imagined_motions import recorded
+from simulated_sweeps import write_folder
+
+SIGNAL = "left_joint4"  # the paper's J3
+TRUTH_NM = 0.8
+KEPT = ("coulomb_friction", "asymmetric_friction", "viscous_friction", "backlash")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``sweeps/``, ``twin.yaml`` and ``diagnosis/`` of it, with gains fitted."""
+    path = tmp_path_factory.mktemp("add_effect")
+    truth = TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=TRUTH_NM, arm="left", joints=["joint4"])])
+    made = [
+        recorded(truth, m, k, signal=SIGNAL, stated=False, effort=True)
+        for k, m in enumerate((CHIRP, AGAIN, HELD_OUT[0]))
+    ]
+    write_folder(path / "sweeps", Measurements(tuple(made[:2]), (made[2],)), ACTION_NAMES[:7])
+    save_twin(TwinConfig(), path / "twin.yaml")
+    without = ",".join(name for name in effects if name not in KEPT)
+    words = [f"--twin={path / 'twin.yaml'}", f"--out={path / 'diagnosis'}", f"--without=[{without}]"]
+    assert main(["diagnose", str(path / "sweeps"), *words]) == 0
+    return path
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Any:
+    def run(*words: Any, verb: str = "add-effect") -> tuple[int, str]:
+        code = main([verb, *map(str, words)])
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, " ".join((shown.out + shown.err).split())
+
+    return run
+
+
+@pytest.fixture
+def words(folder: Path) -> list[str]:
+    return [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={folder / 'diagnosis'}"]
+
+
+def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said: Any, words: list[str]):
+    before = (folder / "twin.yaml").read_bytes()
+    code, text = said("coulomb_friction", *words)
+    copy = folder / "twin+coulomb_friction.yaml"
+    assert code == 0 and f"wrote {copy}" in text and f"{SIGNAL}: coulomb_friction torque_nm 0." in text
+    assert (folder / "twin.yaml").read_bytes() == before
+    twin = load_twin(copy)
+    (effect,) = twin.effects
+    assert effect.acts_on() == [SIGNAL]
+    assert vars(effect)["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
+    low, high = effect.interval["torque_nm"]
+    assert low < vars(effect)["torque_nm"] < high and "held-out error" in effect.evidence
+    # gains that were refitted with it come along, for this joint of this arm
+    found = json.loads((folder / "diagnosis" / "report.json").read_text())["diagnoses"][SIGNAL]
+    assert twin.controller_of("left").kp_nm_per_rad[3] == pytest.approx(found["base"]["kp"])
+    assert twin.controller_of("left").kp_nm_per_rad[:3] == TwinConfig().controller.kp_nm_per_rad[:3]
+    assert twin.controller_of("right") == TwinConfig().controller
+    out = folder / "compared"
+    code, text = said(
+        folder / "sweeps", f"--twin={folder / 'twin.yaml'}", f"--against={copy}", f"--out={out}", verb="compare"
+    )
+    assert code == 0
+    report = json.loads((out / "report.json").read_text())
+    held = [
+        next(s["ratio"] for s in report[k] if s["use"] == "held_out" and s["kind"] == "position")
+        for k in ("scores", "scores_after")
+    ]
+    assert held[0] > 4.0 and held[1] < 1.25
+    code, text = said("coulomb_friction", *words)
+    assert code == 2 and "is there already; give another --out" in text
+
+
+def test_an_effect_that_was_tied_may_be_taken_instead(said: Any, words: list[str], tmp_path: Path):
+    code, text = said("asymmetric_friction", *words, f"--out={tmp_path / 'new.yaml'}")
+    assert code == 0 and "tied with coulomb_friction" in text
+    (effect,) = load_twin(tmp_path / "new.yaml").effects
+    assert effect.name == "asymmetric_friction" and effect.acts_on() == [SIGNAL]
+    assert vars(effect)["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["J3", "joint4", "left_joint4"])
+def test_the_joint_has_three_names(name: str, said: Any, words: list[str], tmp_path: Path):
+    assert said("coulomb_friction", *words, f"--joints=[{name}]", f"--out={tmp_path / 'new.yaml'}")[0] == 0
+    assert load_twin(tmp_path / "new.yaml").effects[0].acts_on() == [SIGNAL]
+
+
+def test_a_joint_that_was_not_diagnosed_is_refused(said: Any, words: list[str], tmp_path: Path):
+    code, text = said("coulomb_friction", *words, "--joints=[J4]", f"--out={tmp_path / 'new.yaml'}")
+    assert code == 2 and "J4" in text and SIGNAL in text
+    assert not (tmp_path / "new.yaml").exists()
+
+
+def test_numbers_by_hand_need_no_diagnosis(said: Any, tmp_path: Path):
+    out = tmp_path / "new.yaml"
+    words = ["coulomb_friction", f"--diagnosis={tmp_path}", f"--out={out}", "--values={torque_nm: 0.4}"]
+    assert said(*words)[0] == 2, "which joints?"
+    code, _ = said(*words, "--joints=[J3]")
+    assert code == 0
+    found = {tuple(e.acts_on()): (vars(e)["torque_nm"], e.evidence) for e in load_twin(out).effects}
+    assert found == {("left_joint4",): (0.4, "by hand"), ("right_joint4",): (0.4, "by hand")}
+
+
+def test_an_effect_of_all_pads_by_hand(said: Any, tmp_path: Path):
+    out = tmp_path / "new.yaml"
+    words = ["touch_lag", f"--out={out}", "--values={time_constant_s: 0.03}"]
+    code, text = said(*words, "--joints=[joint4]")
+    assert code == 2 and "no effect of joints" in text
+    assert said(*words)[0] == 0
+    assert len(load_twin(out).effects[0].acts_on()) == 4
+
+
+def test_numbers_out_of_bounds_are_refused(said: Any, tmp_path: Path):
+    out = tmp_path / "new.yaml"
+    code, text = said("coulomb_friction", "--joints=[joint4]", "--values={torque_nm: -1}", f"--out={out}")
+    assert code == 2 and "outside of" in text and not out.exists()
+
+
+def test_a_diagnosis_of_another_twin_is_refused(folder: Path, said: Any, tmp_path: Path):
+    other = TwinConfig()
+    other.controller.kp_nm_per_rad[0] += 1.0
+    save_twin(other, tmp_path / "other.yaml")
+    code, text = said("coulomb_friction", f"--twin={tmp_path / 'other.yaml'}", f"--diagnosis={folder / 'diagnosis'}")
+    assert code == 2 and "was made with another twin" in text and "twin.yaml" in text
+    assert [p.name for p in tmp_path.iterdir()] == ["other.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("effect", "message"),
+    [
+        ("coulomb_frictoin", "coulomb_friction"),
+        ("slew_limit", "slew_limit was not fitted there"),
+        ("touch_lag", "touch_lag was not fitted there"),
+    ],
+)
+def test_effects_that_are_unknown_or_were_not_fitted(
+    effect: str, message: str, said: Any, words: list[str], tmp_path: Path
+):
+    code, text = said(effect, *words, f"--out={tmp_path / 'new.yaml'}")
+    assert code == 2 and message in text
+
+
+def test_without_a_diagnosis_the_way_out_is_said(folder: Path, said: Any, tmp_path: Path):
+    words = [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={tmp_path}", f"--out={tmp_path / 'new.yaml'}"]
+    code, text = said("coulomb_friction", *words)
+    assert code == 2 and "run `taccorl diagnose` first" in text and "--values={torque_nm: 0.4}" in text
+
+
+def test_in_place_changes_the_file_itself_and_nothing_else(folder: Path, said: Any, tmp_path: Path):
+    path = tmp_path / "twin.yaml"
+    path.write_bytes((folder / "twin.yaml").read_bytes())
+    words = ["coulomb_friction", f"--diagnosis={folder / 'diagnosis'}", "--in_place=true"]
+    assert said(*words)[0] == 2, "of which file?"
+    assert said(*words, f"--twin={path}", f"--out={tmp_path / 'new.yaml'}")[0] == 2
+    assert said(*words, f"--twin={path}")[0] == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["twin.yaml"]
+    assert yaml.safe_load(path.read_text())["effects"][0]["effect"] == "coulomb_friction"
+    code, text = said(*words, f"--twin={path}")
+    assert code == 2 and "another twin" in text, "it is one now"
