@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FormatStrFormatter
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from scipy.stats import binomtest
 
 from taccorl.diagnosis.figure_style import AFTER, BEFORE, FLOOR, legend, new_figure, tidy
@@ -124,8 +124,9 @@ def detection_curve(points: Mapping[str, Sequence[Detection]], origins: Sequence
     axes.axvline(1.0, color=FLOOR, lw=2.5, label="noise floor")
     axes.axhline(0.5, color="#64748b", lw=0.9, ls="--")
     axes.set_xscale("log")
-    for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
-        which(FormatStrFormatter("%g"))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(-0.02, 1.05)
     axes.set_xlabel("signal of the effect / noise floor", fontsize=8)
     axes.set_ylabel("share of seeds in which it is found", fontsize=8)
