@@ -46,7 +46,8 @@ def overlay(first: Measurement, second: Measurement) -> Overlay:
         raise TaccorlError(f"{second.name} and {first.name} hold different signals; one cannot repeat the other")
     for what in ("kp", "kd", "gain_scale", "payload_kg"):
         one, other = getattr(first, what), getattr(second, what)
-        if one != other:
+        silent = what in ("kp", "kd") and not (one and other)  # nobody wrote them down: not known to differ
+        if one != other and not silent:
             raise TaccorlError(
                 f"{second.name} does not repeat {first.name}: {what} is {other or 'as usual'} there and {one or 'as usual'} "
                 "here; mend repeat_of"

@@ -242,7 +242,10 @@ def test_a_joint_that_began_elsewhere_does_not_raise_the_floor_but_one_that_slip
     "changed", [{"kp": {"left_joint1": 80.0}}, {"gain_scale": {"left_joint1": 2.0}}, {"payload_kg": {"left": 0.3}}]
 )
 def test_the_same_commands_with_other_gains_or_a_payload_are_no_repeat(motion, changed):
-    first, second = (measured(*motion, np.random.default_rng(k), NOISE, name=name) for k, name in enumerate("ab"))
+    first, second = (
+        dataclasses.replace(measured(*motion, np.random.default_rng(k), NOISE, name=name), kp={"left_joint1": 40.0})
+        for k, name in enumerate("ab")
+    )
     assert repeats(first, second)
     other = dataclasses.replace(second, **changed)
     assert not repeats(first, other)

@@ -113,7 +113,7 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert "of a typical strength these recordings would not show: encoder_bias (taken up by torque_ff)" in text
     assert "tied with coulomb_friction" in text and "cannot be told from asymmetric_friction" in text
     assert "→ coulomb_friction: torque_nm 0.028" in text and "N·m (0.028" in text
-    assert "at the noise floor; held-out error" in text
+    assert "at the noise floor\n  held-out error in noise floors" in text
     assert f"next: taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}" in text
     assert not (out / "twin.yaml").exists(), "one effect: add-effect writes the twin"
     (out / "notes.txt").write_text("mine")

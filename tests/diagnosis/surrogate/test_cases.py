@@ -135,8 +135,9 @@ def test_the_user_starts_from_wrong_gains_unless_they_are_known():
     wrong = unknown.twin.controller.kp_nm_per_rad[joint] / unknown.gains[0]
     assert 0.5 <= wrong <= 2.0 and abs(wrong - 1) > 0.01
     assert known.twin.controller.kp_nm_per_rad[joint] == known.gains[0]
-    stated = {m.name: m.kp for m in recordings(unknown).all if m.kp}
-    assert stated == {"chirp_2x_gain": {unknown.signal: 2 * unknown.twin.controller.kp_nm_per_rad[joint]}}
+    made = recordings(unknown).all
+    assert not any(m.kp or m.kd for m in made)
+    assert {m.name: m.gain_scale for m in made if m.gain_scale} == {"chirp_2x_gain": {unknown.signal: 2.0}}
     assert all(m.kp[known.signal] == known.gains[0] for m in recordings(known).all)
 
 
