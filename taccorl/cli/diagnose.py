@@ -19,6 +19,7 @@ from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
+    from taccorl.alignment.measurements import Measurements
     from taccorl.diagnosis.comparison import Comparison
     from taccorl.diagnosis.joints import JointFinding
     from taccorl.sim.twin import TwinConfig
@@ -65,8 +66,7 @@ def main(argv: list[str]) -> int:
     from taccorl.alignment.measurements import read_measurements
     from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of
     from taccorl.diagnosis.compare import compare
-    from taccorl.diagnosis.joints import diagnose_joints, mended, swept_joints
-    from taccorl.diagnosis.search import SearchConfig
+    from taccorl.diagnosis.joints import mended, swept_joints
     from taccorl.sim.effects import effects
 
     twin = twin_of(config.twin)
@@ -87,13 +87,13 @@ def main(argv: list[str]) -> int:
         )
         return 1
     signals = joints_named(config.joints, swept_joints(measurements))
-    search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
-    found = _diagnosed(config, twin, signals, measurements, search, diagnose_joints)
+    found = _diagnosed(config, twin, signals, measurements)
     for finding in found:
         print_finding(finding)
     after = compare(mended(twin, found), measurements, name="mended twin")
-    _write(config, argv, twin, found, before, after, findings | late)
-    return int(any(f.diagnosis.status in ("something_else", "too_many") for f in found))
+    said = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
+    _write(config, argv, twin, found, before, after, said)
+    return int(any(f.diagnosis.status not in ("nothing_missing", "at_floor") for f in found))
 
 
 def joints_named(names: Sequence[str], swept: Sequence[str]) -> tuple[str, ...]:
@@ -119,8 +119,14 @@ def joints_named(names: Sequence[str], swept: Sequence[str]) -> tuple[str, ...]:
     return tuple(chosen)
 
 
-def _diagnosed(config, twin, signals, measurements, search, diagnose_joints) -> "list[JointFinding]":
+def _diagnosed(
+    config: DiagnoseConfig, twin: "TwinConfig", signals: Sequence[str], measurements: "Measurements"
+) -> "list[JointFinding]":
     from taccorl.cli.tables import Bars
+    from taccorl.diagnosis.joints import diagnose_joints
+    from taccorl.diagnosis.search import SearchConfig
+
+    search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
 
     with Bars(len(signals)) as bars:
         count = 0
