@@ -29,7 +29,7 @@ def diagnosis_section(part: str, d: Diagnosis, can_tell: Identifiability | None,
         parts.append(note(f"At the end of its range: {', '.join(d.at_bound)}. Its value says little."))
     drawn = waterfall(_steps(d), origins, f"{part}: held-out error, effect by effect")
     parts.append(figure(data_uri(png(drawn)), "held-out error over the noise floor; down is better"))
-    parts += [_effect(d, e) for e in found]
+    parts += [_effect(part, d, e) for e in found]
     parts.append(_numbers(d))
     for k, r in enumerate(d.rounds, start=1):
         parts += [f"<h3>Evidence, round {k}</h3>", _evidence(r)]
@@ -67,9 +67,10 @@ def _can_tell(found: Identifiability) -> str:
 def _errors(d: Diagnosis) -> str:
     lines = []
     for use, words in (("held_out", "held-out"), ("test", "test, which no choice has seen")):
-        before, after = d.errors["before"].get(use), d.errors["after"].get(use)
-        if before is not None and after is not None:
-            lines.append(f"{words}: {before:.3g} → {after:.3g} × floor ({after / before - 1:+.0%})")
+        if use in d.errors["before"]:
+            before, fitted, after = (d.errors[stage][use] for stage in ("before", "fitted", "after"))
+            by_effects = f", by the effects {after / fitted - 1:+.0%}"
+            lines.append(f"{words}: {before:.3g}, numbers refitted {fitted:.3g}, now {after:.3g} × floor{by_effects}")
     return "Error: " + "; ".join(lines)
 
 
@@ -93,8 +94,8 @@ def _numbers(d: Diagnosis) -> str:
     return table(("number", "before", "fitted", "95 %"), rows, numbers=range(1, 4))
 
 
-def _effect(d: Diagnosis, e: Effect) -> str:
-    """What it is, on a robot and for a policy, and who looks like it."""
+def _effect(part: str, d: Diagnosis, e: Effect) -> str:
+    """What it is, on a robot and for a policy, who looks like it, and what to do next."""
     cls = type(e)
     values = [f"{p.symbol} = {getattr(e, p.name):.4g} {p.unit}" for p in e.parameters()]
     rows = [
@@ -107,6 +108,13 @@ def _effect(d: Diagnosis, e: Effect) -> str:
     if e.name in d.rivals:
         words = f"{', '.join(d.rivals[e.name])}: these recordings do not tell which it is"
         rows.append(["<b>does as well</b>", f"<b>{html.escape(words)}</b>"])
+        rows.append(
+            [
+                "what to record next",
+                f"<code>taccorl excite {part} --effects={','.join((e.name, *d.rivals[e.name]))}</code>",
+            ]
+        )
+    rows.append(["to add it", f"<code>taccorl add-effect {e.name}</code>, with the twin and the folder of this page"])
     for other, why in d.twins.get(e.name, {}).items():
         rows.append([f"near-twin {html.escape(other)}", html.escape(why)])
     return f"<h3>{html.escape(e.name)}</h3>" + table((), rows)
