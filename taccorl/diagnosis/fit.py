@@ -17,8 +17,11 @@ FAR = 1e5
 """Residual in floors where a simulation ended in NaN, and the most that one row counts."""
 BLOCK_ROWS, MANY_BLOCKS = 100, 20
 """Rows whose residuals may pull together: half a second at 200 Hz; so many blocks say by how much."""
-_STEP = 1e-3
-"""Of finite differences, in coordinates of order 1."""
+COARSE, FINE = 1e-3, 1e-4
+"""Steps of finite differences, in coordinates of order 1: coarse ones see past the kinks of dry friction and limits while
+hypotheses compete; only fine ones go along the ridge of K_p and K_d to its top, and give intervals that hold."""
+_OPEN = 1e-14
+"""Directions that move the residuals, squared, so little of the strongest one count as this: open."""
 _AT_BOUND = 1e-3
 """Share of a parameter's range from its end that counts as being there."""
 
@@ -56,7 +59,10 @@ class Fit:
         """(p, p) of the coordinates, with as many rows as are independent; wider where whole blocks of rows pull to one side, as
         they do where the model is not quite right (sandwich estimate). Directions that the data leave open are huge."""
         n, p = self.jacobian.shape
-        inverse = np.linalg.pinv(self.jacobian.T @ self.jacobian, rcond=1e-14, hermitian=True)
+        if p == 0:
+            return np.zeros((0, 0))
+        strengths, ways = np.linalg.eigh(self.jacobian.T @ self.jacobian)
+        inverse = ways / np.maximum(strengths, _OPEN * max(float(strengths[-1]), 1e-300)) @ ways.T
         variance = float(self.residuals @ self.residuals) / max(n - p, 1) * n / self.effective_rows
         plain = variance * inverse
         if n < MANY_BLOCKS * BLOCK_ROWS:
@@ -109,13 +115,19 @@ def stacked(
 
 
 def fit(
-    problem: Problem, recordings: Sequence[Recording], names: Sequence[str], start: Mapping[str, float], most: int = 40
+    problem: Problem,
+    recordings: Sequence[Recording],
+    names: Sequence[str],
+    start: Mapping[str, float],
+    most: int = 40,
+    step: float = COARSE,
 ) -> Fit:
     """Fit the numbers of a hypothesis, all at once.
 
     Args:
         start: numbers to start from; those left out start at their own.
         most: steps of the solver.
+        step: of its finite differences.
     """
     candidates = chosen(problem, names)
     frees = (*problem.base, *(f for c in candidates for f in c.frees))
@@ -144,9 +156,9 @@ def fit(
         columns = np.empty((len(here), len(frees)))
         for k in range(len(frees)):
             there = coordinates.copy()
-            step = _STEP if coordinates[k] + _STEP <= high[k] else -_STEP
-            there[k] += step
-            columns[:, k] = (left(there) - here) / step
+            way = step if coordinates[k] + step <= high[k] else -step
+            there[k] += way
+            columns[:, k] = (left(there) - here) / way
         return columns
 
     if len(frees) == 0:

@@ -13,6 +13,7 @@
 Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
 """
 
+import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from taccorl.diagnosis.evidence import bic_gain, block_squares, standard_score
-from taccorl.diagnosis.fit import Fit, best_fit, rms, stacked
+from taccorl.diagnosis.fit import FINE, Fit, best_fit, fit, rms, stacked
 from taccorl.diagnosis.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
 from taccorl.diagnosis.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
@@ -51,7 +52,8 @@ class SearchConfig:
     sure_gain: float = 0.5
     """or so much of it: rare events (a limit that is reached twice) never get a great score,"""
     min_bic: float = 10.0
-    """and lower the Bayesian information criterion by so much."""
+    """and lower the Bayesian information criterion by so much on the fit recordings; those that are sure on the held-out ones by
+    both measures above need only lower it at all."""
     tie_share: float = 0.05
     """Effects that take away as much but for this share are ties,"""
     tie_rise: float = 0.25
@@ -73,6 +75,8 @@ class SearchConfig:
     """times the best."""
     steps: int = 30
     """Of a refit to the end."""
+    last_steps: int = 100
+    """Of the last refit of what was found, with finer slopes."""
 
     def too_little(self, gain: float, score: float) -> str:
         """Why an effect that takes away so much is not believed; empty if it is."""
@@ -227,6 +231,7 @@ class _Search:
         steps = [("", self.error(first)), *((r.added, r.held_out_error) for r in rounds if r.added)]
         model = self._without_superfluous(model)
         model, rivals = self._against_ties(model, rounds)
+        model = self._finished(model)
         return Diagnosis(
             status=self._status(model),
             effects=tuple(self._described(model, first)),
@@ -329,6 +334,21 @@ class _Search:
         beside = [model.values | {f.name: model.values[f.name] * factor} for f in own for factor in BESIDE]
         again = self._fitted(model.names, [model.values, *beside], self.config.steps)
         return min((model, again), key=lambda m: m.error)
+
+    def _finished(self, model: Fit) -> Fit:
+        """The same hypothesis to its very end, with slopes that its intervals can be told from. Numbers that go on moving while
+        χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
+        fine = self._fine(model)
+        if fine.trouble:
+            further = self._fine(fine)
+            fell = (fine.error**2 - further.error**2) / further.error**2 * further.effective_rows
+            fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
+        return fine
+
+    def _fine(self, model: Fit) -> Fit:
+        fine = fit(self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)
+        self.evaluations += fine.evaluations
+        return fine
 
     def _tie(self, row: "_Row", best: "_Row", before: np.ndarray) -> bool:
         """Whether held-out recordings do not tell the two apart."""
@@ -470,7 +490,8 @@ class _Row:
         little = c.too_little(self.gain, self.score)
         if little:
             return little
-        if self.bic < c.min_bic:
+        sure = self.gain >= c.sure_gain and self.score >= c.min_score
+        if self.bic < (0.0 if sure else c.min_bic):
             return f"does not pay for its parameters: ΔBIC {self.bic:.0f}"
         return ""
 

@@ -116,6 +116,7 @@ def told(found: Diagnosis) -> dict[str, Any]:
         "rivals": {name: list(others) for name, others in found.rivals.items()},
         "errors": {k: {use: round(e, 4) for use, e in of.items()} for k, of in found.errors.items()},
         "estimate": {k: float(f"{v:.5g}") for k, v in found.after.values.items()},
+        "interval": {k: [float(f"{v:.5g}") for v in ends] for k, ends in found.intervals.items()},
         "evaluations": found.evaluations,
     }
 

@@ -1,11 +1,13 @@
 """The search on problems whose answers can be written down (made_problem)."""
 
+import dataclasses
+
 import numpy as np
 import pytest
-from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, record
+from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, drive, record
 
 from taccorl.diagnosis import search
-from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search import SearchConfig, diagnose
 from taccorl.errors import TaccorlError
 
 
@@ -109,11 +111,33 @@ def test_an_unknown_effect_is_refused_with_the_nearest_name():
         diagnose(MadeProblem(Ripple), fit, held_out, present=["riple"])
 
 
-def test_a_fit_that_has_not_converged_is_no_proof_that_nothing_is_missing(monkeypatch):
-    """With one step of the solver the error may be low by luck; the status must not rest on it."""
-    plain = search.best_fit
-    monkeypatch.setattr(search, "best_fit", lambda p, r, n, s, most: plain(p, r, n, [{"gain": 3.0, "offset": 0.39}], 1))
-    found = diagnose(MadeProblem(), [record(0)], [record(1)])
-    assert found.errors["after"]["held_out"] < 1.25
-    assert found.trouble
-    assert found.status == "not_converged"
+class Valley(MadeProblem):
+    """measured = gain × drive + steep × (offset − gain²): a curved valley, along which a solver crawls."""
+
+    def simulate(self, base, effects, recording):
+        wall = 500.0 * (base["offset"] - base["gain"] ** 2)
+        return (base["gain"] * drive(recording.time_s, recording.data) + wall)[:, None]
+
+
+def test_a_fit_that_has_not_converged_is_no_proof_that_nothing_is_missing():
+    """Gain 1 to gain 3 is further along the valley than 60 and 200 steps go; wide floors make every place of it look right."""
+    fit, held_out = ([dataclasses.replace(record(k, offset=0.0, noise=0.5), floor=np.array([2.0]))] for k in (0, 1))
+    cut = diagnose(Valley(), fit, held_out)
+    assert cut.errors["after"]["held_out"] < 1.25
+    assert cut.trouble
+    assert cut.status == "not_converged"
+    whole = diagnose(Valley(), fit, held_out, config=SearchConfig(last_steps=1000))
+    assert whole.status == "nothing_missing"
+    assert whole.base["gain"] == pytest.approx(3.0, abs=0.05)
+
+
+def test_a_direction_that_the_recordings_leave_open_is_wide_and_no_trouble(monkeypatch):
+    """With the solver stopped each time after two steps, at the best place there is, χ² has no more to give."""
+    plain = search.fit
+    monkeypatch.setattr(search, "fit", lambda p, r, n, s, most, step: plain(p, r, n, s, 2, step))
+    fit, held_out, _ = made(Squire(strength=1.7))
+    found = diagnose(MadeProblem(Squire), fit, held_out)
+    assert found.names == ("squire",)
+    assert found.trouble == ""
+    low, high = found.effects[0].interval["idle"]  # nothing hangs on it: the whole of its range
+    assert (low, high) == (0.5, 2.0)
