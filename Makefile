@@ -37,7 +37,7 @@ lock: .venv/.ready
 	$(BIN)/uv pip compile pyproject.toml --group dev --python $(BIN)/python --no-annotate --no-header --upgrade -q -o requirements.lock
 
 clean:
-	rm -rf .venv outputs bench.json .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf .venv outputs .pytest_cache .ruff_cache .import_linter_cache
 
 .venv/.ready: requirements.lock pyproject.toml
 	@python=$$(command -v $(PYTHON) || command -v python3); \

@@ -139,12 +139,11 @@ def _line(row: Row) -> str:
 
 
 def _store(rows: list[Row]) -> None:
-    kept: dict[str, dict[str, Any]] = {}
-    if JSON_PATH.exists():
-        kept = {r["name"]: r for r in json.loads(JSON_PATH.read_text())}
-    replaced = {r.name.split(":")[0] for r in rows}
-    kept = {name: r for name, r in kept.items() if name.split(":")[0] not in replaced}
-    merged = list(kept.values()) + [dataclasses.asdict(r) for r in rows]
+    """Instead of the rows that the same benchmark made on the same machine; those of other machines stay beside them."""
+    before = json.loads(JSON_PATH.read_text()) if JSON_PATH.exists() else []
+    replaced = {(r.name.split(":")[0], r.machine) for r in rows}
+    kept = [r for r in before if (r["name"].split(":")[0], r["machine"]) not in replaced]
+    merged = kept + [dataclasses.asdict(r) for r in rows]
     merged.sort(key=lambda r: r["name"].split(":")[0])
     JSON_PATH.write_text(json.dumps(merged, indent=1, ensure_ascii=False) + "\n")
     PAGE_PATH.parent.mkdir(exist_ok=True)

@@ -128,6 +128,21 @@ def test_a_partial_run_keeps_the_rows_of_the_others_and_replaces_its_own(only_mi
     assert "old name" not in (only_mine / "docs/benchmarks.md").read_text()
 
 
+def test_rows_of_another_machine_stay_beside_ones_own(only_mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kind = ["2 cores"]
+    monkeypatch.setattr("taccorl.benchmark.machine", lambda: kind[0])
+
+    @benchmark("pictures")
+    def _() -> Iterator[Row]:
+        yield Row(name=f"drawn by {kind[0]}", value=1.0, unit="ms", n=1, spread=0.0)
+
+    run()
+    kind[0] = "a lent GPU"
+    run()
+    run()
+    assert list(stored(only_mine)) == ["pictures: drawn by 2 cores", "pictures: drawn by a lent GPU"]
+
+
 def test_a_benchmark_that_fails_does_not_cost_the_figures_of_the_others(only_mine: Path) -> None:
     @benchmark("first")
     def _() -> Iterator[Row]:
