@@ -1,6 +1,5 @@
 """``docs/diagnosis.md`` and its pictures, from the rows of ``pipelines/diagnosis_study.py``."""
 
-import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from taccorl.diagnosis.figures_evidence import Detection, confusion_matrix, detection_curve
+from taccorl.diagnosis.figures_evidence import confusion_matrix, detection_curves, half_detected
 from taccorl.diagnosis.study import MATERIAL, exact, exact_but_for_algebra, material, named, silently_wrong
 
 PAGE = Path("docs/diagnosis.md")
@@ -24,10 +23,12 @@ were chosen on seeds below 300 and after a look at 1000 to 1012; these are other
 
 *Material*: the held-out error, gains refitted, is at least {MATERIAL:g} noise floors; below that there is nothing to find.
 *Exact*: the hidden effect is the one that was added first. *Named*: it is that, or named with it as a tie, a rival or a near-twin
-by nature. Intervals are 95 % (Wilson).
+by nature. Intervals are 95 % (Wilson). *Signal*: what the effect leaves above the floor on the held-out recordings once the gains
+are refitted, √(error² − 1) floors. *50 % detection*: the signal at which the effect is named in half of the robots, with its 95 %
+interval, from curves of one steepness (log odds 5 times log signal).
 
-All rows come from `python -m pipelines.diagnosis_study none chirp pack touch pairs removed outside` (20 seeds each by default) on
-two shared cores of an AMD EPYC, one process each; the tables say how many there are so far.
+All rows come from `python -m pipelines.diagnosis_study none chirp pack touch pairs removed outside amplitude` (20 seeds each by
+default) on two shared cores of an AMD EPYC, one process each; the tables say how many there are so far.
 
 """
 
@@ -72,7 +73,7 @@ def write_page(rows: list[dict]) -> None:
     for design in ("pack", "chirp", "press"):
         own = [r for r in rows if r["study"] in ("single", "touch") and r["design"] == design]
         if own:
-            lines += _single(own, design)
+            lines += _single(own, [r for r in rows if r["study"] == "amplitude" and r["design"] == design], design)
     PAGE.write_text("\n".join(lines) + "\n", encoding="utf-8")
     print(PAGE)
 
@@ -94,8 +95,8 @@ def _spread(what: str, values: Sequence[float], asked: tuple[float, float] | Non
     return f"| {what}, median / 90th percentile | {goal} | {found[0]:.2f} / {found[1]:.2f} | {met} |"
 
 
-def _single(rows: list[dict], design: str) -> list[str]:
-    names = list(dict.fromkeys(r["hidden"][0] for r in rows))
+def _single(rows: list[dict], weak: list[dict], design: str) -> list[str]:
+    names = sorted({r["hidden"][0] for r in rows})
     counts = {n: Counter(_said(r) for r in rows if r["hidden"][0] == n and material(r)) for n in names}
     counts = {n: row for n, row in counts.items() if row}
     confusion = Path(f"docs/diagnosis_confusion_{design}.png")
@@ -103,20 +104,29 @@ def _single(rows: list[dict], design: str) -> list[str]:
         confusion, dpi=110
     )
     curve = Path(f"docs/diagnosis_detection_{design}.png")
-    points = {f"all {len(names)} effects": _detections(rows)}
-    detection_curve(points, ORIGIN, f"Found or named, over signal to noise, design {design}").savefig(curve, dpi=110)
+    points = {n: _detections([r for r in (*rows, *weak) if r["hidden"][0] == n]) for n in names}
+    title = f"Found or named, over signal to noise, design {design}"
+    detection_curves(points, ORIGIN, title, SIGNAL_BINS).savefig(curve, dpi=110)
+    inside = [t for r in rows if material(r) and exact(r) for t in _inside(r)]
     lines = [f"## Design {design}", "", f"![confusion]({confusion.name})", "", f"![detection]({curve.name})", ""]
     lines += [
-        "| hidden | cases | material | exact | named | 50 % detection at | error of its strength, median |",
-        "|---|---|---|---|---|---|---|",
+        "True numbers of the effects that were found that lie within their 95 % intervals: "
+        + share(sum(inside), len(inside))
+        + ".",
+        "The surrogate's equations are not the twin's, so some of what is left is not noise.",
+        "",
+        "| hidden | cases | material | exact | named | 50 % detection at | error of its strength, median | within its interval |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for n in names:
         own = [r for r in rows if r["hidden"][0] == n]
         there = [r for r in own if material(r)]
-        found = [e for r in there if exact(r) for e in _strength_errors(r)]
-        error = f"{np.median(found):.1%}" if found else "–"
-        cells = [n, len(own), len(there), sum(map(exact, there)), sum(map(named, there)), _half(own), error]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
+        found = [r for r in there if exact(r)]
+        errors = [e for r in found for e in _strength_errors(r)]
+        error = f"{np.median(errors):.1%}" if errors else "–"
+        within = [t for r in found for t in _inside(r)[:1]]
+        cells = [n, len(own), len(there), len(found), sum(map(named, there)), _half(*points[n]), error]
+        lines.append("| " + " | ".join(map(str, (*cells, f"{sum(within)} of {len(within)}"))) + " |")
     return [*lines, ""]
 
 
@@ -130,23 +140,24 @@ def _signal(row: dict[str, Any]) -> float:
     return float(np.sqrt(max(row["errors"]["fitted"]["held_out"] ** 2 - 1.0, 0.01)))
 
 
-def _detections(rows: list[dict]) -> list[Detection]:
-    found = []
-    for low, high in itertools.pairwise(SIGNAL_BINS):
-        own = [r for r in rows if low <= _signal(r) < high]
-        if own:
-            found.append(Detection(float(np.sqrt(low * high)), sum(map(named, own)), len(own)))
-    return found
+def _detections(rows: list[dict]) -> tuple[np.ndarray, np.ndarray]:
+    """Signals, and whether the effect was named."""
+    return np.array([_signal(r) for r in rows]), np.array([named(r) for r in rows])
 
 
-def _half(rows: list[dict]) -> str:
-    """Signal to noise at which half are named: where the misses above equal the finds below."""
-    signals = np.array([_signal(r) for r in rows])
-    hit = np.array([named(r) for r in rows])
-    if not hit.any():
-        return "never seen"
-    errors = [np.sum(hit & (signals < s)) + np.sum(~hit & (signals >= s)) for s in np.sort(signals)]
-    return f"{np.sort(signals)[int(np.argmin(errors))]:.2g}"
+def _half(signals: np.ndarray, found: np.ndarray) -> str:
+    """Signal to noise at which half are named, with its interval."""
+    half, low, high = half_detected(signals, found)
+    if np.isinf(high):
+        return f"above {low:.2g}: never seen" if not found.any() else f"above {low:.2g}"
+    return f"{half:.2g} ({low:.2g} … {high:.2g})" if low > 0 else f"below {high:.2g}"
+
+
+def _inside(row: dict[str, Any]) -> list[bool]:
+    """For each number of the hidden effect that was fitted, whether the truth lies within its interval."""
+    ends = row["interval"]
+    numbers = {f"{row['hidden'][0]}.{name}": true for name, true in row["true"][0].items()}
+    return [ends[name][0] <= true <= ends[name][1] for name, true in numbers.items() if name in ends]
 
 
 def _strength_errors(row: dict[str, Any]) -> list[float]:

@@ -27,9 +27,12 @@ PAIRS = (
     ("error_deadband", "command_delay"),
     ("slew_limit", "coulomb_friction"),
 )
+AMPLITUDES = (0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.3)
+"""Noise floors that an effect leaves: around those at which it begins to be found."""
 STUDIES = {
     "chirp": lambda n: study.single("chirp", REGISTERED, range(5000, 5000 + n)),
     "pack": lambda n: study.single("pack", REGISTERED, range(5000, 5000 + n)),
+    "amplitude": lambda n: study.amplitude("chirp", REGISTERED, AMPLITUDES, range(8000, 8000 + n // 4)),
     "none": lambda n: study.nothing("chirp", range(5000, 5000 + 5 * n)),
     "removed": lambda n: study.removed("chirp", REGISTERED, range(6000, 6000 + n)),
     "outside": lambda n: study.removed("chirp", OUTSIDE, range(6000, 6000 + n)),

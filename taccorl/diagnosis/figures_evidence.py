@@ -94,42 +94,67 @@ def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[
     return figure
 
 
-@dataclass(frozen=True)
-class Detection:
-    """How often one effect was found at one strength."""
-
-    signal_to_noise: float
-    """RMS that the effect leaves after all else was refitted / noise floor."""
-    found: int
-    n: int
+SLOPE = 5.0
+"""Of all detection curves, in log odds over log signal: from 10 to 90 % within a factor of 2.4 of the signal."""
 
 
-def detection_curve(points: Mapping[str, Sequence[Detection]], origins: Sequence[str], title: str) -> Figure:
-    """Share of seeds in which the effect was found over signal-to-noise, with 95 % Wilson intervals; one line an effect."""
-    figure = new_figure(8.0, 4.8, title, origins)
-    axes = figure.subplots()
-    colors = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b7280", "#111111")
-    styles = ("-", "--", ":")
-    for k, (name, own) in enumerate(points.items()):
-        own = sorted(own, key=lambda d: d.signal_to_noise)
-        x = [d.signal_to_noise for d in own]
-        share = [d.found / d.n for d in own]
-        ends = [binomtest(d.found, d.n).proportion_ci(method="wilson") for d in own]
-        color, style = colors[k % len(colors)], styles[k // len(colors) % len(styles)]
-        axes.plot(
-            x, share, color=color, ls=style, marker="o", ms=3.5, lw=1.3, label=f"{name} (n = {sum(d.n for d in own)})"
-        )
-        if len(points) <= 4:
-            axes.fill_between(x, [e.low for e in ends], [e.high for e in ends], color=color, alpha=0.15, lw=0)
-    axes.axvline(1.0, color=FLOOR, lw=2.5, label="noise floor")
-    axes.axhline(0.5, color="#64748b", lw=0.9, ls="--")
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylim(-0.02, 1.05)
-    axes.set_xlabel("signal of the effect / noise floor", fontsize=8)
-    axes.set_ylabel("share of seeds in which it is found", fontsize=8)
-    tidy(axes)
-    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+def half_detected(signals: np.ndarray, found: np.ndarray, slope: float = SLOPE) -> tuple[float, float, float]:
+    """Signal to noise at which half the seeds find it, with its 95 % interval: p = 1 / (1 + (s½ / s)^slope), likeliest s½.
+
+    Args:
+        signals: (n,) of single seeds, above 0.
+        found: (n,) bool.
+
+    Returns:
+        s½ and the ends of its interval by likelihood ratio; 0 and inf stand for an end that the seeds do not show.
+    """
+    grid = np.geomspace(0.02, 200.0, 2000)
+    odds = slope * (np.log(signals)[:, None] - np.log(grid))
+    likely = -np.logaddexp(0.0, np.where(found[:, None], -odds, odds)).sum(axis=0)
+    inside = np.flatnonzero(likely > likely.max() - 1.92)
+    best = grid[int(np.argmax(likely))]
+    low = 0.0 if inside[0] == 0 else grid[inside[0]]
+    high = np.inf if inside[-1] == len(grid) - 1 else grid[inside[-1]]
+    return float(best), float(low), float(high)
+
+
+def detection_curves(
+    points: Mapping[str, tuple[np.ndarray, np.ndarray]], origins: Sequence[str], title: str, edges: Sequence[float]
+) -> Figure:
+    """A small panel an effect: share of seeds that found it over signal to noise, with 95 % Wilson intervals, and the curve.
+
+    Args:
+        points: effect → signals (n,) and whether it was found (n,).
+        edges: of the bins in which seeds are counted together.
+    """
+    columns = 5
+    rows = -(-len(points) // columns)
+    figure = new_figure(12.0, 1.2 + 1.75 * rows, title, origins)
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    line = np.geomspace(edges[0], edges[-1], 200)
+    for axes, (name, (signals, found)) in zip(panels.flat, points.items(), strict=False):
+        axes.axvline(1.0, color=FLOOR, lw=2.5)
+        axes.axhline(0.5, color="#64748b", lw=0.8, ls="--")
+        bins = np.digitize(signals, edges)
+        for k in np.unique(bins):
+            own = bins == k
+            count, n = int(found[own].sum()), int(own.sum())
+            ends = binomtest(count, n).proportion_ci(method="wilson")
+            x = float(np.exp(np.mean(np.log(signals[own]))))
+            axes.plot([x, x], [ends.low, ends.high], color=AFTER, lw=0.9, alpha=0.6)
+            axes.plot(x, count / n, "o", color=AFTER, ms=3.5)
+        half, _, high = half_detected(signals, found)
+        if found.any() and np.isfinite(high):
+            axes.plot(line, 1.0 / (1.0 + (half / line) ** SLOPE), color=BEFORE, lw=1.2)
+        axes.set_title(f"{name} (n = {len(signals)})", fontsize=8)
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,)))
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylim(-0.04, 1.06)
+        tidy(axes)
+    for axes in panels.flat[len(points) :]:
+        axes.set_axis_off()
+    figure.supxlabel("signal of the effect / noise floor (grey line: 1)", fontsize=8)
+    figure.supylabel("share of seeds in which it is found or named", fontsize=8)
     return figure

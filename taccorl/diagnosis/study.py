@@ -162,6 +162,16 @@ def single(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job]
     return [Job(study="single", hidden=(n,), seed=s, design=design) for s in seeds for n in names]
 
 
+def amplitude(design: str, names: Sequence[str], strengths: Sequence[float], seeds: Sequence[int]) -> list[Job]:
+    """One hidden effect each, at strengths around those at which it begins to be found."""
+    return [
+        Job(study="amplitude", hidden=(n,), seed=s, design=design, strength=x)
+        for s in seeds
+        for x in strengths
+        for n in names
+    ]
+
+
 def touch(names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
     """One hidden effect of the pads each, press–hold–release."""
     return [Job(study="touch", hidden=(n,), seed=s, design="press") for s in seeds for n in names]

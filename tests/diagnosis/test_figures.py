@@ -13,7 +13,14 @@ from taccorl.diagnosis.along import curves
 from taccorl.diagnosis.comparison import TouchTrace
 from taccorl.diagnosis.figure_style import AFTER, BEFORE, data_uri, png
 from taccorl.diagnosis.figures import heat_map_figure, joint_response, residual_along_variables
-from taccorl.diagnosis.figures_evidence import Detection, Step, confusion_matrix, detection_curve, waterfall
+from taccorl.diagnosis.figures_evidence import (
+    SLOPE,
+    Step,
+    confusion_matrix,
+    detection_curves,
+    half_detected,
+    waterfall,
+)
 from taccorl.diagnosis.figures_touch import touch_heat_map_figure, touch_histogram, touch_maps, touch_over_time
 from taccorl.diagnosis.localise import heat_map
 from taccorl.diagnosis.localise_touch import touch_heat_map
@@ -118,14 +125,30 @@ def test_confusion_matrix_holds_the_counts():
     drawn(figure)
 
 
-def test_detection_curve_has_wilson_intervals():
-    figure = detection_curve({"backlash": [Detection(4.0, 10, 10), Detection(1.0, 5, 10)]}, [ORIGIN], "detection")
+def test_half_detection_is_where_misses_turn_into_finds():
+    signals = np.geomspace(0.25, 4.0, 41)
+    half, low, high = half_detected(signals, signals > 1.0)
+    assert half == pytest.approx(1.0, rel=0.1)
+    assert 0.7 < low < half < high < 1.4
+    # drawn from the curve itself: the true 2 lies within the interval
+    rng = np.random.default_rng(0)
+    signals = np.exp(rng.uniform(np.log(0.3), np.log(10), 200))
+    half, low, high = half_detected(signals, rng.random(200) < 1 / (1 + (2.0 / signals) ** SLOPE))
+    assert low < 2.0 < high < 1.3 * low
+    assert half_detected(np.array([3.0, 5.0]), np.array([True, True]))[1] == 0.0  # never missed
+    assert half_detected(np.array([0.1, 0.2]), np.array([False, False]))[2] == np.inf  # never found
+
+
+def test_detection_curves_count_seeds_bin_by_bin():
+    points = {"backlash": (np.array([4.0] * 10 + [1.0] * 10), np.array([True] * 10 + [True, False] * 5))}
+    figure = detection_curves(points, [ORIGIN], "detection", (0.5, 2.0, 8.0))
     axes = figure.axes[0]
-    np.testing.assert_allclose(line(axes, "#0072b2"), [0.5, 1.0])  # sorted by signal
-    band = axes.collections[0].get_paths()[0].vertices[:, 1]
+    assert axes.get_title() == "backlash (n = 20)"
+    dots = [float(mark.get_ydata()[0]) for mark in axes.lines if mark.get_marker() == "o"]
+    assert dots == [0.5, 1.0]
+    bars = [list(mark.get_ydata()) for mark in axes.lines if mark.get_alpha() == 0.6]
     # Wilson, 10 of 10 at z = 1.96: low = 1 / (1 + z² / n) = 0.7225; 5 of 10: 0.5 ± 0.2634
-    assert band.min() == pytest.approx(0.2366, abs=1e-3)
-    assert np.isclose(band, 0.7225, atol=1e-3).any()
+    np.testing.assert_allclose(bars, [[0.2366, 0.7634], [0.7225, 1.0]], atol=1e-3)
     drawn(figure)
 
 
