@@ -10,6 +10,7 @@ Letters in shapes: T rows, J signals (14 for the robot, in the order of actions)
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.actions import ACTION_NAMES
+
+if TYPE_CHECKING:
+    from taccorl.alignment.touch_motion import PressedObject
 
 UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}
 """Unit of a position → those of its velocity and effort."""
@@ -35,7 +39,7 @@ class Touch:
     """Frames of the pads at their own rate. Pads are scanned at different times, so each has its own."""
 
     time_s: np.ndarray
-    """(N, 4) when each pad's frame was taken, on the measurement's clock, in the order of
+    """(N, 4) when each pad's frame had been scanned to its end, on the measurement's clock, in the order of
     ``taccorl.sim.robot.PADS``."""
     counts: np.ndarray
     """(N, K) int16 counts above baseline, unclipped; K = 1536."""
@@ -85,6 +89,8 @@ class Measurement:
     """Signal → factor of both gains over the other recordings', where no more than that is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
     """Arm → known mass in its gripper."""
+    pressed: "PressedObject | None" = None
+    """Known object between the fingers of one arm, where somebody wrote it down: what its pads are judged by."""
     time_error_s: float = 0.0
     """A row's position and target may be taken this much apart from its time (rows of a dataset show the last
     sample)."""

@@ -9,9 +9,15 @@ A folder of recordings may hold a ``measurements.yaml`` that says what the files
       sweep_05.mcap: {use: held_out}
       sweep_02.mcap: {repeat_of: sweep_01.mcap}
       sweep_03.mcap: {kp: {left_joint5: 40}, kd: {left_joint5: 4}, payload_kg: {left: 0.5}, effort_scale: {left_joint1: 0.25}}
+      press_01.mcap: {pressed: &ball {shape: sphere, radius_m: 0.012, arm: left, position_m: [0.001, 0, 0.003]}}
+      press_02.mcap: {pressed: *ball, use: held_out}
+      press_03.mcap: {pressed: {shape: rod, radius_m: 0.008, length_m: 0.04, arm: left, rpy_rad: [0, 1.5708, 0]}}
+
+``pressed`` is a known object between the fingers of one arm; with it ``taccorl compare`` and ``diagnose`` look at the arm's pads.
 """
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,14 +29,39 @@ from taccorl.alignment.dataset_rows import read_dataset
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.recorded import read_recording
 from taccorl.alignment.tables import SUFFIXES, TableSpec, load_table_spec, read_table
+from taccorl.alignment.touch_motion import PressedObject, indenter
 from taccorl.data.decode import natural_key
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_recording_specs
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, TaccorlError, nearest
+from taccorl.sim.actions import OPEN_M
 
 INDEX = "measurements.yaml"
 Use = Literal["fit", "held_out", "test"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PressedNote:
+    """A known object between the fingers of one arm: what ``indenter`` takes."""
+
+    shape: Literal["sphere", "rod"]
+    radius_m: float
+    arm: Literal["left", "right"]
+    length_m: float | None = None
+    """Of a rod, which has flat ends; a sphere has none."""
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Its middle: in the TCP's frame (middle between the pads, z = approach, fingers close along y), or in the world's."""
+    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Fixed-axis roll, pitch, yaw; a rod lies along its own z, and [0, 1.5708, 0] lays it across the pads."""
+    frame: Literal["tcp", "world"] = "tcp"
+    """tcp: it keeps its place in the hand; world: it is fixed to the bench."""
+
+    def made(self) -> PressedObject:
+        """For ``touch_motion``."""
+        size = {} if self.length_m is None else {"length_m": self.length_m}
+        place = {"position_m": self.position_m, "rpy_rad": self.rpy_rad, "frame": self.frame}
+        return indenter(self.shape, self.radius_m, self.arm, **size, **place)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +82,7 @@ class RecordingNote:
     effort_scale: dict[str, float] = field(default_factory=dict)
     """Signal → factor to N·m, N: PiPER's firmware 1.5 to 1.8 reports joints 1 to 3 four times too large
     (piper_sdk issue 73)."""
+    pressed: PressedNote | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,9 +242,26 @@ def _load_index(folder: Path) -> MeasurementIndex:
         arm = next((a for a in note.payload_kg if a not in ("left", "right")), None)
         if arm:
             raise document.error(f"recordings/{name}/payload_kg/{arm}", f"no arm {arm!r}; left, right")
+        if note.pressed is not None:
+            _check_pressed(document, f"recordings/{name}/pressed", note.pressed)
     if index.columns and not (folder / index.columns).is_file():
         raise document.error("columns", f"no file {index.columns!r} beside it")
     return index
+
+
+def _check_pressed(document: Document[MeasurementIndex], key: str, pressed: PressedNote) -> None:
+    if (pressed.shape == "rod") != (pressed.length_m is not None):
+        need = "a rod needs its length_m" if pressed.shape == "rod" else "a sphere has no length_m; leave it out"
+        raise document.error(key if pressed.length_m is None else f"{key}/length_m", need)
+    for name in ("radius_m", "length_m"):
+        size = getattr(pressed, name)
+        if size is not None and not 0 < size < math.inf:
+            raise document.error(f"{key}/{name}", f"{size:g} is not above 0")
+    if 2 * pressed.radius_m > OPEN_M:
+        text = (
+            f"{pressed.radius_m:g} m does not fit between the fingers, which open {OPEN_M:g} m; is it in millimetres?"
+        )
+        raise document.error(f"{key}/radius_m", text)
 
 
 def _beside(folder: Path, name: str) -> str | Path:
@@ -244,15 +293,28 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
                         f"{folder / INDEX}: recordings → {m.name} → {key}: no signal {name!r}; "
                         f"{nearest(name, m.signals)}"
                     )
+        if note.pressed is not None and m.touch is None:
+            why = next((f" ({f.text})" for f in m.findings if f.check == "no_baseline"), "")
+            raise TaccorlError(
+                f"{folder / INDEX}: recordings → {m.name} → pressed: the recording holds no frames of the pads{why}; record "
+                "them, or leave pressed out"
+            )
+        repeat_of = note.repeat_of or m.repeat_of
+        if repeat_of and index.recordings.get(repeat_of, RecordingNote()).pressed != note.pressed:
+            raise TaccorlError(
+                f"{folder / INDEX}: recordings → {m.name} → pressed: it repeats {repeat_of}, for which pressed is not the same; "
+                "mend pressed, or repeat_of"
+            )
         scale = np.array([note.effort_scale.get(name, 1.0) for name in m.signals])
         noted.append(
             dataclasses.replace(
                 m,
-                repeat_of=note.repeat_of or m.repeat_of,
+                repeat_of=repeat_of,
                 kp=m.kp | note.kp,
                 kd=m.kd | note.kd,
                 gain_scale=m.gain_scale | note.gain_scale,
                 payload_kg=m.payload_kg | note.payload_kg,
+                pressed=note.pressed.made() if note.pressed is not None else None,
                 effort=m.effort * scale,
             )
         )

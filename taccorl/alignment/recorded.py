@@ -256,7 +256,8 @@ class _Rows:
             time_s=(self.grid_ns - self.grid_ns[0]) / NS_PER_S,
             target=np.concatenate([self._on_grid(c, held=True) for c in self.commands], axis=1),
             measured=np.concatenate([self._on_grid(c, held=False) for c in self.states], axis=1),
-            **extra,
+            velocity=extra["velocity"],
+            effort=extra["effort"],
             signals=names,
             units=signal_units(self.spec.target),
             quantum=np.array([find_quantum(column) for part in raw for column in part.T]),
@@ -296,8 +297,12 @@ class _Rows:
         )
 
     def _touch(self) -> Touch:
-        """Frame n of the first pad, with each other pad's nearest frame; every pad keeps its own times."""
+        """Frame n of the first pad, with each other pad's nearest frame; every pad keeps its own times.
+
+        Specs take off a scan as latency, to say when a frame began; here a frame's time is the end of its scan.
+        """
         channels = self.spec.features[TACTILE].channels
+        scan_s = self.spec.target.sensors[TACTILE].scan_time_s
         first = self._time_ns(channels[0])
         columns, times = [], []
         for channel in channels:
@@ -305,7 +310,7 @@ class _Rows:
             after = np.clip(np.searchsorted(time_ns, first), 1, len(time_ns) - 1)
             nearer = np.where(first - time_ns[after - 1] <= time_ns[after] - first, after - 1, after)
             columns.append(self._values(channel)[nearer])
-            times.append((time_ns[nearer] - self.grid_ns[0]) / NS_PER_S)
+            times.append((time_ns[nearer] - self.grid_ns[0]) / NS_PER_S + scan_s)
         baseline = self.cutter.baselines[TACTILE]
         counts = np.concatenate(columns, axis=1) - baseline
         return Touch(time_s=np.stack(times, axis=1), counts=counts.astype(np.int16), baseline=baseline)

@@ -1,8 +1,8 @@
 """``taccorl compare --twin=twin.yaml --measurements=sweeps/``: how far the twin is from measurements, and where.
 
 MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may say which
-are held out and which repeat one another. Every recording's commands run through the twin. What is wrong with the data is said
-first; with errors nothing is compared.
+are held out, which repeat one another, and what the pads pressed: then touch is compared, pad by pad. Every recording's commands
+run through the twin. What is wrong with the data is said first; with errors nothing is compared.
 
     --against=other.yaml   another twin beside it: before and after
     --out=DIR              report.html (one page, works anywhere) and report.json
@@ -62,7 +62,7 @@ class CompareConfig:
     held_out_every: int | None = None
     """Every k-th motion is held out; else as measurements.yaml says."""
     pressed: PressedConfig = field(default_factory=PressedConfig)
-    """What the fingers pressed in recordings with pads; then touch is compared, too."""
+    """What the fingers pressed in recordings with pads of which measurements.yaml does not say it."""
     out: Path | None = None
     """Folder for report.html and report.json. An earlier report is replaced, any other file left alone."""
     rerun: Path | None = None
@@ -159,9 +159,12 @@ def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> 
     from taccorl.cli.tables import console
     from taccorl.diagnosis.comparison import origin_words, shown
     from taccorl.diagnosis.localise import heat_map, worst_regime
+    from taccorl.diagnosis.localise_touch import touch_heat_map
 
-    cells = [*heat_map(comparison, "position"), *heat_map(comparison, "effort")]
-    later = {(s.signal, s.kind, s.use): s for s in after.scores()} if after is not None else {}
+    cells = [*heat_map(comparison, "position"), *heat_map(comparison, "effort"), *touch_heat_map(comparison.touches)]
+    scores = [*comparison.scores(), *comparison.pad_scores()]
+    others = [*after.scores(), *after.pad_scores()] if after is not None else []
+    later = {(s.signal, s.kind, s.use): s for s in others}
     table = Table(box=None, pad_edge=False)
     heads = [f"RMSE {comparison.twin}", "× floor"]
     heads += [f"RMSE {after.twin}", "× floor", "change"] if after is not None else []
@@ -169,8 +172,8 @@ def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> 
         table.add_column(
             head, justify="left" if head in ("signal", "use") or "regime" in head else "right", overflow="fold"
         )
-    for s in comparison.scores():
-        row = [Text(f"{s.signal} {s.kind}" if s.kind != "touch" else s.signal), s.use.replace("_", "-")]
+    for s in scores:
+        row = [Text(f"{s.signal} {s.kind}" if s.signal != "touch" else s.signal), s.use.replace("_", "-")]
         row += _error_cells(s)
         other = later.get((s.signal, s.kind, s.use))
         if after is not None:
@@ -180,7 +183,9 @@ def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> 
         table.add_row(*row, f"{s.nrmse:.2%}", floor, f"{worst.regime} ({worst.ratio:.3g} × floor)" if worst else "")
     out = console()
     out.print(table)
-    if any(s.lower_bound for s in comparison.scores()):
+    if any(s.lower_bound and s.kind == "touch" for s in scores):
+        out.print(Text("or more, of touch: the noise of each taxel; what presses do not repeat is not in it", "dim"))
+    if any(s.lower_bound and s.kind != "touch" for s in scores):
         out.print(
             Text(
                 "or more: no recording is declared to repeat another (repeat_of), so this floor is a lower bound", "dim"

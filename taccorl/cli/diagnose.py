@@ -1,10 +1,12 @@
 """``taccorl diagnose --twin=twin.yaml --measurements=sweeps/``: which physical effect the twin lacks, and with what evidence.
 
-Every joint that the recordings sweep is looked at by itself. First what the recordings can show and tell apart at all; then all
+Every joint that the recordings sweep is looked at by itself, then the pads of every arm for which measurements.yaml says what
+they pressed. First what the recordings can show and tell apart at all; then all
 known effects are tried, refitted together with the controller's numbers and judged on recordings that nothing was fitted to.
 Effects that do as well as each other are shown as ties, with the recording that would tell them apart; structure that no known
 effect explains is called "something else".
 
+    --joints=[J3,left_joint5] --pads=[left]    only these
     --until=noise_floor    add effects until nothing is left above the noise floor, and write the mended twin
     --out=DIR              report.html, report.json, which `taccorl add-effect` reads, and the mended twin.yaml
 """
@@ -22,11 +24,14 @@ if TYPE_CHECKING:
     from taccorl.alignment.measurements import Measurements
     from taccorl.diagnosis.comparison import Comparison
     from taccorl.diagnosis.joints import JointFinding
+    from taccorl.diagnosis.pads import PadFinding
     from taccorl.sim.twin import TwinConfig
 
 
 FAR_GAIN = 3.0
 """Fitted gains that are so many times the twin's are doubted."""
+MOST_NAMES = 6
+"""In one line; the report has the others."""
 
 
 @dataclass(kw_only=True)
@@ -38,7 +43,10 @@ class DiagnoseConfig:
     twin: Path | None = None
     """twin.yaml; the nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
-    """Only these: left_joint5, or joint5 and J4 (the paper's name of it) for both arms; all that are swept if not given."""
+    """Only these: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If neither joints
+    nor pads are given, all that are swept and all that press something known."""
+    pads: list[str] = field(default_factory=list)
+    """Only the pads of these arms: left, right."""
     until: Literal["one", "noise_floor"] = "one"
     """``one``: the most likely missing effect of each joint. ``noise_floor``: effects are added until nothing is left."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
@@ -48,7 +56,7 @@ class DiagnoseConfig:
     out: Path = Path("diagnosis")
     """Folder of the report. An earlier report is replaced, any other file left alone."""
     workers: int = 2
-    """Joints that are diagnosed at the same time."""
+    """Joints, or arms with pads, that are diagnosed at the same time."""
     spec: str | None = None
     """Recording spec; needed where several shipped ones read the format."""
     columns: Path | None = None
@@ -66,7 +74,8 @@ def main(argv: list[str]) -> int:
     from taccorl.alignment.measurements import read_measurements
     from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of
     from taccorl.diagnosis.compare import compare
-    from taccorl.diagnosis.joints import mended, swept_joints
+    from taccorl.diagnosis.joints import swept_joints
+    from taccorl.diagnosis.pads import pressed_arms
     from taccorl.sim.effects import effects
 
     twin = twin_of(config.twin)
@@ -78,6 +87,14 @@ def main(argv: list[str]) -> int:
     findings = checked(measurements, "not diagnosed")
     if findings is None:
         return 1
+    swept, pressed = swept_joints(measurements), pressed_arms(measurements)
+    if not swept and not pressed:
+        raise TaccorlError(
+            "no fit recording sweeps a joint (2 mrad at least), or says what pads pressed; record sweeps: taccorl excite plans "
+            "them; of presses, state `pressed` in measurements.yaml"
+        )
+    arms = arms_named(config.pads, pressed) if config.pads or not config.joints else ()
+    signals = joints_named(config.joints, swept) if config.joints or (swept and not config.pads) else ()
     before = compare(twin, measurements, name=name_of(config.twin))
     late = {name: list(found) for name, found in before.clock.items() if found}
     print_findings({f"replay of {name}": found for name, found in late.items()})
@@ -86,14 +103,17 @@ def main(argv: list[str]) -> int:
             "not diagnosed: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"
         )
         return 1
-    signals = joints_named(config.joints, swept_joints(measurements))
-    found = _diagnosed(config, twin, signals, measurements)
-    for finding in found:
+    joints, pads = _diagnosed(config, twin, signals, arms, measurements)
+    for finding in (*joints, *pads):
         print_finding(finding)
-    after = compare(mended(twin, found), measurements, name="mended twin")
+    mended, disagree = _mended(twin, joints, pads)
+    after = compare(mended, measurements, name="mended twin")
     said = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
-    _write(config, argv, twin, found, before, after, said)
-    return int(any(f.diagnosis.status not in ("nothing_missing", "at_floor") for f in found))
+    _write(config, argv, twin, [*joints, *pads], before, after, mended, said)
+    if disagree:
+        print(f"the mended twin's pads are as they were: {disagree}")
+    done = all(f.diagnosis.status in ("nothing_missing", "at_floor") for f in (*joints, *pads))
+    return int(not done or bool(disagree))
 
 
 def joints_named(names: Sequence[str], swept: Sequence[str]) -> tuple[str, ...]:
@@ -119,24 +139,44 @@ def joints_named(names: Sequence[str], swept: Sequence[str]) -> tuple[str, ...]:
     return tuple(chosen)
 
 
+def arms_named(names: Sequence[str], pressed: Sequence[str]) -> tuple[str, ...]:
+    """Arms whose pads are meant.
+
+    Raises:
+        TaccorlError: one whose pads press nothing known.
+    """
+    for name in names:
+        if name not in pressed:
+            raise TaccorlError(
+                f"--pads={name}: no fit recording says what pads of such an arm pressed; "
+                + (nearest(name, pressed) if pressed else "state `pressed` in measurements.yaml")
+            )
+    return tuple(arm for arm in pressed if not names or arm in names)
+
+
 def _diagnosed(
-    config: DiagnoseConfig, twin: "TwinConfig", signals: Sequence[str], measurements: "Measurements"
-) -> "list[JointFinding]":
+    config: DiagnoseConfig,
+    twin: "TwinConfig",
+    signals: Sequence[str],
+    arms: Sequence[str],
+    measurements: "Measurements",
+) -> "tuple[list[JointFinding], list[PadFinding]]":
     from taccorl.cli.tables import Bars
     from taccorl.diagnosis.joints import diagnose_joints
+    from taccorl.diagnosis.pads import diagnose_pads
     from taccorl.diagnosis.search import SearchConfig
 
     search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
-
-    with Bars(len(signals)) as bars:
+    total = len(signals) + len(arms)
+    with Bars(total) as bars:
         count = 0
 
-        def done(signal: str) -> None:
+        def done(part: str) -> None:
             nonlocal count
             count += 1
-            bars.update(signal, count, len(signals))
+            bars.update(part, count, total)
 
-        return diagnose_joints(
+        joints = diagnose_joints(
             twin,
             signals,
             measurements,
@@ -146,32 +186,50 @@ def _diagnosed(
             workers=config.workers,
             done=done,
         )
+        pads = diagnose_pads(
+            twin, arms, measurements, search=search, without=config.without, workers=config.workers, done=done
+        )
+    return joints, pads
 
 
-def print_finding(finding: "JointFinding") -> None:
-    """What was found at one joint: what can be told, the evidence, the verdict."""
+def _mended(
+    twin: "TwinConfig", joints: "Sequence[JointFinding]", pads: "Sequence[PadFinding]"
+) -> "tuple[TwinConfig, str]":
+    """The twin with all that was found, and why its pads are not in it, if they are not."""
+    from taccorl.diagnosis import joints as of_joints
+    from taccorl.diagnosis import pads as of_pads
+
+    mended = of_joints.mended(twin, joints)
+    try:
+        return of_pads.mended(mended, pads), ""
+    except TaccorlError as error:
+        return mended, str(error)
+
+
+def print_finding(finding: "JointFinding | PadFinding") -> None:
+    """What was found at one joint or pair of pads: what can be told, the evidence, the verdict."""
     from rich.table import Table
     from rich.text import Text
 
     from taccorl.cli.tables import console
+    from taccorl.diagnosis.evidence_words import evidence_words
 
     out, d = console(), finding.diagnosis
-    out.print(Text(f"\n{finding.signal}", "bold"))
-    out.print(f"  noise floor {'; effort '.join(f.words() for f in finding.floors)}", highlight=False)
-    gains = "commanded gains" if finding.commanded else "gains fitted (not stated by the recordings)"
+    out.print(Text(f"\n{finding.part}", "bold"))
+    out.print(f"  noise floor {finding.noise}", highlight=False)
     judged = "the last rows of each" if finding.rows_split else ", ".join(finding.recordings["held_out"])
-    out.print(f"  {gains}; judged on {judged}", highlight=False, soft_wrap=True)
-    hardly = [name for name in finding.can_tell.invisible if name not in d.names]
+    out.print(f"  {finding.numbers}; judged on {judged}", highlight=False, soft_wrap=True)
+    hardly = [_why_invisible(finding, name) for name in finding.can_tell.invisible if name not in d.names]
     if hardly:
-        words = ", ".join(_why_invisible(finding, name) for name in hardly)
-        out.print(Text(f"  of a typical strength these recordings would not show: {words}", "dim"), soft_wrap=True)
-    pairs = [f"{a} from {b}" for a, b, _ in finding.can_tell.pairs[:6]]
+        text = f"  of a typical strength these recordings would not show: {_some(hardly)}"
+        out.print(Text(text, "dim"), soft_wrap=True)
+    pairs = [f"{a} from {b}" for a, b, _ in finding.can_tell.pairs]
     if pairs:
-        out.print(Text(f"  nor tell at once: {', '.join(pairs)}", "dim"), soft_wrap=True)
+        out.print(Text(f"  nor tell at once: {_some(pairs)}", "dim"), soft_wrap=True)
     for number, found in enumerate(d.rounds, 1):
         table = Table(box=None, pad_edge=False)
-        for head in ("", f"round {number}: effect", "with", "held-out error", "gain", "÷ s.e.", "ΔBIC", ""):
-            left = head in ("", "with") or "effect" in head
+        for head in ("", f"round {number}: effect", "with", "held-out error", "gain", "÷ s.e.", "evidence", ""):
+            left = head in ("", "with", "evidence") or "effect" in head
             table.add_column(head, justify="left" if left else "right", overflow="fold")
         for e in found.evidence[:6]:
             mark = "→" if e.name == found.added else "=" if e.name in found.ties else ""
@@ -181,40 +239,59 @@ def print_finding(finding: "JointFinding") -> None:
             )
             score = f"{e.score:.1f}"
             table.add_row(
-                mark, e.name, numbers, f"{e.held_out_error:.2f} ×", f"{e.gain:.0%}", score, f"{e.bic:.0f}", trouble
+                mark,
+                e.name,
+                numbers,
+                f"{e.held_out_error:.2f} ×",
+                f"{round(e.gain, 2) + 0.0:.0%}",
+                score,
+                evidence_words(e),
+                trouble,
             )
         out.print(table)
     for line in verdict(finding):
         out.print(line, highlight=False, soft_wrap=True)
 
 
-def _why_invisible(finding: "JointFinding", name: str) -> str:
+def _some(words: Sequence[str]) -> str:
+    """Few enough to be read."""
+    more = len(words) - MOST_NAMES
+    return ", ".join(words[:MOST_NAMES]) + (f" and {more} more: see the report" if more > 0 else "")
+
+
+def _why_invisible(finding: "JointFinding | PadFinding", name: str) -> str:
     from taccorl.sim.effects import effects
 
     twins = [t for t in effects.get(name).near_twins if t in finding.diagnosis.start]
     return f"{name} (taken up by {' and '.join(twins)})" if twins else name
 
 
-def verdict(finding: "JointFinding") -> list[str]:
+def verdict(finding: "JointFinding | PadFinding") -> list[str]:
     """In words: what is missing, what does as well, what remains, what to record."""
+    from taccorl.diagnosis.evidence_words import to_record, unit_words, unjudged
+
     d = finding.diagnosis
     errors = d.errors["fitted"]["held_out"], d.errors["after"]["held_out"]
     added = [e.name for e in d.effects if e.name not in d.present]
     told = [f"{d.errors['before']['held_out']:.2f} as it was", f"{errors[0]:.2f} with its numbers refitted"]
     told += [f"{errors[1]:.2f} with {', '.join(added)}"] * bool(added)
-    what = "angles and efforts together" if len(finding.floors) > 1 else "angles"
-    lines = [f"  {d.words}", f"  held-out error in noise floors ({what}): {', '.join(told)}"]
+    lines = [f"  {d.words}", f"  held-out error in noise floors ({finding.measured}): {', '.join(told)}"]
+    lines += [f"    {words}" for words in (unjudged(d),) if words]
     for name in ("kp", "kd"):
         ratio = d.base.get(name, 1.0) / d.start.get(name, 1.0) if name in d.base else 1.0
         if not 1 / FAR_GAIN < ratio < FAR_GAIN:
             lines.append(f"    {name} became {ratio:.3g} times the twin's: state the commanded gains, or doubt this")
+    for name in ("k_n", "k_d"):
+        if name in d.base:
+            low, high = d.intervals.get(name, (float("nan"), float("nan")))
+            lines.append(f"    {name} {d.base[name]:.4g} ({low:.4g} … {high:.4g}), the twin had {d.start[name]:.4g}")
     for effect in d.effects:
         if effect.name in d.present:
             continue
         numbers = []
         for p in effect.parameters():
             low, high = effect.interval.get(p.name, (float("nan"), float("nan")))
-            numbers.append(f"{p.name} {getattr(effect, p.name):.4g} {p.unit} ({low:.4g} … {high:.4g})")
+            numbers.append(f"{p.name} {getattr(effect, p.name):.4g}{unit_words(p.unit)} ({low:.4g} … {high:.4g})")
         lines.append(f"  → {effect.name}: {', '.join(numbers)}")
         if effect.in_words:
             lines.append(f"    {effect.in_words}")
@@ -223,7 +300,7 @@ def verdict(finding: "JointFinding") -> list[str]:
             lines.append(
                 f"    cannot be told from {', '.join(rivals)} by these recordings, so it may as well be that; what to record:"
             )
-            lines.append(f"      taccorl excite {finding.signal} --effects={','.join((effect.name, *rivals))} …")
+            lines += [f"      {line}" for line in to_record(finding.part, effect.name, rivals)]
         for twin, why in d.twins.get(effect.name, {}).items():
             lines.append(f"    near-twin {twin}: {why}")
     if d.status == "something_else" and d.rounds:
@@ -243,12 +320,13 @@ def _write(
     config: DiagnoseConfig,
     argv: Sequence[str],
     twin: "TwinConfig",
-    found: "Sequence[JointFinding]",
+    found: "Sequence[JointFinding | PadFinding]",
     before: "Comparison",
     after: "Comparison",
+    mended: "TwinConfig",
     findings: dict,
 ) -> None:
-    from taccorl.diagnosis.joints import mended
+    from taccorl.diagnosis.pads import PadFinding
     from taccorl.diagnosis.report import Report, write_report
     from taccorl.sim.twin_file import save_twin, twin_digest
 
@@ -256,8 +334,8 @@ def _write(
         title=f"What {before.twin} lacks, from {config.measurements.name}",
         comparison=before,
         after=after,
-        diagnoses={f.signal: f.diagnosis for f in found},
-        can_tell={f.signal: f.can_tell for f in found},
+        diagnoses={f.part: f.diagnosis for f in found},
+        can_tell={f.part: f.can_tell for f in found},
         findings=findings,
         provenance={
             "command": shlex.join(["taccorl", "diagnose", *argv]),
@@ -271,12 +349,16 @@ def _write(
     names = list(dict.fromkeys(e.name for f in found for e in f.diagnosis.effects if e.name not in f.diagnosis.present))
     if config.until == "noise_floor":
         path = config.out / "twin.yaml"
-        save_twin(mended(twin, found), path)
+        save_twin(mended, path)
+        names = [name for name in names if any(e.name == name for e in mended.effects)]
         print(
             f"wrote {path}: {', '.join(names) or 'the refitted gains, no effect'}; it is what collect and training load"
         )
     elif names:
         words = ["taccorl", "add-effect", names[0]]
+        words += [f"--pads={f.arm}" for f in found if isinstance(f, PadFinding) and names[0] in f.diagnosis.names]
         words += [f"--twin={config.twin}"] * (config.twin is not None)
         words += [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))
         print(f"next: {shlex.join(words)}")
+    elif any(isinstance(f, PadFinding) for f in found):
+        print("next: the same with --until=noise_floor writes a twin with the refitted numbers")

@@ -29,7 +29,7 @@ def checked(measurements: "Measurements", verdict: str) -> dict[str, list["Findi
     from taccorl.alignment.telemetry_checks import check_measurements
 
     found = check_measurements(measurements.all)
-    found = {m.name: [*found.get(m.name, []), *_pose_unknown(m)] for m in measurements.all}
+    found = {m.name: [*_judged(m, found.get(m.name, [])), *_pose_unknown(m)] for m in measurements.all}
     print_findings(found)
     for line in measurements.skipped:
         print(f"not read: {line}")
@@ -44,6 +44,11 @@ def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
     """Whether most recordings say that their time stamps are shifted; one that does alone may lack physics or other gains."""
     shifted = [name for name, found in late.items() if any(f.severity == "error" for f in found)]
     return 2 * len(shifted) > num_recordings
+
+
+def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
+    """A press need not move a joint as far or as long as a sweep does."""
+    return [f for f in findings if m.pressed is None or f.check not in ("no_motion", "short", "too_short")]
 
 
 def _pose_unknown(m: "Measurement") -> list["Finding"]:

@@ -1,13 +1,15 @@
-"""``taccorl surrogate --secret=7 [--out=outputs/surrogate_7] [--effects=[coulomb_friction]] [--design=pack]``
+"""``taccorl surrogate --secret=7 [--pads=left] [--out=outputs/surrogate_7] [--effects=[coulomb_friction]] [--design=pack]``
 
 Recordings of a robot that is not there, with effects hidden in it that the seed draws, for ``taccorl compare`` and ``diagnose``.
 It is a simulation of its own, apart from the twin: other equations, finer steps, friction of bristles, a sampled controller.
+With --pads its fingers press known objects, and what is hidden is in the pads.
 What is hidden lies in a sealed file; ``taccorl surrogate --reveal=outputs/surrogate_7`` prints it.
 """
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
@@ -23,10 +25,12 @@ class SurrogateConfig:
     """Folder; outputs/surrogate_SECRET if not given. It must not be there yet."""
     effects: list[str] | None = None
     """What is hidden, instead of what the seed draws; [] for nothing."""
+    pads: Literal["no", "left", "right", "drawn"] = "no"
+    """Presses of known objects by the pads of this arm, instead of sweeps of a joint; ``drawn``: of either."""
     signal: str | None = None
     """Joint under test, as left_joint5; drawn if not given."""
     strength: float | None = None
-    """Noise floors that each effect leaves after a refit of the gains; 1 to 30 if not given."""
+    """Noise floors that each effect leaves after a refit of the gains; 1 to 30 if not given, 1.5 to 15 on pads."""
     design: str = "pack"
     """What is recorded for fitting: chirp (10 s, twice), or pack."""
     gains_known: bool = False
@@ -38,29 +42,52 @@ class SurrogateConfig:
 def main(argv: list[str]) -> int:
     """0: written."""
     config = parse(SurrogateConfig, argv, positional=None)
-    from taccorl.diagnosis.surrogate.cases import draw_case, draw_secret
-    from taccorl.diagnosis.surrogate.writing import SWEEPS, TWIN, reveal, write_recordings
+    from taccorl.diagnosis.surrogate.writing import SWEEPS, TWIN, reveal
 
     if config.reveal is not None:
         print(json.dumps(reveal(config.reveal), indent=2, ensure_ascii=False))
         return 0
     if config.secret is None or config.secret < 0:
         raise TaccorlError("missing --secret=, a whole number of at least 0; --help says more")
-    names = draw_secret(config.secret) if config.effects is None else config.effects
+    out = config.out or Path("outputs") / f"surrogate_{config.secret}"
+    if out.exists():
+        raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
+    made = _sweeps(config, config.secret, out) if config.pads == "no" else _presses(config, config.secret, out)
+    print(f"{made} in {out / SWEEPS}: a simulated robot, not a real one")
+    print(f"next: taccorl compare --twin={out / TWIN} --measurements={out / SWEEPS}")
+    print(f"then: taccorl diagnose --twin={out / TWIN} --measurements={out / SWEEPS}")
+    print(f"last: taccorl surrogate --reveal={out}")
+    return 0
+
+
+def _sweeps(config: SurrogateConfig, secret: int, out: Path) -> str:
+    from taccorl.diagnosis.surrogate.cases import draw_case, draw_secret
+    from taccorl.diagnosis.surrogate.writing import write_recordings
+
     case = draw_case(
-        names,
-        config.secret,
+        draw_secret(secret) if config.effects is None else config.effects,
+        secret,
         signal=config.signal,
         strength=config.strength,
         gains_known=config.gains_known,
         design=config.design,
     )
-    out = config.out or Path("outputs") / f"surrogate_{config.secret}"
-    if out.exists():
-        raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
-    made = write_recordings(case, out)
-    print(f"{len(made.all)} recordings of {case.signal} in {out / SWEEPS}: a simulated robot, not a real one")
-    print(f"next: taccorl compare --twin={out / TWIN} --measurements={out / SWEEPS}")
-    print(f"then: taccorl diagnose --twin={out / TWIN} --measurements={out / SWEEPS}")
-    print(f"last: taccorl surrogate --reveal={out}")
-    return 0
+    return f"{len(write_recordings(case, out).all)} recordings of {case.signal}"
+
+
+def _presses(config: SurrogateConfig, secret: int, out: Path) -> str:
+    from taccorl.diagnosis.surrogate.touch import draw_touch_case
+    from taccorl.diagnosis.surrogate.writing import draw_touch_secret, write_touch_recordings
+
+    plain = SurrogateConfig()
+    of_joints = [name for name in ("signal", "gains_known", "design") if getattr(config, name) != getattr(plain, name)]
+    if of_joints:
+        raise TaccorlError(f"--{of_joints[0]} is of joints; leave it out with --pads={config.pads}")
+    case = draw_touch_case(
+        draw_touch_secret(secret) if config.effects is None else config.effects,
+        secret,
+        arm=None if config.pads == "drawn" else config.pads,
+        strength=config.strength,
+    )
+    made = write_touch_recordings(case, out)
+    return f"{len(made.pressed)} recordings of the {case.arm} pads, which press known objects,"

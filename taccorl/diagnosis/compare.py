@@ -16,13 +16,15 @@ from taccorl.alignment.measurements import Measurements, Use
 from taccorl.alignment.noise_floor import SignalFloor, noise_floor, touch_floor
 from taccorl.alignment.telemetry_checks import MOVED
 from taccorl.alignment.touch_model import TouchModel
-from taccorl.alignment.touch_motion import PressedObject, touch_motion
+from taccorl.alignment.touch_motion import PressedObject
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison import USES, Comparison, Kind, TouchTrace, Trace
-from taccorl.diagnosis.replays import BENCH_REST, Response, in_contact, replay_joints, replay_whole
+from taccorl.diagnosis.replays import BENCH_REST, Response, in_contact, matched_contact, replay_joints, replay_whole
 from taccorl.errors import TaccorlError
 from taccorl.sim.robot import ARMS, PAD_TAXELS, PADS
 from taccorl.sim.twin import TwinConfig
+
+GRIPPERS = tuple(f"{arm}_gripper" for arm in ARMS)
 
 
 def compare(
@@ -37,12 +39,13 @@ def compare(
 
     Args:
         name: of the twin, for titles.
-        pressed: what the fingers press in the recordings with pads, and where it is. Only then touch is compared: a reading
-            means nothing to a twin that does not know what was touched.
+        pressed: what the fingers press in recordings with pads that do not say it themselves, and where it is. Only then touch
+            is compared: a reading means nothing to a twin that does not know what was touched.
         progress: told (recording, recordings done, recordings in all).
 
     Raises:
-        TaccorlError: a signal that the robot does not have, or recordings with nothing to compare.
+        TaccorlError: a signal that the robot does not have, recordings with nothing to compare, or one that says what was
+            pressed and whose pads say otherwise.
     """
     uses: list[tuple[Use, Measurement]] = [
         (use, m.on_robot(BENCH_REST)) for use in USES for m in getattr(measurements, use)
@@ -59,10 +62,12 @@ def compare(
         traces += _traces(m, use, response, floors)
         if np.isfinite(response.reported).any():
             clock[m.name] = tuple(check_against_twin(response.measurement, response.reported, levels))
-        left_out += [
-            f"{signal} of {m.name}: something was between the fingers, and nothing is in the twin"
-            for signal in held_up(m)
-        ]
+    for signal in GRIPPERS:
+        names = [m.name for m in every if signal in held_up(m)]
+        if names:
+            left_out.append(
+                f"{signal} of {', '.join(names)}: something was between the fingers, and nothing is in the twin"
+            )
     if any(m.touch is not None for m in every):
         touches, why_not = _touches(config, uses, pressed)
         left_out += why_not
@@ -109,9 +114,10 @@ def compared(m: Measurement) -> list[str]:
 
 
 def held_up(m: Measurement) -> list[str]:
-    """Grippers of arms whose pads touch something: the twin's would close further."""
+    """Grippers of arms that press something, as the recording or its pads say: the twin's would close further."""
     touched = np.asarray(in_contact(m).any(axis=0))
-    return [f"{arm}_gripper" for arm, held in zip(ARMS, touched, strict=True) if held]
+    stated = [m.pressed is not None and m.pressed.arm == arm for arm in ARMS]
+    return [signal for signal, held, said in zip(GRIPPERS, touched, stated, strict=True) if held or said]
 
 
 def _traces(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
@@ -157,19 +163,29 @@ def _touches(
 ) -> tuple[list[TouchTrace], list[str]]:
     """Matched contact replays, and why there are none of some recordings."""
     felt: list[tuple[Use, Measurement]] = [(use, m) for use, m in uses if m.touch is not None]
-    if pressed is None:
-        names = ", ".join(m.name for _, m in felt)
-        return [], [f"touch of {names}: what was pressed is not known; say it (--pressed.shape=… --pressed.radius_m=…)"]
+    unknown = [m.name for _, m in felt if m.pressed is None and pressed is None]
+    found, why_not = [], []
+    if unknown:
+        why_not.append(
+            f"touch of {', '.join(unknown)}: what was pressed is not known; say it: `pressed` in measurements.yaml, or "
+            "--pressed.shape=… --pressed.radius_m=…"
+        )
+    if len(unknown) == len(felt):
+        return found, why_not
     model, sensor = TouchModel(config), TouchModel(config).sensor
     floor = touch_floor([m for _, m in felt])
     if floor is None:
         return [], [f"touch of {', '.join(m.name for _, m in felt)}: too few frames for a noise floor"]
     floor = floor.reshape(len(PADS), *PAD_TAXELS)
-    found, why_not = [], []
     for use, m in felt:
+        solid = m.pressed or pressed
+        if solid is None:
+            continue
         try:
-            motion = touch_motion(m, config, pressed)
+            motion = matched_contact(m, config, solid)
         except TaccorlError as error:
+            if m.pressed is not None:
+                raise
             why_not.append(f"touch: {error}")
             continue
         reading = model.simulate(motion, sensor.normal_stiffness_per_m, sensor.normal_damping_s_per_m)
@@ -183,6 +199,7 @@ def _touches(
                 replayed=model.counts(motion, reading),
                 floor=floor[[PADS.index(pad) for pad in motion.pads]],
                 origin=m.origin,
+                touched=np.asarray((motion.depth()[0] > 0).any(axis=(2, 3))),
             )
         )
     return found, why_not

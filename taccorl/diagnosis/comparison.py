@@ -19,6 +19,7 @@ from taccorl.alignment.noise_floor import SignalFloor
 from taccorl.data.finding import Finding
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.robot import PADS
 
 Kind = Literal["position", "effort"]
 Way = Literal["joint", "twin"]
@@ -86,6 +87,8 @@ class TouchTrace:
     floor: np.ndarray
     """(P, R, C)."""
     origin: str
+    touched: np.ndarray | None = None
+    """(N, P) bool: what is pressed is in the pad, by where both are; None where that is not known."""
 
     @property
     def residual(self) -> np.ndarray:
@@ -177,6 +180,12 @@ class Comparison:
         found += [_touch_score([t for t in self.touches if t.use == use]) for use in self.uses]
         return [s for s in found if s is not None]
 
+    def pad_scores(self) -> list[Score]:
+        """Every pad and use."""
+        pads = [pad for pad in PADS if any(pad in t.pads for t in self.touches)]
+        found = [_touch_score([t for t in self.touches if t.use == use], pad) for pad in pads for use in self.uses]
+        return [s for s in found if s is not None]
+
 
 # scores ----------------------------------------------------------------------------------------------------------------
 
@@ -204,14 +213,21 @@ def _score(traces: Sequence[Trace]) -> Score:
     )
 
 
-def _touch_score(traces: Sequence[TouchTrace]) -> Score | None:
-    """Over the readings in which measurement or replay is beyond its noise: frames of nothing would hide the rest."""
+def _touch_score(traces: Sequence[TouchTrace], pad: str | None = None) -> Score | None:
+    """Over the readings in which measurement or replay is beyond its noise: frames of nothing would hide the rest.
+
+    Args:
+        pad: this one alone; all together if not given.
+    """
+    traces = [t for t in traces if pad is None or pad in t.pads]
     if not traces:
         return None
     sums, counts, readings, floors = [], [], [], []
     for t in traces:
         level = FELT_FLOORS * t.floor
         felt = (np.abs(t.measured) > level) | (np.abs(t.replayed) > level)
+        if pad is not None:
+            felt = felt & (np.arange(len(t.pads)) == t.pads.index(pad))[:, None, None]
         rows = round(BLOCK_S / t.period_s)
         sums.append(block_sums(np.where(felt, t.residual**2, 0.0).sum(axis=(1, 2, 3)), rows)[0])
         counts.append(block_sums(felt.sum(axis=(1, 2, 3)).astype(float), rows)[0])
@@ -224,7 +240,7 @@ def _touch_score(traces: Sequence[TouchTrace]) -> Score | None:
     level = float(np.sqrt(np.mean(np.concatenate(floors) ** 2)))
     spread = float(np.std(np.concatenate(readings)))
     return Score(
-        signal="touch",
+        signal="touch" if pad is None else pad,
         kind="touch",
         use=traces[0].use,
         unit="counts",

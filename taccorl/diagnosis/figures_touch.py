@@ -1,15 +1,16 @@
-"""Figures of touch: histogram of readings and maps side by side, as the paper has them (App. B.2)."""
+"""Figures of touch: histogram of readings and maps side by side, as the paper has them (App. B.2); sums and errors over time."""
 
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from taccorl.diagnosis.comparison import FELT_FLOORS, TouchTrace
 from taccorl.diagnosis.figure_style import AFTER, BEFORE, FLOOR, MEASURED, legend, new_figure, tidy
 from taccorl.diagnosis.figures import TWINS, ratio_map
 from taccorl.diagnosis.localise import Cell
-from taccorl.diagnosis.localise_touch import PHASES
+from taccorl.diagnosis.localise_touch import REGIMES
 
 BINS = 48
 
@@ -42,7 +43,10 @@ def touch_histogram(
 
 def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
     """The pads at the frame of the strongest touch: measured, twin, and RMS residual of every taxel over time."""
-    frame = int(np.argmax(before.measured.sum(axis=(1, 2, 3))))
+    strength = before.measured.sum(axis=(1, 2, 3)).astype(float)
+    if before.touched is not None and before.touched.any():
+        strength[~before.touched.any(axis=1)] = -np.inf  # a zero that drifts is no touch
+    frame = int(np.argmax(strength))
     rows = [("measured", before.measured[frame]), (names[0], before.replayed[frame])]
     left = [(f"RMS residual, {names[0]}", before)]
     if after is not None:
@@ -66,7 +70,7 @@ def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple
             if p == 0:
                 axis.set_title(name, fontsize=7.5)
             if j == 0:
-                axis.set_ylabel(pad, fontsize=8)
+                axis.set_ylabel(f"{pad} (palm above, tip below)", fontsize=8)
         if j in (len(rows) - 1, len(maps) - 1):
             bar = figure.colorbar(image, ax=axes[:, j].tolist(), shrink=0.5, pad=0.02)
             bar.ax.tick_params(labelsize=7)
@@ -76,28 +80,46 @@ def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple
 
 
 def touch_over_time(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
-    """Sum over each pad: loading, hold, unloading, and what remains after release."""
-    title = f"sum of each pad: {before.recording} ({before.use.replace('_', '-')})"
-    figure = new_figure(10.0, 1.4 + 1.7 * len(before.pads), title, [before.origin])
-    axes = figure.subplots(len(before.pads), 1, sharex=True, squeeze=False)[:, 0]
+    """Sum over each pad: loading, hold, unloading, and what remains after release; below it the error of its taxels."""
+    title = f"sum of each pad, and RMS error of its taxels: {before.recording} ({before.use.replace('_', '-')})"
+    figure = new_figure(10.0, 1.4 + 3.0 * len(before.pads), title, [before.origin])
+    rows = figure.subplots(
+        2 * len(before.pads), 1, sharex=True, squeeze=False, height_ratios=[1.7, 1.3] * len(before.pads)
+    )
+    axes, below = rows[::2, 0], rows[1::2, 0]
     for p, pad in enumerate(before.pads):
+        _error_over_time(below[p], before, after, p)
         sums = [(before.measured, MEASURED, "measured"), (before.replayed, BEFORE, names[0])]
         sums += [(after.replayed, AFTER, names[1])] if after is not None else []
         floor = 2 * float(np.sqrt((before.floor[p] ** 2).sum()))
         axes[p].axhspan(-floor, floor, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor ± {floor:.3g}")
         for values, color, name in sums:
             axes[p].plot(before.time_s[:, p], values[:, p].sum(axis=(1, 2)), color=color, lw=1.1, label=name)
-        axes[p].set_ylabel(f"{pad}\n[counts]", fontsize=8)
+        axes[p].set_ylabel(f"{pad}, sum\n[counts]", fontsize=8)
         tidy(axes[p])
     legend(axes[0])
-    axes[-1].set_xlabel("time [s]", fontsize=8)
+    below[-1].set_xlabel("time [s]", fontsize=8)
     return figure
 
 
+def _error_over_time(axes: Axes, before: TouchTrace, after: TouchTrace | None, pad: int) -> None:
+    """RMS over the taxels that feel something at some time, in every frame; noise alone stays at the floor."""
+    felt = before.felt(pad)
+    floor = float(np.sqrt(np.mean(before.floor[pad][felt] ** 2))) if felt.any() else float(np.median(before.floor[pad]))
+    axes.axhspan(0, floor, color=FLOOR, alpha=0.45, lw=0)
+    for trace, color in ((before, BEFORE), (after, AFTER)):
+        if trace is not None and felt.any():
+            error = np.sqrt(np.mean(trace.residual[:, pad][:, felt] ** 2, axis=1))
+            axes.plot(trace.time_s[:, pad], error, color=color, lw=0.9)
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel(f"RMS error of\n{felt.sum()} taxels [counts]", fontsize=8)
+    tidy(axes)
+
+
 def touch_heat_map_figure(cells: Sequence[Cell], origins: Sequence[str]) -> Figure:
-    """Pad × phase: RMSE over the noise floor. An empty cell: too few frames."""
+    """Pad × regime: RMSE over the noise floor. An empty cell: too few readings."""
     title = "pads: where the twin is off"
-    return ratio_map(cells, [name for name in PHASES if any(c.regime == name for c in cells)], origins, title)
+    return ratio_map(cells, [name for name in REGIMES if any(c.regime == name for c in cells)], origins, title)
 
 
 def _origins(traces: Sequence[TouchTrace]) -> list[str]:

@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
@@ -43,6 +44,25 @@ class JointFinding:
     rows_split: bool
     """No recording was held out: rows at the end of each were."""
 
+    @property
+    def part(self) -> str:
+        """How tables and reports call it."""
+        return self.signal
+
+    @property
+    def noise(self) -> str:
+        return "; effort ".join(f.words() for f in self.floors)
+
+    @property
+    def numbers(self) -> str:
+        """Where the always fitted numbers are from."""
+        return "commanded gains" if self.commanded else "gains fitted (not stated by the recordings)"
+
+    @property
+    def measured(self) -> str:
+        """What the errors are of."""
+        return "angles and efforts together" if len(self.floors) > 1 else "angles"
+
 
 def swept_joints(measurements: Measurements) -> tuple[str, ...]:
     """Joints that at least one fit recording moves."""
@@ -50,7 +70,10 @@ def swept_joints(measurements: Measurements) -> tuple[str, ...]:
 
 
 def moves(m: Measurement, signal: str) -> bool:
-    """Whether the recording commands the joint to move."""
+    """Whether the recording commands the joint to move, and its arm presses nothing: what pushes back at a hand turns its joints,
+    and one joint by itself does not know of it."""
+    if m.pressed is not None and signal.startswith(f"{m.pressed.arm}_"):
+        return False
     return signal in m.signals and float(np.ptp(m.target[:, m.column(signal)])) > MOVES_RAD
 
 
@@ -117,19 +140,22 @@ def diagnose_joints(
     Args:
         done: called with each joint that is finished.
     """
-    if workers <= 1 or len(signals) <= 1:
+    one = partial(diagnose_joint, config, measurements=measurements, gains=gains, search=search, without=without)
+    return each(one, signals, workers, done)
+
+
+def each[FindingT](
+    diagnosed: Callable[[str], FindingT], parts: Sequence[str], workers: int, done: Callable[[str], None]
+) -> list[FindingT]:
+    """``diagnosed`` of every part, in ``workers`` processes; the same for any number of them."""
+    if workers <= 1 or len(parts) <= 1:
         found = []
-        for signal in signals:
-            found.append(diagnose_joint(config, signal, measurements, gains=gains, search=search, without=without))
-            done(signal)
+        for part in parts:
+            found.append(diagnosed(part))
+            done(part)
         return found
-    with ProcessPoolExecutor(min(workers, len(signals)), mp_context=get_context("spawn")) as pool:
-        jobs = {
-            pool.submit(
-                diagnose_joint, config, signal, measurements, gains=gains, search=search, without=without
-            ): signal
-            for signal in signals
-        }
+    with ProcessPoolExecutor(min(workers, len(parts)), mp_context=get_context("spawn")) as pool:
+        jobs = {pool.submit(diagnosed, part): part for part in parts}
         for job in as_completed(jobs):
             job.result()
             done(jobs[job])

@@ -1,8 +1,8 @@
-"""Where the pads of a twin are off: pad × phase of a touch (loading, hold, unloading, just released, untouched).
+"""Where the pads of a twin are off: in contact or not, in which phase of a touch, on which third of the pad.
 
 As in ``localise``: this says where, never why. Creep, hysteresis and a late sensor all show while a pad is unloaded.
 
-Letters in shapes: N touch frames.
+Letters in shapes: N touch frames, R × C taxels.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,7 @@ from taccorl.data.timing import runs
 from taccorl.diagnosis.comparison import TouchTrace
 from taccorl.diagnosis.localise import LEAST_SHARE, Cell
 from taccorl.diagnosis.replays import CONTACT_COUNTS
+from taccorl.sim.robot import PAD_TAXELS
 
 PHASES = {
     "loading": "the pad's sum rises",
@@ -22,6 +23,9 @@ PHASES = {
     "just released": "the first second after a touch",
     "untouched": "the rest",
 }
+THIRDS = ("palm third", "middle third", "tip third")
+"""Of a pad's rows."""
+REGIMES = ("in contact", "no contact", *PHASES, *THIRDS)
 RELEASED_S = 1.0
 CHANGE_PER_S = 0.25
 """Of the touch's strongest sum: faster is loading or unloading, slower is a hold."""
@@ -29,12 +33,13 @@ SMOOTH_S = 0.05
 
 
 def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
-    """Phase → (N,) bool; each frame is in exactly one. Read off the measured counts."""
+    """Phase → (N,) bool; each frame is in exactly one. Loading is read off the measured counts, and contact where it is not known
+    by geometry."""
     counts = trace.measured[:, pad].reshape(len(trace.measured), -1).astype(float)
     period_s = trace.period_s
     total = gaussian_filter1d(counts.sum(axis=1), SMOOTH_S / period_s)
     rate = np.gradient(total, period_s)
-    touched = np.asarray((counts > CONTACT_COUNTS).any(axis=1))
+    touched = np.asarray((counts > CONTACT_COUNTS).any(axis=1)) if trace.touched is None else trace.touched[:, pad]
     found = {name: np.zeros(len(total), dtype=bool) for name in PHASES}
     for first, end in runs(touched):
         fast = CHANGE_PER_S * total[first:end].max()
@@ -47,20 +52,35 @@ def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
     return found
 
 
+def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Regime → its frames (N,) and its taxels (R, C), bool."""
+    everywhere = np.ones(PAD_TAXELS, dtype=bool)
+    always = np.ones(len(trace.measured), dtype=bool)
+    found = phases(trace, pad)
+    quiet = found["just released"] | found["untouched"]
+    third = np.arange(PAD_TAXELS[0])[:, None] * len(THIRDS) // PAD_TAXELS[0]
+    return {
+        "in contact": (~quiet, everywhere),
+        "no contact": (quiet, everywhere),
+        **{name: (rows, everywhere) for name, rows in found.items()},
+        **{name: (always, everywhere & (third == k)) for k, name in enumerate(THIRDS)},
+    }
+
+
 def touch_heat_map(traces: Sequence[TouchTrace]) -> list[Cell]:
-    """Every pad in every phase, over the taxels that feel something at some time."""
+    """Every pad in every regime, over the taxels that feel something at some time."""
     cells = []
     for pad in dict.fromkeys(pad for t in traces for pad in t.pads):
-        squares: dict[str, list[np.ndarray]] = {name: [] for name in PHASES}
+        squares: dict[str, list[np.ndarray]] = {name: [] for name in REGIMES}
         floor_squares = []
         for t in (t for t in traces if pad in t.pads):
             p = t.pads.index(pad)
             felt = t.felt(p)
             floor_squares.append(t.floor[p][felt] ** 2)
-            for name, rows in phases(t, p).items():
-                squares[name].append((t.residual[rows, p][:, felt] ** 2).ravel())
+            for name, (rows, taxels) in regimes(t, p).items():
+                squares[name].append((t.residual[rows, p][:, felt & taxels] ** 2).ravel())
         parts = {name: np.concatenate(found) for name, found in squares.items()}
-        total, count = sum(float(s.sum()) for s in parts.values()), sum(len(s) for s in parts.values())
+        total, count = sum(float(parts[n].sum()) for n in PHASES), sum(len(parts[n]) for n in PHASES)
         if count == 0:
             continue
         floor = float(np.sqrt(np.mean(np.concatenate(floor_squares))))

@@ -1,4 +1,5 @@
-"""A measurement's commands through the twin: joint by joint, or the whole of it. Row k is the twin at the time of row k.
+"""A measurement's commands through the twin: joint by joint, or the whole of it; and its pads in what they pressed. Row k is the
+twin at the time of row k.
 
 Letters in shapes: T rows.
 """
@@ -12,6 +13,7 @@ import numpy as np
 
 from taccorl.alignment.joint_model import JointModel, joint_motion
 from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.touch_motion import PressedObject, TouchMotion, touch_motion
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
 from taccorl.sim.effects import make_effect
@@ -23,6 +25,8 @@ from taccorl.sim.twin import TwinConfig
 
 CONTACT_COUNTS = 30.0
 """A taxel beyond this is contact: λ_f = 0.4 (paper Table 3) at the data spec's 75 counts for 1."""
+DEEP_M, FELT_COUNTS = 2e-4, 1.0
+"""Taxels so deep in an object read at least so much on average, whatever the pad."""
 START_S = 0.1
 """Where the joints were at the start is the mean of so long a rest: one reading's noise would be a swing of the twin."""
 
@@ -119,3 +123,28 @@ def in_contact(m: Measurement) -> np.ndarray:
     beyond = np.asarray((m.touch.counts.reshape(len(m.touch.counts), 4, -1) > CONTACT_COUNTS).any(axis=2))
     felt = [np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5 for p in range(4)]
     return np.stack([felt[0] | felt[1], felt[2] | felt[3]], axis=1)
+
+
+def matched_contact(m: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
+    """Where the taxels were in the object; what was said of the object must fit what the pads say.
+
+    Raises:
+        TaccorlError: as ``touch_motion``; the object touches no pad, or a pad does not feel it.
+    """
+    motion = touch_motion(m, config, pressed)
+    depth, _ = motion.depth()
+    if not (depth > 0).any():
+        most = float(motion.measured.max())
+        told = f", and their taxels read up to {most:.0f} counts" if most > CONTACT_COUNTS else ""
+        raise TaccorlError(
+            f"{m.name}: what is pressed comes near the pads of the {pressed.arm} arm and never touches them, by its size, "
+            f"pose and the measured opening{told}; press it, or correct radius_m and position_m of its `pressed`"
+        )
+    for p, pad in enumerate(motion.pads):
+        deep = depth[:, p] > DEEP_M
+        if deep.any() and abs(float(motion.measured[:, p][deep].mean())) < FELT_COUNTS:
+            raise TaccorlError(
+                f"{m.name}: {pad} should be {1e3 * depth[:, p].max():.2f} mm deep in what is pressed, and its taxels read "
+                "nothing; look whether it is plugged in, whether `pressed` names the right arm, and at the clocks"
+            )
+    return motion

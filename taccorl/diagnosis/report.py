@@ -40,7 +40,7 @@ class Report:
     after: Comparison | None = None
     """Of the mended twin, or of another one, on the same recordings."""
     diagnoses: Mapping[str, Diagnosis] = field(default_factory=dict)
-    """Part ("left_joint5", "pads") → what was found there."""
+    """Part ("left_joint5", "left pads") → what was found there."""
     can_tell: Mapping[str, Identifiability] = field(default_factory=dict)
     """Part → what its recordings can tell, whatever they say."""
     findings: Mapping[str, Sequence[Finding]] = field(default_factory=dict)
@@ -129,8 +129,8 @@ def as_json(report: Report) -> dict[str, Any]:
         "mended_twin": None if after is None else {"name": after.twin, "effects": list(after.effects)},
         "recordings": c.split,
         "findings": {name: [_plain(f) for f in found] for name, found in report.findings.items()},
-        "scores": [_scored(s) for s in c.scores()],
-        "scores_after": [] if after is None else [_scored(s) for s in after.scores()],
+        "scores": [_scored(s) for s in (*c.scores(), *c.pad_scores())],
+        "scores_after": [] if after is None else [_scored(s) for s in (*after.scores(), *after.pad_scores())],
         "where": {"note": WHERE_NOT_WHY, "cells": [_plain(cell) for cell in report.cells()]},
         "along": [_plain(curve) for signal, kind in c.signals for curve in curves(c, signal, kind)],
         "diagnoses": {part: _diagnosis(d) for part, d in report.diagnoses.items()},

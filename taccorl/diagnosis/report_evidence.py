@@ -3,13 +3,12 @@
 import html
 from collections.abc import Sequence
 
+from taccorl.diagnosis.evidence_words import effect_class, evidence_words, to_record, unit_words, unjudged
 from taccorl.diagnosis.figure_style import data_uri, png
 from taccorl.diagnosis.figures_evidence import Step, waterfall
 from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.report_html import figure, note, table
 from taccorl.diagnosis.search import Diagnosis, Evidence, Round
-from taccorl.errors import TaccorlError
-from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 
 ALWAYS_FITTED = "numbers refitted, no effect"
@@ -25,6 +24,8 @@ def diagnosis_section(part: str, d: Diagnosis, can_tell: Identifiability | None,
     ]
     if d.trouble:
         parts.append(note(f"The last fit: {d.trouble}."))
+    if unjudged(d):
+        parts.append(note(f"{unjudged(d)[0].upper()}{unjudged(d)[1:]}."))
     if d.at_bound:
         parts.append(note(f"At the end of its range: {', '.join(d.at_bound)}. Its value says little."))
     drawn = waterfall(_steps(d), origins, f"{part}: held-out error, effect by effect")
@@ -37,7 +38,8 @@ def diagnosis_section(part: str, d: Diagnosis, can_tell: Identifiability | None,
         parts.append(
             note(
                 "gain: share of the held-out squared error above the floor that goes away after everything was refitted. z: that "
-                "gain over its standard error between half-second blocks. ΔBIC: above 10 it pays for its parameters."
+                "gain over its standard error between half-second blocks. Evidence: from both and "
+                "ΔBIC, which must be above 10 to pay for the parameters; it is shown when pointed at, and in report.json."
             )
         )
     for name in d.removed:
@@ -97,7 +99,7 @@ def _numbers(d: Diagnosis) -> str:
 def _effect(part: str, d: Diagnosis, e: Effect) -> str:
     """What it is, on a robot and for a policy, who looks like it, and what to do next."""
     cls = type(e)
-    values = [f"{p.symbol} = {getattr(e, p.name):.4g} {p.unit}" for p in e.parameters()]
+    values = [f"{p.symbol} = {getattr(e, p.name):.4g}{unit_words(p.unit)}" for p in e.parameters()]
     rows = [
         ["equation", f"<code>{html.escape(cls.equation)}</code>"],
         ["here", html.escape(", ".join(values))],
@@ -108,12 +110,9 @@ def _effect(part: str, d: Diagnosis, e: Effect) -> str:
     if e.name in d.rivals:
         words = f"{', '.join(d.rivals[e.name])}: these recordings do not tell which it is"
         rows.append(["<b>does as well</b>", f"<b>{html.escape(words)}</b>"])
-        rows.append(
-            [
-                "what to record next",
-                f"<code>taccorl excite {part} --effects={','.join((e.name, *d.rivals[e.name]))}</code>",
-            ]
-        )
+        lines = [html.escape(line) for line in to_record(part, e.name, d.rivals[e.name])]
+        command = "_joint" in part
+        rows.append(["what to record next", "<br>".join(f"<code>{x}</code>" if command else x for x in lines)])
     rows.append(["to add it", f"<code>taccorl add-effect {e.name}</code>, with the twin and the folder of this page"])
     for other, why in d.twins.get(e.name, {}).items():
         rows.append([f"near-twin {html.escape(other)}", html.escape(why)])
@@ -121,10 +120,10 @@ def _effect(part: str, d: Diagnosis, e: Effect) -> str:
 
 
 def _evidence(r: Round) -> str:
-    heads = ("effect", "equation", "held-out × floor", "gain", "z", "ΔBIC", "fitted", "at bound", "verdict")
+    heads = ("effect", "equation", "held-out × floor", "gain", "z", "evidence", "fitted", "at bound", "verdict")
     rows, classes = [], []
     for e in r.evidence:
-        cls = _class(e.name)
+        cls = effect_class(e.name)
         values = ", ".join(f"{k.split('.', 1)[1]} {v:.4g}" for k, v in e.values.items())
         verdict = "; ".join(part for part in (e.verdict, e.trouble) if part)
         rows.append(
@@ -134,14 +133,14 @@ def _evidence(r: Round) -> str:
                 f"{e.held_out_error:.3g}",
                 f"{round(e.gain, 2) + 0.0:.0%}",
                 f"{e.score:.1f}",
-                f"{e.bic:.0f}",
+                f'<span title="ΔBIC {e.bic:.0f}">{evidence_words(e)}</span>',
                 html.escape(values),
                 html.escape(", ".join(name.split(".", 1)[1] for name in e.at_bound)),
                 html.escape(verdict),
             ]
         )
-        classes.append(_row_class(e, r))
-    text = table(heads, rows, numbers=range(2, 6), classes=classes)
+        classes.append(_roweffect_class(e, r))
+    text = table(heads, rows, numbers=range(2, 5), classes=classes)
     if r.not_refitted:
         text += note(f"Screened out by their first probe: {', '.join(r.not_refitted)}.")
     return text
@@ -154,13 +153,5 @@ def _in_words(cls: type[Effect]) -> str:
     return f"<details class=small><summary>what is it?</summary>{'<br>'.join(html.escape(line) for line in lines)}</details>"
 
 
-def _row_class(e: Evidence, r: Round) -> str:
+def _roweffect_class(e: Evidence, r: Round) -> str:
     return "added" if e.name == r.added else "tie" if e.name in r.ties else ""
-
-
-def _class(name: str) -> type[Effect] | None:
-    """None: an effect of a problem outside the registry, such as a one-axis drive's own."""
-    try:
-        return effects.get(name)
-    except TaccorlError:
-        return None

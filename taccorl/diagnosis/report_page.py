@@ -85,14 +85,19 @@ def _about(report: Report) -> str:
 
 def _score_table(c: Comparison, after: Comparison | None) -> str:
     """Before and after in one line: signal and use."""
-    later = {(s.signal, s.kind, s.use): s for s in after.scores()} if after is not None else {}
+    others = [*after.scores(), *after.pad_scores()] if after is not None else []
+    later = {(s.signal, s.kind, s.use): s for s in others}
     heads = ["signal", "recordings", f"RMSE, {c.twin}", "95 %", "× floor"]
     heads += [f"RMSE, {after.twin}", "95 %", "× floor", "change"] if after is not None else []
     heads += ["NRMSE", "noise floor", "n"]
     rows = []
-    for s in c.scores():
+    for s in (*c.scores(), *c.pad_scores()):
         other = later.get((s.signal, s.kind, s.use))
-        row = [f"{s.signal} {'' if s.kind == 'touch' else s.kind}", f"{USE_WORDS[s.use]} ({s.recordings})", *_errors(s)]
+        row = [
+            f"{s.signal} {'' if s.signal == 'touch' else s.kind}",
+            f"{USE_WORDS[s.use]} ({s.recordings})",
+            *_errors(s),
+        ]
         if after is not None:
             row += [*_errors(other), f"{other.rmse / s.rmse - 1:+.0%}"] if other is not None else [""] * 4
         floor = f'<span title="{html.escape(s.floor_words)}">{shown(s.floor, s.unit)}{" (lower bound)" * s.lower_bound}</span>'
@@ -133,7 +138,12 @@ def _where(report: Report) -> list[str]:
             found.append(figure(data_uri(png(drawn)), f"{kind}: joint × regime, all recordings together"))
     own = [cell for cell in cells if cell.kind == "touch"]
     if own:
-        found.append(figure(data_uri(png(touch_heat_map_figure(own, report.origins))), "touch: pad × phase"))
+        found.append(
+            figure(
+                data_uri(png(touch_heat_map_figure(own, report.origins))),
+                "touch: pad × contact, phase, and third of the pad; all recordings together",
+            )
+        )
     return found
 
 
@@ -177,14 +187,19 @@ def _touch(c: Comparison, after: Comparison | None) -> Iterable[str]:
         return []
     names = (c.twin, after.twin if after is not None else "")
     later = after.touches if after is not None else ()
-    shown_one = next(t for use in ("held_out", "test", "fit") for t in c.touches if t.use == use)
-    other = next((t for t in later if t.recording == shown_one.recording), None)
-    return [
-        "<h2>Touch</h2>",
-        figure(data_uri(png(touch_histogram(c.touches, later, names))), "all recordings"),
-        figure(data_uri(png(touch_maps(shown_one, other, names))), "where on the pads"),
-        figure(data_uri(png(touch_over_time(shown_one, other, names))), "loading, hold, unloading, release"),
-    ]
+    parts = ["<h2>Touch</h2>", figure(data_uri(png(touch_histogram(c.touches, later, names))), "all recordings")]
+    for pads in dict.fromkeys(t.pads for t in c.touches):
+        own = [t for t in c.touches if t.pads == pads]
+        shown_one = next(t for use in ("held_out", "test", "fit") for t in own if t.use == use)
+        other = next((t for t in later if t.recording == shown_one.recording), None)
+        maps, over_time = touch_maps(shown_one, other, names), touch_over_time(shown_one, other, names)
+        parts.append(
+            figure(
+                data_uri(png(maps)), f"{' and '.join(pads)}: measured beside simulated, and where on the pads it is off"
+            )
+        )
+        parts.append(figure(data_uri(png(over_time)), "loading, hold, unloading, release; the error of every frame"))
+    return parts
 
 
 def _left_over(report: Report) -> list[str]:

@@ -78,6 +78,13 @@ class SearchConfig:
     last_steps: int = 100
     """Of the last refit of what was found, with finer slopes."""
 
+    def refusal(self, gain: float, score: float, bic: float) -> str:
+        """Why an effect is not believed; empty if it is."""
+        sure = gain >= self.sure_gain and score >= self.min_score
+        if bic < (0.0 if sure else self.min_bic):
+            return self.too_little(gain, score) or f"does not pay for its parameters: ΔBIC {bic:.0f}"
+        return self.too_little(gain, score)
+
     def too_little(self, gain: float, score: float) -> str:
         """Why an effect that takes away so much is not believed; empty if it is."""
         if gain < self.min_gain:
@@ -486,14 +493,7 @@ class _Row:
 
     def refused(self) -> str:
         """Why it is not believed; empty if it is."""
-        c = self._config
-        little = c.too_little(self.gain, self.score)
-        if little:
-            return little
-        sure = self.gain >= c.sure_gain and self.score >= c.min_score
-        if self.bic < (0.0 if sure else c.min_bic):
-            return f"does not pay for its parameters: ΔBIC {self.bic:.0f}"
-        return ""
+        return self._config.refusal(self.gain, self.score, self.bic)
 
     def evidence(self, verdict: str) -> Evidence:
         own = f"{self.name}."

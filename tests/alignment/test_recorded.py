@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from mcap.reader import make_reader
 
 from taccorl.alignment.clock_checks import check_against_twin
 from taccorl.alignment.dataset_rows import from_episode, read_dataset
@@ -132,6 +133,16 @@ def test_effort_and_velocity_come_beside_the_positions(recorded, moved):
     np.testing.assert_allclose(recorded.velocity[rows][:, arms], slope[samples][:, arms], atol=1e-6)
     assert np.isnan(recorded.velocity[:, ~arms]).all()  # PiPER reports none for its grippers
     assert recorded.has_effort().sum() == 14
+
+
+def test_a_frame_of_a_pad_has_the_time_at_which_its_scan_had_been_read(recorded, moved):
+    """The boards' own 4 ms on the way stay in it: they are for ``touch_delay`` to find."""
+    with (moved.folder / "bench.mcap").open("rb") as file:
+        log_ns = [m.log_time for _, _, m in make_reader(file).iter_messages(topics=["/left_robot_left_finger"])]
+    read_s = (np.array(log_ns) - recorded.start_ns) * 1e-9
+    nearest = np.abs(recorded.touch.time_s[:, 0][:, None] - read_s).min(axis=1)
+    assert len(nearest) > 300
+    assert nearest.max() < 1e-6
 
 
 def test_what_the_recording_says_of_itself_is_kept(recorded):

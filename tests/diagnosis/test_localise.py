@@ -1,5 +1,7 @@
 """Errors planted in one regime, one phase, along one variable: found there, nowhere else, and not where there is nothing."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from made_traces import FLOOR_RAD, RATE_HZ, alike, comparison, swing, trace
@@ -185,3 +187,43 @@ def test_error_planted_in_a_phase_is_found_there(phase):
     assert cells["left_a", phase].share_of_error == pytest.approx(1.0)
     assert cells["left_a", phase].ratio == pytest.approx(10.0)  # 13 counts of 1.3
     assert not any(signal == "left_b" for signal, _ in cells), "it feels nothing at any time"
+
+
+def test_contact_and_thirds_of_the_pad_are_regimes_too():
+    one = press()
+    # touched in rows 20 to 29 instead of 10 to 19, and off by 13 counts there where the tip third begins, from row 22 on
+    for values in (one.measured, one.replayed):
+        values[:, 0, 10:20], values[:, 0, 20:30] = 0.0, values[:, 0, 10:20].copy()
+    one.replayed[:, 0, 22:30, 3:9] -= np.where(one.measured[:, 0, 22:30, 3:9] > 30, 13.0, 0.0)
+    cells = {c.regime: c for c in touch_heat_map([one]) if c.signal == "left_a"}
+    assert "palm third" not in cells, "it feels nothing there"
+    assert cells["tip third"].share_of_error == pytest.approx(1.0) and cells["middle third"].ratio == 0.0
+    assert cells["tip third"].share_of_time == pytest.approx(0.8)  # 8 of the 10 rows that feel something
+    assert cells["in contact"].share_of_error == pytest.approx(1.0) and cells["no contact"].ratio == 0.0
+    assert cells["in contact"].ratio == pytest.approx(10.0 * np.sqrt(0.8))
+    assert cells["in contact"].n + cells["no contact"].n == 1000 * 10 * 6
+
+
+def test_contact_is_taken_from_geometry_where_it_is_known():
+    soft = press()
+    soft.measured[:] *= 0.2  # 24 counts at most: no taxel says contact
+    assert phases(soft, 0)["untouched"].all()
+    touched = np.zeros((1000, 2), dtype=bool)
+    touched[200:500, 0] = True
+    known = phases(dataclasses.replace(soft, touched=touched), 0)
+    held = known["loading"] | known["hold"] | known["unloading"]
+    np.testing.assert_array_equal(held, touched[:, 0])
+    assert known["loading"][200:240].mean() > 0.9 and known["just released"].sum() == 100
+
+
+def test_every_pad_has_a_score_of_its_own():
+    one = press()
+    one.replayed[:, 0] -= np.where(one.measured[:, 0] > 0, 13.0, 0.0)
+    one.measured[300:400, 1, 5, 5], one.replayed[300:400, 1, 5, 5] = 60.0, 40.0
+    found = comparison(touches=(one,), split={}).pad_scores()
+    assert [(s.signal, s.kind, s.use, s.n) for s in found][1] == ("left_b", "touch", "fit", 100)
+    assert [s.rmse for s in found] == pytest.approx([13.0, 20.0])
+    assert [s.ratio for s in found] == pytest.approx([10.0, 20.0 / 1.3])
+    (both,) = comparison(touches=(one,), split={}).scores()
+    first, second = found
+    assert both.rmse**2 * both.n == pytest.approx(first.rmse**2 * first.n + second.rmse**2 * second.n)

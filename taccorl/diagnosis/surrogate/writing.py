@@ -3,35 +3,50 @@
 FOLDER/sweeps/*.mcap, measurements.yaml    for ``taccorl compare`` and ``diagnose``
 FOLDER/twin.yaml                           without the hidden effects
 FOLDER/sealed_truth.json                   beside the measurements and not among them: nothing that reads them reads it
+
+Surrogate pads are written in the same way; what was pressed stands in their measurements.yaml.
 """
 
 import base64
+import dataclasses
 import json
+import math
 import shutil
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import INDEX, Measurements
+from taccorl.alignment.touch_motion import PressedObject
+from taccorl.demos import stand_in_messages as messages
 from taccorl.demos.stand_in import publish
-from taccorl.demos.stand_in_config import COMMAND_TOPICS, PAD_TOPICS, STATE_TOPICS, StandInConfig
-from taccorl.demos.stand_in_story import PAD_WIRE_SHAPE, EpisodePlan
+from taccorl.demos.stand_in_config import COMMAND_TOPICS, PAD_TOPICS, SCAN_S, STATE_TOPICS, StandInConfig
+from taccorl.demos.stand_in_story import PAD_WIRE_SHAPE, PADS, EpisodePlan
 from taccorl.demos.stand_in_streams import Event, Streams
 from taccorl.diagnosis.surrogate.cases import Case
 from taccorl.diagnosis.surrogate.recordings import recordings
+from taccorl.diagnosis.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
+from taccorl.diagnosis.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import ARMS
+from taccorl.sim.robot import ARMS, PAD_TAXELS
+from taccorl.sim.shapes import Capsule, Cylinder
+from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
 
 SWEEPS, TWIN, TRUTH = "sweeps", "twin.yaml", "sealed_truth.json"
+FINGERS_LAG_S = 0.03
+"""Time constant with which surrogate fingers follow their command. A choice."""
 _NOTE = "What is hidden in this surrogate robot. Compare and diagnose do not read it; `taccorl surrogate --reveal` prints it."
 
 
 class _Rows:
-    """A measurement as the drivers' story: what stands in its rows, between which nobody asks."""
+    """A measurement as the drivers' story: what stands in its rows, between which nobody asks. A driver that measures no
+    velocity or effort sends zeros."""
 
     def __init__(self, measurement: Measurement) -> None:
         self.measurement = measurement
@@ -52,11 +67,11 @@ class _Rows:
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
         """(N, 14)."""
-        return self._at(self.measurement.velocity, time_s)
+        return self._at(np.nan_to_num(self.measurement.velocity), time_s)
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
         """(N, 14)."""
-        return self._at(self.measurement.effort, time_s)
+        return self._at(np.nan_to_num(self.measurement.effort), time_s)
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
         """(N, 12, 32) in wire order: nothing is touched."""
@@ -73,6 +88,27 @@ class _Dark:
 
 class _Sweep(Streams):
     """Joints, commands and pads."""
+
+    def __init__(self, config: StandInConfig, rows: _Rows) -> None:
+        super().__init__(config, rows, _Dark())
+        self._touch = rows.measurement.touch
+
+    def _pad(self, topic: str, pad: str) -> Iterator[Event]:
+        """The frames that were measured, byte for byte, logged when they had been scanned: no time is lost on the wire."""
+        if self._touch is None:
+            yield from super()._pad(topic, pad)
+            return
+        wire = (self._touch.counts + self._touch.baseline).reshape(-1, len(PADS), *PAD_TAXELS)[:, PADS.index(pad)]
+        rows, columns = PAD_WIRE_SHAPE
+        dim = [
+            {"label": "rows", "size": rows, "stride": rows * columns},
+            {"label": "cols", "size": columns, "stride": columns},
+        ]
+        for stamp, frame in zip(
+            self._touch.time_s[:, PADS.index(pad)].tolist(), wire.swapaxes(1, 2).astype(np.uint8), strict=True
+        ):
+            message = {"layout": {"dim": dim, "data_offset": 0}, "data": frame.tobytes()}
+            yield Event(stamp, stamp - SCAN_S / 2, topic, messages.UINT8_ARRAY, message)
 
     def all(self) -> list[Iterator[Event]]:
         """One stream per topic, each in order of log time."""
@@ -91,7 +127,7 @@ def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: 
     )
     label = {"origin": measurement.origin, "instruction": measurement.instruction, "repeat_of": repeat_of or ""}
     label |= {key: json.dumps(getattr(measurement, key)) for key in ("kp", "kd", "gain_scale", "payload_kg")}
-    publish(path, _Sweep(config, story, _Dark()), label)
+    publish(path, _Sweep(config, story), label)
 
 
 def write_recordings(case: Case, folder: Path) -> Measurements:
@@ -100,19 +136,78 @@ def write_recordings(case: Case, folder: Path) -> Measurements:
     Raises:
         TaccorlError: the folder holds something that is no surrogate's.
     """
-    folder = Path(folder)
-    _cleared(folder)
     made = recordings(case)
-    files = {m.name: f"{k:02d}_{m.name}.mcap" for k, m in enumerate(made.all, 1)}
-    uses = {m.name: use for use in ("fit", "held_out", "test") for m in getattr(made, use)}
-    (folder / SWEEPS).mkdir(parents=True)
-    seal(folder, case.truth())
-    for k, m in enumerate(made.all):
-        write_recording(folder / SWEEPS / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
-    index = {"recordings": {files[name]: {"use": use} for name, use in uses.items()}}
-    (folder / SWEEPS / INDEX).write_text(yaml.safe_dump(index, sort_keys=False), encoding="utf-8")
-    save_twin(case.twin, folder / TWIN)
+    uses = [(use, m) for use in ("fit", "held_out", "test") for m in getattr(made, use)]
+    _write(Path(folder), case.truth(), case.twin, uses, {})
     return made
+
+
+def write_touch_recordings(case: TouchCase, folder: Path) -> TouchRecordings:
+    """Surrogate pads as files: as ``write_recordings``, and what was pressed in each recording.
+
+    Raises:
+        TaccorlError: the folder holds something that is no surrogate's.
+    """
+    made = touch_recordings(case)
+    uses = [(use, _commanded(m, case.arm)) for use in ("fit", "held_out", "test") for m in getattr(made, use)]
+    pressed = {name: _pressed(of) for name, of in made.pressed.items()}
+    _write(Path(folder), case.truth(), case.twin, uses, pressed)
+    return made
+
+
+def _write(
+    folder: Path,
+    truth: dict[str, object],
+    twin: TwinConfig,
+    uses: Sequence[tuple[str, Measurement]],
+    pressed: dict[str, dict[str, Any]],
+) -> None:
+    _cleared(folder)
+    files = {m.name: f"{k:02d}_{m.name}.mcap" for k, (_, m) in enumerate(uses, 1)}
+    (folder / SWEEPS).mkdir(parents=True)
+    seal(folder, truth)
+    for k, (_, m) in enumerate(uses):
+        write_recording(folder / SWEEPS / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
+    notes: dict[str, dict[str, Any]] = {files[m.name]: {"use": use} for use, m in uses}
+    for name, of in pressed.items():
+        notes[files[name]]["pressed"] = of
+    text = yaml.safe_dump({"recordings": notes}, sort_keys=False, default_flow_style=None, width=120)
+    (folder / SWEEPS / INDEX).write_text(text, encoding="utf-8")
+    save_twin(twin, folder / TWIN)
+
+
+def _commanded(m: Measurement, arm: str) -> Measurement:
+    """Made presses know where the fingers are, not what they were told: a command that they follow with a lag and a row late."""
+    gripper, target = m.column(f"{arm}_gripper"), m.target.copy()
+    opening = target[:, gripper]
+    told = opening + FINGERS_LAG_S * np.gradient(opening, m.period_s)
+    target[:, gripper] = np.append(told[1:], told[-1])
+    return dataclasses.replace(m, target=target)
+
+
+def _pressed(of: PressedObject) -> dict[str, Any]:
+    """As measurements.yaml has it. Surrogate rods lie across the pads."""
+    (solid,) = of.solids
+    assert isinstance(solid, Capsule | Cylinder)
+    rod = (
+        {"length_m": 2 * solid.half_height_m, "rpy_rad": [0.0, math.pi / 2, 0.0]} if isinstance(solid, Cylinder) else {}
+    )
+    return {
+        "shape": "rod" if rod else "sphere",
+        "radius_m": solid.radius_m,
+        "arm": of.arm,
+        "position_m": of.pose[:3, 3].tolist(),
+    } | rod
+
+
+def draw_touch_secret(seed: int) -> tuple[str, ...]:
+    """Names of what pads of this seed hide: mostly one effect of the registry, or none, or one from outside of it."""
+    rng = np.random.default_rng([seed, zlib.crc32(b"secret pads")])
+    fate = rng.random()
+    if fate < 0.1:
+        return ()
+    outside = [name for name in TOUCH_KINDS if name not in REGISTERED_TOUCH]
+    return (str(rng.choice(outside if fate < 0.25 else REGISTERED_TOUCH)),)
 
 
 def _cleared(folder: Path) -> None:

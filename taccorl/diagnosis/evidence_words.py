@@ -1,0 +1,59 @@
+"""What a diagnosis says, in words: the same in the terminal and on the page."""
+
+from collections.abc import Sequence
+
+from taccorl.diagnosis.search import Diagnosis, Evidence, SearchConfig
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import Effect
+
+OVERWHELMING_BIC, OVERWHELMING_SCORE = 100.0, 5.0
+"""ΔBIC, twice the logarithm of a Bayes factor (above 10 is very strong: Kass and Raftery 1995), and standard errors."""
+UNJUDGED = 1.3
+"""Times the held-out error that the error on the fit recordings is remarkable: more than another motion's noise makes it."""
+NO_GAIN = 0.01
+"""Of the held-out squared error above the floor: less is none."""
+
+
+def evidence_words(e: Evidence) -> str:
+    """What speaks for an effect: on the recordings that it was fitted to (ΔBIC) and on those that judge (gain, standard errors).
+
+    ``weak`` is what the search would not add; ``none``: nothing goes away.
+    """
+    if e.gain < NO_GAIN or e.bic <= 0:
+        return "none"
+    if SearchConfig().refusal(e.gain, e.score, e.bic):
+        return "weak"
+    return "overwhelming" if e.bic >= OVERWHELMING_BIC and e.score >= OVERWHELMING_SCORE else "strong"
+
+
+def unjudged(d: Diagnosis) -> str:
+    """What shows in the recordings that were fitted and hardly in those that judge, where nothing can be believed or refuted;
+    empty if there is no such thing."""
+    fit, held_out = d.errors["after"]["fit"], d.errors["after"]["held_out"]
+    if fit <= UNJUDGED * max(held_out, 1.0):
+        return ""
+    return (
+        f"the recordings that were fitted keep {fit:.2f} floors, those that judge {held_out:.2f}: something acts there that no "
+        "held-out recording shows; hold one of each kind of motion out"
+    )
+
+
+def unit_words(unit: str) -> str:
+    """To be put behind a number; nothing for a pure one."""
+    return "" if unit == "1" else f" {unit}"
+
+
+def to_record(part: str, name: str, rivals: Sequence[str]) -> list[str]:
+    """What would tell an effect from its rivals: a command that plans it for a joint, in words for pads."""
+    if "_joint" in part:
+        return [f"taccorl excite {part} --effects={','.join((name, *rivals))}"]
+    return list(dict.fromkeys(cls.to_record for other in (name, *rivals) if (cls := effect_class(other))))
+
+
+def effect_class(name: str) -> type[Effect] | None:
+    """None: an effect of a problem outside the registry, such as a one-axis drive's own."""
+    try:
+        return effects.get(name)
+    except TaccorlError:
+        return None

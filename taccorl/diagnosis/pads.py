@@ -1,0 +1,229 @@
+"""The pads of every arm that pressed a known object, each pair diagnosed by itself, and the twin that comes out of it.
+
+A pair is judged by matched contact replays (``TouchProblem``): its fingers stand where they were measured, in an object whose
+place is known. A twin has one k_n and one k_d for all of its pads, effects act on the pads in which they were found.
+"""
+
+import copy
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.noise_floor import repeat_pairs
+from taccorl.alignment.touch_motion import TouchMotion
+from taccorl.diagnosis.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.joints import add_effect, each
+from taccorl.diagnosis.problem import split_rows
+from taccorl.diagnosis.replays import matched_contact
+from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, TouchProblem
+from taccorl.errors import TaccorlError
+from taccorl.sim.robot import ARMS
+from taccorl.sim.twin import TwinConfig
+
+FIELDS = {"k_n": "normal_stiffness_per_m", "k_d": "normal_damping_s_per_m"}
+"""Fitted number → field of the twin's sensor. The zeros of pads are of a recording's baseline and have no place in a twin."""
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PadFinding:
+    """What was found out about the pads of one arm."""
+
+    arm: str
+    pads: tuple[str, ...]
+    """Those that came near the objects."""
+    diagnosis: Diagnosis
+    can_tell: Identifiability
+    """What their recordings can show and tell apart, whatever they say."""
+    floor_count: float
+    """Noise floor of a row, the mean of ``FRAMES_A_ROW`` frames: median over the taxels that were looked at."""
+    lower_bound: bool
+    """No press was recorded twice: what the pads and the opening do not repeat is not in the floor."""
+    recordings: dict[str, tuple[str, ...]]
+    """fit, held_out, test → names."""
+    rows_split: bool
+    """No recording was held out: rows at the end of each were."""
+
+    @property
+    def part(self) -> str:
+        """``left pads``: how tables and reports call them."""
+        return part_of(self.arm)
+
+    @property
+    def noise(self) -> str:
+        bound = "; a lower bound: record a press twice" if self.lower_bound else ""
+        return f"{self.floor_count:.2g} counts, a taxel's mean over {FRAMES_A_ROW} frames (the median taxel{bound})"
+
+    @property
+    def numbers(self) -> str:
+        """Where the always fitted numbers are from."""
+        return "k_n, k_d and each pad's zero fitted"
+
+    measured = f"means of {FRAMES_A_ROW} frames"
+
+
+def part_of(arm: str) -> str:
+    return f"{arm} pads"
+
+
+def pads_of(base: Mapping[str, float]) -> list[str]:
+    """Pads whose zero is among the fitted numbers."""
+    return [name.removeprefix("zero_") for name in base if name.startswith("zero_")]
+
+
+def presses(m: Measurement, arm: str) -> bool:
+    """Whether it is stated what the pads of an arm pressed in a recording."""
+    return m.pressed is not None and m.pressed.arm == arm
+
+
+def pressed_arms(measurements: Measurements) -> tuple[str, ...]:
+    """Arms whose pads press a known object in at least one fit recording."""
+    return tuple(arm for arm in ARMS if any(presses(m, arm) for m in measurements.fit))
+
+
+def diagnose_arm(
+    config: TwinConfig,
+    arm: str,
+    measurements: Measurements,
+    *,
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+) -> PadFinding:
+    """Search for what is missing in the pads of one arm, in the recordings that say what they pressed.
+
+    Raises:
+        TaccorlError: no fit recording says so, or one that cannot be a matched contact replay of the same pads.
+    """
+    uses: dict[str, tuple[Measurement, ...]] = {
+        use: tuple(m for m in getattr(measurements, use) if presses(m, arm)) for use in ("fit", "held_out", "test")
+    }
+    if not uses["fit"]:
+        raise TaccorlError(
+            f"{part_of(arm)}: no fit recording says what they pressed; state `pressed` in measurements.yaml"
+        )
+    motions = {use: [_motion(m, config) for m in some] for use, some in uses.items()}
+    every = [motion for some in motions.values() for motion in some]
+    _check_pads(every)
+    problem = TouchProblem(every, config)
+    fit_to, held_out, test = ([problem.recording(m) for m in some] for some in motions.values())
+    floor_count = float(np.median(np.concatenate([r.floor for r in fit_to])))
+    rows_split = not held_out
+    if rows_split:
+        fit_to, held_out = split_rows(fit_to)
+    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
+    found = diagnose(
+        problem,
+        fit_to,
+        held_out,
+        test,
+        start=problem.start,
+        present=problem.present,
+        without=without,
+        config=search,
+    )
+    return PadFinding(
+        arm=arm,
+        pads=problem.pads,
+        diagnosis=found,
+        can_tell=can_tell,
+        floor_count=floor_count,
+        lower_bound=not repeat_pairs(m for some in uses.values() for m in some),
+        recordings={use: tuple(m.name for m in some) for use, some in uses.items()},
+        rows_split=rows_split,
+    )
+
+
+def diagnose_pads(
+    config: TwinConfig,
+    arms: Sequence[str],
+    measurements: Measurements,
+    *,
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+    workers: int = 1,
+    done: Callable[[str], None] = lambda _: None,
+) -> list[PadFinding]:
+    """The pads of several arms, as ``diagnose_joints`` does joints."""
+    one = partial(diagnose_arm, config, measurements=measurements, search=search, without=without)
+    return each(one, arms, workers, lambda arm: done(part_of(arm)))
+
+
+def _motion(m: Measurement, config: TwinConfig) -> TouchMotion:
+    assert m.pressed is not None
+    return matched_contact(m, config, m.pressed)
+
+
+def _check_pads(motions: Sequence[TouchMotion]) -> None:
+    first = motions[0]
+    other = next((m for m in motions if m.pads != first.pads), None)
+    if other is not None:
+        raise TaccorlError(
+            f"{first.name} presses {' and '.join(first.pads)}, {other.name} {' and '.join(other.pads)}: one diagnosis takes "
+            "recordings of the same pads; put them into folders of their own, or correct position_m of what one pad misses"
+        )
+
+
+# the twin --------------------------------------------------------------------------------------------------------------
+
+
+def mended(config: TwinConfig, findings: Sequence[PadFinding]) -> TwinConfig:
+    """``config`` with the effects that were found, and with the k_n and k_d that were fitted beside them.
+
+    Raises:
+        TaccorlError: the pads of two arms need different ones.
+    """
+    new = copy.deepcopy(config)
+    if findings:
+        fitted = {f.part: (f.diagnosis.base, f.diagnosis.intervals) for f in findings}
+        set_numbers(new, agreed(fitted))
+    for finding in findings:
+        for effect in finding.diagnosis.effects:
+            add_effect(new, effect)
+    return new
+
+
+def set_numbers(config: TwinConfig, base: Mapping[str, float]) -> None:
+    """Write fitted k_n and k_d into ``config``: they are those of all its pads."""
+    fields = {field: float(base[name]) for name, field in FIELDS.items()}
+    config.sensor = dataclasses.replace(config.sensor, **fields)
+
+
+def agreed(fitted: Mapping[str, tuple[Mapping[str, float], Mapping[str, Sequence[float]]]]) -> dict[str, float]:
+    """k_n and k_d that all parts can share: means of those fitted, each with the weight of its interval.
+
+    Args:
+        fitted: ``left pads`` → fitted numbers and their 95 % intervals.
+
+    Raises:
+        TaccorlError: two parts' intervals have nothing in common.
+    """
+    found = {}
+    for name in FIELDS:
+        values = {part: base[name] for part, (base, _) in fitted.items()}
+        ends = {part: _ends(values[part], intervals.get(name)) for part, (_, intervals) in fitted.items()}
+        if max(low for low, _ in ends.values()) > min(high for _, high in ends.values()):
+            told = ", ".join(
+                f"{part} {values[part]:.4g} ({low:.4g} … {high:.4g})" for part, (low, high) in ends.items()
+            )
+            arms = " or ".join(f"--pads={part.split()[0]}" for part in fitted)
+            raise TaccorlError(
+                f"{name} of {told}: they differ, and a twin has one for all its pads. Take one arm's, {arms}; tasks that touch "
+                "with both hands will be off on the other"
+            )
+        widths = np.array([max(high - low, 1e-9 * abs(low) + 1e-12) for low, high in ends.values()])
+        shares = widths**-2 / np.sum(widths**-2)
+        found[name] = float(np.array(list(values.values())) @ shares)
+    return found
+
+
+def _ends(value: float, interval: Sequence[float] | None) -> Range:
+    """An interval that is not known is the value alone."""
+    if interval is None or not np.isfinite(np.array(interval, float)).all():
+        return value, value
+    return float(interval[0]), float(interval[1])

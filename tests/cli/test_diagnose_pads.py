@@ -1,0 +1,217 @@
+"""The story of the pads as a user types it: surrogate, compare, diagnose, add-effect, compare (simulated, not a robot)."""
+
+import dataclasses
+import io
+import json
+import shutil
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from taccorl.alignment.measurements import INDEX
+from taccorl.cli.main import main
+from taccorl.diagnosis.surrogate import touch
+from taccorl.sim.effects import effects
+from taccorl.sim.sensors.flexitac import FlexiTacConfig
+from taccorl.sim.twin_file import load_twin
+
+DEPTHS = touch._presses((3e-4, 6e-4, 1e-3), (0.12, 0.5), 0.4, 2.5, 2.0)
+FIT = touch.Press(name="press", knots=DEPTHS, x_m=0.001, z_m=0.003)
+SHORT = {
+    "fit": (FIT, dataclasses.replace(FIT, name="again", repeat_of="press")),
+    "held_out": (touch.Press(name="held", knots=touch._presses((8e-4, 4e-4), (0.1, 0.4), 0.5, 2.5, 2.0), z_m=0.002),),
+    "test": (),
+}
+CONSIDERED = ("taxel_saturation", "taxel_creep", "baseline_drift", "touch_lag")
+FEW = f"--without=[{','.join(name for name in effects if name not in CONSIDERED)}]"
+
+
+def surrogate(folder: Path, effect: str, strength: float, patched: bool = True) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        if patched:
+            patch.setattr(touch, "_USES", SHORT)
+        words = ["--secret=4", "--pads=left", f"--effects=[{effect}]", f"--strength={strength}", f"--out={folder}"]
+        assert main(["surrogate", *words]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``sweeps/`` with three short presses, ``twin.yaml``, ``found/`` with what was diagnosed from them, ``said.txt``."""
+    folder = surrogate(tmp_path_factory.mktemp("pads") / "robot", "taxel_saturation", 8.0)
+    words = [f"--twin={folder / 'twin.yaml'}", f"--out={folder / 'found'}", FEW, "--until=noise_floor"]
+    with redirect_stdout(io.StringIO()) as said:
+        assert main(["diagnose", str(folder / "sweeps"), *words]) == 0
+    (folder / "said.txt").write_text(said.getvalue())
+    return folder
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Any:
+    def run(verb: str, *words: Any) -> tuple[int, str]:
+        code = main([verb, *map(str, words)])
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, shown.out + shown.err
+
+    return run
+
+
+def test_the_report_holds_the_effect_with_its_numbers(robot: Path):
+    report = json.loads((robot / "found" / "report.json").read_text())
+    assert list(report["diagnoses"]) == ["left pads"], "the gripper moves, and no joint is swept"
+    found = report["diagnoses"]["left pads"]
+    assert found["status"] == "at_floor"
+    assert [(e["effect"], e["pads"]) for e in found["effects"]] == [("taxel_saturation", ["left_a", "left_b"])]
+    assert {"k_n", "k_d", "zero_left_a", "zero_left_b"} == set(found["base"])
+    assert all(e["bic"] is not None for r in found["rounds"] for e in r["evidence"])
+    assert "left pads" in report["can_tell"]
+    assert report["data"] == ["surrogate robot, simulated; not a robot; left pads"]
+    cells = {(c["signal"], c["regime"]): c["ratio"] for c in report["where"]["cells"]}
+    assert cells["left_a", "in contact"] > 2 * cells["left_a", "no contact"]
+    assert {"loading", "hold", "unloading", "middle third"} <= {regime for _, regime in cells}
+    page = (robot / "found" / "report.html").read_text()
+    assert "<h2>Touch</h2>" in page and "ΔBIC" in page
+    for signal in ("touch", "left_a", "left_b"):
+        before, after = (
+            next(s["ratio"] for s in report[k] if s["signal"] == signal and s["use"] == "held_out")
+            for k in ("scores", "scores_after")
+        )
+        assert after < 0.35 * before and after < 1.35
+
+
+def test_what_was_found_goes_into_a_copy_and_the_error_falls(robot: Path, said: Any, tmp_path: Path):
+    out = tmp_path / "new.yaml"
+    twin = f"--twin={robot / 'twin.yaml'}"
+    words = ["taxel_saturation", twin, "--pads=left", f"--diagnosis={robot / 'found'}", f"--out={out}"]
+    code, text = said("add-effect", *words)
+    assert code == 0 and "left pads: taxel_saturation limit 0.3" in text and "with k_n " in text
+    new, old = load_twin(out), load_twin(robot / "twin.yaml")
+    found = json.loads((robot / "found" / "report.json").read_text())["diagnoses"]["left pads"]
+    (effect,) = new.effects
+    assert effect.acts_on() == ["left_a", "left_b"]
+    assert vars(effect)["limit"] == pytest.approx(found["effects"][0]["limit"])
+    truth = json.loads(_sealed(said, robot))
+    assert vars(effect)["limit"] == pytest.approx(truth["hidden"][0]["values"]["limit"], rel=0.15)
+    assert isinstance(new.sensor, FlexiTacConfig) and isinstance(old.sensor, FlexiTacConfig)
+    assert new.sensor.normal_stiffness_per_m == pytest.approx(found["base"]["k_n"], rel=1e-12)
+    assert new.sensor.normal_damping_s_per_m == pytest.approx(found["base"]["k_d"], rel=1e-12)
+    assert new.controller == old.controller and not new.arm_controllers
+    code, text = said("compare", robot / "sweeps", twin, f"--against={out}")
+    assert code == 0
+    for pad in ("left_a", "left_b"):
+        line = next(x.split() for x in text.splitlines() if x.startswith(f"{pad} touch") and "held-out" in x)
+        before, after = float(line[5]), float(line[8])
+        assert line[4] == line[7] == "counts" and before > 4.0 and after < 1.35
+    assert "data: surrogate robot, simulated; not a robot" in text
+
+
+def _sealed(said: Any, robot: Path) -> str:
+    return said("surrogate", f"--reveal={robot}")[1]
+
+
+def test_the_terminal_tells_noise_evidence_and_numbers(robot: Path):
+    text = (robot / "said.txt").read_text()
+    assert (
+        "\nleft pads\n  noise floor 0." in text
+        and "k_n, k_d and each pad's zero fitted; judged on 03_held.mcap" in text
+    )
+    assert "lower bound" not in text, "one press is recorded twice"
+    assert "→  taxel_saturation" in text and "strong" in text and "ΔBIC" not in text
+    assert "held-out error in noise floors (means of 5 frames): " in text
+    assert "    k_n " in text and ", the twin had 695.8" in text
+    assert max(len(line) for line in text.splitlines() if "would not show" in line) < 400
+
+
+def test_until_the_noise_floor_the_mended_twin_is_written(robot: Path):
+    assert "found/twin.yaml: taxel_saturation; it is what collect and training load" in (robot / "said.txt").read_text()
+    new = load_twin(robot / "found" / "twin.yaml")
+    assert [e.name for e in new.effects] == ["taxel_saturation"]
+    base = json.loads((robot / "found" / "report.json").read_text())["diagnoses"]["left pads"]["base"]
+    assert isinstance(new.sensor, FlexiTacConfig) and new.sensor.normal_stiffness_per_m == pytest.approx(base["k_n"])
+
+
+def test_of_an_arm_that_was_not_diagnosed_there_is_nothing_to_add(robot: Path, said: Any, tmp_path: Path):
+    words = ["taxel_saturation", f"--twin={robot / 'twin.yaml'}", f"--diagnosis={robot / 'found'}"]
+    code, text = said("add-effect", *words, "--pads=right", f"--out={tmp_path / 'x'}")
+    assert code == 2 and "--pads=right: no pads of that arm here; " in text and "left" in text
+    code, text = said("add-effect", "touch_lag", *words[1:], f"--out={tmp_path / 'x'}")
+    assert code == 2 and "left pads: the diagnosis refused touch_lag: " in text
+    assert not (tmp_path / "x").exists()
+
+
+def test_by_hand_an_effect_may_act_on_the_pads_of_one_arm(said: Any, tmp_path: Path):
+    out = tmp_path / "x.yaml"
+    words = [f"--out={out}", "--values={time_constant_s: 0.03}"]
+    code, text = said("add-effect", "touch_lag", *words, "--pads=lft")
+    assert code == 2 and "did you mean 'left'" in text
+    assert said("add-effect", "touch_lag", *words, "--pads=left")[0] == 0
+    assert load_twin(out).effects[0].acts_on() == ["left_a", "left_b"]
+    code, text = said(
+        "add-effect", "coulomb_friction", "--pads=left", "--values={torque_nm: 0.1}", f"--out={tmp_path / 'y'}"
+    )
+    assert code == 2 and "is an effect of joints; leave --pads out" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--pads=right"], "--pads=right: no fit recording says what pads of such an arm pressed; known: left"),
+        (["--joints=J3"], "no fit recording sweeps a joint"),
+    ],
+)
+def test_what_is_not_there_is_said(words: list[str], message: str, robot: Path, said: Any, tmp_path: Path):
+    code, text = said("diagnose", robot / "sweeps", f"--out={tmp_path / 'out'}", *words)
+    assert code == 2 and message in " ".join(text.split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"arm": "right"}, "01_press.mcap: the object never comes within 1 mm of the pads of the right arm"),
+        ({"radius_m": 0.0098}, "01_press.mcap: the object never comes within 1 mm"),
+        ({"radius_m": 0.0108}, "01_press.mcap: what is pressed comes near the pads of the left arm and never touches"),
+        ({"shape": "cube"}, "'cube' is none of 'sphere', 'rod'"),
+    ],
+)
+@pytest.mark.parametrize("verb", ["compare", "diagnose"])
+def test_a_wrong_object_is_an_error_with_a_way_out(
+    verb: str, change: dict, message: str, robot: Path, said: Any, tmp_path: Path
+):
+    sweeps = tmp_path / "sweeps"
+    sweeps.mkdir()
+    for name in ("01_press.mcap", "03_held.mcap"):
+        (sweeps / name).symlink_to(robot / "sweeps" / name)
+    index = yaml.safe_load((robot / "sweeps" / INDEX).read_text())
+    del index["recordings"]["02_again.mcap"]
+    index["recordings"]["01_press.mcap"]["pressed"] |= change
+    (sweeps / INDEX).write_text(yaml.safe_dump(index))
+    words = [f"--out={tmp_path / 'out'}"]
+    code, text = said(verb, sweeps, *words)
+    assert code == 2 and message in " ".join(text.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_a_word_of_what_was_pressed_the_way_out_is_said(robot: Path, said: Any, tmp_path: Path):
+    shutil.copy(robot / "sweeps" / "01_press.mcap", tmp_path)
+    code, text = said("diagnose", tmp_path, f"--out={tmp_path / 'out'}")
+    assert code == 2 and "of presses, state `pressed` in measurements.yaml" in " ".join(text.split())
+
+
+@pytest.mark.slow
+def test_a_drifting_zero_is_found_among_all_effects(tmp_path: Path, said: Any):
+    folder = surrogate(tmp_path / "robot", "baseline_drift", 8.0, patched=False)
+    words = [f"--twin={folder / 'twin.yaml'}", f"--out={folder / 'found'}", "--workers=1"]
+    code, text = said("diagnose", folder / "sweeps", *words)
+    found = json.loads((folder / "found" / "report.json").read_text())["diagnoses"]["left pads"]
+    assert found["effects"][0]["effect"] == "baseline_drift"
+    (drift,) = found["effects"]
+    truth = json.loads(_sealed(said, folder))["hidden"][0]["values"]["rate_per_min"]
+    assert drift["rate_per_min"] == pytest.approx(truth, rel=0.03)
+    assert "overwhelming" in text and "next: taccorl add-effect baseline_drift --pads=left" in text
+    assert found["errors"]["after"]["held_out"] < 0.25 * found["errors"]["fitted"]["held_out"]
+    assert code == int(found["status"] != "at_floor"), "taxels do not drift alike: that may be something else"
