@@ -17,6 +17,7 @@ from taccorl.data.spec import (
     load_recording_spec,
     load_sensor_spec,
 )
+from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.errors import SpecError
 
 REMOVE = object()
@@ -162,7 +163,8 @@ def leaves(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 @pytest.mark.parametrize("path", sorted(data_specs_folder().rglob("*.yaml")), ids=lambda p: p.stem)
 def test_every_shipped_spec_loads(path):
-    load = {"sensors": load_sensor_spec, "recordings": load_recording_spec}.get(path.parent.name, load_dataset_spec)
+    loaders = {"sensors": load_sensor_spec, "recordings": load_recording_spec, "mimicgen": load_mimic_spec}
+    load = loaders.get(path.parent.name, load_dataset_spec)
     assert load(path).spec_version == 1
     assert find_spec(path.stem) == path
 

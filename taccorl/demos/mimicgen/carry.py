@@ -1,0 +1,89 @@
+"""Carrying a motion over to a new scene: transforms of objects, of what a hand holds, bridges, and which source is nearest.
+
+Pure functions of (4, 4) poses ``a_from_b``.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from taccorl.demos.experts.se3 import between, inverse, rotvec, turn
+from taccorl.demos.mimicgen.spec import BridgeSpec, SelectionSpec
+
+_PEAK_OF_MEAN = 1.875  # of a minimum-jerk profile's speed
+_ROUNDING = 1e-6
+
+
+class Distance(NamedTuple):
+    """Between two poses."""
+
+    position_m: float
+    rotation_rad: float
+
+
+def distance(one: np.ndarray, other: np.ndarray) -> Distance:
+    """How far one pose is from another."""
+    return Distance(float(np.linalg.norm(one[:3, 3] - other[:3, 3])), float(np.linalg.norm(rotvec(one, other))))
+
+
+def look_alike(pose: np.ndarray, reference: np.ndarray, num_turns: int) -> np.ndarray:
+    """Of the turns of ``pose`` about its own z that look the same, the one nearest to ``reference``'s rotation; 0: any turn."""
+    if num_turns == 1:
+        return pose
+    off = pose[:3, :3].T @ reference[:3, :3]
+    angle = math.atan2(off[1, 0] - off[0, 1], off[0, 0] + off[1, 1])
+    period = 2 * math.pi / num_turns if num_turns else 0.0
+    return pose @ turn((0, 0, period * round(angle / period) if period else angle))
+
+
+def object_delta(new: np.ndarray, source: np.ndarray, num_turns: int = 1) -> np.ndarray:
+    """Δ = O_new · O_src⁻¹, world to world."""
+    return look_alike(new, source, num_turns) @ inverse(source)
+
+
+def translation(delta: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Only the shift of the object at ``source`` that ``delta`` makes."""
+    shift = np.eye(4)
+    shift[:3, 3] = (delta @ source)[:3, 3] - source[:3, 3]
+    return shift
+
+
+def shaken(delta: np.ndarray, about: np.ndarray, shift_m: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
+    """``delta`` followed by a turn (3,) about where it brings the pose ``about``, and a shift (3,), world."""
+    centre = (delta @ about)[:3, 3]
+    extra = turn(turn_rad)
+    extra[:3, 3] = centre - extra[:3, :3] @ centre + shift_m
+    return extra @ delta
+
+
+def in_hand_correction(
+    tcp_src: np.ndarray, held_src: np.ndarray, tcp_new: np.ndarray, held_new: np.ndarray, num_turns: int = 1
+) -> np.ndarray:
+    """C = G_src · G_new⁻¹ with G = TCP-from-held: a hand that follows T · C takes what it holds along the source's path.
+
+    T_new · G_new = T_src · C · G_new = T_src · G_src, for every T_src.
+    """
+    in_hand_src, in_hand_new = inverse(tcp_src) @ held_src, inverse(tcp_new) @ held_new
+    return in_hand_src @ inverse(look_alike(in_hand_new, in_hand_src, num_turns))
+
+
+def bridge(start: np.ndarray, end: np.ndarray, limits: BridgeSpec, hz: float) -> list[np.ndarray]:
+    """Poses after ``start`` up to ``end``, straight, minimum jerk, within the peak speeds; none if the two are the same."""
+    off = distance(start, end)
+    duration_s = _PEAK_OF_MEAN * max(off.position_m / limits.speed_mps, off.rotation_rad / limits.turn_radps)
+    num = math.ceil(duration_s * hz - _ROUNDING)
+    return [between(start, end, minimum_jerk(k / num)) for k in range(1, num + 1)]
+
+
+def minimum_jerk(x: float) -> float:
+    """Share of the way at share ``x`` of the time: 10x³ − 15x⁴ + 6x⁵."""
+    return 10 * x**3 - 15 * x**4 + 6 * x**5
+
+
+def one_of_nearest(distances: Sequence[Distance], how: SelectionSpec, rng: np.random.Generator) -> int:
+    """Index of one of the ``nn_k`` nearest, each as likely."""
+    size = [how.pos_weight * d.position_m + how.rot_weight * d.rotation_rad for d in distances]
+    nearest = np.argsort(size, kind="stable")[: how.nn_k]
+    return int(nearest[rng.integers(len(nearest))])

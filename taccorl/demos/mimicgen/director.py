@@ -1,0 +1,367 @@
+"""One attempt, step by step: which source, which transform, where each hand goes now. Knows poses, but no simulator.
+
+``Director.step(scene)`` is asked once a control step and gives a ``Wish`` for each arm; whoever executes it (the twin, or a
+test's ideal hands) shows the scene that came of it in the next step.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from taccorl.demos.experts.se3 import turn
+from taccorl.demos.mimicgen.carry import (
+    Distance,
+    bridge,
+    distance,
+    in_hand_correction,
+    look_alike,
+    minimum_jerk,
+    object_delta,
+    one_of_nearest,
+    shaken,
+    translation,
+)
+from taccorl.demos.mimicgen.schedule import Place, Schedule
+from taccorl.demos.mimicgen.source import ArmTrack, Segment, SourcePool, contact_row
+from taccorl.demos.mimicgen.spec import ConstraintSpec, SubtaskSpec
+
+_SETTLED_M, _SETTLED_RAD = 0.0004, 0.004  # a hand that moves less in a control step is at rest
+_REACH_M = 0.4  # of a joint to the hand: how far noise of the joints moves it
+
+
+class SeenPoses(Protocol):
+    """The scene as it is now."""
+
+    def tcp(self, arm: str) -> np.ndarray:
+        """World-from-TCP (4, 4)."""
+        ...
+
+    def body(self, name: str) -> np.ndarray:
+        """World-from-body (4, 4)."""
+        ...
+
+    def mated(self, name: str) -> bool:
+        """Whether a body touches what it goes into, or what goes into it."""
+        ...
+
+
+class Kinematics(Protocol):
+    """One arm's."""
+
+    def pose(self, joints_rad: np.ndarray) -> np.ndarray:
+        """World-from-TCP (4, 4)."""
+        ...
+
+    def solve(self, tcp_world: np.ndarray, start_rad: np.ndarray) -> tuple[np.ndarray, float]:
+        """Joints (6,) near ``start_rad`` that bring the TCP there, and the error left [m]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Wish:
+    """What an arm is to do in a control step."""
+
+    goal: np.ndarray
+    """World-from-TCP (4, 4)."""
+    opening_m: float
+    joints_rad: np.ndarray | None = None
+    """(6,) where the joints themselves are told; ``goal`` is theirs."""
+    contact: bool = False
+    """What is held touches its mate, or soon will: nothing is learnt of the arm's rest here."""
+    noisy: bool = True
+
+
+@dataclass
+class Choice:
+    """What an attempt does in one subtask; goes into the provenance."""
+
+    source: int
+    segment: Segment
+    delta: np.ndarray
+    """Δ (4, 4), world to world."""
+    correction: np.ndarray
+    """C = G_src · G_new⁻¹ (4, 4) as it is now."""
+
+
+@dataclass
+class _Path:
+    """One subtask of one arm: a bridge, then rows of a source."""
+
+    bridge: list[Wish]
+    choice: Choice
+    track: ArmTrack
+    held: str | None
+    """What the hand holds, where its path is to be kept."""
+    rows: np.ndarray
+    """Of the source, one for each step after the bridge."""
+    contact: int
+    """First row that counts as contact."""
+    joints_rad: np.ndarray | None
+    """(steps after the bridge, 6) where joints are told."""
+
+    def __len__(self) -> int:
+        return len(self.bridge) + len(self.rows)
+
+    def row(self, step: int) -> int | None:
+        """Of the source; None on the bridge."""
+        return int(self.rows[step - len(self.bridge)]) if step >= len(self.bridge) else None
+
+
+@dataclass
+class _Hand:
+    last: Wish
+    joints_rad: np.ndarray | None = None
+    """(6,) of the last wish, as the executor solved it."""
+    path: _Path | None = None
+    seen: np.ndarray | None = None
+    """World-from-TCP (4, 4) a control step ago."""
+    waited: int = 0
+
+
+class Director:
+    """Of one attempt. Arrays in, arrays out; all chance comes from ``rng``."""
+
+    def __init__(
+        self,
+        pool: SourcePool,
+        scene: SeenPoses,
+        openings_m: Mapping[str, float],
+        rng: np.random.Generator,
+        *,
+        hz: float,
+        kinematics: Mapping[str, Kinematics] | None = None,
+    ) -> None:
+        """
+        Args:
+            openings_m: of the grippers now.
+            kinematics: arm → its own; only subtasks without an object_ref need it.
+        """
+        self.pool, self.spec, self.hz, self.kinematics = pool, pool.spec, hz, kinematics or {}
+        self._rng, self._noise_rng = rng.spawn(2)
+        self.schedule = Schedule(self.spec.signals, self.spec.constraints)
+        self.choices: dict[Place, Choice] = {}
+        self._hands = {
+            arm: _Hand(Wish(goal=scene.tcp(arm), opening_m=openings_m[arm], noisy=False)) for arm in self.spec.signals
+        }
+        self._chosen: dict[str, int] = {}
+        self._shared: dict[int, tuple[int, np.ndarray]] = {}
+        """Coordination → the source and Δ that both arms use."""
+        self._offsets: dict[Place, int] = {}
+        for arm, subtasks in self.spec.subtask_configs.items():
+            for k, subtask in enumerate(subtasks):
+                low, high = subtask.subtask_term_offset_range
+                self._offsets[arm, k] = int(self._rng.integers(low, high + 1))
+
+    @property
+    def done(self) -> bool:
+        """Nothing is left to do; the hands stay where they are."""
+        return self.schedule.done
+
+    def step(self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None) -> dict[str, Wish]:
+        """Each arm's wish for the coming control step. ``joints_rad``: (6,) of each arm's last wish, if joints are told.
+
+        Raises:
+            DeadlockError: the arms wait for each other.
+        """
+        for arm, joints in (joints_rad or {}).items():
+            self._hands[arm].joints_rad = joints
+        for arm in self.schedule.to_plan():
+            self._plan(arm, scene)
+        held = [arm for arm in self._hands if self._is_to_settle(arm, scene)]
+        cues = self.schedule.tick(held) if not self.done else {}
+        wishes = {}
+        for arm, hand in self._hands.items():
+            if arm in cues:
+                hand.last, hand.waited = self._wish(arm, cues[arm].step, scene), 0
+                wishes[arm] = self._shaken(hand.last)
+            else:
+                hand.waited += arm in held
+                hand.last = replace(hand.last, noisy=False)
+                wishes[arm] = hand.last
+            hand.seen = scene.tcp(arm)
+        return wishes
+
+    # settling and noise -----------------------------------------------------------------------------------------------
+
+    def _is_to_settle(self, arm: str, scene: SeenPoses) -> bool:
+        """Whether the arm's gripper would act next while the arm still moves."""
+        cue, hand = self.schedule.upcoming(arm), self._hands[arm]
+        if cue is None or hand.path is None or hand.seen is None:
+            return False
+        row = hand.path.row(cue.step)
+        if row is None or not hand.path.track.gripper_acts[row]:
+            return False
+        if hand.waited >= self.spec.datagen_config.num_settle_steps_before_gripper:
+            return False
+        moved = distance(hand.seen, scene.tcp(arm))
+        return moved.position_m > _SETTLED_M or moved.rotation_rad > _SETTLED_RAD
+
+    def _shaken(self, wish: Wish) -> Wish:
+        noise = self.spec.datagen_config.noise
+        std = noise.contact if wish.contact else noise.transport
+        if not wish.noisy or (std.position_m == 0 and std.rotation_rad == 0):
+            return wish
+        draw = self._noise_rng.normal(size=6)
+        if wish.joints_rad is not None:
+            return replace(wish, joints_rad=wish.joints_rad + draw * std.position_m / _REACH_M)
+        goal = wish.goal @ turn(draw[3:] * std.rotation_rad)
+        goal[:3, 3] += draw[:3] * std.position_m
+        return replace(wish, goal=goal)
+
+    # planning ---------------------------------------------------------------------------------------------------------
+
+    def _plan(self, arm: str, scene: SeenPoses) -> None:
+        """The path of the arm's present subtask, from what the scene is now."""
+        k = self.schedule.subtask(arm)
+        subtask, coordination = self.spec.subtask_configs[arm][k], self.spec.coordination(arm, k)
+        i, delta = self._source_and_delta(arm, k, subtask, coordination, scene)
+        source, segment = self.pool.sources[i], self.pool.segment(i, arm, k, self._offsets)
+        hand, track = self._hands[arm], source.arms[arm]
+        keeps_path = subtask.held_object and self.spec.datagen_config.retarget == "held_object"
+        choice = self.choices[arm, k] = Choice(i, segment, delta, np.eye(4))
+        hand.path = path = _Path(
+            bridge=[],
+            choice=choice,
+            track=track,
+            held=subtask.held_object if keeps_path else None,
+            rows=np.arange(segment.start, segment.end),
+            contact=contact_row(source, self._held_now(arm, k), segment, self.spec.datagen_config.contact_lead_steps),
+            joints_rad=None,
+        )
+        self._look_into_hand(arm, path, segment.start, scene)
+        if subtask.object_ref is None and coordination is None:
+            path.rows, path.joints_rad = self._along_joints(arm, track, segment, choice.correction)
+        else:
+            before = track.goal[segment.start - 1] if segment.start else track.tcp[0]
+            first = delta @ before @ choice.correction
+            goals = bridge(hand.last.goal, first, self.spec.datagen_config.bridge, self.hz)
+            path.bridge = [Wish(goal=goal, opening_m=hand.last.opening_m) for goal in goals]
+        self.schedule.plan(arm, len(path), segment.num_together)
+
+    def _wish(self, arm: str, step: int, scene: SeenPoses) -> Wish:
+        """Of a step of the arm's path, without noise."""
+        path = self._hands[arm].path
+        assert path is not None
+        row = path.row(step)
+        if row is None:
+            return path.bridge[step]
+        choice, told = path.choice, None
+        if path.joints_rad is not None:
+            told = path.joints_rad[step - len(path.bridge)]
+            goal = self.kinematics[arm].pose(told)
+        else:
+            if path.held and self._is_free(path.held, choice.source, row, scene):
+                self._look_into_hand(arm, path, row, scene)
+            goal = choice.delta @ path.track.goal[row] @ choice.correction
+        opening_m = float(path.track.opening_m[row])
+        return Wish(goal=goal, opening_m=opening_m, joints_rad=told, contact=row >= path.contact)
+
+    def _look_into_hand(self, arm: str, path: _Path, row: int, scene: SeenPoses) -> None:
+        """C = G_src · G_new⁻¹ of what the hand holds, now and in that row: what has slipped since is made good."""
+        if path.held is None:
+            return
+        held_src = self.pool.sources[path.choice.source].objects[path.held][row]
+        path.choice.correction = in_hand_correction(
+            path.track.tcp[row], held_src, scene.tcp(arm), scene.body(path.held), self._num_turns(path.held)
+        )
+
+    def _is_free(self, body: str, source: int, row: int, scene: SeenPoses) -> bool:
+        """Whether a held body touches nothing but the hand, then and now: a hand that corrects what something else holds, too,
+        would push ever harder."""
+        return bool(self.pool.sources[source].free[body][row]) and not scene.mated(body)
+
+    def _held_now(self, arm: str, k: int) -> list[str]:
+        """What this hand holds in its subtask ``k``, and the other one in what is coordinated with it."""
+        coordination = self.spec.coordination(arm, k)
+        places = coordination.eef_subtask_constraint_tuple if coordination else ((arm, k),)
+        held = [self.spec.subtask_configs[a][j].held_object for a, j in places]
+        return [body for body in held if body is not None]
+
+    def _source_and_delta(
+        self, arm: str, k: int, subtask: SubtaskSpec, coordination: ConstraintSpec | None, scene: SeenPoses
+    ) -> tuple[int, np.ndarray]:
+        """Which source the subtask repeats, and the transform Δ of it."""
+        if coordination is None:
+            i = self._choose(arm, k, scene)
+            return i, self._object_delta(i, arm, k, subtask.object_ref, scene)
+        key = self.spec.task_constraint_configs.index(coordination)
+        if key not in self._shared:
+            i = self._choose(arm, k, scene)
+            self._shared[key] = i, self._coordinated_delta(i, arm, k, subtask, coordination, scene)
+        return self._shared[key]
+
+    def _coordinated_delta(
+        self, i: int, arm: str, k: int, subtask: SubtaskSpec, coordination: ConstraintSpec, scene: SeenPoses
+    ) -> np.ndarray:
+        row = self.pool.segment(i, arm, k, self._offsets).start
+        about = self.pool.sources[i].objects[subtask.object_ref][row] if subtask.object_ref else np.eye(4)
+        delta = np.eye(4)
+        if coordination.coordination_scheme != "replay":
+            delta = self._object_delta(i, arm, k, subtask.object_ref, scene)
+        if coordination.coordination_scheme == "translate":
+            delta = translation(delta, about)
+        draw = self._rng.uniform(-1, 1, size=6)
+        shift_m = draw[:3] * coordination.coordination_scheme_pos_noise_scale
+        return shaken(delta, about, shift_m, draw[3:] * coordination.coordination_scheme_rot_noise_scale)
+
+    def _object_delta(self, i: int, arm: str, k: int, body: str | None, scene: SeenPoses) -> np.ndarray:
+        if body is None:
+            return np.eye(4)
+        row = self.pool.segment(i, arm, k, self._offsets).start
+        return object_delta(scene.body(body), self.pool.sources[i].objects[body][row], self._num_turns(body))
+
+    def _along_joints(
+        self, arm: str, track: ArmTrack, segment: Segment, correction: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows, and joints (steps, 6), of a subtask that refers to no object: the source's, blended into where the arm is and
+        to where what it holds ends as in the source. A straight line of the hand may pass a singularity; this cannot.
+        A longer way than the source's takes more steps.
+        """
+        hand, kinematics = self._hands[arm], self.kinematics[arm]
+        joints = track.joints_rad[segment.rows]
+        now = hand.joints_rad if hand.joints_rad is not None else kinematics.solve(hand.last.goal, joints[0])[0]
+        end, _ = kinematics.solve(track.goal[segment.end - 1] @ correction, joints[-1])
+        share = np.array([minimum_jerk(x) for x in np.linspace(0, 1, len(joints))])[:, None]
+        joints = joints + (1 - share) * (now - joints[0]) + share * (end - joints[-1])
+        fastest = np.abs(np.diff(joints, axis=0)).max(initial=0.0) * self.hz
+        slower = max(1.0, fastest / self.spec.datagen_config.bridge.joint_speed_radps)
+        at = np.linspace(0, len(joints) - 1, math.ceil(len(joints) * slower))
+        resampled = np.stack([np.interp(at, np.arange(len(joints)), column) for column in joints.T], axis=1)
+        return segment.start + np.round(at).astype(int), resampled
+
+    # selection --------------------------------------------------------------------------------------------------------
+
+    def _choose(self, arm: str, k: int, scene: SeenPoses) -> int:
+        generation = self.spec.datagen_config
+        if not generation.generation_select_src_per_subtask:
+            if arm in self._chosen:
+                return self._chosen[arm]
+            if self._chosen and not generation.generation_select_src_per_arm:
+                self._chosen[arm] = next(iter(self._chosen.values()))
+                return self._chosen[arm]
+        self._chosen[arm] = self._select(arm, k, scene)
+        return self._chosen[arm]
+
+    def _select(self, arm: str, k: int, scene: SeenPoses) -> int:
+        subtask = self.spec.subtask_configs[arm][k]
+        strategy, how = subtask.selection_strategy, subtask.selection_strategy_kwargs
+        if strategy == "random" or subtask.object_ref is None:
+            return int(self._rng.integers(len(self.pool)))
+        of = self._object_distance if strategy == "nearest_neighbor_object" else self._hand_distance
+        distances = [of(i, arm, k, subtask.object_ref, scene) for i in range(len(self.pool))]
+        return one_of_nearest(distances, how, self._rng)
+
+    def _object_distance(self, i: int, arm: str, k: int, body: str, scene: SeenPoses) -> Distance:
+        then = self.pool.sources[i].objects[body][self.pool.segment(i, arm, k, self._offsets).start]
+        return distance(look_alike(scene.body(body), then, self._num_turns(body)), then)
+
+    def _hand_distance(self, i: int, arm: str, k: int, body: str, scene: SeenPoses) -> Distance:
+        row = self.pool.segment(i, arm, k, self._offsets).start
+        first = self._object_delta(i, arm, k, body, scene) @ self.pool.sources[i].arms[arm].goal[row]
+        return distance(scene.tcp(arm), first)
+
+    def _num_turns(self, body: str) -> int:
+        return self.spec.symmetry.get(body, 1)

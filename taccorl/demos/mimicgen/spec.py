@@ -1,0 +1,320 @@
+"""How demonstrations of a task become new ones: ``data_specs/mimicgen/<task>.yaml``, with IsaacLab Mimic's field names.
+
+Every distance is in metres, every angle in radians; a step is a control step, 1/30 s.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from taccorl.data.spec import SPEC_VERSION, find_spec
+from taccorl.data.strict_yaml import Document
+from taccorl.demos.mimicgen.schedule import Constraint, DeadlockError, rehearse
+from taccorl.errors import SpecError, TaccorlError, nearest
+from taccorl.sim.robot import ARMS
+from taccorl.sim.tasks.task import Task
+
+UNTIL_THE_END = "until the end"
+"""Name of a last subtask without a signal."""
+Retarget = Literal["held_object", "eef"]
+ContactMode = Literal["replay"]
+Strategy = Literal["random", "nearest_neighbor_object", "nearest_neighbor_robot_distance"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionSpec:
+    """How a strategy chooses among sources."""
+
+    nn_k: int = 3
+    """One of so many nearest sources, each as likely."""
+    pos_weight: float = 1.0
+    """Of a metre."""
+    rot_weight: float = 0.2
+    """Of a radian: a hand is some 0.2 m long. MimicGen's own is 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubtaskSpec:
+    """One stretch of one arm's work."""
+
+    subtask_term_signal: str | None
+    """The task's subtask (``taccorl.sim.tasks``) that this one is; it ends when that one's ``done`` turns true. Null, last of
+    an arm: what it does until the source ends, its retreat say, so that nobody has to wait for that."""
+    object_ref: str | None = None
+    """Body that carries the motion over: T' = O_new · O_src⁻¹ · T_src. Null: the motion is repeated joint by joint, blended
+    into where the arm is and to where what it holds is to come."""
+    held_object: str | None = None
+    """Body in this hand: its path is carried over instead of the hand's (``retarget: held_object``)."""
+    subtask_term_offset_range: tuple[int, int] = (0, 0)
+    """Steps after the signal, both included, of which one is drawn for each attempt. (0, 0) for an arm's last subtask."""
+    selection_strategy: Strategy = "random"
+    selection_strategy_kwargs: SelectionSpec = field(default_factory=SelectionSpec)
+
+    @property
+    def name(self) -> str:
+        """For schedules and messages."""
+        return UNTIL_THE_END if self.subtask_term_signal is None else self.subtask_term_signal
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConstraintSpec:
+    """What ties two subtasks together."""
+
+    eef_subtask_constraint_tuple: tuple[tuple[str, int], tuple[str, int]]
+    """(arm, number of its subtask from 0), twice; of a sequence the former first."""
+    constraint_type: Literal["sequential", "coordination"]
+    sequential_min_time_diff: int = -1
+    """-1: the latter begins when the former has ended. m ≥ 0: the latter waits with m steps left."""
+    coordination_scheme: Literal["replay", "transform", "translate"] = "replay"
+    """One source and one transform Δ for both: none, the object's, or the object's position only. The object is that of the
+    subtask that begins first."""
+    coordination_scheme_pos_noise_scale: float = 0.0
+    """Half width [m] of a uniform shift of Δ, per axis: the hands meet elsewhere."""
+    coordination_scheme_rot_noise_scale: float = 0.0
+    """Half width [rad] of a uniform rotation vector of Δ about the object, per axis."""
+    coordination_synchronize_start: bool = False
+    """Both begin together, at the later one's beginning in the source; else only their ends run together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BridgeSpec:
+    """From where a hand is to where a segment begins: minimum jerk, as long as these peak speeds need."""
+
+    speed_mps: float = 0.25
+    turn_radps: float = 1.5
+    joint_speed_radps: float = 2.5
+    """Of any joint where joints are told."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseSpec:
+    """Standard deviation of white noise on the hand's goal, per axis, each step. MimicGen's default is 2.5 mm and 1.4°."""
+
+    position_m: float = 0.0
+    rotation_rad: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitNoiseSpec:
+    """Noise by what the hand does."""
+
+    transport: NoiseSpec = field(default_factory=NoiseSpec)
+    """Everywhere else: in free motion and while it grips."""
+    contact: NoiseSpec = field(default_factory=NoiseSpec)
+    """From ``contact_lead_steps`` before what it holds first touches its mate in the source."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenerationSpec:
+    """What holds for all subtasks."""
+
+    generation_select_src_per_subtask: bool = False
+    """Choose a source anew for each subtask; else once."""
+    generation_select_src_per_arm: bool = False
+    """Each arm chooses its own; coordinated subtasks always share one."""
+    retarget: Retarget = "held_object"
+    """What keeps its path: T' = Δ · T_src · G_src · G_new⁻¹ with the object's pose G in the hand; eef: T' = Δ · T_src."""
+    contact_mode: ContactMode = "replay"
+    """Who moves the hands in contact: the source's motion. Kept in the provenance."""
+    bridge: BridgeSpec = field(default_factory=BridgeSpec)
+    num_settle_steps_before_gripper: int = 12
+    """At most so many steps, without noise, an arm waits to come to rest before its gripper opens or closes; its partner in a
+    coordination waits, too."""
+    contact_lead_steps: int = 15
+    noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GatesSpec:
+    """What a success must keep to be kept. Physical limits of the parts, the arms and the solver."""
+
+    max_force_n: float = 80.0
+    """Net force between mating parts."""
+    max_penetration_m: float = 0.0003
+    """Overlap of mating parts: less than the play on a side."""
+    max_joint_speed_radps: float = 3.1
+    """Of any joint, as it turns: PiPER's slowest turn by 180°/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MimicSpec:
+    """Everything that generation of one task depends on, but for the twin and the sources."""
+
+    spec_version: int
+    task: str
+    subtask_configs: dict[str, tuple[SubtaskSpec, ...]]
+    """Arm → its subtasks in order."""
+    task_constraint_configs: tuple[ConstraintSpec, ...] = ()
+    symmetry: dict[str, int] = field(default_factory=dict)
+    """Body → how many turns about its own z axis look the same; 0: any."""
+    datagen_config: GenerationSpec = field(default_factory=GenerationSpec)
+    gates: GatesSpec = field(default_factory=GatesSpec)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that decides; layout and comments of the file do not."""
+        return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """As the schedule wants them."""
+        return tuple(
+            Constraint(
+                former=c.eef_subtask_constraint_tuple[0],
+                latter=c.eef_subtask_constraint_tuple[1],
+                coordinated=c.constraint_type == "coordination",
+                min_time_diff=c.sequential_min_time_diff,
+                synchronize_start=c.coordination_synchronize_start,
+            )
+            for c in self.task_constraint_configs
+        )
+
+    @property
+    def signals(self) -> dict[str, tuple[str, ...]]:
+        """Arm → names of its subtasks."""
+        return {arm: tuple(s.name for s in subtasks) for arm, subtasks in self.subtask_configs.items()}
+
+    def coordination(self, arm: str, k: int) -> ConstraintSpec | None:
+        """What ties subtask ``k`` of ``arm`` to one of the other arm at the same time."""
+        return next((c for c in self._of(arm, k) if c.constraint_type == "coordination"), None)
+
+    def formers(self, arm: str, k: int) -> list[tuple[str, int]]:
+        """Subtasks that must have ended before subtask ``k`` of ``arm`` begins."""
+        sequences = [c for c in self._of(arm, k) if c.constraint_type == "sequential"]
+        return [c.eef_subtask_constraint_tuple[0] for c in sequences if c.eef_subtask_constraint_tuple[1] == (arm, k)]
+
+    def _of(self, arm: str, k: int) -> Iterator[ConstraintSpec]:
+        return (c for c in self.task_constraint_configs if (arm, k) in c.eef_subtask_constraint_tuple)
+
+
+def load_mimic_spec(name: str | Path) -> MimicSpec:
+    """The spec of that file, or the shipped one of that task.
+
+    Raises:
+        SpecError: with file, line, the key, and the way out.
+    """
+    document = Document(MimicSpec, find_spec(name))
+    spec = document.value
+    if spec.spec_version != SPEC_VERSION:
+        raise document.error("spec_version", f"{spec.spec_version}; this taccorl reads version {SPEC_VERSION}")
+    for key, text in _mistakes(spec):
+        raise document.error(key, text)
+    return spec
+
+
+def _mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
+    """(key, what is wrong) of a spec that parses."""
+    for arm in spec.subtask_configs:
+        if arm not in ARMS:
+            yield f"subtask_configs/{arm}", f"no arm {arm!r}; {nearest(arm, ARMS)}"
+    for arm in ARMS:
+        if not spec.subtask_configs.get(arm):
+            yield "subtask_configs", f"the {arm} arm has no subtasks"
+    for arm, subtasks in spec.subtask_configs.items():
+        for k, subtask in enumerate(subtasks):
+            yield from _subtask_mistakes(f"subtask_configs/{arm}/{k}", subtask, last=k == len(subtasks) - 1)
+    for body, turns in spec.symmetry.items():
+        if turns < 0:
+            yield f"symmetry/{body}", f"{turns}: how many turns look the same; 0 for any"
+    yield from _number_mistakes(spec)
+    bound: dict[tuple[str, int], int] = {}
+    for i, constraint in enumerate(spec.task_constraint_configs):
+        key = f"task_constraint_configs/{i}/eef_subtask_constraint_tuple"
+        pair = constraint.eef_subtask_constraint_tuple
+        for arm, k in pair:
+            if not 0 <= k < len(spec.subtask_configs.get(arm, ())):
+                yield key, f"there is no subtask {k} of {arm!r}; {_counts(spec)}"
+        if pair[0][0] == pair[1][0]:
+            yield key, f"both are of the {pair[0][0]} arm; an arm's own subtasks run in order anyway"
+        for end in pair if constraint.constraint_type == "coordination" else pair[1:]:
+            if end in bound:
+                yield key, f"{end[0]} subtask {end[1]} waits in constraint {bound[end]} already; one for each subtask"
+            bound[end] = i
+    try:
+        rehearse(spec.signals, spec.constraints)
+    except DeadlockError as error:
+        yield "task_constraint_configs", str(error)
+
+
+def _subtask_mistakes(key: str, subtask: SubtaskSpec, *, last: bool) -> Iterator[tuple[str, str]]:
+    low, high = subtask.subtask_term_offset_range
+    if low > high:
+        yield f"{key}/subtask_term_offset_range", f"[{low}, {high}]: the lower bound comes first"
+    if subtask.subtask_term_signal is None and not last:
+        yield f"{key}/subtask_term_signal", "null: only an arm's last subtask needs no signal"
+    if last and (low, high) != (0, 0):
+        yield f"{key}/subtask_term_offset_range", f"[{low}, {high}]: an arm's last subtask ends where the source ends"
+    if subtask.selection_strategy_kwargs.nn_k < 1:
+        yield f"{key}/selection_strategy_kwargs/nn_k", "at least 1"
+    if subtask.selection_strategy != "random" and subtask.object_ref is None:
+        yield f"{key}/selection_strategy", f"{subtask.selection_strategy} needs an object_ref"
+
+
+def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
+    generation = spec.datagen_config
+    positive = {f"bridge/{f.name}": getattr(generation.bridge, f.name) for f in dataclasses.fields(BridgeSpec)}
+    not_negative = {
+        name: getattr(generation, name) for name in ("num_settle_steps_before_gripper", "contact_lead_steps")
+    }
+    for part in ("transport", "contact"):
+        noise = getattr(generation.noise, part)
+        not_negative |= {f"noise/{part}/{f.name}": getattr(noise, f.name) for f in dataclasses.fields(noise)}
+    for name, value in (positive | not_negative).items():
+        if value < 0 or (name in positive and value == 0):
+            yield (
+                f"datagen_config/{name}",
+                f"{value:g} is not wanted; give a number {'> 0' if name in positive else '≥ 0'}",
+            )
+
+
+def _counts(spec: MimicSpec) -> str:
+    return ", ".join(f"{arm} has 0 … {len(subtasks) - 1}" for arm, subtasks in spec.subtask_configs.items())
+
+
+def check_task(spec: MimicSpec, task: Task) -> None:
+    """The spec is of this task: the same subtasks in the same order, objects that it has.
+
+    Raises:
+        SpecError: names what the task does not have, and what is near.
+    """
+    where = f"mimicgen spec of {spec.task}"
+    if spec.task != task.name:
+        raise SpecError(f"{where}: the task is {task.name}")
+    bodies = (*task.parts, *task.clamped)
+    for arm, subtasks in task.subtasks().items():
+        known = [s.name for s in subtasks]
+        named = [s.subtask_term_signal for s in spec.subtask_configs[arm] if s.subtask_term_signal is not None]
+        for k, name in enumerate(named):
+            if name not in known:
+                raise SpecError(f"{where}: subtask_configs → {arm} → {k}: no subtask {name!r}; {nearest(name, known)}")
+        if named != known:
+            raise SpecError(
+                f"{where}: subtask_configs → {arm}: has {', '.join(named)}; the task has {', '.join(known)}"
+            )
+        for k, subtask in enumerate(spec.subtask_configs[arm]):
+            for key in ("object_ref", "held_object"):
+                body = getattr(subtask, key)
+                if body is not None and body not in bodies:
+                    raise SpecError(
+                        f"{where}: subtask_configs → {arm} → {k} → {key}: no {body!r}; {nearest(body, bodies)}"
+                    )
+    for body in spec.symmetry:
+        if body not in bodies:
+            raise SpecError(f"{where}: symmetry: no {body!r}; {nearest(body, bodies)}")
+
+
+def with_options(spec: MimicSpec, **changes: object) -> MimicSpec:
+    """The spec with other ``datagen_config`` fields.
+
+    Raises:
+        TaccorlError: there is no such field.
+    """
+    known = [f.name for f in dataclasses.fields(GenerationSpec)]
+    for name in changes:
+        if name not in known:
+            raise TaccorlError(f"datagen_config: no {name!r}; {nearest(name, known)}")
+    return dataclasses.replace(spec, datagen_config=dataclasses.replace(spec.datagen_config, **changes))  # pyright: ignore[reportArgumentType]

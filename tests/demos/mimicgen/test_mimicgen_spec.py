@@ -1,0 +1,114 @@
+"""Specs of generation: the shipped ones fit their tasks, and a slip is named with file, line and what is near."""
+
+import re
+
+import pytest
+import yaml
+
+from taccorl.data.spec import find_spec
+from taccorl.demos.mimicgen.schedule import rehearse
+from taccorl.demos.mimicgen.spec import GenerationSpec, check_task, load_mimic_spec, with_options
+from taccorl.errors import SpecError, TaccorlError
+from taccorl.sim.tasks import tasks
+
+TASKS = ("assembly_1", "assembly_2", "puzzle", "test_tube")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_a_spec_that_is_its_own(task):
+    spec = load_mimic_spec(task)
+    assert spec.task == task
+    check_task(spec, tasks.get(task)())
+    rehearse(spec.signals, spec.constraints)
+    held = {s.held_object for subtasks in spec.subtask_configs.values() for s in subtasks} - {None}
+    assert {part for pair in tasks.get(task).mating for part in pair} - {"tray"} <= held | {"rack"}
+    assert spec.datagen_config.retarget == "held_object"
+
+
+def test_a_spec_says_of_each_subtask_what_the_task_says():
+    for name in TASKS:
+        spec = load_mimic_spec(name)
+        for arm, subtasks in tasks.get(name)().subtasks().items():
+            for k, subtask in enumerate(subtasks):
+                told = spec.subtask_configs[arm][k]
+                assert (told.object_ref, told.held_object) == (subtask.object_ref, subtask.held)
+                coordination = spec.coordination(arm, k)
+                assert (coordination is not None) == (subtask.coordinated_with is not None)
+                formers = [spec.signals[other][j] for other, j in spec.formers(arm, k)]
+                assert formers == ([subtask.after] if subtask.after else [])
+
+
+def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
+    path = tmp_path / "a.yaml"
+    document = yaml.safe_load(find_spec("assembly_2").read_text())
+    path.write_text(yaml.safe_dump(document, default_flow_style=True))
+    spec = load_mimic_spec("assembly_2")
+    assert load_mimic_spec(path).digest == spec.digest
+    assert with_options(spec, retarget="eef").digest != spec.digest
+    with pytest.raises(TaccorlError, match="no 'retarge'; did you mean 'retarget'"):
+        with_options(spec, retarge="eef")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("object_ref: plug", "object_rev: plug", r"unknown key 'object_rev'; did you mean 'object_ref'"),
+        ("coordination_scheme: replay", "coordination_scheme: replai", r"'replai' is none of .*did you mean 'replay'"),
+        ("nearest_neighbor_object", "nearest_neighbour_object", r"did you mean 'nearest_neighbor_object'"),
+        (
+            "[[left, 1], [right, 1]]",
+            "[[left, 1], [right, 2]]",
+            r"no subtask 2 of 'right'; left has 0 … 1, right has 0 … 1",
+        ),
+        ("[[left, 1], [right, 1]]", "[[left, 0], [left, 1]]", r"both are of the left arm"),
+        ("[2, 6]", "[6, 2]", r"\[6, 2\]: the lower bound comes first"),
+        (
+            "held_object: cradle",
+            "held_object: cradle, subtask_term_offset_range: [0, 4]",
+            r"an arm's last subtask ends where",
+        ),
+        ("subtask_term_signal: grasp cradle", "subtask_term_signal: null", r"null: only an arm's last subtask"),
+        ("spec_version: 1", "spec_version: 2", r"this taccorl reads version 1"),
+        ("task: assembly_2", "task: assembly_2\ndatagen_config: {bridge: {speed_mps: 0.0}}", r"give a number > 0"),
+        (
+            "[[left, 1], [right, 1]], constraint_type: coordination, coordination_scheme: replay}",
+            "[[left, 1], [right, 0]], constraint_type: sequential}\n"
+            "  - {eef_subtask_constraint_tuple: [[right, 1], [left, 0]], constraint_type: sequential}",
+            r"deadlock: left waits to begin 'grasp cradle' until right has ended 'insert plug'; right waits",
+        ),
+    ],
+)
+def test_a_slip_in_a_spec_is_named_with_its_place(old, new, said, tmp_path):
+    text = find_spec("assembly_2").read_text()
+    assert old in text
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(SpecError, match=rf"mine\.yaml:\d+: .*{said}") as error:
+        load_mimic_spec(path)
+    assert re.search(r"mine\.yaml:(?!1:)\d+", str(error.value)) or "spec_version" in old or "deadlock" in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("grasp plug", "grasp plog", r"right → 0: no subtask 'grasp plog'; did you mean 'grasp plug'"),
+        ("held_object: cradle", "held_object: cradel", r"left → 1 → held_object: no 'cradel'; did you mean 'cradle'"),
+        ("task: assembly_2", "task: assembly_1", r"mimicgen spec of assembly_1: the task is assembly_2"),
+        (
+            "task_constraint_configs",
+            "symmetry: {plugg: 2}\ntask_constraint_configs",
+            r"symmetry: no 'plugg'; did you mean 'plug'",
+        ),
+    ],
+)
+def test_a_spec_that_is_not_the_tasks_is_named(old, new, said, tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(find_spec("assembly_2").read_text().replace(old, new, 1))
+    with pytest.raises(SpecError, match=said):
+        check_task(load_mimic_spec(path), tasks.get("assembly_2")())
+
+
+def test_defaults_are_the_held_object_without_noise():
+    generation = GenerationSpec()
+    assert (generation.retarget, generation.contact_mode) == ("held_object", "replay")
+    assert generation.noise.transport.position_m == generation.noise.contact.rotation_rad == 0.0
