@@ -199,8 +199,8 @@ def collect(plan: Plan, out: Path, store: Store, progress: Progress = print) -> 
             )
     report = _report(plan, entries)
     config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": twin}
-    assemble = dataclasses.replace(_COLLECTION, fn=lambda _, inputs, folder: _assemble(spec, report, inputs, folder))
-    store.run(assemble, config, shards, destination=out)
+    collection = dataclasses.replace(_COLLECTION, fn=lambda _, inputs, folder: assemble(spec, report, inputs, folder))
+    store.run(collection, config, shards, destination=out)
     sim.close()
     return report
 
@@ -211,7 +211,7 @@ def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
 
 _DEMONSTRATION = Stage("demonstration", _not_yet, ATTEMPT_VERSION)
 _COLLECTION = Stage("collection", _not_yet, manifest=f"{PROVENANCE}/manifest.json")
-_REPORT = "collect_report.json"
+REPORT = "collect_report.json"
 
 
 def _check_out(plan: Plan, out: Path, store: Store) -> None:
@@ -234,7 +234,7 @@ def _check_out(plan: Plan, out: Path, store: Store) -> None:
 
 def _may_be_of(plan: Plan, out: Path, store: Store) -> bool:
     """Whether the dataset at ``out`` is made of attempts of this very plan, and of as many."""
-    manifest, report = read_manifest(out), out / PROVENANCE / _REPORT
+    manifest, report = read_manifest(out), out / PROVENANCE / REPORT
     if not manifest or manifest["stage"] != _COLLECTION.name or not report.is_file():
         return False
     told, twin = json.loads(report.read_text()), twin_text(plan.twin_config())
@@ -286,8 +286,8 @@ def _build_attempt(
     _dump(folder / "entry.json", entry)
 
 
-def _assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], folder: Path) -> None:
-    """Stage ``collection``: the kept attempts merged, with their provenance in meta/taccorl/."""
+def assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], folder: Path) -> None:
+    """Kept attempts, each dataset/ with episodes.json, merged at ``folder``, with their provenance in meta/taccorl/."""
     from taccorl.data.lerobot_format import merge
 
     merge([shard / "dataset" for shard in shards], folder)
@@ -295,7 +295,7 @@ def _assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], fol
     meta.mkdir(parents=True, exist_ok=True)
     records = [record for shard in shards for record in json.loads((shard / "episodes.json").read_text())]
     _dump(meta / "episodes.json", records)
-    _dump(meta / _REPORT, report)
+    _dump(meta / REPORT, report)
     _dump(meta / "dataset_spec.json", dataset_spec_to_json(spec))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from taccorl.data.episode import Episode, Pictures
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.sim.robot import ARMS
-from taccorl.sim.simulation import Simulation
+from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
 ORIGIN = "MuJoCo twin, not a robot"
@@ -60,8 +60,11 @@ class EpisodeRecorder:
     def __post_init__(self) -> None:
         self._dense = DenseRecorder(self.sim) if self.dense else None
 
-    def step(self, action: np.ndarray) -> None:
-        """One row and one control step. The action is rounded to float32 before it acts: what is stored is what was done."""
+    def step(self, action: np.ndarray, watch: Watch | None = None) -> None:
+        """One row and one control step. The action is rounded to float32 before it acts: what is stored is what was done.
+
+        ``watch`` sees the state in between, if nothing dense is kept.
+        """
         action = np.asarray(action, dtype=np.float32)
         sim = self.sim
         row = {
@@ -71,7 +74,7 @@ class EpisodeRecorder:
             "sim.seed": sim.seeds[:1].copy(),
             "sim.subtask": sim.judge.subtask[0].astype(np.int16),
         }
-        sim.step(action[None].astype(np.float64), watch=self._dense.watch() if self._dense else None)
+        sim.step(action[None].astype(np.float64), watch=self._dense.watch() if self._dense else watch)
         row["action"] = sim.executed[0].astype(np.float32)
         row["sim.success"] = sim.judge.success[:1].astype(np.int16)
         self.rows.append(row)

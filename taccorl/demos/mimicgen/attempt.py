@@ -1,0 +1,203 @@
+"""One attempt in the twin: physics only, a pure function of (spec, sources, twin, seed, k); then what is kept is done again.
+
+An attempt that succeeds is executed a second time from its stored actions: that must end in the same state bit for bit, shows
+what the gates judge, and gives the rows with touch. So physics comes first, and touch and pictures only for what is kept.
+"""
+
+import time
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taccorl.data.spec import DatasetSpec
+from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.demos.mimicgen.director import Director, Wish
+from taccorl.demos.mimicgen.gates import GateKeeper, Measured, foreign_contact
+from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
+from taccorl.demos.mimicgen.schedule import DeadlockError
+from taccorl.demos.mimicgen.source import SourcePool
+from taccorl.demos.recorder import EpisodeRecorder
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.sim.robot import ARMS
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks.task import HOLD_S
+from taccorl.sim.twin import CONTROL_HZ
+
+_UNREACHABLE_M = 0.005  # that inverse kinematics leaves: the hand would be elsewhere
+_AFTER_STEPS = round((HOLD_S + 0.5) * CONTROL_HZ)  # a goal reached last of all must still hold
+_WORD = "mimicgen"  # apart from the scenes of ``taccorl collect`` with the same seed
+
+
+def attempt_seeds(root: int, task: str, k: int) -> tuple[int, np.random.Generator]:
+    """Scene seed and generator of attempt ``k``: ``SeedSequence(root, spawn_key=(task, k))``, independent of all others."""
+    sequence = np.random.SeedSequence(root, spawn_key=(zlib.crc32(f"{_WORD} {task}".encode()), k))
+    scene, rest = sequence.spawn(2)
+    return int(scene.generate_state(1, np.uint64)[0] >> np.uint64(2)), np.random.default_rng(rest)
+
+
+@dataclass
+class Attempted:
+    """What became of an attempt."""
+
+    k: int
+    scene_seed: int
+    outcome: str
+    """``success``; a failure's category of the task; ``timeout``, ``diverged``, ``unfinished``: nothing failed, but nothing was
+    reached; ``unreachable``; ``deadlock``; or the gate that a success did not pass."""
+    reason: str = ""
+    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 14), np.float32))
+    """(T, 14) float32 as they were executed."""
+    last_state: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(row_size,) after the last action."""
+    provenance: dict[str, object] = field(default_factory=dict)
+    cpu_s: float = 0.0
+
+    @property
+    def success(self) -> bool:
+        return self.outcome == "success"
+
+
+class TwinScene:
+    """Simulation 0 as the director sees it."""
+
+    def __init__(self, sim: Simulation) -> None:
+        self.sim = sim
+
+    def tcp(self, arm: str) -> np.ndarray:
+        return self.sim.tcp(arm)[0]
+
+    def body(self, name: str) -> np.ndarray:
+        return self.sim.poses(name)[0]
+
+    def mated(self, name: str) -> bool:
+        pairs = [pair for pair in self.sim.task.mating if name in pair]
+        return any(self.sim.contact(*pair).touching[0] for pair in pairs)
+
+
+class Hands:
+    """Wishes into joint targets: inverse kinematics, and what the joints rest off."""
+
+    def __init__(self, sim: Simulation, kinematics: Mapping[str, ArmKinematics]) -> None:
+        """After a reset."""
+        self.sim, self.kinematics = sim, kinematics
+        self.joints_rad, self._rest = {}, {}
+        self._joints = {arm: joint_addresses(sim.model, arm) for arm in ARMS}
+        self.unreached_m, self.unreached = 0.0, ""
+        command = sim.arrays["ctrl"][0, sim.action_actuators]
+        for a, arm in enumerate(ARMS):
+            gains = sim.config.controller_of(arm)
+            joints = sim.arrays["qpos"][0, self._joints[arm]]
+            lag_s = np.divide(gains.kd_nms_per_rad, gains.kp_nm_per_rad)
+            self.joints_rad[arm] = joints
+            self._rest[arm] = RestOffset(joints, command[7 * a : 7 * a + 6].copy(), lag_s)
+
+    def action(self, wishes: Mapping[str, Wish]) -> np.ndarray:
+        """(14,) float32 joint targets [rad] and openings [m]."""
+        action, qpos = np.empty(14), self.sim.arrays["qpos"][0]
+        for a, arm in enumerate(ARMS):
+            wish, rest = wishes[arm], self._rest[arm]
+            if not wish.contact:
+                rest.see(qpos[self._joints[arm]])
+            if wish.joints_rad is None:
+                joints, error_m = self.kinematics[arm].solve(wish.goal, self.joints_rad[arm])
+                if error_m > self.unreached_m:
+                    self.unreached_m, self.unreached = (
+                        error_m,
+                        f"{arm} arm: TCP at {np.round(wish.goal[:3, 3], 3).tolist()} m",
+                    )
+            else:
+                joints = wish.joints_rad
+            self.joints_rad[arm] = joints
+            action[7 * a : 7 * a + 6] = rest.command(joints)
+            action[7 * a + 6] = wish.opening_m
+        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+
+
+class Attempts:
+    """Attempts of one spec with one pool of sources in one simulation; ``run(k)`` does not depend on what ran before."""
+
+    def __init__(self, pool: SourcePool, sim: Simulation, seed: int) -> None:
+        self.pool, self.spec, self.sim, self.seed = pool, pool.spec, sim, seed
+        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+
+    def run(self, k: int) -> Attempted:
+        """Attempt ``k``, physics only."""
+        began_s = time.process_time()
+        sim, (scene_seed, rng) = self.sim, attempt_seeds(self.seed, self.spec.task, k)
+        sim.reset([scene_seed])
+        scene, hands = TwinScene(sim), Hands(sim, self.kinematics)
+        command = sim.arrays["ctrl"][0, sim.action_actuators]
+        openings = {arm: float(command[7 * a + 6]) for a, arm in enumerate(ARMS)}
+        director = Director(self.pool, scene, openings, rng, hz=CONTROL_HZ, kinematics=self.kinematics)
+        done = Attempted(k, scene_seed, "unfinished")
+        actions, after = [], 0
+        while after < _AFTER_STEPS and not sim.judge.outcome.over[0]:
+            try:
+                wishes = director.step(scene, hands.joints_rad)
+            except DeadlockError as error:
+                done.outcome, done.reason = "deadlock", str(error)
+                break
+            action = hands.action(wishes)
+            if hands.unreached_m > _UNREACHABLE_M:
+                done.outcome = "unreachable"
+                done.reason = f"{hands.unreached} is out of reach by {hands.unreached_m * 1e3:.1f} mm"
+                break
+            sim.step(action[None].astype(np.float64))
+            actions.append(action)
+            after += director.done
+        outcome = sim.judge.outcome
+        if outcome.over[0]:
+            done.outcome = "success" if outcome.success[0] else str(outcome.failure[0])
+        done.actions = np.array(actions, np.float32).reshape(-1, 14)
+        done.last_state = sim.state_rows()[0]
+        done.provenance = self._provenance(director, k, scene_seed)
+        done.cpu_s = time.process_time() - began_s
+        return done
+
+    def redo(self, done: Attempted, spec: DatasetSpec, noise: np.random.Generator | None = None) -> EpisodeRecorder:
+        """Execute a success again from its stored actions, with touch, under the gates; its outcome may become a gate's name."""
+        sim = self.sim
+        sim.reset([done.scene_seed])
+        recorder, gates = EpisodeRecorder(sim, spec, noise), GateKeeper(sim)
+        for action in done.actions:
+            recorder.step(action, gates.watch())
+        gates.see_actions(done.actions)
+        states = np.stack([row["sim.state"] for row in recorder.rows])
+        measured = gates.measured
+        done.provenance["gates"] = measured.told()
+        if not (np.array_equal(sim.state_rows()[0], done.last_state) and sim.judge.outcome.success[0]):
+            done.outcome, done.reason = "not reproduced", "the stored actions end in another state than the attempt did"
+        elif reason := self._refused(measured, states):
+            done.outcome, done.reason = reason
+        return recorder
+
+    def _refused(self, measured: Measured, states: np.ndarray) -> tuple[str, str] | None:
+        """Gate that a success does not pass and why."""
+        return measured.refused(self.spec.gates) or foreign_contact(self.sim, states)
+
+    def _provenance(self, director: Director, k: int, scene_seed: int) -> dict[str, object]:
+        choices = []
+        for (arm, number), choice in sorted(director.choices.items()):
+            choices.append(
+                {
+                    "arm": arm,
+                    "subtask": self.spec.signals[arm][number],
+                    "source": self.pool.sources[choice.source].name,
+                    "rows": [choice.segment.start, choice.segment.end],
+                    "delta": np.round(choice.delta, 9).tolist(),
+                    "in_hand_correction": np.round(choice.correction, 9).tolist(),
+                }
+            )
+        generation = self.spec.datagen_config
+        return {
+            "attempt": k,
+            "seed": self.seed,
+            "scene_seed": scene_seed,
+            "spec": self.spec.digest,
+            "retarget": generation.retarget,
+            "contact_mode": generation.contact_mode,
+            "draw": {name: np.asarray(value).tolist() for name, value in self.sim.draws[0].items()},
+            "subtasks": choices,
+        }

@@ -1,0 +1,163 @@
+"""Sources out of a dataset that ``taccorl collect`` made: every pose follows from the stored state, none is measured.
+
+Needed columns: ``sim.state``, ``sim.seed``, ``sim.subtask``, ``action``. Poses and contacts are computed from the state with
+the model of the very twin that the dataset was made in.
+"""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from taccorl.data.dataset import Dataset
+from taccorl.data.episode import Episode
+from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
+from taccorl.demos.mimicgen.source import ArmTrack, Source
+from taccorl.demos.mimicgen.spec import MimicSpec
+from taccorl.errors import DatasetError
+from taccorl.sim.robot import ARMS
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks import tasks
+from taccorl.sim.twin_file import load_twin
+
+COLUMNS = ("sim.state", "sim.seed", "sim.subtask", "action")
+
+
+def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
+    """Every successful episode of a dataset as a source.
+
+    Raises:
+        DatasetError: no simulator state, another task, or a twin that is no longer the same; with the way out.
+    """
+    dataset = Dataset(root)
+    missing = [key for key in COLUMNS if key not in dataset.info["features"]]
+    if missing:
+        raise DatasetError(
+            f"{root}: has no {', '.join(missing)}: object poses are not known, as in every recording of a robot, so it cannot "
+            f"be a source. Sources come from the twin: taccorl collect --task={spec.task} --out=outputs/{spec.task}"
+        )
+    episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
+    kept = [episode for episode in episodes if episode.success]
+    if not kept:
+        raise DatasetError(f"{root}: none of its {len(episodes)} episodes is a success; taccorl collect makes some")
+    reader = SourceReader(simulation_of(kept[0], spec.task))
+    return [reader.read(episode) for episode in kept]
+
+
+def simulation_of(episode: Episode, task: str) -> Simulation:
+    """The simulation that a collected episode was made in.
+
+    Raises:
+        DatasetError: of another task, or nobody wrote down in which simulation.
+    """
+    told = episode.provenance.get("simulation")
+    if not isinstance(told, dict) or "twin" not in told:
+        raise DatasetError(f"{episode.name}: does not say in which twin it was made; collect it with this taccorl")
+    if told["task"] != task:
+        raise DatasetError(f"{episode.name}: is of task {told['task']}, the spec is of {task}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "twin.yaml"
+        path.write_text(told["twin"], encoding="utf-8")
+        twin = load_twin(path)
+    return Simulation(tasks.get(task)(told["difficulty"]), twin, scale=float(told["randomization"]))
+
+
+class SourceReader:
+    """Reads episodes of one simulation; made once, used for all of them."""
+
+    def __init__(self, sim: Simulation) -> None:
+        self.sim = sim
+        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+        self._data = mujoco.MjData(sim.model)
+        bodies = [sim.model.body(i).name for i in sim.model.geom_bodyid]
+        self._owner = ["arm" if name.startswith(ARMS) else name for name in bodies]
+        """Of each geom: a part, a clamped body, the table (its name is world), or any piece of an arm."""
+
+    def read(self, episode: Episode) -> Source:
+        """
+        Raises:
+            DatasetError: states of another scene than this simulation's.
+        """
+        states, actions = episode.arrays["sim.state"], episode.arrays["action"].astype(float)
+        if states.shape[1] != self.sim.row_size or (states[:, 0] != self.sim.scene).any():
+            raise DatasetError(
+                f"{episode.name}: its states are of another scene than {self.sim.task.name}, {self.sim.task.difficulty}, in the "
+                "twin it names: an older taccorl made it. Collect it again"
+            )
+        names = (*self.sim.task.parts, *self.sim.task.clamped)
+        seen = [self._look(row, names) for row in states]
+        objects = {name: np.stack([look.poses[name] for look in seen]) for name in names}
+        mated, free = (
+            {name: np.array([getattr(look, what)[name] for look in seen]) for name in self.sim.task.parts}
+            for what in ("mated", "free")
+        )
+        touched = np.logical_or.accumulate(np.logical_or.reduce(list(mated.values())))
+        rest_command = self._command(states[0])
+        arms = {}
+        for a, arm in enumerate(ARMS):
+            commands = actions[:, 7 * a : 7 * a + 6]
+            joints = np.stack([look.joints_rad[arm] for look in seen])
+            goals = self._goals(arm, joints, commands, rest_command[7 * a : 7 * a + 6], touched)
+            goal = np.stack([self.kinematics[arm].pose(row) for row in goals])
+            tcp = np.stack([look.tcp[arm] for look in seen])
+            arms[arm] = ArmTrack(tcp, goal, goals, actions[:, 7 * a + 6])
+        subtask = episode.arrays["sim.subtask"]
+        signals = {
+            arm: {s.name: subtask[:, a] > k for k, s in enumerate(self.sim.task.subtasks()[arm])}
+            for a, arm in enumerate(ARMS)
+        }
+        return Source(episode.name, arms, objects, signals, mated, free)
+
+    def _look(self, row: np.ndarray, names: tuple[str, ...]) -> "_Look":
+        """What a stored state shows."""
+        model, data, task = self.sim.model, self._data, self.sim.task
+        mujoco.mj_setState(model, data, row[1 : 1 + self.sim.batch.nstate], mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        touching = [{self._owner[geom] for geom in contact.geom} for contact in data.contact]
+        mated = {name for pair in task.mating if set(pair) in touching for name in pair}
+        return _Look(
+            poses={name: _pose(data.body(name).xpos, data.body(name).xmat) for name in names},
+            tcp={arm: _pose(data.site(f"{arm}_tcp").xpos, data.site(f"{arm}_tcp").xmat) for arm in ARMS},
+            joints_rad={arm: data.qpos[joint_addresses(model, arm)] for arm in ARMS},
+            mated={name: name in mated for name in task.parts},
+            free={name: not any(name in pair and "arm" not in pair for pair in touching) for name in task.parts},
+        )
+
+    def _command(self, row: np.ndarray) -> np.ndarray:
+        """(14,) the targets in force in a stored state."""
+        return self.sim.row_memory(row[None])["targets"][0]
+
+    def _goals(
+        self, arm: str, joints: np.ndarray, commands: np.ndarray, at_rest: np.ndarray, touched: np.ndarray
+    ) -> np.ndarray:
+        """(T, 6) where the commands (T, 6) were to bring the joints (T, 6). From when parts have ``touched`` (T,) each other
+        nothing is learnt of the arm's rest: contact holds it back."""
+        gains = self.sim.config.controller_of(arm)
+        rest = RestOffset(joints[0], at_rest, np.divide(gains.kd_nms_per_rad, gains.kp_nm_per_rad))
+        goals = []
+        for now, command, held_back in zip(joints, commands, touched, strict=True):
+            if not held_back:
+                rest.see(now)
+            goals.append(rest.goal(command))
+        return np.array(goals)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What a stored state shows."""
+
+    poses: dict[str, np.ndarray]
+    tcp: dict[str, np.ndarray]
+    joints_rad: dict[str, np.ndarray]
+    mated: dict[str, bool]
+    free: dict[str, bool]
+
+
+def _pose(pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = mat.reshape(3, 3), pos
+    return pose

@@ -1,0 +1,214 @@
+"""From a collected dataset to new episodes in the twin: poses are the simulator's own, an attempt is a pure function of its
+number, and what is kept has been done twice."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from taccorl.data.dataset import Dataset
+from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.demos.collect import Plan
+from taccorl.demos.experts import experts
+from taccorl.demos.experts.scripted import EXACT
+from taccorl.demos.mimicgen.attempt import Attempts, attempt_seeds
+from taccorl.demos.mimicgen.from_dataset import SourceReader, read_sources, simulation_of
+from taccorl.demos.mimicgen.gates import Measured, foreign_contact
+from taccorl.demos.mimicgen.rest import RestOffset
+from taccorl.demos.mimicgen.source import SourcePool
+from taccorl.demos.mimicgen.spec import GatesSpec, load_mimic_spec
+from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.errors import DatasetError
+from taccorl.sim.robot import ARMS
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks.assembly_2 import Assembly2
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return Simulation(Assembly2())
+
+
+@pytest.fixture(scope="module")
+def rows_spec(sim):
+    return with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+
+
+@pytest.fixture(scope="module")
+def pool(collected):
+    spec = load_mimic_spec("assembly_2")
+    return SourcePool(spec, read_sources(collected, spec))
+
+
+@pytest.fixture(scope="module")
+def succeeded(pool, sim):
+    """The first attempt that succeeds."""
+    attempts = Attempts(pool, sim, seed=11)
+    return next(done for k in range(6) if (done := attempts.run(k)).success)
+
+
+# sources ------------------------------------------------------------------------------------------------------------------
+
+
+def test_poses_of_a_source_are_the_simulators_own(collected, pool, sim):
+    episode, source = Dataset(collected).episode(1), pool.sources[1]
+    assert simulation_of(episode, "assembly_2").scene == sim.scene
+    for row in (0, 150, len(episode.arrays["action"]) - 1):
+        sim.restore_rows(episode.arrays["sim.state"][[row]], episode.arrays["sim.seed"][row])
+        for body in ("plug", "cradle"):
+            np.testing.assert_array_equal(source.objects[body][row], sim.poses(body)[0])
+        for arm in ARMS:
+            np.testing.assert_array_equal(source.arms[arm].tcp[row], sim.tcp(arm)[0])
+        assert source.mated["plug"][row] == sim.contact("plug", "cradle").touching[0]
+    np.testing.assert_array_equal(source.arms["left"].opening_m, episode.arrays["action"][:, 6])
+    ends = [int(np.argmax(source.signals["right"][name])) for name in ("grasp plug", "insert plug")]
+    assert ends == [int(np.argmax(episode.arrays["sim.subtask"][:, 1] > k)) for k in (0, 1)]
+
+
+def test_goals_are_what_the_hand_wanted_and_not_what_it_commanded(rows_spec):
+    sim = Simulation(Assembly2())
+    sim.reset([5])
+    expert, recorder = experts.get("assembly_2")(sim, np.random.default_rng(0), EXACT), EpisodeRecorder(sim, rows_spec)
+    expert.start()
+    wanted, commanded = [], []
+    while not expert.done and not sim.judge.outcome.over[0]:
+        action = expert.act()
+        wanted.append(expert.hands["right"].goal[:3, 3].copy())
+        commanded.append(expert.kinematics["right"].pose(action[7:13].astype(float))[:3, 3])
+        recorder.step(action)
+    source = SourceReader(sim).read(recorder.episode("exact", {}))
+    free = slice(0, int(np.argmax(source.mated["plug"])))
+    off_m = np.linalg.norm(source.arms["right"].goal[free, :3, 3] - np.array(wanted)[free], axis=1)
+    naive_m = np.linalg.norm(np.array(commanded)[free] - np.array(wanted)[free], axis=1)
+    assert np.median(off_m) < 0.0003
+    assert off_m.max() < 0.001
+    assert np.median(naive_m) > 0.002  # T_ref / K_p of joint 5 alone: 11 mrad at 0.26 m
+
+
+def test_what_an_arm_rests_off_is_learnt_when_it_stands_still():
+    home, lag = np.full(6, 0.5), np.full(6, 0.1)
+    rest = RestOffset(home, home - 0.01, lag)
+    np.testing.assert_allclose(rest.offset_rad, 0.01)
+    assert rest.command(home)[0] == pytest.approx(0.49)
+    for _ in range(100):  # now it rests 0.03 off its command
+        rest.see(rest.command(home) + 0.03)
+    np.testing.assert_allclose(rest.offset_rad, 0.03, atol=1e-4)
+    before = rest.offset_rad
+    rest.command(home + 0.1)
+    rest.see(home + 1.0)  # an arm that moves teaches nothing
+    np.testing.assert_array_equal(rest.offset_rad, before)
+
+
+def test_a_recording_without_simulator_state_is_refused_with_the_way_out(collected, tmp_path):
+    shutil.copytree(collected, tmp_path / "real")
+    for name in ("info.json", "taccorl/dataset_spec.json"):  # as of a robot's recording
+        path = tmp_path / "real" / "meta" / name
+        document = json.loads(path.read_text())
+        document["features"] = {key: f for key, f in document["features"].items() if not key.startswith("sim.")}
+        path.write_text(json.dumps(document))
+    with pytest.raises(DatasetError, match=r"has no sim\.state, .* taccorl collect --task=assembly_2"):
+        read_sources(tmp_path / "real", load_mimic_spec("assembly_2"))
+
+
+def test_sources_of_another_task_are_refused(collected):
+    with pytest.raises(DatasetError, match="is of task assembly_2, the spec is of assembly_1"):
+        read_sources(collected, load_mimic_spec("assembly_1"))
+
+
+# attempts -----------------------------------------------------------------------------------------------------------------
+
+
+def test_seeds_are_of_root_task_and_attempt_and_not_those_of_collect():
+    seeds = {attempt_seeds(root, task, k)[0] for root in (0, 1) for task in ("assembly_1", "puzzle") for k in range(5)}
+    assert len(seeds) == 20
+    one, same = attempt_seeds(0, "puzzle", 3), attempt_seeds(0, "puzzle", 3)
+    assert one[0] == same[0]
+    assert one[1].random() == same[1].random()
+    assert one[0] != Plan(task="puzzle", seed=0).attempt_seed(3)
+
+
+def test_an_attempt_is_the_same_whatever_ran_before(pool, succeeded):
+    again = Attempts(pool, Simulation(Assembly2()), seed=11).run(succeeded.k)
+    np.testing.assert_array_equal(again.actions, succeeded.actions)
+    np.testing.assert_array_equal(again.last_state, succeeded.last_state)
+    assert again.outcome == "success"
+    assert again.provenance["subtasks"] == succeeded.provenance["subtasks"]
+
+
+def test_a_success_is_done_again_bit_for_bit_and_its_last_frame_is_whole(pool, sim, rows_spec, succeeded):
+    recorder = Attempts(pool, sim, seed=11).redo(succeeded, rows_spec, np.random.default_rng(0))
+    assert succeeded.outcome == "success"
+    assert len(recorder.rows) == len(succeeded.actions)
+    np.testing.assert_array_equal([row["action"] for row in recorder.rows], succeeded.actions)
+    assert sim.task.look(sim).goal[0]  # not a part in flight
+    assert max(row["observation.tactile"].max() for row in recorder.rows) > 45  # 10 N and more
+    gates = succeeded.provenance["gates"]
+    assert isinstance(gates, dict)
+    assert 3 < gates["force_n"] < 80
+    assert gates["penetration_m"] < 0.0003
+    subtasks = succeeded.provenance["subtasks"]
+    assert isinstance(subtasks, list)
+    assert [(s["arm"], s["subtask"]) for s in subtasks] == [
+        *(("left", "grasp cradle"), ("left", "hold cradle")),
+        *(("right", "grasp plug"), ("right", "insert plug")),
+    ]
+
+
+def test_actions_that_were_not_the_attempts_are_not_reproduced(pool, sim, rows_spec, succeeded):
+    changed = dataclasses.replace(succeeded, actions=succeeded.actions.copy(), provenance={})
+    changed.actions[200, 9] += np.float32(1e-3)
+    Attempts(pool, sim, seed=11).redo(changed, rows_spec)
+    assert changed.outcome == "not reproduced"
+
+
+def test_a_gate_that_is_not_passed_is_the_outcome(pool, sim, rows_spec, succeeded):
+    spec = dataclasses.replace(pool.spec, gates=GatesSpec(max_force_n=1.0))
+    strict = dataclasses.replace(succeeded, provenance={})
+    Attempts(SourcePool(spec, pool.sources), sim, seed=11).redo(strict, rows_spec)
+    assert strict.outcome == "force"
+    assert "N between mating parts, the gate is 1" in strict.reason
+
+
+def test_each_gate_names_what_it_measured():
+    gates = GatesSpec()
+    assert Measured(force_n=79.0, penetration_m=0.0002, joint_speed_radps=3.0).refused(gates) is None
+    assert Measured(force_n=np.nan).refused(gates) == ("force", "nan N between mating parts, the gate is 80")
+    assert Measured(penetration_m=4e-4).refused(gates) == (
+        "penetration",
+        "0.4 mm overlap of mating parts, the gate is 0.3",
+    )
+    assert Measured(joint_speed_radps=3.5).refused(gates) == (
+        "speed",
+        "3.5 rad/s of a joint, the gate is 3.1",
+    )
+    assert Measured(at_limit="left_joint5").refused(gates) == ("joint limit", "left_joint5 is commanded to its limit")
+
+
+def test_an_arm_that_touches_the_table_is_a_foreign_contact(sim):
+    sim.reset([0])
+    assert foreign_contact(sim, sim.state_rows()) is None
+    down = sim.proprioception()[0].copy()
+    down[1] += 1.0  # the left shoulder
+    sim.place_arms(down, down)
+    told = foreign_contact(sim, sim.state_rows())
+    assert told is not None
+    assert told[0] == "foreign contact"
+    assert "left_" in told[1]
+    assert "table" in told[1]
+
+
+def test_a_pose_out_of_reach_is_counted_and_not_raised(pool, sim):
+    far = [
+        dataclasses.replace(s, objects=dict(s.objects, plug=_shifted(s.objects["plug"], -1.0))) for s in pool.sources
+    ]
+    done = Attempts(SourcePool(pool.spec, far), sim, seed=11).run(0)
+    assert done.outcome == "unreachable"
+    assert "right arm: TCP at" in done.reason
+
+
+def _shifted(poses, x_m):
+    poses = poses.copy()
+    poses[:, 0, 3] += x_m
+    return poses
