@@ -27,8 +27,8 @@ by nature. Intervals are 95 % (Wilson). *Signal*: what the effect leaves above t
 are refitted, √(error² − 1) floors. *50 % detection*: the signal at which the effect is named in half of the robots, with its 95 %
 interval, from curves of one steepness (log odds 5 times log signal).
 
-All rows come from `python -m pipelines.diagnosis_study none chirp pack touch pairs removed outside amplitude` (20 seeds each by
-default) on two shared cores of an AMD EPYC, one process each; the tables say how many there are so far.
+All rows come from `python -m pipelines.diagnosis_study none chirp pack touch pairs_alike pairs removed outside amplitude` (20 seeds
+each by default) on two shared cores of an AMD EPYC, one process each; the tables say how many there are so far.
 
 """
 
@@ -63,8 +63,14 @@ def write_page(rows: list[dict]) -> None:
     lines.append(_spread("… held-out error / floor afterwards", held, (1.1, 1.3)))
     none = [r for r in rows if r["study"] == "none"]
     lines.append(_share("no hidden effect: nothing added", none, lambda r: not r["found"], 0.98))
-    both = [r for r in rows if r["study"] == "pairs" and material(r)]
-    lines.append(_share("two hidden effects: both found", both, exact, 0.75))
+    for words, alike in (
+        ("of 5 floors each", True),
+        ("of 1 to 30 floors each, so that one may be hidden by the other", False),
+    ):
+        both = [r for r in rows if r["study"] == "pairs" and material(r) and (r["strength"] is not None) == alike]
+        lines.append(_share(f"two hidden effects {words}: both found", both, exact_but_for_algebra, 0.75))
+        lines.append(_share("… both found to the letter", both, exact, 0.75))
+        lines.append(_share("… both named", both, named, 0.75))
     gone = [r for r in rows if r["study"] == "removed" and material(r)]
     words = 'the hidden effect unknown to the search: "something else" or a near-twin'
     lines.append(_share(words, gone, lambda r: r["status"] != "at_floor" or named(r), 0.95))

@@ -27,6 +27,8 @@ PAIRS = (
     ("error_deadband", "command_delay"),
     ("slew_limit", "coulomb_friction"),
 )
+PAIR_FLOORS = 5.0
+"""Noise floors that each of two effects leaves alone."""
 AMPLITUDES = (0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.3)
 """Noise floors that an effect leaves: around those at which it begins to be found."""
 STUDIES = {
@@ -38,6 +40,7 @@ STUDIES = {
     "outside": lambda n: study.removed("chirp", OUTSIDE, range(6000, 6000 + n)),
     "touch": lambda n: study.touch(REGISTERED_TOUCH, range(5000, 5000 + n)),
     "pairs": lambda n: study.pairs("pack", PAIRS, range(7000, 7000 + n)),
+    "pairs_alike": lambda n: study.pairs("pack", PAIRS, range(7000, 7000 + n), strength=PAIR_FLOORS),
 }
 
 

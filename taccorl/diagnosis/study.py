@@ -145,11 +145,8 @@ def named(row: dict[str, Any]) -> bool:
 
 def exact_but_for_algebra(row: dict[str, Any]) -> bool:
     """As ``exact``, but that of effects which no position can ever tell apart either one will do."""
-    if exact(row):
-        return True
-    if len(row["hidden"]) != 1 or not row["found"]:
-        return False
-    return any({row["hidden"][0], row["found"][0]} <= group for group in IDENTICAL)
+    found = row["found"] if len(row["hidden"]) > 1 else row["found"][:1]
+    return all(any(h == f or any({h, f} <= group for group in IDENTICAL) for f in found) for h in row["hidden"])
 
 
 def silently_wrong(row: dict[str, Any]) -> bool:
@@ -191,6 +188,8 @@ def removed(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job
     ]
 
 
-def pairs(design: str, couples: Sequence[tuple[str, str]], seeds: Sequence[int]) -> list[Job]:
-    """Two hidden effects at once."""
-    return [Job(study="pairs", hidden=c, seed=s, design=design) for s in seeds for c in couples]
+def pairs(
+    design: str, couples: Sequence[tuple[str, str]], seeds: Sequence[int], strength: float | None = None
+) -> list[Job]:
+    """Two hidden effects at once, each drawn as a single one is, or each of that strength: both of them are there to be found."""
+    return [Job(study="pairs", hidden=c, seed=s, design=design, strength=strength) for s in seeds for c in couples]

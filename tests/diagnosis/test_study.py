@@ -46,6 +46,9 @@ def test_what_algebra_makes_one_counts_either_way():
     assert not exact_but_for_algebra(row(("coulomb_friction",), ("stribeck_friction",)))
     assert not exact_but_for_algebra(row(("coulomb_friction",), ("backlash", "asymmetric_friction")))
     assert not exact_but_for_algebra(row(("coulomb_friction",), ()))
+    both = ("coulomb_friction", "command_delay")
+    assert exact_but_for_algebra(row(both, ("sensor_delay", "coulomb_friction")))
+    assert not exact_but_for_algebra(row(both, ("coulomb_friction", "asymmetric_friction")))  # one of them twice
 
 
 def test_effects_that_are_one_by_algebra_call_each_other_near_twins():
