@@ -27,8 +27,8 @@ by nature. Intervals are 95 % (Wilson). *Signal*: what the effect leaves above t
 are refitted, √(error² − 1) floors. *50 % detection*: the signal at which the effect is named in half of the robots, with its 95 %
 interval, from curves of one steepness (log odds 5 times log signal).
 
-All rows come from `python -m pipelines.diagnosis_study none chirp pack touch pairs_alike pairs removed outside amplitude` (20 seeds
-each by default) on two shared cores of an AMD EPYC, one process each; the tables say how many there are so far.
+All rows come from `python -m pipelines.diagnosis_study none chirp pack touch pairs_alike pairs removed outside amplitude` (20
+seeds each by default) on two shared cores of an AMD EPYC, one process each; the tables say how many there are so far.
 
 """
 

@@ -90,8 +90,8 @@ def main(argv: list[str]) -> int:
     swept, pressed = swept_joints(measurements), pressed_arms(measurements)
     if not swept and not pressed:
         raise TaccorlError(
-            "no fit recording sweeps a joint (2 mrad at least), or says what pads pressed; record sweeps: taccorl excite plans "
-            "them; of presses, state `pressed` in measurements.yaml"
+            "no fit recording sweeps a joint (2 mrad at least), or says what pads pressed; record sweeps or presses: taccorl "
+            "excite plans both; of presses, state `pressed` in measurements.yaml"
         )
     arms = arms_named(config.pads, pressed) if config.pads or not config.joints else ()
     signals = joints_named(config.joints, swept) if config.joints or (swept and not config.pads) else ()

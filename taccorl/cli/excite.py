@@ -1,11 +1,18 @@
 """``taccorl excite --twin=twin.yaml --joint=left_joint5 --effects=backlash,joint_compliance``: which motion to record next.
+``taccorl excite --twin=twin.yaml --pads=left --effects=taxel_creep,touch_lag``: how to press the pads next.
 
-Every motion of the library is scored by how far apart it keeps the rival explanations, in noise floors, however each is
-refitted; what is recorded already (--measurements) counts. Motions beyond the joint's limits or the motor's torque are refused.
-Writes a recording plan: plan.yaml, and for each motion a table of targets at 200 Hz, which a driver can send.
+Every motion or press of the library is scored by how far apart it keeps the rival explanations, in noise floors, however each is
+refitted; what is recorded already (--measurements) counts. Motions beyond the joint's limits or the motor's torque are refused,
+and presses beyond the gripper's range, its fingers' speed or the pads' travel.
+Writes a recording plan: plan.yaml, and for each motion or press a table of targets at 200 Hz, which a driver can send; for
+presses also what to say of them in measurements.yaml.
 """
 
 import csv
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,15 +21,22 @@ from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
 
 if TYPE_CHECKING:
-    from taccorl.diagnosis.excitation import Plan
+    import numpy as np
+
+    from taccorl.alignment.measurements import Measurements
+    from taccorl.diagnosis.excitation import Plan, PlannedMotion
+    from taccorl.diagnosis.presses import PlannedPress
+    from taccorl.sim.twin import TwinConfig
 
 
 @dataclass(kw_only=True)
 class ExciteConfig:
-    """Which motion to record next, so that rival effects can be told apart."""
+    """Which motion or press to record next, so that rival effects can be told apart."""
 
-    joint: str
+    joint: str | None = None
     """left_joint5."""
+    pads: str | None = None
+    """left, right: the pads of this arm, instead of a joint."""
     effects: list[str] = field(default_factory=list)
     """Rivals, two or more; those of the diagnosis in --diagnosis if not given."""
     twin: Path | None = None
@@ -32,63 +46,116 @@ class ExciteConfig:
     diagnosis: Path = Path("diagnosis")
     """Folder of a diagnosis: its fitted numbers, and its rivals where no effects are given."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
-    """``fitted``: nobody knows the gains, which then take up more."""
+    """Of a joint. ``fitted``: nobody knows the gains, which then take up more."""
     floor_rad: float = 2e-4
-    """Noise floor of the angle; that of the recordings where there are any."""
+    """Noise floor of a joint's angle; that of the recordings where there are any. Pads have the twin's own noise without."""
     num: int = 3
-    """So many motions are written, best first."""
+    """So many motions or presses are written, best first."""
     out: Path = Path("recording_plan")
     """Folder of the plan; it must not be there yet."""
 
 
 def main(argv: list[str]) -> int:
-    """0: a motion tells them apart; 1: none does."""
+    """0: something tells them apart; 1: nothing does."""
     config = parse(ExciteConfig, argv, positional="joint")
+    part = _part(config)
     if config.out.exists():
         raise TaccorlError(f"{config.out}: is there already; give another --out, or remove it")
     from taccorl.alignment.measurements import read_measurements
-    from taccorl.alignment.noise_floor import noise_floor
     from taccorl.cli.measured import twin_of
-    from taccorl.cli.tables import Bars
+
+    twin = twin_of(config.twin)
+    rivals, fitted = _rivals(config, part)
+    measurements = None if config.measurements is None else read_measurements(config.measurements)
+    if config.pads:
+        pressed = _presses(config.pads, twin, rivals, fitted, measurements)
+        _press_table(pressed)
+        _write_presses(pressed, config)
+        return int(bool(pressed.hopeless))
+    found = _motions(config, part, twin, rivals, fitted, measurements)
+    _table(found)
+    _write(found, config)
+    return int(bool(found.hopeless))
+
+
+def _part(config: ExciteConfig) -> str:
+    """``left_joint5`` or ``left pads``."""
+    from taccorl.diagnosis.motions import joint_number
+    from taccorl.errors import nearest
+    from taccorl.sim.robot import ARMS
+
+    if config.joint is not None and config.pads is not None:
+        raise TaccorlError(f"excite: {config.joint} or --pads={config.pads}: one at a time")
+    if config.joint is not None:
+        joint_number(config.joint)
+        return config.joint
+    if config.pads is None:
+        raise TaccorlError("excite: missing --joint=left_joint5, or --pads=left for the pads of that arm")
+    if config.pads not in ARMS:
+        raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ARMS)}")
+    for name in ("gains", "floor_rad"):
+        if getattr(config, name) != getattr(ExciteConfig(), name):
+            raise TaccorlError(f"--{name} is of joints; leave it out with --pads={config.pads}")
+    return f"{config.pads} pads"
+
+
+def _motions(
+    config: ExciteConfig,
+    signal: str,
+    twin: "TwinConfig",
+    rivals: list[str],
+    fitted: dict[str, dict[str, float]],
+    measurements: "Measurements | None",
+) -> "Plan[PlannedMotion]":
+    from taccorl.alignment.noise_floor import noise_floor
     from taccorl.diagnosis.excitation import plan, rest_pose
-    from taccorl.diagnosis.motions import LIBRARY, joint_number
+    from taccorl.diagnosis.motions import LIBRARY
     from taccorl.diagnosis.replays import BENCH_REST
 
-    joint_number(config.joint)
-    twin = twin_of(config.twin)
-    rivals, fitted = _rivals(config)
-    measurements = None if config.measurements is None else read_measurements(config.measurements)
     floor_rad = config.floor_rad
     if measurements is not None:
-        swept = [m for m in measurements.all if config.joint in m.signals]
+        swept = [m for m in measurements.all if signal in m.signals]
         if not swept:
-            raise TaccorlError(f"{config.measurements}: no recording has {config.joint}")
-        floor_rad = noise_floor([m.on_robot(BENCH_REST) for m in swept])[config.joint].value
-    with Bars(len(LIBRARY)) as bars:
-        count = 0
-
-        def done(name: str) -> None:
-            nonlocal count
-            count += 1
-            bars.update(name, count, len(LIBRARY))
-
-        found = plan(
+            raise TaccorlError(f"{config.measurements}: no recording has {signal}")
+        floor_rad = noise_floor([m.on_robot(BENCH_REST) for m in swept])[signal].value
+    with _counted(len(LIBRARY)) as done:
+        return plan(
             twin,
-            config.joint,
+            signal,
             rivals,
-            pose=rest_pose(config.joint, measurements),
+            pose=rest_pose(signal, measurements),
             floor_rad=floor_rad,
             measurements=measurements,
             gains=config.gains,
             fitted=fitted,
             done=done,
         )
-    _table(found)
-    _write(found, config)
-    return int(bool(found.hopeless))
 
 
-def _rivals(config: ExciteConfig) -> tuple[list[str], dict[str, dict[str, float]]]:
+def _presses(
+    arm: str,
+    twin: "TwinConfig",
+    rivals: list[str],
+    fitted: dict[str, dict[str, float]],
+    measurements: "Measurements | None",
+) -> "Plan[PlannedPress]":
+    from taccorl.diagnosis.presses import LIBRARY, plan_presses
+
+    with _counted(len(LIBRARY)) as done:
+        return plan_presses(twin, arm, rivals, measurements=measurements, fitted=fitted, done=done)
+
+
+@contextmanager
+def _counted(num: int) -> Iterator[Callable[[str], None]]:
+    """A bar over ``num`` motions or presses, to be told each one's name when it has been scored."""
+    from taccorl.cli.tables import Bars
+
+    with Bars(num) as bars:
+        count = itertools.count(1)
+        yield lambda name: bars.update(name, next(count), num)
+
+
+def _rivals(config: ExciteConfig, part: str) -> tuple[list[str], dict[str, dict[str, float]]]:
     """Effects to tell apart, and the numbers that a diagnosis fitted with each."""
     import json
 
@@ -98,7 +165,7 @@ def _rivals(config: ExciteConfig) -> tuple[list[str], dict[str, dict[str, float]
     path = config.diagnosis / NUMBERS
     d = {}
     if path.is_file():
-        d = json.loads(path.read_text(encoding="utf-8")).get("diagnoses", {}).get(config.joint, {})
+        d = json.loads(path.read_text(encoding="utf-8")).get("diagnoses", {}).get(part, {})
     rows = [e for r in d.get("rounds", [])[:1] for e in r["evidence"]]
     fitted = {e["name"]: e["base"] | e["values"] for e in rows}
     names = config.effects
@@ -106,8 +173,8 @@ def _rivals(config: ExciteConfig) -> tuple[list[str], dict[str, dict[str, float]
         names = [n for name, others in d.get("rivals", {}).items() for n in (name, *others)]
         if len(names) < 2:
             raise TaccorlError(
-                f"excite: which effects are to be told apart? {path} names no rivals of {config.joint}; "
-                "give --effects=backlash,joint_compliance"
+                f"excite: which effects are to be told apart? {path} names no rivals of {part}; "
+                f"give --effects={'taxel_creep,touch_lag' if config.pads else 'backlash,joint_compliance'}"
             )
     names = [part for name in names for part in name.split(",")]
     for name in names:
@@ -115,7 +182,44 @@ def _rivals(config: ExciteConfig) -> tuple[list[str], dict[str, dict[str, float]
     return names, fitted
 
 
-def _table(found: "Plan") -> None:
+def _table(found: "Plan[PlannedMotion]") -> None:
+    rows = [
+        (
+            p.motion.name,
+            f"× {p.motion.gain:g}",
+            f"{p.motion.payload_kg:g} kg" if p.motion.payload_kg else "",
+            f"{p.peak_torque_nm:.2f} N·m",
+        )
+        for p in found.planned
+    ]
+    floor = f"{found.floor * 1e3:.3g} mrad"
+    same = "from angles they are the same thing, pick either, or record efforts"
+    _show(found, floor, ("motion", "gains", "payload", "peak torque"), rows, same)
+
+
+def _press_table(found: "Plan[PlannedPress]") -> None:
+    from taccorl.diagnosis.touch_problem import FRAMES_A_ROW
+
+    rows = [
+        (
+            p.press.name,
+            f"{p.press.shape} of {1e3 * p.press.pressed('left').radius_m:g} mm",
+            f"{1e3 * p.press.penetration_m().max():.2f} mm",
+            f"{p.peak_force_n:.0f} N",
+        )
+        for p in found.planned
+    ]
+    floor = f"{found.floor:.2g} counts, a taxel's mean over {FRAMES_A_ROW} frames"
+    same = "from what pads read in a known object they are the same thing, pick either"
+    _show(found, floor, ("press", "radius", "depth", "peak force"), rows, same)
+
+
+def _show(found: "Plan", floor: str, heads: Sequence[str], rows: Sequence[Sequence[str]], same: str) -> None:
+    """The table, best first, what was refused, and what nothing tells apart.
+
+    Args:
+        same: what it means if two rivals cannot be told apart by anything.
+    """
     from rich.table import Table
 
     from taccorl.cli.tables import console
@@ -123,41 +227,43 @@ def _table(found: "Plan") -> None:
 
     pairs = list(found.planned[0].discrimination) if found.planned else []
     table = Table(box=None, pad_edge=False)
-    for head in ("motion", "gains", "payload", "peak torque", *pairs):
-        table.add_column(head, justify="left" if head == "motion" else "right", overflow="fold")
-    for p in found.planned:
-        apart = [f"{p.discrimination[pair]:.2f} ×" for pair in pairs]
-        payload = f"{p.motion.payload_kg:g} kg" if p.motion.payload_kg else ""
-        table.add_row(p.motion.name, f"× {p.motion.gain:g}", payload, f"{p.peak_torque_nm:.2f} N·m", *apart)
+    for head in (*heads, *pairs):
+        table.add_column(head, justify="left" if head == heads[0] else "right", overflow="fold")
+    for p, row in zip(found.planned, rows, strict=True):
+        table.add_row(*row, *(f"{p.discrimination[pair]:.2f} ×" for pair in pairs))
     out = console()
-    out.print(f"{found.signal}: noise floors ({found.floor_rad * 1e3:.3g} mrad) that stay between rivals after a refit")
+    out.print(f"{found.part}: noise floors ({floor}) that stay between rivals after a refit")
     out.print(table)
     for name, why in found.refused.items():
         out.print(f"not {name}: {why}")
     for pair in found.hopeless:
         best = found.best(pair)
-        same = (
-            "from angles they are the same thing, pick either, or record efforts"
-            if best < SAME
-            else "no single motion tells them apart for sure"
+        why = same if best < SAME else f"no single {heads[0]} tells them apart for sure"
+        out.print(f"{pair}: {best:.2f} floors at best, less than {TELLS:g}: {why}{_one_way(found, pair, rows)}")
+
+
+def _one_way(found: "Plan", pair: str, rows: Sequence[Sequence[str]]) -> str:
+    """What tells the two apart if it is one of them that is true."""
+    from taccorl.diagnosis.excitation import TELLS
+
+    words = ""
+    for k, truth in enumerate(pair.split(" | ")):
+        apart, name = max(
+            ((p.ways[pair][k], row[0]) for p, row in zip(found.planned, rows, strict=True)), default=(0.0, "")
         )
-        out.print(f"{pair}: {best:.2f} floors at best, less than {TELLS:g}: {same}")
+        if apart >= TELLS:
+            words += f"; if it is {truth}, {name} shows it ({apart:.2f})"
+    return words
 
 
-def _write(found: "Plan", config: ExciteConfig) -> None:
-    import yaml
-
+def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
     from taccorl.diagnosis.motions import RATE_HZ
 
     config.out.mkdir(parents=True)
-    chosen = found.planned[: config.num]
     entries = []
-    for number, p in enumerate(chosen, 1):
+    for number, p in enumerate(found.planned[: config.num], 1):
         name = f"{number}_{p.motion.name}.csv"
-        with (config.out / name).open("w", newline="", encoding="utf-8") as file:
-            rows = csv.writer(file)
-            rows.writerow(["t", f"{found.signal}.q_target"])
-            rows.writerows([f"{k / RATE_HZ:.3f}", f"{q:.6f}"] for k, q in enumerate(p.target))
+        _write_table(config.out / name, {f"{found.part}.q_target": p.target})
         entries.append(
             {
                 "table": name,
@@ -170,13 +276,65 @@ def _write(found: "Plan", config: ExciteConfig) -> None:
             }
         )
     words = {
-        "joint": found.signal,
+        "joint": found.part,
         "tells_apart": list(found.rivals),
         "rate_hz": RATE_HZ,
         "units": "t in s, q_target in rad",
         "how": "begin and end at rest; hold the other joints; record one motion twice",
         "motions": entries,
     }
-    path = config.out / "plan.yaml"
+    _write_plan(config.out, words, len(entries))
+
+
+def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
+    from taccorl.diagnosis.motions import RATE_HZ
+
+    config.out.mkdir(parents=True)
+    gripper = f"{config.pads}_gripper"
+    entries = []
+    for number, p in enumerate(found.planned[: config.num], 1):
+        name = f"{number}_{p.press.name}.csv"
+        _write_table(config.out / name, {f"{gripper}.q_target": p.target_m, f"{gripper}.opening": p.opening_m})
+        note = dataclasses.asdict(p.press.pressed(str(config.pads)))
+        entries.append(
+            {
+                "table": name,
+                "seconds": round(len(p.target_m) / RATE_HZ, 1),
+                "depth_m": round(float(p.press.penetration_m().max()), 6),
+                "range_m": [round(float(p.target_m.min()), 6), round(float(p.target_m.max()), 6)],
+                "peak_force_n": round(p.peak_force_n, 1),
+                "floors_apart": {pair: round(apart, 2) for pair, apart in p.discrimination.items()},
+                "pressed": {k: list(v) if isinstance(v, tuple) else v for k, v in note.items() if v is not None},
+            }
+        )
+    words = {
+        "pads": found.part,
+        "tells_apart": list(found.rivals),
+        "rate_hz": RATE_HZ,
+        "units": "t in s, q_target and opening in m",
+        "how": "hold the object where `pressed` says, in the hand's own frame, and the arm still; record pads and measured "
+        "opening, one press twice; put `pressed` under the recording's name in measurements.yaml",
+        "targets": "q_target is what to command a gripper that yields as the twin's does, opening is where its fingers shall "
+        "then be; a gripper that goes where it is told is sent the opening",
+        "presses": entries,
+    }
+    _write_plan(config.out, words, len(entries))
+
+
+def _write_table(path: Path, columns: "dict[str, np.ndarray]") -> None:
+    """``t`` [s] and the columns at 200 Hz, to the micrometre or microrad."""
+    from taccorl.diagnosis.motions import RATE_HZ
+
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(["t", *columns])
+        for k, values in enumerate(zip(*columns.values(), strict=True)):
+            rows.writerow([f"{k / RATE_HZ:.3f}", *(f"{v:.6f}" for v in values)])
+
+
+def _write_plan(folder: Path, words: dict[str, object], num: int) -> None:
+    import yaml
+
+    path = folder / "plan.yaml"
     path.write_text(yaml.safe_dump(words, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    print(f"wrote {path} and {len(entries)} tables of targets")
+    print(f"wrote {path} and {num} tables of targets")

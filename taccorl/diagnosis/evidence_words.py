@@ -45,9 +45,10 @@ def unit_words(unit: str) -> str:
 
 
 def to_record(part: str, name: str, rivals: Sequence[str]) -> list[str]:
-    """What would tell an effect from its rivals: a command that plans it for a joint, in words for pads."""
-    if "_joint" in part:
-        return [f"taccorl excite {part} --effects={','.join((name, *rivals))}"]
+    """What would tell an effect from its rivals: a command that plans it for a joint or for pads, in words for anything else."""
+    where = part if "_joint" in part else f"--pads={part.removesuffix(' pads')}" if part.endswith(" pads") else ""
+    if where:
+        return [f"taccorl excite {where} --effects={','.join((name, *rivals))}"]
     return list(dict.fromkeys(cls.to_record for other in (name, *rivals) if (cls := effect_class(other))))
 
 

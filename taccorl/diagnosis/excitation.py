@@ -1,4 +1,5 @@
 """Which motion to record next: the one on which two rival explanations stay furthest apart, however the other is refitted.
+Joints here; presses of the pads, by the same measure, in ``presses``.
 
 T-optimal design (Atkinson and Fedorov 1975): for rivals A and B and a motion, A predicts what would be measured; B with all its
 numbers is fitted to that; what it cannot follow, in noise floors, is the discrimination, in the worse of both directions. Below
@@ -21,9 +22,10 @@ from taccorl.diagnosis.fit import fit, rms, stacked
 from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.joints import moves
 from taccorl.diagnosis.motions import LIBRARY, OPENING_M, POSES, RATE_HZ, TORQUE_NM, Motion, Room, joint_number
-from taccorl.diagnosis.problem import Recording, Values, chosen
+from taccorl.diagnosis.problem import Problem, Recording, Values, chosen
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.sim.effects.effect import Effect
 from taccorl.sim.robot import JOINTS
 from taccorl.sim.twin import TwinConfig
 
@@ -37,15 +39,15 @@ STEPS = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """A motion that could be recorded."""
+    """Something that could be recorded."""
 
-    motion: Motion
-    target: np.ndarray
-    """(T,) rad at 200 Hz."""
-    peak_torque_nm: float
-    """That the motor would need, as the twin says."""
-    discrimination: dict[str, float]
-    """"a | b" → floors that stay between the two after a refit."""
+    ways: dict[str, tuple[float, float]]
+    """"a | b" → floors that stay between the two after a refit of b to a's truth, and of a to b's."""
+
+    @property
+    def discrimination(self) -> dict[str, float]:
+        """ "a | b" → the lesser of both: nobody knows which is true."""
+        return {pair: min(ways) for pair, ways in self.ways.items()}
 
     @property
     def worst(self) -> float:
@@ -58,24 +60,37 @@ class Planned:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
-    """Motions that could be recorded of one joint, best first."""
+class PlannedMotion(Planned):
+    """A motion of a joint."""
 
-    signal: str
+    motion: Motion
+    target: np.ndarray
+    """(T,) rad at 200 Hz."""
+    peak_torque_nm: float
+    """That the motor would need, as the twin says."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan[PlannedT: Planned]:
+    """What could be recorded of one part, best first."""
+
+    part: str
+    """``left_joint5``, ``left pads``."""
     rivals: tuple[str, ...]
-    floor_rad: float
-    planned: tuple[Planned, ...]
+    floor: float
+    """Of noise: rad of a joint, counts of a row of a pad's taxel."""
+    planned: tuple[PlannedT, ...]
     refused: dict[str, str]
-    """Motion → why it must not be recorded."""
+    """Motion or press → why it must not be recorded."""
 
     @property
     def hopeless(self) -> tuple[str, ...]:
-        """Pairs that no motion here tells apart for sure."""
+        """Pairs that nothing here tells apart for sure."""
         pairs = [f"{a} | {b}" for a, b in itertools.combinations(self.rivals, 2)]
         return tuple(pair for pair in pairs if self.best(pair) < TELLS)
 
     def best(self, pair: str) -> float:
-        """Floors between the two on the motion that keeps them furthest apart; 0 without any motion."""
+        """Floors between the two on what keeps them furthest apart; 0 where nothing may be recorded."""
         return max((p.discrimination[pair] for p in self.planned), default=0.0)
 
 
@@ -90,7 +105,7 @@ def plan(
     fitted: Mapping[str, Values] | None = None,
     gains: GainsAre = "auto",
     done: Callable[[str], None] = lambda _: None,
-) -> Plan:
+) -> Plan[PlannedMotion]:
     """Score every motion of the library.
 
     Args:
@@ -103,10 +118,7 @@ def plan(
     Raises:
         TaccorlError: less than two rivals, or the joint has no room to move about its pose.
     """
-    if len(set(rivals)) < 2:
-        raise TaccorlError(
-            f"excite: give two effects or more that are to be told apart, not {', '.join(rivals) or 'none'}"
-        )
+    check_rivals(rivals)
     room = room_of(config, signal, pose)
     if min(room.wide_rad, room.sweep_rad) <= 0:
         raise TaccorlError(
@@ -124,10 +136,24 @@ def plan(
             refused[motion.name] = f"needs {peak:.1f} N·m of {limit:g}"
         else:
             apart = _apart(config, signal, rivals, pose, motion, target, floor_rad, measurements, fitted or {}, gains)
-            planned.append(Planned(motion=motion, target=target, peak_torque_nm=peak, discrimination=apart))
+            planned.append(PlannedMotion(motion=motion, target=target, peak_torque_nm=peak, ways=apart))
         done(motion.name)
-    planned.sort(key=lambda p: (-p.worst, -p.mean))
-    return Plan(signal=signal, rivals=tuple(rivals), floor_rad=floor_rad, planned=tuple(planned), refused=refused)
+    return Plan(part=signal, rivals=tuple(rivals), floor=floor_rad, planned=best_first(planned), refused=refused)
+
+
+def check_rivals(rivals: Sequence[str]) -> None:
+    """
+    Raises:
+        TaccorlError: less than two.
+    """
+    if len(set(rivals)) < 2:
+        raise TaccorlError(
+            f"excite: give two effects or more that are to be told apart, not {', '.join(rivals) or 'none'}"
+        )
+
+
+def best_first[PlannedT: Planned](planned: Sequence[PlannedT]) -> tuple[PlannedT, ...]:
+    return tuple(sorted(planned, key=lambda p: (-p.worst, -p.mean)))
 
 
 def room_of(config: TwinConfig, signal: str, pose: np.ndarray) -> Room:
@@ -197,40 +223,63 @@ def _apart(
     measurements: Measurements | None,
     fitted: Mapping[str, Values],
     gains: GainsAre,
-) -> dict[str, float]:
-    """Pair → floors between the two on this motion."""
+) -> dict[str, tuple[float, float]]:
+    """Pair → floors between the two on this motion, each being the truth."""
     new = imagined(config, signal, pose, motion, target, floor_rad)
     known = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
     known = [m if m.signals == ACTION_NAMES else m.on_robot(new.target[0]) for m in known]
     problem = JointProblem(config, signal, Measurements((*known, new)), gains=gains, effort=False)
-    numbers = {
-        c.name: problem.start
-        | {f.name: f.start for f in c.frees}
-        | c.starts[len(c.starts) // 2]
-        | fitted.get(c.name, {})
-        for c in chosen(problem, rivals)
+    recordings = [dataclasses.replace(r, floor=np.array([floor_rad])) for r in problem.fit]
+    present = [problem.candidates[name].make(problem.start) for name in problem.present]
+    told = explanations(problem, rivals, problem.start, fitted)
+    return {
+        f"{a} | {b}": floors_between(problem, present, told[a], told[b], recordings)
+        for a, b in itertools.combinations(rivals, 2)
     }
-    answers = {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """An effect with all numbers of the part, as if that were the truth."""
+
+    values: Values
+    effect: Effect
+
+
+def explanations(
+    problem: Problem, rivals: Sequence[str], start: Mapping[str, float], fitted: Mapping[str, Values]
+) -> dict[str, Explanation]:
+    """Rivals with the numbers that were ``fitted`` with each; without, typical of their kind.
+
+    Args:
+        start: numbers of the part without a rival.
+
+    Raises:
+        TaccorlError: a rival that is no candidate of the problem.
+    """
+    found = {}
     for c in chosen(problem, rivals):
-        effects = [*_present(problem), c.make(numbers[c.name])]
-        answers[c.name] = [_said(problem, r, numbers[c.name], effects, floor_rad) for r in problem.fit]
-    apart = {}
-    for a, b in itertools.combinations(rivals, 2):
-        ways = []
-        for truth, other in ((a, b), (b, a)):
-            model = fit(problem, answers[truth], (*problem.present, other), numbers[other], STEPS)
-            ways.append(rms(stacked(problem, model.values, model.effects, answers[truth][-1:])))
-        apart[f"{a} | {b}"] = min(ways)
-    return apart
+        typical = {f.name: f.start for f in c.frees} | c.starts[len(c.starts) // 2]
+        values = dict(start) | typical | fitted.get(c.name, {})
+        found[c.name] = Explanation(values=values, effect=c.make(values))
+    return found
 
 
-def _present(problem: JointProblem) -> list:
-    return [problem.candidates[name].make(problem.start) for name in problem.present]
+def floors_between(
+    problem: Problem, present: Sequence[Effect], a: Explanation, b: Explanation, recordings: Sequence[Recording]
+) -> tuple[float, float]:
+    """Floors that stay between two explanations on the last recording, b fitted to what a says of all of them, and a to b's.
 
+    Args:
+        present: effects that the twin has in any case; their numbers are fitted, too.
+        recordings: those that are there already, then the one that could be made.
+    """
 
-def _said(
-    problem: JointProblem, recording: Recording, values: Values, effects: Sequence, floor_rad: float
-) -> Recording:
-    """The recording as these numbers explain it, without noise."""
-    measured = problem.simulate(values, effects, recording)
-    return dataclasses.replace(recording, measured=measured, floor=np.array([floor_rad]))
+    def left(truth: Explanation, other: Explanation) -> float:
+        effects = [*present, truth.effect]
+        said = [dataclasses.replace(r, measured=problem.simulate(truth.values, effects, r)) for r in recordings]
+        names = (*(e.name for e in present), other.effect.name)
+        model = fit(problem, said, names, other.values, STEPS)
+        return rms(stacked(problem, model.values, model.effects, said[-1:]))
+
+    return left(a, b), left(b, a)
