@@ -1,6 +1,10 @@
 """Importing this registers what TacCoRL adds to LeRobot. LeRobot does so by itself (see ``_shim.py``).
 
-Nothing else lives here. The tactile policy will register here, too.
+Nothing else lives here.
 """
 
-import taccorl.lerobot_plugin.env  # noqa: F401
+import taccorl.lerobot_plugin.env
+import taccorl.policies.tactile_pi05.configuration_tactile_pi05
+import taccorl.training.reading
+
+taccorl.training.reading.install()

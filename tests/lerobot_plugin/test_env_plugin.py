@@ -129,7 +129,7 @@ def test_unknown_task_is_named_with_its_neighbour() -> None:
 @pytest.mark.slow
 def test_loading_the_plugin_loads_no_simulator() -> None:
     code = (
-        "import sys, lerobot.envs.configs; before = set(sys.modules); import taccorl.lerobot_plugin\n"
+        "import sys, lerobot.envs.configs, lerobot.policies; before = set(sys.modules); import taccorl.lerobot_plugin\n"
         "new = set(sys.modules) - before; assert all(m.startswith('taccorl') for m in new), new\n"
         "assert 'mujoco' not in sys.modules\n"
     )

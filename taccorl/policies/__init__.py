@@ -1,0 +1,1 @@
+"""Policies that feel, as LeRobot policies."""

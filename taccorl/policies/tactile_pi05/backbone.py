@@ -1,0 +1,119 @@
+"""Sizes of the vision-language model and its action expert: π0.5's own, and small ones of the same code to train from scratch.
+
+LeRobot 0.6.1 writes three things into pi05 that a smaller one cannot change: 8 query heads with one key-value head, as many
+layers in the expert as in the language model, and its sizes (modeling_pi05.py, ``compute_layer_complete`` and
+``PaliGemmaWithExpertModel.__init__``). So the small ones keep the first two and have an ``__init__`` of their own.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot.policies.pi05.modeling_pi05 import (
+    CONFIG_MAPPING,
+    PaliGemmaForConditionalGenerationWithPiGemma,
+    PaliGemmaWithExpertModel,
+    PiGemmaForCausalLM,
+)
+from torch import nn
+
+_HEADS, _KV_HEADS = 8, 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """Widths are of hidden states; an ``mlp`` is the inner width of a layer's feed-forward half."""
+
+    depth: int
+    head_width: int
+    text_width: int
+    text_mlp: int
+    expert_width: int
+    expert_mlp: int
+    vision_width: int
+    vision_depth: int
+    vision_heads: int
+    vision_mlp: int
+    patch_px: int
+    vocabulary: int
+
+
+SIZES = {
+    # 30 M, for one GPU from scratch: 196 tokens a camera
+    "small": Size(
+        depth=7, head_width=48, text_width=384, text_mlp=1536, expert_width=256, expert_mlp=1024,
+        vision_width=256, vision_depth=6, vision_heads=4, vision_mlp=1024, patch_px=16, vocabulary=512,
+    ),
+    # 1 M, for a CPU: 64 tokens a camera
+    "tiny": Size(
+        depth=3, head_width=16, text_width=96, text_mlp=192, expert_width=64, expert_mlp=128,
+        vision_width=64, vision_depth=2, vision_heads=4, vision_mlp=128, patch_px=28, vocabulary=512,
+    ),
+}  # fmt: skip
+BACKBONES = ("full", *SIZES)
+
+
+class SmallBackbone(PaliGemmaWithExpertModel):
+    """LeRobot's PaliGemma with its action expert, in another size and without language heads."""
+
+    def __init__(
+        self, size: Size, *, precision: Any, image_px: int, freeze_vision_encoder: bool, train_expert_only: bool
+    ) -> None:
+        nn.Module.__init__(self)
+        self.freeze_vision_encoder = freeze_vision_encoder
+        self.train_expert_only = train_expert_only
+        shared: dict[str, Any] = {
+            "num_hidden_layers": size.depth,
+            "num_attention_heads": _HEADS,
+            "num_key_value_heads": _KV_HEADS,
+            "head_dim": size.head_width,
+            "vocab_size": size.vocabulary,
+            "pad_token_id": 0,
+            "hidden_activation": "gelu_pytorch_tanh",
+            "dtype": "float32",
+        }
+        text = {"model_type": "gemma", "hidden_size": size.text_width, "intermediate_size": size.text_mlp, **shared}
+        vision = {
+            "model_type": "siglip_vision_model",
+            "hidden_size": size.vision_width,
+            "intermediate_size": size.vision_mlp,
+            "num_hidden_layers": size.vision_depth,
+            "num_attention_heads": size.vision_heads,
+            "image_size": image_px,
+            "patch_size": size.patch_px,
+            "projection_dim": size.text_width,
+            "vision_use_head": False,
+            "dtype": "float32",
+        }
+        # transformers' configs take any key; their declared type is that of their common base
+        make_paligemma: Any = CONFIG_MAPPING["paligemma"]
+        make_gemma: Any = CONFIG_MAPPING["gemma"]
+        self.paligemma = PaliGemmaForConditionalGenerationWithPiGemma(
+            config=make_paligemma(
+                text_config={**text, "use_adarms": False, "adarms_cond_dim": None},
+                vision_config=vision,
+                projection_dim=size.text_width,
+                hidden_size=size.text_width,
+                image_token_index=size.vocabulary - 1,
+            )
+        )
+        self.gemma_expert = PiGemmaForCausalLM(
+            config=make_gemma(
+                hidden_size=size.expert_width,
+                intermediate_size=size.expert_mlp,
+                use_adarms=True,
+                adarms_cond_dim=size.expert_width,
+                **shared,
+            )
+        )
+        expert: Any = self.gemma_expert.model
+        expert.embed_tokens = None
+        without_language_heads(self)
+        self.to_bfloat16_for_selected_params(precision)
+        self._set_requires_grad()
+
+
+def without_language_heads(backbone: PaliGemmaWithExpertModel) -> None:
+    """Actions never use them: 0.79 of the full size's 4.14 billion parameters."""
+    models: list[Any] = [backbone.paligemma, backbone.gemma_expert]
+    for model in models:
+        model.lm_head = None

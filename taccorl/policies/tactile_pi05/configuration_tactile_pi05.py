@@ -1,0 +1,239 @@
+"""``lerobot-train --policy.type=tactile_pi05``: every setting of the policy; the defaults are the paper's co-training table."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig, LRSchedulerConfig
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.utils.constants import OBS_STATE
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
+
+TACTILE = "observation.tactile"
+_PALIGEMMA = "google/paligemma-3b-pt-224"
+_BACKBONES = ("full", "small", "tiny")
+
+
+@LRSchedulerConfig.register_subclass("warmup_then_cosine")
+@dataclass
+class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
+    """LeRobot's schedule over the whole training, however long it is, with a warm-up that stays as long as it says.
+
+    LeRobot's own shortens the warm-up with the training: 100 of 3000 steps become 33 of 1000, the paper's 100 are for both.
+    """
+
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=min(self.num_warmup_steps, num_training_steps),
+            num_decay_steps=num_training_steps,
+            peak_lr=self.peak_lr,
+            decay_lr=self.decay_lr,
+        ).build(optimizer, num_training_steps)
+
+
+@dataclass(frozen=True)
+class TactileFormat:
+    """How a dataset stores touch: ``tactile`` of the feature in its ``meta/info.json``."""
+
+    sensor: str
+    pads: tuple[str, ...]
+    rows: int
+    columns: int
+    scheme: str
+    gain_per_count: float
+
+    @property
+    def layout(self) -> tuple[int, int, int]:
+        """Pads, rows, columns."""
+        return len(self.pads), self.rows, self.columns
+
+    @property
+    def num_taxels(self) -> int:
+        """K."""
+        return math.prod(self.layout)
+
+    @classmethod
+    def of_feature(cls, feature: dict[str, Any], where: str) -> "TactileFormat":
+        """
+        Args:
+            feature: its entry in LeRobot's features dict.
+            where: the dataset, for errors.
+
+        Raises:
+            TaccorlError: the feature does not say its format, or says one that its shape denies.
+        """
+        told = feature.get("tactile")
+        if not isinstance(told, dict):
+            raise TaccorlError(
+                f"{where}: {TACTILE} does not say what its {feature.get('shape')} numbers are (no 'tactile' with layout, scheme "
+                "and gain in meta/info.json): write the dataset with taccorl ingest, which brings other LeRobot datasets, too"
+            )
+        history, pads, rows, columns = told["layout"]
+        if history != 1 or math.prod(told["layout"]) != math.prod(feature["shape"]):
+            raise TaccorlError(f"{where}: {TACTILE} has shape {feature['shape']}, its layout says {told['layout']}")
+        names = tuple(told["pads"])
+        if len(names) != pads:
+            raise TaccorlError(f"{where}: {TACTILE} names the pads {', '.join(names)}, its layout says {pads}")
+        return cls(told["sensor"], names, rows, columns, told["scheme"], float(told["gain_per_count"]))
+
+
+@PreTrainedConfig.register_subclass("tactile_pi05")
+@dataclass
+class TactilePI05Config(PI05Config):
+    """π0.5 with touch. Fields that are not here are those of LeRobot's pi05."""
+
+    backbone: str = "full"
+    """full: π0.5's own size (3.4 billion parameters); small (30 million) and tiny (1 million): from scratch, same code."""
+    base_checkpoint: str | None = None
+    """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: at random."""
+    tokenizer: str | None = None
+    """Hub id, folder, or ``bytes``. None: the backbone's own, PaliGemma's for full and bytes for small and tiny."""
+    tactile: bool = True
+    """False: vision only. The same policy without touch: LeRobot's pi05."""
+    tactile_history: int = 10
+    """L: readings in the window, one a row of the dataset."""
+    prefix_tokens: int = 8
+    """M_pre: touch tokens in the context of the vision-language model."""
+    suffix_tokens: int = 8
+    """M_suf: touch tokens beside the actions, in the action expert."""
+    contact_threshold: float = CONTACT_THRESHOLD
+    """λ_f: a reading above this is contact."""
+    contact_min_active: int = MIN_ACTIVE
+    """m: taxels of one reading that have to be above it."""
+    tactile_format: TactileFormat | None = None
+    """How touch is stored. None: read from the dataset when training starts, then kept in the checkpoint."""
+    fps: int | None = None
+    """Rows a second that the window and the actions count in. None: read from the dataset likewise."""
+    sim_weight: float = 0.5
+    """α: how much simulated rows count against real ones. Used where the dataset tells them apart (``observation.is_sim``)."""
+
+    cuda_graph: bool = True
+    """On a GPU, record a chunk's computation once and replay it (see ``graphed``). False: step by step, as LeRobot does."""
+
+    chunk_size: int = 10
+    """H: actions that are predicted."""
+    n_action_steps: int = 10
+    """Actions of a chunk that are executed before the policy looks again."""
+    num_inference_steps: int = 4
+    """K_denoise."""
+    optimizer_lr: float = 2.5e-5
+    """η_max."""
+    scheduler_warmup_steps: int = 100
+    """T_warm."""
+    scheduler_decay_lr: float = 5e-6
+    """η_min, reached at the last step of the training, whatever ``scheduler_decay_steps`` says."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: a setting out of its range or an unknown backbone.
+        """
+        super().__post_init__()
+        if self.backbone not in _BACKBONES:
+            raise TaccorlError(f"--policy.backbone={self.backbone}: {nearest(self.backbone, _BACKBONES)}")
+        if self.base_checkpoint and self.backbone != "full":
+            raise TaccorlError(
+                f"--policy.base_checkpoint={self.base_checkpoint}: π0.5's weights fit --policy.backbone=full only, not "
+                f"{self.backbone}, which is trained from scratch"
+            )
+        for name in ("tactile_history", "prefix_tokens", "suffix_tokens", "contact_min_active"):
+            if getattr(self, name) < 1:
+                raise TaccorlError(
+                    f"--policy.{name}={getattr(self, name)}: at least 1; no touch at all: --policy.tactile=false"
+                )
+        if not 0 <= self.contact_threshold < math.inf:
+            raise TaccorlError(
+                f"--policy.contact_threshold={self.contact_threshold}: 0 or more, in normalised readings"
+            )
+        if self.compile_model:
+            raise TaccorlError(
+                "--policy.compile_model=true: LeRobot's compilation does not know of touch; leave it out"
+            )
+
+    @property
+    def tokenizer_name(self) -> str:
+        """The tokenizer that is meant."""
+        return self.tokenizer or (_PALIGEMMA if self.backbone == "full" else "bytes")
+
+    @property
+    def window_delta_indices(self) -> dict[str, list[int]]:
+        """Features that come with their last rows, −(L−1) … 0. Read by ``taccorl.training.reading``."""
+        return {TACTILE: list(range(1 - self.tactile_history, 1))} if self.tactile and self.tactile_history > 1 else {}
+
+    def get_scheduler_preset(self) -> WarmupThenCosine:
+        return WarmupThenCosine(
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_decay_lr,
+        )
+
+    def validate_features(self) -> None:
+        """Keeps what the policy looks at: state, pictures and, unless it is vision only, touch.
+
+        Touch becomes ``ENV``, a kind that LeRobot's normaliser leaves as it is. The rest (a flag, the touch of faster clocks)
+        would be normalised for nothing.
+        """
+        super().validate_features()
+        given = self.input_features or {}
+        kept = {k: f for k, f in given.items() if f.type is FeatureType.VISUAL or k == OBS_STATE}
+        if self.tactile and TACTILE in given:
+            kept[TACTILE] = PolicyFeature(FeatureType.ENV, given[TACTILE].shape)
+        self.input_features = kept
+
+    def require_tactile_format(self) -> TactileFormat:
+        """
+        Raises:
+            TaccorlError: neither a dataset nor a checkpoint has told it.
+        """
+        if self.tactile_format is None:
+            raise TaccorlError(
+                "tactile_pi05 does not know how touch is stored: make the policy from a dataset or a checkpoint, or set "
+                "--policy.tactile_format; without touch: --policy.tactile=false"
+            )
+        return self.tactile_format
+
+    def match_dataset(self, meta: Any) -> None:
+        """Take the format of touch and the rate from the dataset's metadata, or compare with those known already.
+
+        Args:
+            meta: LeRobot's ``LeRobotDatasetMetadata``.
+
+        Raises:
+            TaccorlError: no touch, another format or rate than the checkpoint's, episodes shorter than the window.
+        """
+        where = f"dataset {meta.repo_id} ({meta.root})"
+        if self.fps is not None and self.fps != meta.fps:
+            raise TaccorlError(
+                f"{where} has {meta.fps} rows a second, the checkpoint was trained with {self.fps}: its action chunks would be "
+                f"another length. Ingest the recordings at {self.fps}, or train anew"
+            )
+        self.fps = int(meta.fps)
+        if not self.tactile:
+            return
+        if TACTILE not in meta.features:
+            raise TaccorlError(
+                f"{where} has no {TACTILE}, the policy feels: --policy.tactile=false trains on vision only; a dataset with touch "
+                f"comes from taccorl ingest. It has: {', '.join(k for k in meta.features if k.startswith('observation.'))}"
+            )
+        found = TactileFormat.of_feature(meta.features[TACTILE], where)
+        if self.tactile_format is not None and self.tactile_format != found:
+            ours, theirs = dataclasses.asdict(self.tactile_format), dataclasses.asdict(found)
+            said = "; ".join(
+                f"{k}: {theirs[k]} there, {ours[k]} in the checkpoint" for k in ours if ours[k] != theirs[k]
+            )
+            raise TaccorlError(f"{where}: its touch is not that of the checkpoint: {said}. Ingest alike, or train anew")
+        self.tactile_format = found
+        lengths = list(meta.episodes["length"])
+        if min(lengths) < self.tactile_history:
+            shortest = lengths.index(min(lengths))
+            raise TaccorlError(
+                f"{where}: episode {shortest} has {min(lengths)} rows, the window of touch {self.tactile_history}: leave it out "
+                "(lerobot-edit-dataset, --operation.type=delete_episodes), or give a shorter --policy.tactile_history"
+            )

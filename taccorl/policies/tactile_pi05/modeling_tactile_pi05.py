@@ -1,0 +1,418 @@
+"""π0.5 with touch: LeRobot's pi05 with two more kinds of tokens, gated by contact (paper §3.2).
+
+    Z̄ = Z_base + CrossAttn(Z_base, Z_touch)        the cross-attention's output is zero when training starts
+    prefix = [Z̄, Z_touch]                          images, language and state; then M_pre tokens of touch
+    suffix = [Z_touch, actions]                     M_suf tokens of touch, then the noisy actions
+
+Without contact neither exists for the row: attention masks the tokens, positions do not count them and the sum is left out.
+So a row without contact is what plain pi05 makes of it, bit by bit: when the whole batch is without, and on a CPU also beside
+rows with contact (``_by_contact``).
+"""
+
+import logging
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import torch
+from lerobot.policies.pi05.modeling_pi05 import PI05Policy, PI05Pytorch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from torch import Tensor, nn
+
+from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.backbone import SIZES, SmallBackbone, without_language_heads
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TACTILE, TactilePI05Config
+from taccorl.policies.tactile_pi05.encoder import TactileEncoder, TouchIntoContext
+from taccorl.policies.tactile_pi05.gate import contact
+from taccorl.policies.tactile_pi05.graphed import GraphedCall
+from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
+from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkpoint
+
+# B batch, L history, K taxels, P pads, R rows, C columns, M tokens, T tokens of the context, D width, H horizon, A action
+ACTION_IS_PAD = "action_is_pad"
+_TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
+
+_log = logging.getLogger(__name__)
+
+
+class Touch(NamedTuple):
+    """Touch of a batch as tokens."""
+
+    prefix_BMD: Tensor
+    suffix_BMD: Tensor
+    contact_B: Tensor
+    """c_t: rows without contact do not have the tokens."""
+
+
+class TactileConditioning(nn.Module):
+    """All that touch adds to pi05's weights: ``model.tactile.*`` of a checkpoint."""
+
+    def __init__(self, config: TactilePI05Config, prefix_width: int, suffix_width: int) -> None:
+        super().__init__()
+        width = min(_TOUCH_WIDTH, prefix_width)
+        self.num_prefix = config.prefix_tokens
+        self.encoder = TactileEncoder(
+            config.require_tactile_format().layout,
+            config.tactile_history,
+            config.prefix_tokens + config.suffix_tokens,
+            width,
+        )
+        self.to_prefix = nn.Linear(width, prefix_width)  # W_τ
+        self.to_suffix = nn.Linear(width, suffix_width)
+        self.into_context = TouchIntoContext(prefix_width)
+
+    def forward(self, readings_BLPRC: Tensor, contact_B: Tensor) -> Touch:
+        """Tokens of normalised readings."""
+        tokens_BMD = self.encoder(readings_BLPRC)
+        prefix_BMD, suffix_BMD = tokens_BMD[:, : self.num_prefix], tokens_BMD[:, self.num_prefix :]
+        return Touch(self.to_prefix(prefix_BMD), self.to_suffix(suffix_BMD), contact_B)
+
+
+class TactilePI05Pytorch(PI05Pytorch):
+    """LeRobot's model; only ``embed_prefix`` and ``embed_suffix`` know of touch."""
+
+    def __init__(self, config: TactilePI05Config, rtc_processor: Any = None) -> None:
+        if config.backbone == "full":
+            super().__init__(config, rtc_processor)
+            without_language_heads(self.paligemma_with_expert)
+        else:
+            self._init_small(config, rtc_processor)
+        if config.tactile:
+            text_config: Any = self.paligemma_with_expert.paligemma.config.text_config
+            prefix_width = text_config.hidden_size
+            self.tactile = TactileConditioning(config, prefix_width, self.action_in_proj.out_features)
+        self._touch: Touch | None = None
+
+    def _init_small(self, config: TactilePI05Config, rtc_processor: Any) -> None:
+        """As ``PI05Pytorch.__init__``, around another backbone."""
+        nn.Module.__init__(self)
+        self.config, self.rtc_processor = config, rtc_processor
+        size = SIZES[config.backbone]
+        image_px = config.image_resolution[0]
+        if config.image_resolution != (image_px, image_px) or image_px % size.patch_px:
+            raise TaccorlError(
+                f"--policy.image_resolution={config.image_resolution}: --policy.backbone={config.backbone} takes squares of a "
+                f"multiple of {size.patch_px} pixels, such as [224, 224]"
+            )
+        self.paligemma_with_expert = SmallBackbone(
+            size,
+            precision=config.dtype,
+            image_px=image_px,
+            freeze_vision_encoder=config.freeze_vision_encoder,
+            train_expert_only=config.train_expert_only,
+        )
+        width = size.expert_width
+        self.action_in_proj = nn.Linear(config.max_action_dim, width)
+        self.action_out_proj = nn.Linear(width, config.max_action_dim)
+        self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
+        self.gradient_checkpointing_enabled = False
+
+    @contextmanager
+    def feeling(
+        self, readings_BLPRC: Tensor | None, contact_B: Tensor | None, *, masked: bool = False
+    ) -> Iterator[None]:
+        """Whatever is computed inside feels these readings. None, or contact nowhere in the batch: plain pi05.
+
+        Args:
+            masked: tokens are there, masked, even if contact is nowhere; so that nothing is read back from a GPU.
+        """
+        if readings_BLPRC is not None and contact_B is not None and (masked or bool(contact_B.any())):
+            self._touch = self.tactile(readings_BLPRC, contact_B)
+        try:
+            yield
+        finally:
+            self._touch = None
+
+    def embed_prefix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor]:
+        context_BTD, valid_BT, starts_block_BT = super().embed_prefix(*args, **kwargs)
+        if self._touch is None:
+            return context_BTD, valid_BT, starts_block_BT
+        tokens_BMD, contact_B = self._touch.prefix_BMD, self._touch.contact_B
+        felt_BTD = self.tactile.into_context(context_BTD.to(tokens_BMD.dtype), tokens_BMD).to(context_BTD.dtype)
+        # where, not a product with the gate: 0 · x is not 0 for every x, and −0 + 0 is not −0
+        context_BTD = torch.where(contact_B[:, None, None], context_BTD + felt_BTD, context_BTD)
+        num_tokens = tokens_BMD.shape[1]
+        return (
+            torch.cat([context_BTD, tokens_BMD.to(context_BTD.dtype)], dim=1),
+            torch.cat([valid_BT, contact_B[:, None].expand(-1, num_tokens)], dim=1),
+            torch.cat([starts_block_BT, starts_block_BT.new_zeros(len(starts_block_BT), num_tokens)], dim=1),
+        )
+
+    def embed_suffix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        actions_BHD, valid_BH, starts_block_BH, condition_BD = super().embed_suffix(*args, **kwargs)
+        if self._touch is None:
+            return actions_BHD, valid_BH, starts_block_BH, condition_BD
+        tokens_BMD, contact_B = self._touch.suffix_BMD, self._touch.contact_B
+        # Touch is a block of its own: the context does not look at it, the actions do, and it does not look at them.
+        starts_block_BM = starts_block_BH.new_zeros(len(starts_block_BH), tokens_BMD.shape[1])
+        starts_block_BM[:, 0] = 1
+        return (
+            torch.cat([tokens_BMD.to(actions_BHD.dtype), actions_BHD], dim=1),
+            torch.cat([contact_B[:, None].expand(-1, tokens_BMD.shape[1]), valid_BH], dim=1),
+            torch.cat([starts_block_BM, starts_block_BH], dim=1),
+            condition_BD,
+        )
+
+
+class TactilePI05Policy(PI05Policy):
+    """The policy that LeRobot trains and scores. Made from a dataset's metadata or a checkpoint."""
+
+    config_class = TactilePI05Config
+    name = "tactile_pi05"
+
+    def __init__(
+        self,
+        config: TactilePI05Config,
+        *,
+        dataset_meta: Any = None,
+        dataset_stats: Any = None,
+        from_base: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        """
+        Args:
+            dataset_meta: LeRobot's metadata of the dataset that it is trained on; None when it is only used.
+            dataset_stats: its statistics, of which the share of simulated rows is used.
+            from_base: start from ``config.base_checkpoint``, if there is one; a checkpoint of its own needs no start.
+
+        Raises:
+            TaccorlError: the dataset does not fit (see ``TactilePI05Config.match_dataset``), lacks a domain that counts, or
+                the base checkpoint does not fit.
+        """
+        PreTrainedPolicy.__init__(self, config)
+        if dataset_meta is not None:
+            config.match_dataset(dataset_meta)
+        self.mixture = Mixture.of_statistics(dataset_stats, config.sim_weight)
+        if dataset_meta is not None and self.mixture is None:
+            _log.info("dataset %s has no %s: one domain, sim_weight is not used", dataset_meta.repo_id, IS_SIM)
+        config.validate_features()
+        self.config: TactilePI05Config = config
+        self.init_rtc_processor()
+        self.model = TactilePI05Pytorch(config, rtc_processor=self.rtc_processor)
+        if config.base_checkpoint and from_base:
+            load_base_weights(self, config.base_checkpoint)
+        if config.gradient_checkpointing:
+            self.model.gradient_checkpointing_enable()
+        self.model.to(config.device)
+        self.reset()
+
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: Any, *, config: Any = None, revision: str | None = None, **kwargs: Any
+    ) -> "TactilePI05Policy":
+        """A checkpoint of this policy, in evaluation mode. LeRobot's own for pi05 goes on with random weights where it cannot
+        read them.
+
+        Raises:
+            TaccorlError: it cannot be read, or its weights are not exactly this policy's.
+        """
+        hub = {k: kwargs.pop(k) for k in ("cache_dir", "token", "local_files_only", "force_download") if k in kwargs}
+        for ignored in ("strict", "proxies", "resume_download"):
+            kwargs.pop(ignored, None)
+        if config is None:
+            config = TactilePI05Config.from_pretrained(pretrained_name_or_path, revision=revision, **hub)
+        policy = cls(config, from_base=False, **kwargs)
+        load_checkpoint(policy, str(pretrained_name_or_path), revision=revision, **hub)
+        return policy.eval()
+
+    def reset(self) -> None:
+        """Forget actions and touch of the last episode."""
+        super().reset()
+        self._graph: GraphedCall | None = getattr(self, "_graph", None)
+        self._felt: deque[Tensor] = deque(maxlen=self.config.tactile_history)
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
+        """The co-training loss (see ``mixture``) over pi05's flow-matching losses, and what there is to be logged.
+
+        A row's loss is the mean over its action steps without those behind the episode's end (LeRobot's pi05 counts them,
+        too). Where there are none, and one domain, it is LeRobot's to the bit.
+
+        Args:
+            reduction: "mean", or "none" for the rows, (B,), of which it is the mean.
+        """
+        losses_BHA, contact_B = self.flow_losses(batch)
+        rows, horizon = losses_BHA.shape[:2]
+        counts_BH = losses_BHA.new_ones(rows, horizon)
+        if ACTION_IS_PAD in batch:
+            valid_BH = ~batch[ACTION_IS_PAD].to(losses_BHA.device)
+            counts_BH = valid_BH * (horizon / valid_BH.sum(dim=1, keepdim=True).clamp(min=1))
+        losses_BHA = losses_BHA * counts_BH[:, :, None]
+        num_actions = self._num_actions
+        told: dict[str, Tensor] = {}
+        if self.mixture is not None:
+            is_sim_B = self._is_sim(batch)
+            told |= self.mixture.means(losses_BHA[:, :, :num_actions].mean(dim=(1, 2)).detach(), is_sim_B)
+            losses_BHA = losses_BHA * self.mixture.weights(is_sim_B)[:, None, None]
+        losses_BHA = losses_BHA[:, :, :num_actions]
+        loss = losses_BHA.mean(dim=(1, 2)) if reduction == "none" else losses_BHA.mean()
+        told["loss"] = loss.detach().mean()
+        if contact_B is not None:
+            told["contact_rate"] = contact_B.float().mean()
+        said: dict[str, Any] = dict(zip(told, torch.stack(list(told.values())).tolist(), strict=True))
+        return loss, said
+
+    def flow_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
+        """(B, H, 32) squared errors of the velocity at a random time, and (B,) contact (None: vision only).
+
+        Draws noise and time from torch's generator as LeRobot's pi05 does.
+        """
+        images, image_masks = self._preprocess_images(batch)
+        actions = self.prepare_action(batch)
+        noise = self.model.sample_noise(actions.shape, actions.device)
+        time = self.model.sample_time(len(actions), actions.device)
+        prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+
+        def compute(rows: Any) -> Tensor:
+            seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
+            return self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
+
+        return self._by_contact(batch, compute)
+
+    @property
+    def _num_actions(self) -> int:
+        """A; the rest fills up to π0.5's 32."""
+        assert self.config.output_features is not None, "validate_features, which __init__ calls, has set them"
+        return self.config.output_features[ACTION].shape[0]
+
+    def _by_contact(
+        self, batch: dict[str, Tensor], compute: Callable[[Any], Tensor], *, together: bool = False
+    ) -> tuple[Tensor, Tensor | None]:
+        """What ``compute(rows)`` gives for all rows, which feel what they touch; and (B,) contact.
+
+        Masked tokens weigh exactly nothing, but they make sums longer, and a longer sum is rounded elsewhere: 5e-7 in a
+        chunk. So on a CPU rows with and without contact are computed apart, for the same work, and the latter are plain
+        pi05's to the bit. A GPU's kernels round by the size of the batch in any case, and half a batch costs it as much
+        time as a whole one: there they stay together.
+
+        Args:
+            together: on a CPU, too.
+        """
+        readings, contact_B = self._readings(batch)
+        if readings is None or contact_B is None or together or contact_B.device.type != "cpu" or contact_B.all():
+            with self.model.feeling(readings, contact_B):
+                return compute(slice(None)), contact_B
+        kinds = [rows for rows in (contact_B.nonzero()[:, 0], (~contact_B).nonzero()[:, 0]) if len(rows)]
+        parts = []
+        for rows in kinds:
+            with self.model.feeling(readings[rows], contact_B[rows]):
+                parts.append(compute(rows))
+        return torch.cat(parts)[torch.cat(kinds).argsort()], contact_B
+
+    def _is_sim(self, batch: dict[str, Tensor]) -> Tensor:
+        if IS_SIM not in batch:
+            raise TaccorlError(f"the batch has no {IS_SIM}, the dataset's statistics have: they are of another dataset")
+        return batch[IS_SIM].reshape(len(batch[IS_SIM])) > 0.5
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor]) -> Tensor:
+        """The next action of each environment; called at every control step, as it is here that touch is remembered."""
+        if self.config.tactile and TACTILE in batch and batch[TACTILE].ndim == 2:
+            batch = {**batch, TACTILE: self._remember(batch[TACTILE])}
+        return super().select_action(batch)
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """(B, H, A). ``observation.tactile`` is the window, (B, L, K): a caller that re-plans rarely has to bring it along.
+
+        Args:
+            kwargs: LeRobot's, for real-time chunking; and ``noise`` (B, H, 32), ``num_steps``.
+        """
+        self.eval()
+        images, image_masks = self._preprocess_images(batch)
+        prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        noise = kwargs.pop("noise", None)
+        if noise is None:
+            shape = len(prompt[0]), self.config.chunk_size, self.config.max_action_dim
+            noise = self.model.sample_noise(shape, prompt[0].device)
+
+        if self._may_graph(prompt[0].device) and not kwargs:
+            actions = self._graphed_chunk(images, image_masks, *prompt, noise, *self._readings(batch))
+            return actions[:, :, : self._num_actions]
+
+        def compute(rows: Any) -> Tensor:
+            seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
+            return self.model.sample_actions(*seen, *(x[rows] for x in prompt), noise=noise[rows], **kwargs)
+
+        actions, _ = self._by_contact(batch, compute, together=self._rtc_enabled())
+        return actions[:, :, : self._num_actions]
+
+    def _may_graph(self, device: torch.device) -> bool:
+        # Autocast keeps copies of weights, which a graph would go on using.
+        return (
+            self.config.cuda_graph
+            and device.type == "cuda"
+            and not self._rtc_enabled()
+            and not torch.is_autocast_enabled(device.type)
+        )
+
+    def _graphed_chunk(
+        self,
+        images: list[Tensor],
+        image_masks: list[Tensor],
+        tokens: Tensor,
+        token_mask: Tensor,
+        noise: Tensor,
+        readings: Tensor | None,
+        contact_B: Tensor | None,
+    ) -> Tensor:
+        """(B, H, 32) by a recorded graph; contact is a mask, also where there is none."""
+        num, felt = len(images), () if readings is None or contact_B is None else (readings, contact_B)
+
+        def compute(*x: Tensor) -> Tensor:
+            with self.model.feeling(*(x[2 * num + 3 :] or (None, None)), masked=True):
+                return self.model.sample_actions(
+                    list(x[:num]), list(x[num : 2 * num]), *x[2 * num : 2 * num + 2], noise=x[2 * num + 2]
+                )
+
+        if self._graph is None:
+            self._graph = GraphedCall(compute)
+        return self._graph(*images, *image_masks, tokens, token_mask, noise, *felt)
+
+    def train(self, mode: bool = True) -> "TactilePI05Policy":
+        if not mode and not self.training:
+            return self  # LeRobot says so at every step; going through all modules takes longer than touch does
+        if mode:
+            self._graph = None  # its memory is training's
+        return super().train(mode)
+
+    def _remember(self, reading_BK: Tensor) -> Tensor:
+        """(B, L, K): the last L readings; before the first there were none, it is repeated, as in datasets."""
+        if self._felt and self._felt[-1].shape != reading_BK.shape:
+            raise TaccorlError(
+                f"{TACTILE}: {tuple(reading_BK.shape)} after {tuple(self._felt[-1].shape)}: another number of environments "
+                "is another rollout; call reset() first"
+            )
+        self._felt.append(reading_BK)
+        missing = self.config.tactile_history - len(self._felt)
+        return torch.stack([self._felt[0]] * missing + list(self._felt), dim=1)
+
+    def _readings(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
+        """(B, L, P, R, C) readings and (B,) contact; None and None for vision only.
+
+        Raises:
+            TaccorlError: no touch, or another number of readings or taxels than the policy takes.
+        """
+        if not self.config.tactile:
+            return None, None
+        told = self.config.require_tactile_format()
+        if TACTILE not in batch:
+            raise TaccorlError(f"the policy feels, but the batch has no {TACTILE}; it has: {', '.join(batch)}")
+        readings, history, num_taxels = batch[TACTILE], self.config.tactile_history, told.num_taxels
+        if readings.ndim == 2 and history == 1:
+            readings = readings[:, None]
+        if readings.shape[1:] != (history, num_taxels):
+            raise TaccorlError(
+                f"{TACTILE}: {tuple(readings.shape)}, the policy takes (batch, {history}, {num_taxels}): a window of "
+                f"{history} readings. In training it comes from LeRobot's reader as taccorl.lerobot_plugin extends it, which "
+                "TACCORL_NO_PATCH=1 turns off (then: --policy.tactile_history=1); predict_action_chunk needs it in the "
+                "observation; select_action remembers it by itself"
+            )
+        readings = readings.to(torch.float32)
+        gate = contact(readings, self.config.contact_threshold, self.config.contact_min_active)
+        return readings.unflatten(-1, told.layout), gate
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        targets = super()._get_default_peft_targets()
+        return {**targets, "modules_to_save": ["model.tactile"]} if self.config.tactile else targets

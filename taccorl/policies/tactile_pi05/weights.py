@@ -1,0 +1,83 @@
+"""Weights from files, loudly: LeRobot's loader for pi05 prints what went wrong and goes on with random weights."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub import hf_hub_download
+from lerobot.policies.pi05.modeling_pi05 import PI05Policy
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from taccorl.errors import TaccorlError
+
+WEIGHTS = "model.safetensors"
+_TACTILE = "model.tactile."
+_UNUSED = "lm_head.weight"
+
+
+def load_base_weights(policy: PI05Policy, source: str) -> None:
+    """Plain π0.5 into ``policy``: everything but touch comes from it, and all of it is used but for its language heads.
+
+    Args:
+        source: folder, file or hub id, such as lerobot/pi05_base.
+
+    Raises:
+        TaccorlError: it cannot be read, or does not match; nothing was loaded then.
+    """
+    stored = _read(source, f"--policy.base_checkpoint={source}")
+    fixed = policy._fix_pytorch_state_dict_keys(
+        stored, policy.config
+    )  # older names; the embedding out of the language head
+    weights = {k if k.startswith("model.") else f"model.{k}": v for k, v in fixed.items() if not k.endswith(_UNUSED)}
+    _load(policy, weights, f"--policy.base_checkpoint={source}", may_miss=_TACTILE)
+
+
+def load_checkpoint(policy: PI05Policy, source: str, **hub: Any) -> None:
+    """The policy's own weights, all of them and no others.
+
+    Raises:
+        TaccorlError: they cannot be read, or do not match; nothing was loaded then.
+    """
+    _load(policy, _read(source, f"checkpoint {source}", **hub), f"checkpoint {source}", may_miss=None)
+
+
+def _read(source: str, said: str, **hub: Any) -> dict[str, Tensor]:
+    path = Path(source).expanduser()
+    try:
+        if path.is_dir():
+            path = path / WEIGHTS
+        elif not path.is_file():
+            path = Path(hf_hub_download(source, WEIGHTS, **hub))
+        return load_file(path)
+    except (OSError, ValueError, SafetensorError) as error:  # the hub's own errors are OSErrors or ValueErrors
+        first = next(iter(str(error).splitlines()), type(error).__name__)
+        raise TaccorlError(
+            f"{said}: no weights to read: {first} Give a folder with {WEIGHTS}, that file, or a hub id (which needs network, "
+            "HF_HUB_OFFLINE unset)"
+        ) from error
+
+
+def _load(policy: PI05Policy, weights: dict[str, Tensor], said: str, *, may_miss: str | None) -> None:
+    wanted = {k: v.shape for k, v in policy.state_dict().items()}
+    missing = [k for k in wanted if k not in weights and not (may_miss and k.startswith(may_miss))]
+    unknown = [k for k in weights if k not in wanted]
+    other = [
+        f"{k} {tuple(v.shape)} there, {tuple(wanted[k])} here"
+        for k, v in weights.items()
+        if k in wanted and v.shape != wanted[k]
+    ]
+    faults = [("missing", missing), ("unknown here", unknown), ("of another shape", other)]
+    if any(names for _, names in faults):
+        config: Any = policy.config
+        told = "; ".join(f"{len(names)} {what}, first {_first(names)}" for what, names in faults if names)
+        raise TaccorlError(
+            f"{said}: its weights are not those of this policy (--policy.backbone={config.backbone}, "
+            f"--policy.tactile={str(config.tactile).lower()}): {told}. Nothing was loaded"
+        )
+    policy.load_state_dict(weights, strict=False)
+
+
+def _first(names: Iterable[str]) -> str:
+    return next(iter(names))

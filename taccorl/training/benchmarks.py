@@ -1,0 +1,110 @@
+"""Figures of training; ``make bench ONLY=loading``."""
+
+import dataclasses
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import numpy as np
+
+from taccorl.benchmark import Row, benchmark, spread
+
+EPISODES, EPISODE_ROWS = 2, 128
+BATCH, WORKERS, EPOCHS = 8, 2, 3
+HORIZON, HISTORY = 10, 10
+
+
+@benchmark("loading")
+def loading_speed() -> Iterator[Row]:
+    """Rows a second out of two worker processes, taccorl's reader beside LeRobot's own on the same dataset."""
+    from lerobot.datasets.dataset_reader import DatasetReader
+
+    from taccorl.training.reading import FastReader
+
+    with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
+        for label, cameras, goal in (("3 × 224² video", 3, "≥ 2"), ("no video", 0, "≥ 5")):
+            root = _write(Path(name) / f"cameras_{cameras}", cameras)
+            loaders = {reader: _loader(root, reader) for reader in (FastReader, DatasetReader)}
+            backend = loaders[FastReader].dataset.reader._video_backend  # pyright: ignore[reportAttributeAccessIssue]
+            # One epoch of each in turn: other work on the machine meets both. The first, in which workers start, is not counted.
+            figures = {reader: [] for reader in loaders}
+            for _ in range(1 + EPOCHS):
+                for reader, loader in loaders.items():
+                    figures[reader].append(_rows_per_s(loader))
+            ours, stock = figures[FastReader][1:], figures[DatasetReader][1:]
+            ratios = [a / b for a, b in zip(ours, stock, strict=True)]
+            shown = f"{label} ({backend})" if cameras else label
+            yield Row(
+                name=f"rows per second over LeRobot's reader, {shown}, H = {HORIZON}, L = {HISTORY}, {WORKERS} workers",
+                value=mean(ratios), unit="×", goal=goal, rival="LeRobot, rows/s", rival_value=mean(stock), n=EPOCHS,
+                spread=spread(ratios),
+            )  # fmt: skip
+            yield Row(name=f"rows per second, {shown}", value=mean(ours), unit="rows/s", n=EPOCHS, spread=spread(ours))
+
+
+def _write(root: Path, cameras: int) -> Path:
+    """Noisy touch and smooth, moving pictures: simulated, not a robot's."""
+    from taccorl.data.episode import Episode, Pictures
+    from taccorl.data.lerobot_format import write_episodes
+    from taccorl.data.spec import find_spec, load_dataset_spec
+
+    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
+    features = {key: f for key, f in spec.features.items() if not f.optional}
+    for key in spec.keys("video")[cameras:]:
+        del features[key]
+    touch = "observation.tactile"
+    spec = dataclasses.replace(spec, features=features, sensors={touch: spec.sensors[touch]})
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[0:224, 0:224]
+
+    def pictures() -> Iterator[Pictures]:
+        for k in range(EPISODE_ROWS):
+            wave = 128 + 80 * np.sin((row + 3 * k) / 17) * np.cos((column - 2 * k) / 23)
+            picture = np.clip(wave[:, :, None] + rng.normal(0, 4, (224, 224, 3)), 0, 255).astype(np.uint8)
+            yield {key: picture.copy() for key in spec.keys("video")}
+
+    def episode(seed: int) -> Episode:
+        numbers = np.random.default_rng(seed)
+        arrays: dict[str, np.ndarray] = {
+            key: numbers.normal(size=(EPISODE_ROWS, 14)).astype(np.float32) for key in ("observation.state", "action")
+        }
+        arrays[touch] = numbers.integers(-15, 15, (EPISODE_ROWS, 1536)).astype(np.int16)
+        return Episode(
+            name=f"benchmark {seed}", spec=spec, start_ns=0, arrays=arrays, picture_keys=tuple(spec.keys("video")),
+            pictures=pictures if cameras else lambda: iter([{}] * EPISODE_ROWS), instruction="insert the plug",
+            origin="simulated: made for a benchmark",
+        )  # fmt: skip
+
+    write_episodes([episode(seed) for seed in range(EPISODES)], root)
+    return root
+
+
+def _loader(root: Path, reader: Any) -> Any:
+    """As lerobot-train makes it, with ``reader`` inside."""
+    import torch
+    from lerobot.datasets import lerobot_dataset
+
+    before = lerobot_dataset.DatasetReader
+    lerobot_dataset.DatasetReader = reader
+    try:
+        windows = {
+            "observation.tactile": [k / 30 for k in range(1 - HISTORY, 1)],
+            "action": [k / 30 for k in range(HORIZON)],
+        }
+        dataset = lerobot_dataset.LeRobotDataset("local/bench", root=root, delta_timestamps=windows, return_uint8=True)
+    finally:
+        lerobot_dataset.DatasetReader = before
+    return torch.utils.data.DataLoader(
+        dataset, BATCH, shuffle=True, num_workers=WORKERS, persistent_workers=True, multiprocessing_context="spawn"
+    )
+
+
+def _rows_per_s(loader: Any) -> float:
+    """Of one epoch."""
+    start_s, rows = time.perf_counter(), 0
+    for batch in loader:
+        rows += len(batch["index"])
+    return rows / (time.perf_counter() - start_s)

@@ -1,0 +1,234 @@
+"""LeRobot's dataset reader, faster and with windows of touch; installed by ``taccorl.lerobot_plugin``.
+
+LeRobot 0.6.1 makes Python lists of every column of every row that a window or an action chunk names (dataset_reader.py,
+``_query_hf_dataset``), opens a video anew for every picture where torchcodec finds no FFmpeg (video_utils.py), and gives a
+window to all observations or to none (factory.py, ``resolve_delta_timestamps``). Here rows are read out of the Arrow columns
+that are wanted, videos stay open, and a policy's ``window_delta_indices`` names the features that get a window. What comes out
+is the same, to the bit and the type; tests compare.
+
+``TACCORL_NO_PATCH=1`` leaves LeRobot as it is. So does any other version of LeRobot than the one that was compared.
+"""
+
+import bisect
+import contextlib
+import logging
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import torch
+from av.container import InputContainer
+from lerobot import __version__ as lerobot_version
+from lerobot.datasets.dataset_reader import DatasetReader
+from torch import Tensor
+
+from taccorl.policies.tactile_pi05.mixture import IS_SIM
+
+COMPARED_VERSION = "0.6.1"
+OPEN_VIDEOS = 16
+"""Video files that a process keeps open, each with a decoder of a few MB."""
+_log = logging.getLogger(__name__)
+
+
+def install() -> bool:
+    """Let LeRobot make its datasets with ``FastReader``; once, however often it is called. False: left as it is."""
+    from lerobot.datasets import factory, lerobot_dataset
+
+    if os.environ.get("TACCORL_NO_PATCH") == "1":
+        _log.warning(
+            "TACCORL_NO_PATCH=1: LeRobot reads datasets by itself: 5 to 20 times slower, touch without its history "
+            "(--policy.tactile_history=1), and α takes the share of simulated rows of the whole dataset even where "
+            "--dataset.episodes takes a part of it"
+        )
+        return False
+    if lerobot_version != COMPARED_VERSION:
+        _log.warning(
+            "LeRobot %s reads datasets by itself: taccorl's faster reader was compared with %s only. Touch comes without its "
+            "history (--policy.tactile_history=1); pip install lerobot==%s has all",
+            lerobot_version,
+            COMPARED_VERSION,
+            COMPARED_VERSION,
+        )
+        return False
+    if lerobot_dataset.DatasetReader is not FastReader:
+        lerobot_dataset.DatasetReader = FastReader
+        factory.resolve_delta_timestamps = with_windows(factory.resolve_delta_timestamps)
+    return True
+
+
+def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Callable[[Any, Any], dict[str, list] | None]:
+    """LeRobot's ``resolve_delta_timestamps``, to which a policy's ``window_delta_indices`` (feature → rows) are added."""
+
+    def resolve_with_windows(cfg: Any, ds_meta: Any) -> dict[str, list] | None:
+        deltas = dict(resolve(cfg, ds_meta) or {})
+        for key, indices in (getattr(cfg, "window_delta_indices", None) or {}).items():
+            if key in ds_meta.features:
+                deltas[key] = [index / ds_meta.fps for index in indices]
+        return deltas or None
+
+    return resolve_with_windows
+
+
+class Column:
+    """One column of a table as NumPy views of its pieces: nothing is copied before a row is asked for."""
+
+    def __init__(self, column: pa.ChunkedArray) -> None:
+        """
+        Raises:
+            TypeError: no numbers, or some are missing.
+        """
+        kind = column.type
+        size = 1
+        self.shape: tuple[int, ...] = ()
+        if pa.types.is_fixed_size_list(kind):
+            size, kind = kind.list_size, kind.value_type
+            self.shape = (size,)
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or column.null_count:
+            raise TypeError(f"a column of {column.type}")
+        self._pieces, self._starts, start = [], [], 0
+        for chunk in column.chunks:
+            if len(chunk):
+                numbers = chunk.flatten() if self.shape else chunk
+                self._pieces.append(numbers.to_numpy(zero_copy_only=True).reshape(len(chunk), size))
+                self._starts.append(start)
+                start += len(chunk)
+        # As LeRobot's own way through Python's numbers makes them.
+        self._dtype = np.int64 if pa.types.is_integer(kind) else np.float32
+
+    def rows(self, rows: list[int]) -> Tensor:
+        """(len(rows), *shape)"""
+        found = []
+        for row in rows:
+            piece = bisect.bisect_right(self._starts, row) - 1
+            found.append(self._pieces[piece][row - self._starts[piece]])
+        return torch.from_numpy(np.stack(found).astype(self._dtype)).reshape(len(rows), *self.shape)
+
+
+class FastReader(DatasetReader):
+    """LeRobot's reader, where a dataset is numbers and colour videos; anything else goes LeRobot's own way."""
+
+    _columns: dict[str, Column] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k != "_columns"}  # a worker makes its own, of the same files
+
+    def _build_index_mapping(self) -> None:
+        super()._build_index_mapping()
+        self._columns = None
+        if self.episodes is not None and self.hf_dataset is not None and IS_SIM in self.hf_dataset.column_names:
+            # Which rows the share p of the loss's weights counts: those that are trained on.
+            share = np.asarray(self.hf_dataset.data.column(IS_SIM).to_numpy(), dtype=np.float64).mean()
+            assert self._meta.stats is not None, "LeRobot writes statistics with every dataset"
+            self._meta.stats[IS_SIM]["mean"] = np.array([share])
+
+    def columns(self) -> dict[str, Column]:
+        """Feature → its column; empty: a dataset that is left to LeRobot."""
+        if self._columns is None:
+            dataset, features = self.hf_dataset, self._meta.features
+            assert dataset is not None, "LeRobot loads the table before it reads rows"
+            self._columns = {}
+            plain = dataset._indices is None and not self._meta.depth_keys and not self._meta.image_keys
+            if plain and set(dataset.column_names) == set(features) - set(self._meta.video_keys):
+                with contextlib.suppress(TypeError, pa.ArrowInvalid):
+                    self._columns = {key: Column(dataset.data.column(key)) for key in dataset.column_names}
+        return self._columns
+
+    def get_item(self, idx: int) -> dict:
+        columns = self.columns()
+        if not columns or not isinstance(idx, int | np.integer):
+            return super().get_item(idx)
+        row = int(idx) + len(self.hf_dataset) * (idx < 0)  # pyright: ignore[reportArgumentType]
+        if not 0 <= row < len(self.hf_dataset):  # pyright: ignore[reportArgumentType]
+            return super().get_item(idx)
+        episode, index = int(columns["episode_index"].rows([row])), int(columns["index"].rows([row]))
+        windows: dict[str, list[int]] = {}
+        padding: dict[str, Tensor] = {}
+        if self.delta_indices is not None:
+            windows, padding = self._get_query_indices(index, episode)
+        item: dict[str, Any] = {k: column.rows([row])[0] for k, column in columns.items() if k not in windows}
+        item |= padding | self._query_hf_dataset(windows)
+        if self._meta.video_keys:
+            times_s = self._get_query_timestamps(item["timestamp"].item(), windows)
+            item = self._query_videos(times_s, episode) | item
+        if self._image_transforms is not None:
+            for camera in self._meta.camera_keys:
+                item[camera] = self._image_transforms(item[camera])
+        assert self._meta.tasks is not None, "LeRobot loads tasks with the metadata"
+        item["task"] = self._meta.tasks.iloc[item["task_index"].item()].name
+        return item
+
+    def _query_hf_dataset(self, query_indices: dict[str, list[int]]) -> dict:
+        columns = self.columns()
+        if not columns:
+            return super()._query_hf_dataset(query_indices)
+        relative = self._absolute_to_relative_idx
+        return {
+            key: columns[key].rows(rows if relative is None else [relative[row] for row in rows])
+            for key, rows in query_indices.items()
+            if key in columns
+        }
+
+    def _query_videos(self, query_timestamps: dict[str, list[float]], ep_idx: int) -> dict[str, Tensor]:
+        single = all(len(times_s) == 1 for times_s in query_timestamps.values())
+        if self._video_backend != "pyav" or not single or self._meta.depth_keys:
+            return super()._query_videos(query_timestamps, ep_idx)
+        assert self._meta.episodes is not None, "LeRobot loads episodes with the metadata"
+        episode, pictures = self._meta.episodes[ep_idx], {}
+        for key, (time_s,) in query_timestamps.items():
+            path = self.root / self._meta.get_video_file_path(ep_idx, key)
+            picture = _OPEN.picture(path, episode[f"videos/{key}/from_timestamp"] + time_s, self._tolerance_s)
+            if picture is None:  # LeRobot says what is wrong
+                return super()._query_videos(query_timestamps, ep_idx)
+            pictures[key] = picture if self._return_uint8 else picture.to(torch.float32) / 255
+        return pictures
+
+
+class OpenVideos(threading.local):
+    """Videos that stay open between pictures; each thread and each process has its own."""
+
+    def __init__(self) -> None:
+        self._process = os.getpid()
+        self._open: OrderedDict[Path, InputContainer] = OrderedDict()
+
+    def picture(self, path: Path, time_s: float, tolerance_s: float) -> Tensor | None:
+        """(3, rows, columns) uint8 of the frame that is nearest to ``time_s``; None: none within the tolerance."""
+        nearest, distance_s = None, tolerance_s
+        for frame, frame_s in self._frames(path, time_s):
+            if abs(frame_s - time_s) < distance_s:
+                nearest, distance_s = frame, abs(frame_s - time_s)
+            if frame_s >= time_s:
+                break
+        if nearest is None:
+            return None
+        return torch.from_numpy(nearest.to_ndarray(format="rgb24")).permute(2, 0, 1).contiguous()
+
+    def _frames(self, path: Path, time_s: float) -> Iterator[tuple[av.VideoFrame, float]]:
+        """From the last keyframe that is not after ``time_s`` on."""
+        container = self._container(path)
+        stream = container.streams.video[0]
+        assert stream.time_base is not None, "LeRobot's videos have a time base"
+        container.seek(round(time_s / stream.time_base) - 1, backward=True, any_frame=False, stream=stream)
+        for frame in container.decode(stream):
+            if frame.pts is not None:
+                yield frame, float(frame.pts * stream.time_base)
+
+    def _container(self, path: Path) -> InputContainer:
+        if self._process != os.getpid():  # a fork shares its parent's place in each file
+            self.__init__()
+        if path in self._open:
+            self._open.move_to_end(path)
+            return self._open[path]
+        container = self._open[path] = av.open(str(path))
+        container.streams.video[0].thread_type = "NONE"  # frame threads read ahead, for one frame that is in vain
+        if len(self._open) > OPEN_VIDEOS:
+            self._open.popitem(last=False)[1].close()
+        return container
+
+
+_OPEN = OpenVideos()

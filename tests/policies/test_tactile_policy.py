@@ -1,0 +1,273 @@
+"""Touch on its way into the policy: windows, formats, processors, weights, and what is said when they do not fit."""
+
+import copy
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from safetensors.torch import save_file
+from tiny_policies import FORMAT, TACTILE, batch_of, chunk, plain_pi05, readings, tiny_config, tiny_policy
+
+from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
+from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+from taccorl.policies.tactile_pi05.processor_tactile_pi05 import TactileReadingStep
+from taccorl.policies.tactile_pi05.tokenizer import ByteTokenizer, PromptTokenizerStep
+from taccorl.policies.tactile_pi05.weights import load_base_weights
+
+FEATURE = {
+    "dtype": "int16",
+    "shape": (1536,),
+    "tactile": {
+        "sensor": "flexitac_v2",
+        "layout": [1, 4, 32, 12],
+        "pads": ["left_a", "left_b", "right_a", "right_b"],
+        "scheme": "fixed_scale",
+        "gain_per_count": 1 / 75,
+    },
+}
+
+
+def metadata(**changes: Any) -> SimpleNamespace:
+    """Of a dataset, as much of it as the policy reads."""
+    known = {"repo_id": "local/demo", "root": "/demo", "fps": 30, "episodes": {"length": [40, 12]}}
+    return SimpleNamespace(**{**known, "features": {TACTILE: FEATURE, "observation.state": {}}, **changes})
+
+
+def test_defaults_are_the_papers_table():
+    config = TactilePI05Config(device="cpu")
+    assert (config.tactile_history, config.prefix_tokens, config.suffix_tokens) == (10, 8, 8)
+    assert (config.contact_threshold, config.contact_min_active) == (0.4, 1)
+    assert (config.chunk_size, config.num_inference_steps, config.sim_weight) == (10, 4, 0.5)
+    assert config.get_optimizer_preset().lr == 2.5e-5 and config.get_optimizer_preset().type == "adamw"
+    optimizer = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=2.5e-5)
+    for steps in (1000, 3000):
+        scheduler = config.get_scheduler_preset().build(optimizer, steps)
+        assert isinstance(config.get_scheduler_preset(), WarmupThenCosine)
+        rate = scheduler.lr_lambdas[0]
+        assert rate(0) == pytest.approx(1 / 101) and rate(50) < rate(99) < 1  # T_warm = 100, however long the training
+        assert rate(100) == pytest.approx(1, abs=0.03) and 2.5e-5 * rate(steps) == pytest.approx(5e-6)
+
+
+def test_lerobot_finds_the_policy_by_its_name():
+    import taccorl.lerobot_plugin  # noqa: F401
+
+    assert PreTrainedConfig.get_choice_class("tactile_pi05") is TactilePI05Config
+    assert get_policy_class("tactile_pi05") is TactilePI05Policy
+
+
+def test_the_window_is_the_last_readings_and_the_first_one_before_there_were_any():
+    policy = tiny_policy(tactile_history=4, n_action_steps=1)
+    batch, felt = batch_of(True, False), torch.rand(6, 2, 1536)
+    for step, reading in enumerate(felt):
+        torch.manual_seed(step)
+        action = policy.select_action({**batch, TACTILE: reading})
+        window = felt[[max(0, step - age) for age in (3, 2, 1, 0)]].transpose(
+            0, 1
+        )  # as LeRobot fills up a dataset's windows
+        assert torch.equal(action, chunk(policy, {**batch, TACTILE: window}, seed=step)[:, 0])
+    policy.reset()
+    torch.manual_seed(0)
+    again = policy.select_action({**batch, TACTILE: felt[5]})
+    assert torch.equal(again, chunk(policy, {**batch, TACTILE: felt[5][:, None].expand(-1, 4, -1)}, seed=0)[:, 0])
+    with pytest.raises(TaccorlError, match=r"\(1, 1536\) after \(2, 1536\).*reset\(\)"):
+        policy.select_action({k: v[:1] for k, v in batch.items()} | {TACTILE: felt[5, :1]})
+
+
+def test_an_observation_may_bring_its_window_along():
+    policy, batch = tiny_policy(n_action_steps=1), batch_of(True, False)
+    torch.manual_seed(7)
+    assert torch.equal(policy.select_action(batch), chunk(policy, batch)[:, 0])
+
+
+def test_touch_of_another_shape_or_none_is_refused():
+    policy, batch = tiny_policy(), batch_of(True)
+    with pytest.raises(TaccorlError, match=r"\(1, 1536\), the policy takes \(batch, 10, 1536\).*TACCORL_NO_PATCH"):
+        policy.predict_action_chunk({**batch, TACTILE: readings(True)[:, -1]})
+    with pytest.raises(TaccorlError, match=r"\(1, 10, 768\)"):
+        policy.forward({**batch, TACTILE: readings(True)[..., :768]})
+    del batch[TACTILE]
+    with pytest.raises(TaccorlError, match=f"has no {TACTILE}; it has: observation.images.front"):
+        policy.forward(batch)
+
+
+def test_the_format_comes_from_the_dataset_and_stays():
+    config = tiny_config(tactile_format=None)
+    with pytest.raises(TaccorlError, match="does not know how touch is stored"):
+        TactilePI05Policy(config)
+    config.match_dataset(metadata())
+    assert config.tactile_format == FORMAT and config.fps == 30
+    config.match_dataset(metadata(repo_id="local/other"))
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        (
+            {"features": {"observation.state": {}}},
+            "has no observation.tactile, the policy feels: --policy.tactile=false",
+        ),
+        ({"fps": 50}, "has 50 rows a second, the checkpoint was trained with 30"),
+        ({"episodes": {"length": [40, 9]}}, "episode 1 has 9 rows, the window of touch 10"),
+        ({"features": {TACTILE: {"shape": (1536,)}}}, "does not say what its"),
+    ],
+)
+def test_a_dataset_that_does_not_fit_is_named_with_both_sides(told, said):
+    config = tiny_config(fps=30)
+    with pytest.raises(TaccorlError, match=said) as error:
+        config.match_dataset(metadata(**told))
+    assert "local/demo" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"gain_per_count": 0.01}, "gain_per_count: 0.01 there, 0.0133333"),
+        ({"layout": [1, 4, 12, 32]}, "rows: 12 there, 32 in the checkpoint; columns: 32 there, 12"),
+        ({"scheme": "per_frame_max"}, "scheme: per_frame_max there, fixed_scale in the checkpoint"),
+        ({"layout": [1, 4, 32, 16]}, r"has shape \(1536,\), its layout says \[1, 4, 32, 16\]"),
+        ({"pads": ["a", "b"]}, "names the pads a, b, its layout says 4"),
+    ],
+)
+def test_touch_that_is_not_the_checkpoints_is_named_with_both_sides(changed, said):
+    feature = {**FEATURE, "tactile": {**FEATURE["tactile"], **changed}}
+    with pytest.raises(TaccorlError, match=said):
+        tiny_config().match_dataset(metadata(features={TACTILE: feature}))
+
+
+def test_counts_become_readings_and_the_normaliser_leaves_them(tmp_path):
+    stats = {
+        key: {
+            name: torch.full((size,), value)
+            for name, value in (("q01", -2.0), ("q99", 2.0), ("mean", 0.0), ("std", 1.0))
+        }
+        for key, size in (("observation.state", 14), ("action", 14), (TACTILE, 1536))
+    }
+    config = tiny_config(tokenizer_max_length=150)
+    config.validate_features()
+    before, after = make_pre_post_processors(config, dataset_stats=stats)
+    counts = torch.randint(-20, 240, (2, 10, 1536))  # LeRobot gives int64
+    raw = {
+        **{k: v for k, v in batch_of(True, False).items() if "language" not in k},
+        TACTILE: counts,
+        "observation.state": torch.tensor([[1.0] * 14, [-2.0] * 14]),
+        "action_is_pad": torch.zeros(2, 10, dtype=torch.bool),
+        "task": ["insert the plug", "move"],
+    }
+    seen = before(dict(raw))
+    torch.testing.assert_close(seen[TACTILE], counts.float() / 75)
+    torch.testing.assert_close(seen["observation.state"][0], torch.full((14,), 0.5))  # quantiles −2 … 2 → −1 … 1
+    assert torch.equal(seen["action_is_pad"], raw["action_is_pad"])
+    tokens = seen["observation.language.tokens"][0][seen["observation.language.attention_mask"][0]]
+    prompt = f"Task: insert the plug, State: {' '.join(['192'] * 14)};\nAction: "
+    assert bytes((tokens[1:] - 2).tolist()).decode() == prompt
+    assert seen["observation.language.tokens"].shape == (2, 150)
+    # Saved and loaded without being told anything, as lerobot-eval does.
+    before.save_pretrained(tmp_path)
+    after.save_pretrained(tmp_path)
+    loaded, _ = make_pre_post_processors(config, pretrained_path=str(tmp_path))
+    again = loaded(dict(raw))
+    assert all(torch.equal(again[k], v) for k, v in seen.items() if isinstance(v, torch.Tensor))
+
+
+def test_a_prompt_is_never_cut_and_other_tokenizers_are_asked_for_by_name(tmp_path):
+    step = PromptTokenizerStep(tokenizer_name="bytes", max_length=12)
+    assert step._tokenize_text("ä")["input_ids"].tolist() == [[1, 0xC3 + 2, 0xA4 + 2] + 9 * [0]]
+    with pytest.raises(TaccorlError, match="a prompt of 13 tokens, the policy takes 12: 'insert plugs'"):
+        step._tokenize_text(["insert plugs"])
+    assert len(ByteTokenizer()) == 258
+    with pytest.raises(TaccorlError, match=r"tokenizer=.*cannot be loaded.*Without network"):
+        PromptTokenizerStep(tokenizer_name=str(tmp_path))
+    with pytest.raises(TaccorlError, match="'per_frame_max': only 'fixed_scale'"):
+        TactileReadingStep(scheme="per_frame_max")
+
+
+def test_plain_pi05s_weights_are_a_start_and_only_touch_may_be_missing(monkeypatch, tmp_path):
+    torch.manual_seed(3)
+    plain = plain_pi05(tiny_policy(), monkeypatch)
+    # As openpi names and keeps them: without "model.", with a language head.
+    weights = {k.removeprefix("model."): v.clone() for k, v in plain.state_dict().items()}
+    embedding = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+    weights["paligemma_with_expert.paligemma.lm_head.weight"] = weights.pop(embedding)
+    weights["paligemma_with_expert.gemma_expert.lm_head.weight"] = torch.zeros(512, 64)
+    save_file(weights, tmp_path / "model.safetensors")
+    torch.manual_seed(4)
+    policy = TactilePI05Policy(tiny_config())
+    load_base_weights(policy, str(tmp_path))
+    batch = batch_of(False, False)
+    assert torch.equal(chunk(policy.eval(), batch), chunk(plain, batch))
+    before = {k: v.clone() for k, v in policy.state_dict().items()}
+    for name, said in (
+        ("time_mlp_in.weight", "1 missing, first model.time_mlp_in.weight"),
+        (None, "1 unknown here, first"),
+    ):
+        broken = {k: v + 1 for k, v in weights.items() if k != name}
+        if name is None:
+            broken["state_head.weight"] = torch.zeros(1)
+        save_file(broken, tmp_path / "model.safetensors")
+        with pytest.raises(TaccorlError, match=f"{said}.*Nothing was loaded"):
+            load_base_weights(policy, str(tmp_path / "model.safetensors"))
+    save_file({**weights, "action_in_proj.weight": torch.zeros(64, 7)}, tmp_path / "model.safetensors")
+    with pytest.raises(
+        TaccorlError, match=r"1 of another shape, first model.action_in_proj.weight \(64, 7\) there, \(64, 32\)"
+    ):
+        load_base_weights(policy, str(tmp_path))
+    assert all(torch.equal(before[k], v) for k, v in policy.state_dict().items())
+
+
+def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
+    policy = tiny_policy()
+    policy.save_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").unlink()
+    with pytest.raises(TaccorlError, match=r"no weights to read.*model\.safetensors"):
+        TactilePI05Policy.from_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").write_bytes(b"cut off")
+    with pytest.raises(TaccorlError, match="no weights to read"):
+        TactilePI05Policy.from_pretrained(tmp_path)
+    with pytest.raises(TaccorlError, match=f"--policy.base_checkpoint={tmp_path}: no weights to read"):
+        load_base_weights(policy, str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ({"backbone": "tny"}, "--policy.backbone=tny: did you mean 'tiny'"),
+        ({"base_checkpoint": "lerobot/pi05_base"}, "fit --policy.backbone=full only, not tiny"),
+        ({"tactile_history": 0}, "--policy.tactile_history=0: at least 1"),
+        ({"contact_threshold": float("nan")}, "--policy.contact_threshold=nan"),
+        ({"compile_model": True}, "--policy.compile_model=true"),
+    ],
+)
+def test_settings_out_of_range_are_refused(setting, said):
+    with pytest.raises(TaccorlError, match=said):
+        tiny_config(**setting)
+
+
+def test_two_steps_stop_resume_are_the_numbers_of_four_steps(tmp_path):
+    def train(policy: TactilePI05Policy, optimizer: torch.optim.Optimizer, steps: range) -> list[float]:
+        losses = []
+        policy.train()
+        for step in steps:
+            loss, _ = policy.forward(batch_of(True, False, seed=step))
+            loss.backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            losses.append(loss.item())
+        return losses
+
+    torch.manual_seed(0)
+    policy = TactilePI05Policy(tiny_config())
+    optimizer = policy.config.get_optimizer_preset().build(policy.parameters())
+    train(policy, optimizer, range(2))
+    policy.save_pretrained(tmp_path)
+    kept, generator = copy.deepcopy(optimizer.state_dict()), torch.get_rng_state()
+    straight = train(policy, optimizer, range(2, 4))
+    resumed = TactilePI05Policy.from_pretrained(tmp_path)
+    optimizer = resumed.config.get_optimizer_preset().build(resumed.parameters())
+    optimizer.load_state_dict(kept)
+    torch.set_rng_state(generator)
+    assert train(resumed, optimizer, range(2, 4)) == straight
+    assert all(torch.equal(resumed.state_dict()[k], v) for k, v in policy.state_dict().items())

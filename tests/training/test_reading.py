@@ -1,0 +1,129 @@
+"""The faster reader gives what LeRobot's gives; it is installed once, for one version, and can be left out."""
+
+import logging
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.datasets import dataset_reader, factory, lerobot_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tiny_dataset import IS_SIM, TOUCH, write_tiny
+
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+from taccorl.training import reading
+from taccorl.training.reading import FastReader, with_windows
+
+WINDOWS = {TOUCH: [k / 30 for k in range(-9, 1)], "action": [k / 30 for k in range(10)]}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("tiny") / "dataset", rows=(14, 11, 12), sim_episodes=1, cameras=2)
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Into LeRobot as it came, and out of it again."""
+    monkeypatch.delenv("TACCORL_NO_PATCH", raising=False)
+    monkeypatch.setattr(lerobot_dataset, "DatasetReader", dataset_reader.DatasetReader)
+    monkeypatch.setattr(factory, "resolve_delta_timestamps", stock_resolve())
+
+
+def stock_resolve():
+    """LeRobot's, also when a plugin of an earlier test has wrapped it."""
+    resolve = factory.resolve_delta_timestamps
+    return resolve.__closure__[0].cell_contents if resolve.__closure__ else resolve
+
+
+def load(root: Path, reader: type, monkeypatch: pytest.MonkeyPatch, **settings) -> LeRobotDataset:
+    monkeypatch.setattr(lerobot_dataset, "DatasetReader", reader)
+    return LeRobotDataset("local/tiny", root=root, video_backend="pyav", **settings)
+
+
+def assert_equal_items(ours: dict, theirs: dict) -> None:
+    assert set(ours) == set(theirs)
+    for key, value in theirs.items():
+        if isinstance(value, torch.Tensor):
+            assert ours[key].dtype == value.dtype and torch.equal(ours[key], value), key
+        else:
+            assert ours[key] == value
+
+
+@pytest.mark.parametrize(
+    ("episodes", "windows", "uint8"), [(None, None, False), (None, WINDOWS, True), ([0, 2], WINDOWS, False)]
+)
+def test_every_row_is_lerobots_to_the_bit_and_the_type(root, monkeypatch, episodes, windows, uint8):
+    settings = {"episodes": episodes, "delta_timestamps": windows, "return_uint8": uint8}
+    stock = load(root, dataset_reader.DatasetReader, monkeypatch, **settings)
+    fast = load(root, FastReader, monkeypatch, **settings)
+    assert fast.reader.columns(), "it would go LeRobot's way"
+    assert len(fast) == len(stock) == (37 if episodes is None else 26)
+    for row in (0, 5, 13, 14, 20, len(stock) - 1, -1):
+        assert_equal_items(fast[row], stock[row])
+
+
+def test_a_worker_reads_the_same_after_it_was_sent_the_dataset(root, monkeypatch):
+    fast = load(root, FastReader, monkeypatch, delta_timestamps=WINDOWS)
+    before = fast[20]
+    sent = pickle.dumps(fast)
+    assert len(sent) < 2e6  # not the columns themselves
+    assert_equal_items(pickle.loads(sent)[20], before)
+
+
+def test_what_it_does_not_know_goes_lerobots_way(root, monkeypatch):
+    windows_of_pictures = {"observation.images.front": [-1 / 30, 0.0]}
+    fast = load(root, FastReader, monkeypatch, delta_timestamps=windows_of_pictures)
+    stock = load(root, dataset_reader.DatasetReader, monkeypatch, delta_timestamps=windows_of_pictures)
+    assert_equal_items(fast[16], stock[16])
+    for dataset in (fast, stock):
+        dataset.reader.delta_indices = None
+        dataset.reader.set_image_transforms(lambda picture: picture * 0.5)
+    assert_equal_items(fast[3], stock[3])
+    fast.reader.hf_dataset = fast.reader.hf_dataset.shuffle(seed=0)
+    fast.reader._columns = None
+    assert fast.reader.columns() == {}
+    assert fast[0]["index"] == fast.reader.hf_dataset[0]["index"] != 0
+
+
+def test_the_share_of_simulated_rows_is_that_of_the_episodes_trained_on(root, monkeypatch):
+    for episodes, share in ((None, 14 / 37), ([0, 2], 14 / 26), ([1, 2], 0.0)):
+        dataset = load(root, FastReader, monkeypatch, episodes=episodes)
+        assert float(dataset.meta.stats[IS_SIM]["mean"][0]) == pytest.approx(share, abs=1e-12)
+
+
+def test_only_touch_gets_a_window(root, monkeypatch):
+    metadata = load(root, FastReader, monkeypatch).meta
+    config = TactilePI05Config(device="cpu", backbone="tiny", tactile_history=3, chunk_size=2, n_action_steps=2)
+    resolve = with_windows(stock_resolve())
+    assert resolve(config, metadata) == {TOUCH: [-2 / 30, -1 / 30, 0.0], "action": [0.0, 1 / 30]}
+    config.tactile = False
+    assert resolve(config, metadata) == {"action": [0.0, 1 / 30]}
+
+
+def test_padded_start_of_a_window_repeats_the_first_row(root, monkeypatch):
+    item = load(root, FastReader, monkeypatch, delta_timestamps=WINDOWS)[16]  # third row of the second episode
+    assert item[f"{TOUCH}_is_pad"].tolist() == [True] * 7 + [False] * 3
+    assert all(torch.equal(item[TOUCH][k], item[TOUCH][7]) for k in range(7))
+    assert not torch.equal(item[TOUCH][8], item[TOUCH][7])
+
+
+def test_it_is_installed_once_and_for_the_version_it_was_compared_with(installed, monkeypatch, caplog):
+    stock = factory.resolve_delta_timestamps
+    assert reading.install() and reading.install()
+    assert lerobot_dataset.DatasetReader is FastReader
+    assert factory.resolve_delta_timestamps.__closure__[0].cell_contents is stock
+    monkeypatch.setattr(lerobot_dataset, "DatasetReader", dataset_reader.DatasetReader)
+    with caplog.at_level(logging.WARNING):
+        monkeypatch.setattr(reading, "lerobot_version", "0.6.2")
+        assert not reading.install()
+    assert "LeRobot 0.6.2 reads datasets by itself" in caplog.text
+    assert lerobot_dataset.DatasetReader is dataset_reader.DatasetReader
+
+
+def test_it_can_be_left_out(installed, monkeypatch, caplog):
+    monkeypatch.setenv("TACCORL_NO_PATCH", "1")
+    with caplog.at_level(logging.WARNING):
+        assert not reading.install()
+    assert "TACCORL_NO_PATCH=1" in caplog.text and "--policy.tactile_history=1" in caplog.text
+    assert lerobot_dataset.DatasetReader is dataset_reader.DatasetReader

@@ -1,0 +1,65 @@
+"""Small LeRobot datasets by LeRobot's own writer: random numbers, pictures that tell their row, touch in its real layout."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from taccorl.data.episode import Episode, Pictures
+from taccorl.data.lerobot_format import write_episodes
+from taccorl.data.spec import DatasetSpec, FeatureSpec, data_specs_folder, load_dataset_spec
+
+TOUCH, IS_SIM = "observation.tactile", "observation.is_sim"
+PICTURE_PX = 56
+
+
+def tiny_spec(*, cameras: int = 1, picture_px: int = PICTURE_PX, is_sim: bool = False) -> DatasetSpec:
+    """The shipped spec without its optional window, with fewer and smaller pictures."""
+    spec = load_dataset_spec(data_specs_folder() / "taccorl_bimanual.yaml")
+    features = {key: f for key, f in spec.features.items() if not f.optional}
+    for key in spec.keys("video")[cameras:]:
+        del features[key]
+    for key, feature in features.items():
+        if feature.dtype == "video":
+            features[key] = dataclasses.replace(feature, shape=(picture_px, picture_px, 3))
+    if is_sim:
+        told = {"dtype": "float32", "shape": (1,), "unit": "1", "frame": "none", "rate_hz": 30, "range": (0, 1)}
+        features[IS_SIM] = FeatureSpec(**told)
+    return dataclasses.replace(spec, features=features, sensors={TOUCH: spec.sensors[TOUCH]})
+
+
+def tiny_episode(spec: DatasetSpec, num_rows: int, seed: int, is_sim: float = 0.0) -> Episode:
+    """Touched in its second half."""
+    rng = np.random.default_rng(seed)
+    touch = rng.integers(-10, 10, (num_rows, 1536)).astype(np.int16)
+    touch[num_rows // 2 :, 40:60] += 120
+    low, high = spec.features["action"].limits.T
+    state, action = rng.uniform(0.5 * low + 0.5 * high, 0.4 * low + 0.6 * high, (2, num_rows, 14)).astype(np.float32)
+    arrays = {"observation.state": state, "action": action, TOUCH: touch}
+    if IS_SIM in spec.features:
+        arrays[IS_SIM] = np.full((num_rows, 1), is_sim, dtype=np.float32)
+    cameras = tuple(spec.keys("video"))
+
+    def pictures() -> Iterator[Pictures]:
+        for row in range(num_rows):
+            shape = spec.features[cameras[0]].shape
+            yield {key: np.full(shape, (20 + 5 * row + 40 * k) % 256, dtype=np.uint8) for k, key in enumerate(cameras)}
+
+    return Episode(
+        name=f"tiny {seed}",
+        spec=spec,
+        start_ns=0,
+        arrays=arrays,
+        pictures=pictures if cameras else lambda: iter([{}] * num_rows),
+        picture_keys=cameras,
+        instruction="insert the plug",
+        origin="surrogate: random numbers, not a robot",
+    )
+
+
+def write_tiny(root: Path, *, rows: tuple[int, ...] = (24, 18), sim_episodes: int = 0, **spec_changes: int) -> Path:
+    """Episodes of so many rows, the first ``sim_episodes`` of them simulated."""
+    spec = tiny_spec(is_sim=sim_episodes > 0, **spec_changes)
+    write_episodes([tiny_episode(spec, n, k, float(k < sim_episodes)) for k, n in enumerate(rows)], root)
+    return root
