@@ -1,4 +1,4 @@
-"""Shared by all tests: one small stand-in recording and the dataset made from it, by the real commands."""
+"""Shared by all tests: one small stand-in recording, the dataset made from it by the real commands, and demonstrations."""
 
 import os
 from pathlib import Path
@@ -31,3 +31,15 @@ def dataset(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = folder / "dataset"
     assert main(["ingest", str(recordings), f"--spec={SPEC}", f"--out={out}", f"--store={folder / 'store'}"]) == 0
     return out
+
+
+@pytest.fixture(scope="session")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with two demonstrations of assembly_2 from the twin, without pictures: sources of MimicGen."""
+    from taccorl.demos.collect import Plan, collect
+    from taccorl.lineage.store import Store
+
+    folder = tmp_path_factory.mktemp("mimicgen_sources")
+    plan = Plan(task="assembly_2", episodes=2, images=False, seed=3)
+    collect(plan, folder / "dataset", Store(folder / "store"), lambda _: None)
+    return folder / "dataset"

@@ -10,6 +10,7 @@ from taccorl.errors import TaccorlError, nearest
 VERBS = {
     "twin": {
         "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them",
+        "augment": "a few demonstrations from the twin → many new ones (MimicGen), with a report of yield and coverage",
         "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
         "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",
         "add-effect": "the twin with one effect more, with the fitted values",

@@ -1,6 +1,7 @@
 """``taccorl view PATH [--episode=0] [--spec=piper_flexitac_mcap]``: an episode in Rerun.
 
-PATH is a LeRobot dataset's folder, or a recording with the spec that reads it. Opens a window; where there is no screen:
+PATH is a LeRobot dataset's folder, a recording with the spec that reads it, or an attempt of ``taccorl augment`` in the store,
+which is executed again. Opens a window; where there is no screen:
 
     --serve=true          a page for a browser on this machine
     --save=x.rrd          a file for the Rerun program anywhere
@@ -31,7 +32,7 @@ class ViewConfig:
     """An episode in Rerun."""
 
     path: Path
-    """A LeRobot dataset's folder, or a recording."""
+    """A LeRobot dataset's folder, a recording, or an attempt of `taccorl augment` in the store."""
     episode: int = 0
     """Which one, counted from 0."""
     spec: str | None = None
@@ -94,6 +95,12 @@ def _opened(config: ViewConfig) -> Iterator["Episode"]:
         return
     if not config.path.exists():
         raise TaccorlError(f"{config.path}: no such file or folder")
+    if config.spec is None and (config.path / "entry.json").is_file():
+        from taccorl.demos.mimicgen.augment import attempt_episode, is_attempt
+
+        if is_attempt(config.path):
+            yield attempt_episode(config.path)
+            return
     if config.spec is None:
         raise TaccorlError(
             f"{config.path} is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"

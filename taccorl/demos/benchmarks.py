@@ -1,5 +1,6 @@
-"""Figures of reading and writing recordings, and of the twin's experts; ``make bench ONLY=ingest`` and the others."""
+"""Figures of reading and writing recordings, of the twin's experts and of MimicGen; ``make bench ONLY=ingest`` and the others."""
 
+import math
 import os
 import resource
 import subprocess
@@ -23,6 +24,8 @@ RIVAL_ROWS = 150
 REPEATS = 3
 EXPERT_EPISODES = 100
 PENETRATION_EPISODES = 20
+MIMICGEN_ATTEMPTS = 100
+MIMICGEN_SOURCES = 20
 NATIVE = [480, 640, 3]
 
 
@@ -298,3 +301,65 @@ def expert_rows() -> Iterator[Row]:
             n=len(deepest),
             spread=spread(deepest),
         )
+
+
+@benchmark("mimicgen")
+def mimicgen_rows() -> Iterator[Row]:
+    """Yield of MimicGen on the four tasks, its cost, and end-effector replay beside it. Simulated."""
+    for task in ("test_tube", "puzzle", "assembly_1", "assembly_2"):
+        yield from mimicgen_cells(task, MIMICGEN_ATTEMPTS, MIMICGEN_SOURCES)
+
+
+def mimicgen_cells(task: str, num_attempts: int, num_sources: int) -> Iterator[Row]:
+    """Rows of one task: ``num_attempts`` attempts for each cell, the same scenes in all of them, sources of the nominal twin."""
+    from taccorl.demos.collect import Plan, collect
+    from taccorl.demos.mimicgen.from_dataset import read_sources
+    from taccorl.demos.mimicgen.scoring import score_generation, stiffened
+    from taccorl.demos.mimicgen.spec import NoiseSpec, SplitNoiseSpec, load_mimic_spec, with_options
+    from taccorl.lineage.store import Store
+    from taccorl.sim.twin import TwinConfig
+
+    ours, twin = load_mimic_spec(task), TwinConfig()
+    with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
+        plan = Plan(task=task, episodes=num_sources, images=False)
+        collect(plan, Path(name) / "sources", Store(Path(name) / "store"), lambda _: None)
+        sources = read_sources(Path(name) / "sources", ours)
+    plain = score_generation(ours, sources, twin, num_attempts, check=True)
+    yield _yield_row(f"{task}: yield", plain, "≥ 80")
+    cost = sum(plain.cpu_s) / max(sum(plain.duration_s), 1.0)  # for each second of what is kept
+    yield Row(
+        name=f"{task}: physics, failed attempts too, for 15 s of kept episodes of {mean(plain.duration_s or [0.0]):.1f} s",
+        value=15.0 * cost, unit="CPU-s", goal="≤ 1.5", n=num_attempts, spread=spread(plain.cpu_s),
+    )  # fmt: skip
+    yield Row(
+        name=f"{task}: kept episodes that are broken at the last frame or not reproduced from their own actions",
+        value=plain.broken + plain.outcomes.count("not reproduced"), unit="episodes", goal="≤ 0", n=len(plain.duration_s),
+        spread=0.0,
+    )  # fmt: skip
+    noise = SplitNoiseSpec(transport=NoiseSpec(position_m=0.0025, rotation_rad=math.radians(1.4)))
+    cells = (
+        ("MimicGen's noise of 2.5 mm and 1.4° a step in transport", with_options(ours, noise=noise), twin, "≥ 70", ""),
+        ("stiffness halved, which the sources had not", ours, stiffened(twin, 0.5), "≥ 75", "≤ 30"),
+        ("stiffness doubled, which the sources had not", ours, stiffened(twin, 2.0), "≥ 75", "≤ 30"),
+    )
+    for words, spec, place, goal, replay_goal in cells:
+        held = score_generation(spec, sources, place, num_attempts)
+        replay = score_generation(with_options(spec, retarget="eef"), sources, place, num_attempts)
+        yield _yield_row(f"{task}: yield, {words}", held, goal)
+        yield _yield_row(f"{task}: yield of end-effector replay, {words}", replay, replay_goal)
+        if place is twin:
+            yield Row(
+                name=f"{task}: yield over that of end-effector replay (its 0 counts as 1), {words}",
+                value=held.share.successes / max(replay.share.successes, 1), unit="×", goal="≥ 3", n=num_attempts,
+                spread=0.0,
+            )  # fmt: skip
+
+
+def _yield_row(name: str, score: Any, goal: str) -> Row:
+    """Value and 95 % interval (Wilson) of a yield."""
+    low, high = score.share.interval
+    failures = ", ".join(f"{count} {what}" for what, count in score.failures.items()) or "no failures"
+    return Row(
+        name=f"{name} (95 %: {100 * low:.0f} … {100 * high:.0f}); {failures}",
+        value=100 * score.share.rate, unit="%", goal=goal, n=score.share.attempts, spread=50 * (high - low),
+    )  # fmt: skip

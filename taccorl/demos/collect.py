@@ -216,8 +216,12 @@ REPORT = "collect_report.json"
 
 def _check_out(plan: Plan, out: Path, store: Store) -> None:
     """Refuses what cannot be the dataset of this plan: hours of attempts would end at the store's refusal."""
-    if not os.path.lexists(out) or _may_be_of(plan, out, store):
-        return
+    if os.path.lexists(out) and not _may_be_of(plan, out, store):
+        raise in_the_way(out, _COLLECTION, plan.task)
+
+
+def in_the_way(out: Path, stage: Stage, task: str) -> InTheWayError:
+    """What lies at ``out``, where ``stage`` was to publish a dataset of ``task``."""
     manifest = read_manifest(out)
     if manifest:
         held = (
@@ -226,8 +230,8 @@ def _check_out(plan: Plan, out: Path, store: Store) -> None:
     else:
         kind = f"a folder of {sum(1 for _ in out.rglob('*'))} entries" if out.is_dir() else "a file"
         held = f"is {kind} without a taccorl manifest"
-    raise InTheWayError(
-        f"{out} is in the way: it {held}; this run makes {_COLLECTION.name} v{_COLLECTION.version} of {plan.task}. "
+    return InTheWayError(
+        f"{out} is in the way: it {held}; this run makes {stage.name} v{stage.version} of {task}. "
         "Nothing was touched: give another destination, or move that one away yourself."
     )
 

@@ -7,6 +7,8 @@ killed goes on where it was, another spec or other sources never mix with it, an
 import dataclasses
 import functools
 import json
+import os
+import shlex
 import traceback
 from collections import Counter
 from collections.abc import Callable
@@ -18,17 +20,19 @@ import mujoco
 import numpy as np
 
 import taccorl
-from taccorl.data.dataset import episode_record
+from taccorl.data.dataset import PROVENANCE, episode_record
+from taccorl.data.episode import Episode
 from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.demos.collect import assemble
+from taccorl.demos.collect import REPORT, assemble, in_the_way
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts
-from taccorl.demos.mimicgen.from_dataset import read_sources
+from taccorl.demos.mimicgen.from_dataset import read_sources, simulation_told
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import MimicSpec, check_task
-from taccorl.demos.recorder import ORIGIN, with_simulator
+from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.errors import TaccorlError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
@@ -37,7 +41,9 @@ from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
 VERSION = 1  # of an attempt
-_ROUND = 20  # attempts between two looks at how many have succeeded
+_ROUND = (
+    20  # attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end
+)
 _HOPELESS = 0.05  # of a hundred attempts
 _HUNDRED = 100
 
@@ -105,35 +111,82 @@ def augment(
     """
     sources = store.source(source)
     engine, entries, made = engine or LocalEngine(), [], []
-    _attempts(plan, sources.path, sources.digest)  # before anything is sent away: what does not fit is refused here
+    # Before anything is sent away: what does not fit is refused here.
+    sim = _attempts(plan, sources.path, sources.digest).sim
+    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=plan.images)
+    fn = functools.partial(run_attempt, plan, sources, store)
+
+    def told(k: int, artefact: Artefact) -> None:
+        entry = _entry(artefact.path)
+        progress(f"attempt {k}: {entry['outcome']} after {entry['seconds']:.1f} s")
+
     while (successes := sum(e["outcome"] == "success" for e in entries)) < plan.episodes:
+        if entries:
+            progress(f"{successes} of {plan.episodes} after {len(entries)} attempts")
         if len(entries) >= _HUNDRED and successes < _HOPELESS * len(entries):
+            failed = next(a.path for a, e in zip(made, entries, strict=True) if e["outcome"] != "success")
             raise TaccorlError(
                 f"{plan.spec.task}: {successes} of {len(entries)} attempts succeeded, nothing was written to {out}. Failures: "
-                f"{_outcomes(entries)}"
+                f"{_outcomes(entries)}. Look at one: taccorl view {shlex.quote(str(failed))}"
             )
-        numbers = list(range(len(entries), len(entries) + _ROUND))
-        fn = functools.partial(run_attempt, plan, sources, store)
-        for k, artefact in zip(numbers, engine.map(fn, numbers, name=lambda k: f"attempt {k}"), strict=True):
-            entry = json.loads((artefact.path / "entry.json").read_text())
+        # Never fewer than are missing, so none of them is in vain but for the few at the end.
+        num = min(max(plan.episodes - successes, min(_ROUND, plan.episodes // 10)), _HUNDRED)
+        numbers = list(range(len(entries), len(entries) + num))
+        for artefact in engine.map(fn, numbers, on_done=told, name=lambda k: f"attempt {k}"):
+            entry = _entry(artefact.path)
             entries.append(entry)
             made.append(artefact)
             successes += entry["outcome"] == "success"
-            progress(f"attempt {k}: {entry['outcome']} after {entry['seconds']:.1f} s ({successes} of {plan.episodes})")
             if successes == plan.episodes:
                 break
     kept = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["outcome"] == "success"]
     report = _report(plan, entries)
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), plan.make(), pictures=plan.images)
 
     def collection(_: Any, inputs: list[Path], folder: Path) -> None:
         assemble(spec, report, inputs, folder)
 
-    stage = Stage("augmented", collection, VERSION, manifest="meta/taccorl/manifest.json")
+    stage = dataclasses.replace(_AUGMENTED, fn=collection)
     store.run(
         stage, {"task": plan.spec.task, "spec": plan.spec.digest, "attempts": len(entries)}, kept, destination=out
     )
     return report
+
+
+def check_out(plan: AugmentPlan, source: Path, out: Path, store: Store) -> None:
+    """Refuses what cannot be the dataset of this plan, before hours of attempts end at the store's refusal.
+
+    Raises:
+        InTheWayError: says what is at ``out``.
+    """
+    if os.path.lexists(out) and not _may_be_of(plan, store.source(source), out, store):
+        raise in_the_way(out, _AUGMENTED, plan.spec.task)
+
+
+def _may_be_of(plan: AugmentPlan, sources: Artefact, out: Path, store: Store) -> bool:
+    """Whether the dataset at ``out`` is made of attempts of this very plan, and of as many successes."""
+    manifest, report = read_manifest(out), out / PROVENANCE / REPORT
+    if not manifest or manifest["stage"] != _AUGMENTED.name or not report.is_file():
+        return False
+    told = json.loads(report.read_text(encoding="utf-8"))
+    if told["episodes"] != plan.episodes:
+        return False
+    attempts = {store.key(_ATTEMPT, plan.config(k), [sources]) for k in range(told["attempts"])}
+    return {entry["key"] for entry in manifest["inputs"]} <= attempts
+
+
+def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> list[Path]:
+    """Folders of the attempts 0 … num − 1 in the store, each as ``run_attempt`` says; nothing is made.
+
+    Raises:
+        TaccorlError: one of them is not there.
+    """
+    sources, found = store.source(source), []
+    for k in range(num):
+        artefact = store.find(_ATTEMPT, plan.config(k), [sources])
+        if artefact is None:
+            raise TaccorlError(f"{store.root}: attempt {k} is not there any more; augment again makes it again")
+        found.append(artefact.path)
+    return found
 
 
 def run_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int) -> Artefact:
@@ -142,7 +195,55 @@ def run_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int) -> A
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
         _build(plan, sources, k, config, folder)
 
-    return store.run(Stage("mimicgen", build, VERSION), plan.config(k), [sources])
+    return store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
+
+
+def is_attempt(folder: Path) -> bool:
+    """Whether ``run_attempt`` made that folder."""
+    manifest = read_manifest(folder) if folder.is_dir() else None
+    return bool(manifest) and manifest["stage"] == _ATTEMPT.name
+
+
+def attempt_episode(folder: Path) -> Episode:
+    """An attempt, failed ones above all, executed again from its stored actions and its scene's seed, with touch.
+
+    Raises:
+        TaccorlError: it broke before its first action.
+    """
+    config, entry, actions = _config(folder), _entry(folder), np.load(folder / "actions.npy")
+    if not len(actions):
+        raise TaccorlError(
+            f"{folder}: attempt {entry['attempt']} has no actions to show: {entry['outcome']}: {entry['reason']}"
+        )
+    sim, scene_seed = simulation_told(config), entry["scene_seed"]
+    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=config["images"])
+    sim.reset([scene_seed])
+    recorder = EpisodeRecorder(sim, spec, np.random.default_rng([scene_seed, 2]))
+    for action in actions:
+        recorder.step(action)
+    told = {key: value for key, value in config.items() if key != "spec"} | {"mimicgen": entry["provenance"]}
+    ended = f"{entry['outcome']}: {entry['reason']}" if entry["reason"] else entry["outcome"]
+    episode = recorder.episode(f"{config['task']} attempt {entry['attempt']}, {ended}", told)
+    return dataclasses.replace(episode, origin=config["origin"], success=entry["outcome"] == "success")
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    """Of an attempt, as ``AugmentPlan.config`` gave it."""
+    manifest = read_manifest(folder)
+    assert manifest is not None, folder
+    return manifest["config"]
+
+
+def _entry(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "entry.json").read_text(encoding="utf-8"))
+
+
+def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
+    raise NotImplementedError("the function comes with the attempts")
+
+
+_ATTEMPT = Stage("mimicgen", _not_yet, VERSION)
+_AUGMENTED = Stage("augmented", _not_yet, VERSION, manifest=f"{PROVENANCE}/manifest.json")
 
 
 def _build(plan: AugmentPlan, sources: Artefact, k: int, config: dict[str, Any], folder: Path) -> None:

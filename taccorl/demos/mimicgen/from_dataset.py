@@ -5,8 +5,10 @@ the model of the very twin that the dataset was made in.
 """
 
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -32,19 +34,29 @@ def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
     Raises:
         DatasetError: no simulator state, another task, or a twin that is no longer the same; with the way out.
     """
-    dataset = Dataset(root)
-    missing = [key for key in COLUMNS if key not in dataset.info["features"]]
-    if missing:
-        raise DatasetError(
-            f"{root}: has no {', '.join(missing)}: object poses are not known, as in every recording of a robot, so it cannot "
-            f"be a source. Sources come from the twin: taccorl collect --task={spec.task} --out=outputs/{spec.task}"
-        )
+    dataset = open_sources(root, spec.task)
     episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
     kept = [episode for episode in episodes if episode.success]
     if not kept:
         raise DatasetError(f"{root}: none of its {len(episodes)} episodes is a success; taccorl collect makes some")
     reader = SourceReader(simulation_of(kept[0], spec.task))
     return [reader.read(episode) for episode in kept]
+
+
+def open_sources(root: Path, task: str) -> Dataset:
+    """The dataset, if it has what sources need. Reads ``meta/`` only.
+
+    Raises:
+        DatasetError: no dataset, or no simulator state; with the way out.
+    """
+    dataset = Dataset(root)
+    missing = [key for key in COLUMNS if key not in dataset.info["features"]]
+    if missing:
+        raise DatasetError(
+            f"{root}: has no {', '.join(missing)}: object poses are not known, as in every recording of a robot, so it cannot "
+            f"be a source. Sources come from the twin: taccorl collect --task={task} --out=outputs/{task}"
+        )
+    return dataset
 
 
 def simulation_of(episode: Episode, task: str) -> Simulation:
@@ -58,11 +70,16 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
         raise DatasetError(f"{episode.name}: does not say in which twin it was made; collect it with this taccorl")
     if told["task"] != task:
         raise DatasetError(f"{episode.name}: is of task {told['task']}, the spec is of {task}")
+    return simulation_told(told)
+
+
+def simulation_told(told: Mapping[str, Any]) -> Simulation:
+    """The simulation that ``task``, ``difficulty``, ``twin`` (a file's text) and ``randomization`` describe."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "twin.yaml"
         path.write_text(told["twin"], encoding="utf-8")
         twin = load_twin(path)
-    return Simulation(tasks.get(task)(told["difficulty"]), twin, scale=float(told["randomization"]))
+    return Simulation(tasks.get(told["task"])(told["difficulty"]), twin, scale=float(told["randomization"]))
 
 
 class SourceReader:

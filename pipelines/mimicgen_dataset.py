@@ -1,0 +1,58 @@
+"""``python -m pipelines.mimicgen_dataset [TASK …] [--episodes=200] [--workers=2] [--images=true]``: a dataset for each task.
+
+20 demonstrations of the scripted expert → ``taccorl augment`` → report. Everything lands in outputs/mimicgen; a run that was
+stopped goes on where it was. There is no robot here: all of it comes from the twin, and says so.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+from taccorl.cli import main as cli
+
+OUT = Path("outputs/mimicgen")
+TASKS = ("assembly_1", "assembly_2", "puzzle", "test_tube")
+SOURCES = 20
+OPTIONS = {"episodes": "200", "workers": "2", "images": "true"}
+
+
+def taccorl(*words: str) -> None:
+    """One command, shown as a user would type it."""
+    print(f"\n$ taccorl {' '.join(words)}", flush=True)
+    code = cli.main(list(words))
+    if code != 0:
+        raise SystemExit(f"taccorl {words[0]} ended with {code}")
+
+
+def make(task: str, options: dict[str, str], out: Path = OUT, sources: int = SOURCES) -> Path:
+    """Sources and new episodes of one task; returns the dataset's folder."""
+    source, new, store = out / f"{task}_sources", out / task, f"--store={out / 'store'}"
+    # Pictures of the sources are never looked at.
+    taccorl("collect", f"--task={task}", f"--episodes={sources}", "--images=false", f"--out={source}", store)
+    engine = f"--engine.workers={options['workers']}"
+    words = (f"--episodes={options['episodes']}", f"--images={options['images']}", engine)
+    taccorl("augment", f"--source={source}", f"--task={task}", *words, f"--out={new}", store)
+    return new
+
+
+def main(words: list[str]) -> None:
+    """Words: tasks, all four by default, and options."""
+    options = OPTIONS | dict(word.removeprefix("--").split("=", 1) for word in words if word.startswith("--"))
+    named = [word for word in words if not word.startswith("--")] or list(TASKS)
+    odd = [*(set(options) - set(OPTIONS)), *(set(named) - set(TASKS))]
+    if odd:
+        raise SystemExit(f"no {odd[0]!r}; tasks: {', '.join(TASKS)}; options: {', '.join(f'--{o}=' for o in OPTIONS)}")
+    lines = []
+    for task in named:
+        began_s = time.perf_counter()
+        new = make(task, options)
+        told = json.loads(new.with_name(f"{new.name}.augment_report.json").read_text(encoding="utf-8"))
+        share, minutes = told["yield"], (time.perf_counter() - began_s) / 60
+        counts = f"{share['successes']} of {share['attempts']} attempts ({100 * share['rate']:.0f} %)"
+        lines.append(f"{task:12s}{counts}, {minutes:.0f} min in this run: {new}.augment_report.html")
+    print("\n" + "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

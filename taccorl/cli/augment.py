@@ -1,0 +1,114 @@
+"""``taccorl augment --source=outputs/assembly_2 --task=assembly_2 [--episodes=200] [--out=outputs/assembly_2_augmented]``
+
+A few demonstrations out of the twin (``taccorl collect``) into a LeRobot dataset of many new, successful ones with touch and
+pictures: MimicGen for two hands, held objects carried over. Beside it a report: yield, coverage, failures and how to see them.
+The dataset is the same for any number of workers: --engine.workers=2, --engine.type=ray, --engine.type=slurm.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from taccorl.cli.parse import parse
+from taccorl.errors import DatasetError, TaccorlError
+from taccorl.lineage.engines import Engine, LocalEngine
+
+if TYPE_CHECKING:
+    from taccorl.demos.mimicgen.augment import AugmentPlan
+
+
+@dataclass(kw_only=True)
+class AugmentConfig:
+    """New demonstrations out of a few."""
+
+    source: Path
+    """Dataset of successful demonstrations from the twin, of this task."""
+    task: str
+    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's."""
+    episodes: int = 200
+    """How many successful ones."""
+    out: Path | None = None
+    """The dataset's folder; outputs/TASK_augmented if not given. It must not hold anything else."""
+    store: Path = Path("outputs/store")
+    """Finished attempts are kept here, so that a second run goes on where the first ended."""
+    difficulty: str = "train"
+    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    twin: Path | None = None
+    """A twin.yaml; the nominal twin if not given. It need not be that of the sources."""
+    spec: str | None = None
+    """How, as a file like those of data_specs/mimicgen/; the shipped one of the task if not given."""
+    images: bool = True
+    """Render the three cameras (needs OpenGL)."""
+    seed: int = 0
+    """Of all attempts, at least 0; another seed gives other scenes."""
+    engine: Engine = field(default_factory=LocalEngine)
+    """Where to work: --engine.type=local --engine.workers=2, slurm, ray."""
+
+
+def main(argv: list[str]) -> int:
+    """0: augmented."""
+    config = parse(AugmentConfig, argv, positional=None)
+    from taccorl.benchmark import cpu_s
+    from taccorl.demos.mimicgen.augment import augment, check_out
+    from taccorl.demos.mimicgen.coverage import Share
+    from taccorl.demos.mimicgen.report import pages_of, write_report
+    from taccorl.lineage.store import Store
+
+    plan = _plan(config)
+    out = config.out or Path("outputs") / f"{config.task}_augmented"
+    _check_places(config, out)
+    pages_of(out)
+    store = Store(config.store)
+    check_out(plan, config.source, out, store)
+    before, began_s = {path.name for path in store.artefacts()}, cpu_s(children=True)
+    report = augment(plan, config.source, out, store, config.engine)
+    spent_s = cpu_s(children=True) - began_s
+    made = sum(path.parent.name == "mimicgen" and path.name not in before for path in store.artefacts())
+    known = isinstance(config.engine, LocalEngine) and made >= report["attempts"]
+    page = write_report(plan, config.source, out, store, report["attempts"], cpu_s=spent_s if known else None)
+    print(f"dataset: {out}  ({report['episodes']} episodes, {report['rows']} rows): {plan.origin}")
+    print(f"yield:   {Share(successes=report['episodes'], attempts=report['attempts'])}")
+    print(f"report:  {page}")
+    print(f"next:    taccorl view {out} --episode=0")
+    return 0
+
+
+def _plan(config: AugmentConfig) -> "AugmentPlan":
+    """What was asked for, if there is such a task, spec and twin, and the sources can be any.
+
+    Raises:
+        TaccorlError: names what is not there, with the near name.
+    """
+    from taccorl.demos.mimicgen.augment import AugmentPlan
+    from taccorl.demos.mimicgen.from_dataset import open_sources
+    from taccorl.demos.mimicgen.spec import check_task, load_mimic_spec
+    from taccorl.sim.tasks import tasks
+
+    task = tasks.get(config.task)(config.difficulty)
+    spec = load_mimic_spec(config.spec or config.task)
+    if spec.task != config.task:
+        raise TaccorlError(f"--spec={config.spec} is of task {spec.task}, --task={config.task}")
+    check_task(spec, task)
+    open_sources(config.source, config.task)
+    plan = AugmentPlan(
+        spec=spec,
+        episodes=config.episodes,
+        difficulty=config.difficulty,
+        twin=config.twin,
+        images=config.images,
+        seed=config.seed,
+    )
+    plan.twin_config()
+    return plan
+
+
+def _check_places(config: AugmentConfig, out: Path) -> None:
+    """Places that lie in one another would change while they are read."""
+    from taccorl.data.lerobot_format import check_path
+
+    check_path(out)
+    places = {"--source": config.source.resolve(), "--store": config.store.resolve()}
+    whole = out.resolve()
+    for option, place in places.items():
+        if whole.is_relative_to(place) or place.is_relative_to(whole):
+            raise DatasetError(f"--out={out} and {option}={place} lie in one another: choose another --out")

@@ -1,0 +1,339 @@
+"""What a run of MimicGen gave: yield, where in the reset space it is poor, sources, failures one by one, cost. HTML and JSON.
+
+The page needs no other file; ``….json`` holds every number of it. Both lie beside the dataset. All simulated.
+"""
+
+import base64
+import html
+import io
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+import taccorl
+from taccorl.demos.mimicgen.augment import AugmentPlan
+from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of, drawn_rows, read_attempts, share_of
+from taccorl.errors import TaccorlError
+from taccorl.lineage.store import Store
+
+GENERATOR = "taccorl augment report"
+_HEAD_BYTES = 2048
+_SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "°"), "kg": (1e3, "g"), "1": (1.0, "")}
+_GOOD, _BAD, _CELL = "#0072b2", "#d55e00", "#009e73"
+
+
+def pages_of(out: Path) -> tuple[Path, Path]:
+    """HTML and JSON beside the dataset at ``out``.
+
+    Raises:
+        TaccorlError: a file that is not ours lies there.
+    """
+    pages = tuple(out.with_name(f"{out.name}.augment_report.{kind}") for kind in ("html", "json"))
+    for page in pages:
+        if page.exists() and GENERATOR.encode() not in page.read_bytes()[:_HEAD_BYTES]:
+            raise TaccorlError(f"{page}: is there already and no report of ours; give another --out, or remove it")
+    return pages[0], pages[1]
+
+
+def write_report(
+    plan: AugmentPlan, source: Path, out: Path, store: Store, num_attempts: int, *, cpu_s: float | None = None
+) -> Path:
+    """Both files of the attempts 0 … num_attempts − 1; returns the page. An earlier report of ours is replaced.
+
+    Args:
+        cpu_s: what the whole run took, where all of its attempts were made in it.
+    """
+    told = numbers(plan, read_attempts(plan, source, store, num_attempts), cpu_s)
+    told |= {"source": str(source), "dataset": str(out)}
+    page, data = pages_of(out)
+    for path, text in ((data, json.dumps(told, indent=1, ensure_ascii=False) + "\n"), (page, _page(plan, told))):
+        part = path.with_name(f".{path.name}.part")
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    return page
+
+
+def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], cpu_s: float | None) -> dict[str, Any]:
+    """Everything on the page, as JSON knows it."""
+    share = share_of(attempts)
+    bins = list(bins_of(plan, attempts))
+    failed = [a for a in attempts if not a.success]
+    return {
+        "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
+        "task": plan.spec.task,
+        "data": plan.origin,
+        "difficulty": plan.difficulty,
+        "twin": str(plan.twin) if plan.twin else "nominal",
+        "seed": plan.seed,
+        "spec": plan.spec.digest,
+        "retarget": plan.spec.datagen_config.retarget,
+        "yield": share.told(),
+        "bins": [asdict(b) | {"share": b.share.told()} for b in bins],
+        "draws": [
+            {"attempt": a.k, "success": a.success} | {name: value.tolist() for name, value in a.draw.items()}
+            for a in attempts
+        ],
+        "sources": _by_source(attempts, share.successes),
+        "failures": dict(Counter(a.outcome for a in failed).most_common()),
+        "failed": [
+            {"attempt": a.k, "outcome": a.outcome, "reason": a.reason, "seed": a.scene_seed, "command": a.command}
+            for a in failed
+        ],
+        "cost": _cost(attempts, cpu_s),
+    }
+
+
+def _by_source(attempts: Sequence[Attempt], successes: int) -> list[dict[str, Any]]:
+    found = []
+    for name in sorted({name for a in attempts for name in a.sources}):
+        share = share_of([a for a in attempts if name in a.sources])
+        found.append({"source": name, "share_of_successes": share.successes / max(successes, 1)} | share.told())
+    return found
+
+
+def _cost(attempts: Sequence[Attempt], cpu_s: float | None) -> dict[str, Any]:
+    successes = [a.process_s for a in attempts if a.success]
+    failures = [a.process_s for a in attempts if not a.success]
+    return {
+        "process_s_per_success": sum(successes + failures) / max(len(successes), 1),
+        "median_success_process_s": median(successes) if successes else None,
+        "median_failure_process_s": median(failures) if failures else None,
+        "cpu_s_per_success": cpu_s / max(len(successes), 1) if cpu_s is not None else None,
+    }
+
+
+# the page -----------------------------------------------------------------------------------------------------------------
+
+_STYLE = """
+body{font:15px/1.5 system-ui,-apple-system,"Segoe UI",sans-serif;margin:0;color:#111827;background:#f8fafc}
+main{max-width:1240px;margin:0 auto;padding:24px 20px 80px}
+h1{font-size:26px;margin:8px 0}h2{font-size:20px;margin:36px 0 10px;border-bottom:2px solid #e5e7eb;padding-bottom:4px}
+.data{background:#fef3c7;border:1px solid #f59e0b;border-radius:6px;padding:8px 12px;font-weight:600}
+.verdict{font-size:17px;background:#ecfeff;border:1px solid #06b6d4;border-radius:6px;padding:10px 14px;margin:12px 0}
+.note{color:#4b5563;font-size:13.5px;margin:6px 0}
+table{border-collapse:collapse;background:#fff;font-size:13px;margin:8px 0}
+th,td{padding:5px 9px;border-bottom:1px solid #e5e7eb;text-align:left;vertical-align:top}th{background:#f1f5f9}
+td.n{text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums}
+.scroll{overflow-x:auto}img{max-width:100%;background:#fff;border:1px solid #e5e7eb;border-radius:6px}
+code{background:#f1f5f9;padding:1px 4px;border-radius:3px;white-space:nowrap}
+"""
+
+
+def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
+    share = Share(successes=told["yield"]["successes"], attempts=told["yield"]["attempts"])
+    title = f"{plan.spec.task}: {share.successes} new episodes out of {told['source']}"
+    parts = [
+        f"<h1>{html.escape(title)}</h1>",
+        f'<p class="data">{html.escape(plan.origin)}: simulated</p>',
+        f'<div class="verdict">Yield: {share}</div>',
+        _table(
+            ("", ""),
+            [
+                [html.escape(name), html.escape(str(told[name]))]
+                for name in ("dataset", "source", "twin", "difficulty", "seed", "retarget", "spec")
+            ],
+        ),
+        "<h2>Where in the reset space</h2>",
+        *_where(plan, told, share),
+        "<h2>Sources</h2>",
+        _note("An attempt counts for every source that it uses; share: of the new episodes."),
+        _table(
+            ("source", "share", "yield of attempts that use it"),
+            [
+                [
+                    html.escape(s["source"]),
+                    f"{100 * s['share_of_successes']:.0f} %",
+                    str(Share(successes=s["successes"], attempts=s["attempts"])),
+                ]
+                for s in told["sources"]
+            ],
+            right=(1, 2),
+        ),
+        "<h2>Failures</h2>",
+        *_failures(told, share.attempts),
+        "<h2>Cost</h2>",
+        *_costs(told["cost"]),
+    ]
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="generator" content="{told["generator"]}">'
+        f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
+        f"</head><body><main>{chr(10).join(parts)}</main></body></html>\n"
+    )
+
+
+def _where(plan: AugmentPlan, told: dict[str, Any], share: Share) -> Iterator[str]:
+    if not told["bins"]:
+        yield _note("Nothing was drawn: every attempt began in the nominal scene.")
+        return
+    words = (
+        "What each attempt drew, over the whole range that is drawn from. In a box: successes / attempts; green: all succeeded, "
+        "white: none. Whiskers and brackets: 95 % intervals (Wilson)."
+    )
+    picture = base64.b64encode(_png(coverage_figure(plan, told))).decode("ascii")
+    yield f'<figure><img src="data:image/png;base64,{picture}" alt="coverage"></figure>'
+    yield _note(words)
+    poor = [b for b in told["bins"] if b["share"]["attempts"] and b["share"]["interval_95"][1] < share.rate]
+    empty = sum(not b["share"]["attempts"] for b in told["bins"])
+    if empty:
+        yield _note(f"{empty} of {len(told['bins'])} boxes had no attempt.")
+    if poor:
+        yield _note(
+            f"Boxes whose interval lies below the yield of all. Of {len(told['bins'])} boxes alike in truth, about "
+            f"{0.025 * len(told['bins']):.1f} would."
+        )
+        rows = [[b["row"], _range_words(b), str(Share(**_counts(b["share"])))] for b in poor]
+        yield _table(("row", "range", "yield"), rows, right=(2,))
+    else:
+        yield _note("No box's interval lies below the yield of all.")
+
+
+def _counts(told: dict[str, Any]) -> dict[str, int]:
+    return {key: told[key] for key in ("successes", "attempts")}
+
+
+def _range_words(b: dict[str, Any]) -> str:
+    scale, unit = _SHOWN[b["unit"]]
+    return ", ".join(
+        f"{low * scale:.3g} … {high * scale:.3g} {unit}" for low, high in zip(b["low"], b["high"], strict=True)
+    )
+
+
+def _failures(told: dict[str, Any], attempts: int) -> Iterator[str]:
+    if not told["failed"]:
+        yield _note("None.")
+        return
+    rows = [[html.escape(name), str(n), f"{100 * n / attempts:.0f} %"] for name, n in told["failures"].items()]
+    yield _table(("category", "attempts", "of all"), rows, right=(1, 2))
+    yield _note(
+        "The command executes an attempt again, from its stored actions and its scene's seed, and opens it in Rerun."
+    )
+    rows = [
+        [
+            str(f["attempt"]),
+            html.escape(f["outcome"]),
+            html.escape(f["reason"]),
+            f"<code>{html.escape(f['command'])}</code>",
+        ]
+        for f in told["failed"]
+    ]
+    yield _table(("attempt", "category", "why", "to look at it"), rows, right=(0,))
+
+
+def _costs(cost: dict[str, Any]) -> Iterator[str]:
+    words = {
+        "cpu_s_per_success": "CPU time of the whole run for each new episode [CPU-s]",
+        "process_s_per_success": "attempts, failed ones too, for each new episode, wall clock of one process [s]",
+        "median_success_process_s": "median attempt that succeeded: physics, again with touch, pictures, files [s]",
+        "median_failure_process_s": "median attempt that failed: physics [s]",
+    }
+    yield _table(("", ""), [[w, f"{cost[k]:.2f}"] for k, w in words.items() if cost[k] is not None], right=(1,))
+    if cost["cpu_s_per_success"] is None:
+        yield _note("CPU time is not known: attempts lay in the store already, or other machines made them.")
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{html.escape(text)}</p>'
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
+    """Of HTML cells; ``right``: columns of numbers."""
+    top = "<tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in heads) + "</tr>" if any(heads) else ""
+    lines = (
+        "".join(f"<td{' class=n' if i in right else ''}>{cell}</td>" for i, cell in enumerate(row)) for row in rows
+    )
+    return f'<div class="scroll"><table>{top}{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+
+
+def coverage_figure(plan: AugmentPlan, told: dict[str, Any]) -> Any:
+    """A panel a row of the randomisation: draws of successes and failures, and the yield of its boxes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = drawn_rows(plan)
+    columns = min(4, len(rows))
+    lines = -(-len(rows) // columns)
+    figure = Figure(figsize=(3.1 * columns, 3.0 * lines + 0.7), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    for ax, row in zip(axes, rows, strict=False):
+        scale, unit = _SHOWN[row.unit]
+        boxes = [b for b in told["bins"] if b["row"] == row.name]
+        values = np.array([d[row.name] for d in told["draws"]]).reshape(-1, len(row.low)) * scale
+        good = np.array([d["success"] for d in told["draws"]])
+        ax.set_title(row.name.replace("_", " "), fontsize=9)
+        ax.tick_params(labelsize=7)
+        for side in ("top", "right"):
+            ax.spines[side].set_visible(False)
+        (_plane if len(row.low) == 2 else _line)(ax, boxes, values, good, scale, unit)
+    for ax in axes[len(rows) :]:
+        ax.set_visible(False)
+    from matplotlib.lines import Line2D
+
+    points = [
+        Line2D([], [], ls="", marker="o", ms=4, color=_GOOD, label="success"),
+        Line2D([], [], ls="", marker="x", ms=5, color=_BAD, label="failure"),
+    ]
+    figure.suptitle(
+        f"{plan.spec.task}: draws of {len(told['draws'])} attempts ({plan.origin}: simulated)",
+        fontsize=10,
+        x=0.01,
+        ha="left",
+    )
+    figure.legend(handles=points, loc="outside lower left", ncols=2, fontsize=8, frameon=False)
+    return figure
+
+
+def _plane(ax: Any, boxes: list[dict[str, Any]], values: np.ndarray, good: np.ndarray, scale: float, unit: str) -> None:
+    """x and y: boxes shaded by yield, draws over them."""
+    from matplotlib.patches import Rectangle
+
+    for b in boxes:
+        (left, bottom), (right, top) = np.array(b["low"]) * scale, np.array(b["high"]) * scale
+        size, rate = (right - left, top - bottom), b["share"]["rate"] or 0.0
+        ax.add_patch(Rectangle((left, bottom), *size, facecolor=_CELL, alpha=0.45 * rate, lw=0, zorder=0))
+        ax.add_patch(Rectangle((left, bottom), *size, fill=False, edgecolor="#9ca3af", lw=0.6, zorder=1))
+        ax.annotate(
+            f"{b['share']['successes']}/{b['share']['attempts']}", (left, top), (2, -3), textcoords="offset points",
+            va="top", fontsize=7, zorder=4, bbox={"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 0.6},
+        )  # fmt: skip
+    _points(ax, values[:, 0], values[:, 1], good)
+    ax.set_xlabel(f"x [{unit}]", fontsize=8)
+    ax.set_ylabel(f"y [{unit}]", fontsize=8)
+
+
+def _line(ax: Any, boxes: list[dict[str, Any]], values: np.ndarray, good: np.ndarray, scale: float, unit: str) -> None:
+    """One number: yield of each box with its interval, draws above (successes) and below (failures)."""
+    for b in boxes:
+        (low,), (high,) = np.array(b["low"]) * scale, np.array(b["high"]) * scale
+        share = Share(**_counts(b["share"]))
+        if share.attempts:
+            bottom, top = share.interval
+            ax.bar((low + high) / 2, 100 * share.rate, 0.94 * (high - low), color=_CELL, alpha=0.45, zorder=0)
+            ax.vlines((low + high) / 2, 100 * bottom, 100 * top, color="#374151", lw=1)
+        ax.annotate(
+            f"{share.successes}/{share.attempts}", ((low + high) / 2, 0), (0, 3), textcoords="offset points", ha="center",
+            fontsize=7, color="#374151",
+        )  # fmt: skip
+    _points(ax, values[:, 0], np.where(good, 108.0, -8.0), good)
+    ax.set_ylim(-15, 115)
+    ax.set_yticks([0, 50, 100])
+    ax.set_ylabel("yield [%]", fontsize=8)
+    if unit:
+        ax.set_xlabel(f"[{unit}]", fontsize=8)
+
+
+def _points(ax: Any, x: np.ndarray, y: np.ndarray, good: np.ndarray) -> None:
+    ax.scatter(x[good], y[good], s=7, color=_GOOD, alpha=0.7, lw=0, zorder=2)
+    ax.scatter(x[~good], y[~good], s=18, color=_BAD, marker="x", lw=1.1, zorder=3)
+
+
+def _png(figure: Any) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", facecolor="white")
+    return stream.getvalue()

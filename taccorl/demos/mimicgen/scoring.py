@@ -1,0 +1,91 @@
+"""How good generation is in one setting: yield under all gates, what it costs, whether what is kept holds. All simulated."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.demos.mimicgen.attempt import Attempts
+from taccorl.demos.mimicgen.coverage import Share
+from taccorl.demos.mimicgen.source import Source, SourcePool
+from taccorl.demos.mimicgen.spec import MimicSpec
+from taccorl.demos.recorder import with_simulator
+from taccorl.sim.controller import ControllerConfig
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks import tasks
+from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+
+
+@dataclass
+class Score:
+    """Of a number of attempts."""
+
+    outcomes: list[str] = field(default_factory=list)
+    cpu_s: list[float] = field(default_factory=list)
+    """Physics of each attempt, failed ones too, once."""
+    duration_s: list[float] = field(default_factory=list)
+    """Of the successes."""
+    broken: int = 0
+    """Kept ones whose stored actions, in a simulation made anew, end in another state or with the goal not reached."""
+
+    @property
+    def share(self) -> Share:
+        return Share(successes=self.outcomes.count("success"), attempts=len(self.outcomes))
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """Category → how often, the most frequent first."""
+        return dict(Counter(o for o in self.outcomes if o != "success").most_common())
+
+
+def score_generation(
+    spec: MimicSpec,
+    sources: Sequence[Source],
+    twin: TwinConfig,
+    num_attempts: int,
+    *,
+    seed: int = 0,
+    check: bool = False,
+) -> Score:
+    """Attempts 0 … ``num_attempts`` − 1 in ``twin``, as ``taccorl augment`` makes them, without pictures.
+
+    Args:
+        sources: from any twin.
+        check: execute what is kept a third time, in a simulation of its own, for ``Score.broken``.
+    """
+    sim, other = (Simulation(tasks.get(spec.task)(), twin) for _ in range(2))
+    rows = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    attempts, score = Attempts(SourcePool(spec, sources), sim, seed), Score()
+    for k in range(num_attempts):
+        done = attempts.run(k)
+        if done.success:
+            recorder = attempts.redo(done, rows)
+            if done.success:
+                score.duration_s.append(len(done.actions) / CONTROL_HZ)
+                if check:
+                    stored = np.stack([row["action"] for row in recorder.rows])
+                    score.broken += not _holds(other, done.scene_seed, stored, done.last_state)
+        score.outcomes.append(done.outcome)
+        score.cpu_s.append(done.cpu_s)
+    return score
+
+
+def _holds(sim: Simulation, scene_seed: int, actions: np.ndarray, last_state: np.ndarray) -> bool:
+    """Whether stored actions (T, 14) end where the attempt did, in place."""
+    sim.reset([scene_seed])
+    for action in actions:
+        sim.step(action[None].astype(np.float64))
+    return bool(np.array_equal(sim.state_rows()[0], last_state) and sim.task.look(sim).goal[0])
+
+
+def stiffened(twin: TwinConfig, factor: float) -> TwinConfig:
+    """The twin with ``factor`` times the stiffness K_p in every joint of both arms; K_d and T_ref stay."""
+
+    def controller(of: ControllerConfig) -> ControllerConfig:
+        return dataclasses.replace(of, kp_nm_per_rad=[factor * kp for kp in of.kp_nm_per_rad])
+
+    arms = {arm: controller(of) for arm, of in twin.arm_controllers.items()}
+    return dataclasses.replace(twin, controller=controller(twin.controller), arm_controllers=arms)

@@ -1,0 +1,156 @@
+"""``taccorl augment`` as a user types it, on two demonstrations from the twin (simulated, not a robot)."""
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from taccorl.cli.main import main
+from taccorl.data.dataset import Dataset
+from taccorl.data.spec import find_spec
+from taccorl.demos.mimicgen import augment as module
+from taccorl.demos.mimicgen.augment import attempt_episode
+
+WORDS = ("--task=assembly_2", "--episodes=2", "--images=false", "--out=new", "--store=store")
+
+
+@pytest.fixture(scope="module")
+def place(collected: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the command was run once."""
+    folder = tmp_path_factory.mktemp("augment_cli")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main(["augment", f"--source={collected}", *WORDS]) == 0
+    return folder
+
+
+@pytest.fixture
+def said(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs a verb there; (exit code, all that was said)."""
+    monkeypatch.chdir(place)
+
+    def run(*words: Any) -> tuple[int, str]:
+        code = main(list(map(str, words)))
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, shown.out + shown.err
+
+    return run
+
+
+def report(folder: Path, name: str = "new") -> dict[str, Any]:
+    return json.loads((folder / f"{name}.augment_report.json").read_text())
+
+
+def test_the_report_tells_what_the_dataset_holds(place: Path) -> None:
+    told, dataset = report(place), Dataset(place / "new")
+    assert dataset.num_episodes == told["yield"]["successes"] == 2
+    assert told["data"] == "MuJoCo twin, not a robot"
+    assert len(told["failed"]) == told["yield"]["attempts"] - 2
+    assert told["cost"]["cpu_s_per_success"] > 0
+    by_attempt = {draw["attempt"]: draw for draw in told["draws"]}
+    for i in range(2):
+        simulation = dataset.episode(i).provenance["simulation"]
+        assert isinstance(simulation, dict)
+        made = simulation["mimicgen"]
+        for name, value in made["draw"].items():  # reckoned from the seeds; there as the simulation drew it
+            assert by_attempt[made["attempt"]][name] == value
+    page = (place / "new.augment_report.html").read_text()
+    assert "Yield: 2 of " in page
+    assert "data:image/png;base64," in page
+
+
+def test_the_same_command_again_makes_nothing_anew_and_says_so_of_its_cost(
+    collected: Path, place: Path, said: Any
+) -> None:
+    attempts = sorted((place / "store" / "mimicgen").iterdir())
+    code, text = said("augment", f"--source={collected}", *WORDS)
+    assert code == 0
+    assert f"yield:   2 of {len(attempts)}" in text
+    assert "next:    taccorl view new --episode=0" in text
+    assert sorted((place / "store" / "mimicgen").iterdir()) == attempts
+    assert report(place)["cost"]["cpu_s_per_success"] is None
+    assert report(place)["cost"]["process_s_per_success"] > 0
+
+
+def test_an_attempt_is_executed_again_bit_for_bit_from_what_the_store_holds(place: Path) -> None:
+    folders = [path for path in (place / "store" / "mimicgen").iterdir() if (path / "dataset").is_dir()]
+    kept = [Dataset(place / "new").episode(i) for i in range(2)]
+    again = attempt_episode(folders[0])
+    (same,) = [e for e in kept if e.arrays["sim.seed"][0] == again.arrays["sim.seed"][0]]
+    for key in ("action", "sim.state", "observation.tactile"):
+        np.testing.assert_array_equal(again.arrays[key], same.arrays[key])
+
+
+def test_what_never_succeeds_ends_with_a_command_that_shows_a_failure(
+    collected: Path, place: Path, said: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_HUNDRED", 1)
+    spec = yaml.safe_load(find_spec("assembly_2").read_text()) | {"gates": {"max_force_n": 0.5}}
+    (place / "strict.yaml").write_text(yaml.safe_dump(spec))
+    words = ("--spec=strict.yaml", "--task=assembly_2", "--images=false", "--out=strict", "--store=store")
+    code, text = said("augment", f"--source={collected}", *words)
+    assert code == 2
+    assert "0 of 1 attempts succeeded, nothing was written to strict" in text
+    assert "'force': 1" in text
+    command = shlex.split(text.rpartition("Look at one: ")[2])
+    assert command[:2] == ["taccorl", "view"]
+    assert said(*command[1:], "--save=failed.rrd")[0] == 0
+    assert (place / "failed.rrd").stat().st_size > 10_000
+    episode = attempt_episode(Path(command[2]))
+    assert not episode.success
+    assert "force: " in episode.name
+
+
+def test_a_recording_without_simulator_state_is_refused_with_the_command_that_collects(
+    collected: Path, said: Any, tmp_path: Path
+) -> None:
+    shutil.copytree(collected, tmp_path / "real")
+    path = tmp_path / "real" / "meta" / "info.json"  # as of a robot's recording
+    info = json.loads(path.read_text())
+    info["features"] = {key: f for key, f in info["features"].items() if not key.startswith("sim.")}
+    path.write_text(json.dumps(info))
+    shutil.rmtree(tmp_path / "real" / "meta" / "taccorl")
+    code, text = said("augment", f"--source={tmp_path / 'real'}", "--task=assembly_2", "--out=x")
+    assert code == 2
+    assert "has no sim.state" in text
+    assert "taccorl collect --task=assembly_2 --out=outputs/assembly_2" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--task=asembly_2",), "no task 'asembly_2'; did you mean 'assembly_2'?"),
+        (("--task=assembly_1", "--out=x"), "is of task assembly_2, the spec is of assembly_1"),
+        (("--task=assembly_2", "--spec=puzzle"), "--spec=puzzle is of task puzzle, --task=assembly_2"),
+        (("--task=assembly_2", "--difficulty=hrad"), "did you mean 'hard'?"),
+        (("--task=assembly_2", "--twin=no.yaml"), "no.yaml"),
+        (("--task=assembly_2", "--episodes=0"), "--episodes=0: at least one"),
+        (("--task=assembly_2", "--out=store/x", "--store=store"), "lie in one another"),
+        (("--task=assembly_2", "--source=nowhere"), "nowhere: no such folder"),
+        ((*WORDS[:3], "--out=mine", "--store=store"), "mine is in the way: it is a folder of 1 entries without"),
+        ((*WORDS, "--seed=1"), "new is in the way: it holds augmented v1"),
+        ((*WORDS, "--episodes=3"), "new is in the way: it holds augmented v1"),
+        ((*WORDS, "--out=other"), "other.augment_report.html: is there already and no report of ours"),
+        ((*WORDS, "--engine.workers=two"), "engine.workers"),
+        ((*WORDS, "--egnine.workers=2"), "did you mean 'engine.workers'?"),
+    ],
+)
+def test_what_cannot_work_is_named_before_any_attempt(
+    words: tuple[str, ...], expected: str, collected: Path, place: Path, said: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "run_attempt", lambda *_: pytest.fail("an attempt was made"))
+    (place / "mine").mkdir(exist_ok=True)
+    (place / "mine" / "work.txt").write_text("x")
+    (place / "other.augment_report.html").write_text("my own page")
+    options = {word.partition("=")[0]: word for word in (f"--source={collected}", *words)}  # the last one counts
+    code, text = said("augment", *options.values())
+    assert code == 2
+    assert expected in text
+    assert (place / "mine" / "work.txt").read_text() == "x"
+    assert not (place / "x").exists()

@@ -1,0 +1,65 @@
+"""What the figures of MimicGen are made of: attempts in a twin of another stiffness, and what is kept done a third time."""
+
+import numpy as np
+import pytest
+
+from taccorl.demos.benchmarks import mimicgen_cells
+from taccorl.demos.mimicgen.from_dataset import read_sources
+from taccorl.demos.mimicgen.scoring import Score, _holds, score_generation, stiffened
+from taccorl.demos.mimicgen.spec import load_mimic_spec
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks.assembly_2 import Assembly2
+from taccorl.sim.twin import TwinConfig
+
+
+def test_a_stiffened_twin_has_other_gains_and_nothing_else():
+    twin = TwinConfig()
+    soft = stiffened(twin, 0.5)
+    assert soft.controller.kp_nm_per_rad[0] == 0.5 * 1813.0  # paper App. B.1
+    assert soft.controller.kd_nms_per_rad == twin.controller.kd_nms_per_rad
+    assert stiffened(soft, 2.0) == twin
+    assert twin.controller.kp_nm_per_rad[0] == 1813.0
+
+
+def test_a_score_counts_every_attempt_and_what_it_took(collected):
+    spec = load_mimic_spec("assembly_2")
+    score = score_generation(spec, read_sources(collected, spec), TwinConfig(), 2, seed=11, check=True)
+    assert score.share.attempts == len(score.cpu_s) == 2
+    assert len(score.duration_s) == score.share.successes > 0
+    assert min(score.cpu_s) > 0
+    assert all(5 < duration < 30 for duration in score.duration_s)
+    assert score.broken == 0
+
+
+def test_failures_are_counted_by_category():
+    score = Score(outcomes=["dropped", "success", "force", "dropped"])
+    assert score.failures == {"dropped": 2, "force": 1}
+    assert str(score.share) == "1 of 4: 25 % (95 %: 5 … 70)"
+
+
+def test_what_is_not_in_place_or_ends_elsewhere_does_not_hold():
+    sim = Simulation(Assembly2())
+    sim.reset([5])
+    still = np.tile(sim.arrays["ctrl"][0, sim.action_actuators].astype(np.float32), (3, 1))
+    for action in still:
+        sim.step(action[None].astype(float))
+    end = sim.state_rows()[0]
+    assert not _holds(sim, 5, still, end)  # the same state, but the plug stands on the table
+    assert not _holds(sim, 5, still[:2], end)
+
+
+@pytest.mark.slow
+def test_the_rows_of_a_task_name_every_cell():
+    rows = list(mimicgen_cells("assembly_2", 1, 1))
+    assert [(row.unit, row.goal) for row in rows] == [
+        ("%", "≥ 80"),
+        ("CPU-s", "≤ 1.5"),
+        ("episodes", "≤ 0"),
+        ("%", "≥ 70"),
+        ("%", ""),
+        ("×", "≥ 3"),
+        *[("%", "≥ 75"), ("%", "≤ 30")] * 2,
+    ]
+    assert all(row.name.startswith("assembly_2: ") for row in rows)
+    assert rows[0].n == 1
+    assert rows[2].value == 0
