@@ -143,8 +143,8 @@ def detection_curves(
             x = float(np.exp(np.mean(np.log(signals[own]))))
             axes.plot([x, x], [ends.low, ends.high], color=AFTER, lw=0.9, alpha=0.6)
             axes.plot(x, count / n, "o", color=AFTER, ms=3.5)
-        half, _, high = half_detected(signals, found)
-        if found.any() and np.isfinite(high):
+        half, low, high = half_detected(signals, found)
+        if low > 0 and np.isfinite(high):  # seeds on both sides of it
             axes.plot(line, 1.0 / (1.0 + (half / line) ** SLOPE), color=BEFORE, lw=1.2)
         axes.set_title(f"{name} (n = {len(signals)})", fontsize=8)
         axes.set_xscale("log")
@@ -153,8 +153,10 @@ def detection_curves(
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylim(-0.04, 1.06)
         tidy(axes)
-    for axes in panels.flat[len(points) :]:
-        axes.set_axis_off()
+    for k, axes in enumerate(panels.flat):
+        axes.tick_params(labelbottom=len(points) - columns <= k < len(points))
+        if k >= len(points):
+            axes.set_axis_off()
     figure.supxlabel("signal of the effect / noise floor (grey line: 1)", fontsize=8)
     figure.supylabel("share of seeds in which it is found or named", fontsize=8)
     return figure
