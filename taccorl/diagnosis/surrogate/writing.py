@@ -162,7 +162,35 @@ def _write(
     uses: Sequence[tuple[str, Measurement]],
     pressed: dict[str, dict[str, Any]],
 ) -> None:
-    _cleared(folder)
+    """All of it beside ``folder`` first, then in its place: half a robot never stands there.
+
+    Raises:
+        TaccorlError: the folder holds something that is no surrogate's, or there is no room.
+    """
+    _check_is_surrogate(folder)
+    part = folder.with_name(f"{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
+    try:
+        _fill(part, truth, twin, uses, pressed)
+    except OSError as error:
+        shutil.rmtree(part, ignore_errors=True)
+        raise TaccorlError(
+            f"{folder}: {error.strerror or error}; nothing was written or replaced there: make room, or give another --out="
+        ) from error
+    folder.mkdir(exist_ok=True)
+    shutil.rmtree(folder / SWEEPS, ignore_errors=True)
+    for name in (SWEEPS, TRUTH, TWIN):
+        (part / name).replace(folder / name)
+    part.rmdir()
+
+
+def _fill(
+    folder: Path,
+    truth: dict[str, object],
+    twin: TwinConfig,
+    uses: Sequence[tuple[str, Measurement]],
+    pressed: dict[str, dict[str, Any]],
+) -> None:
     files = {m.name: f"{k:02d}_{m.name}.mcap" for k, (_, m) in enumerate(uses, 1)}
     (folder / SWEEPS).mkdir(parents=True)
     seal(folder, truth)
@@ -210,14 +238,9 @@ def draw_touch_secret(seed: int) -> tuple[str, ...]:
     return (str(rng.choice(outside if fate < 0.25 else REGISTERED_TOUCH)),)
 
 
-def _cleared(folder: Path) -> None:
-    if not folder.exists() or not any(folder.iterdir()):
-        return
-    if not (folder / TRUTH).is_file():
+def _check_is_surrogate(folder: Path) -> None:
+    if folder.exists() and any(folder.iterdir()) and not (folder / TRUTH).is_file():
         raise TaccorlError(f"{folder}: it holds something that is no surrogate robot; give another --out=")
-    for name in (TRUTH, TWIN):
-        (folder / name).unlink(missing_ok=True)
-    shutil.rmtree(folder / SWEEPS, ignore_errors=True)
 
 
 def seal(folder: Path, truth: dict[str, object]) -> None:

@@ -1,6 +1,8 @@
 """Surrogate pads as files: frames, stamps and what was pressed are read back as they were made, and nobody reads the truth."""
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from taccorl.alignment.measurements import INDEX, Measurements, read_measurement
 from taccorl.cli.main import main
 from taccorl.cli.measured import checked
 from taccorl.demos.stand_in_config import START_UNIX_NS
-from taccorl.diagnosis.surrogate import touch
+from taccorl.diagnosis.surrogate import touch, writing
 from taccorl.diagnosis.surrogate.touch import TouchCase, TouchRecordings, draw_touch_case
 from taccorl.diagnosis.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 from taccorl.diagnosis.surrogate.writing import SWEEPS, TRUTH, TWIN, draw_touch_secret, reveal, write_touch_recordings
@@ -127,3 +129,22 @@ def test_the_command_line_says_what_is_wrong(words: list[str], message: str, cap
     assert main(["surrogate", "--secret=1", "--pads=left", f"--out={tmp_path / 'x'}", *words]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "x").exists()
+
+
+def test_a_disk_that_is_full_leaves_nothing_half_written_and_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    case = draw_touch_case((), 3, arm="left")
+    monkeypatch.setattr(touch, "_USES", {"fit": (BALL,), "held_out": (), "test": ()})
+    folder = tmp_path / "robot"
+    write_touch_recordings(case, folder)
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(writing, "save_twin", full)
+    with pytest.raises(TaccorlError, match=r"robot: No space left on device; nothing was written or replaced.*--out="):
+        write_touch_recordings(draw_touch_case((), 4, arm="left"), folder)
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
+    assert [p.name for p in tmp_path.iterdir()] == ["robot"]
