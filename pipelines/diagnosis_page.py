@@ -19,7 +19,8 @@ HEAD = f"""# Is the search for missing effects right?
 Written by `python -m pipelines.diagnosis_study`; do not edit. Every case is a surrogate robot, simulated apart from the twin
 (finer steps, rigid-body dynamics of its own, bristle friction, a controller sampled at 1 kHz, noise, quantisation, jitter), with
 known effects hidden in one joint. The search sees positions only, and nobody tells it the gains: the hardest case. Thresholds
-were chosen on seeds below 300 and after a look at 1000 to 1012; these are others.
+were chosen on seeds below 300 and after a look at 1000 to 1012; these are others. Pairs of 5 floors each were added after a look
+at the first 27 pairs of drawn strength, without a change to the search.
 
 *Material*: the held-out error, gains refitted, is at least {MATERIAL:g} noise floors; below that there is nothing to find.
 *Exact*: the hidden effect is the one that was added first. *Named*: it is that, or named with it as a tie, a rival or a near-twin
