@@ -271,3 +271,11 @@ def test_two_steps_stop_resume_are_the_numbers_of_four_steps(tmp_path):
     torch.set_rng_state(generator)
     assert train(resumed, optimizer, range(2, 4)) == straight
     assert all(torch.equal(resumed.state_dict()[k], v) for k, v in policy.state_dict().items())
+
+
+def test_every_backbone_that_can_be_named_has_a_size():
+    """The configuration lists them without importing transformers."""
+    from taccorl.policies.tactile_pi05.backbone import SIZES
+    from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import _BACKBONES
+
+    assert _BACKBONES == ("full", *SIZES)

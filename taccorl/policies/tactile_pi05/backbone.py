@@ -49,7 +49,6 @@ SIZES = {
         vision_width=64, vision_depth=2, vision_heads=4, vision_mlp=128, patch_px=28, vocabulary=512,
     ),
 }  # fmt: skip
-BACKBONES = ("full", *SIZES)
 
 
 class SmallBackbone(PaliGemmaWithExpertModel):
