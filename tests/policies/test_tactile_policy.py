@@ -278,4 +278,4 @@ def test_every_backbone_that_can_be_named_has_a_size():
     from taccorl.policies.tactile_pi05.backbone import SIZES
     from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import _BACKBONES
 
-    assert _BACKBONES == ("full", *SIZES)
+    assert ("full", *SIZES) == _BACKBONES
