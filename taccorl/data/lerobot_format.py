@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import av.logging
+import cv2
 import numpy as np
 import pyarrow as pa
 
@@ -138,17 +139,18 @@ def _write(episodes: Sequence[Episode], root: Path, progress: Callable[[int], No
         )
         done = 0
         try:
-            for episode in episodes:
-                for row in _rows(episode):
-                    _wait_for_room(dataset)
-                    dataset.add_frame(row)
-                    done += 1
-                    if done % PRIORITY_ROWS == 1:
-                        _normal_priority()
-                    if progress is not None:
-                        progress(done)
-                with _large_features_in_blocks(dataset.writer), _statistics_in_order(dataset_metadata):
-                    dataset.save_episode()
+            with _pixels_counted():
+                for episode in episodes:
+                    for row in _rows(episode):
+                        _wait_for_room(dataset)
+                        dataset.add_frame(row)
+                        done += 1
+                        if done % PRIORITY_ROWS == 1:
+                            _normal_priority()
+                        if progress is not None:
+                            progress(done)
+                    with _large_features_in_blocks(dataset.writer), _statistics_in_order(dataset_metadata):
+                        dataset.save_episode()
             dataset.finalize()
         except BaseException:
             with contextlib.suppress(Exception):  # stop encoder threads; the error that brought us here matters
@@ -210,6 +212,56 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
     finally:
         dataset_writer.compute_episode_stats, writer._save_episode_data = compute, save
         dataset_writer.embed_images, arrow_dataset.generate_fingerprint = embed, fingerprint
+
+
+@contextlib.contextmanager
+def _pixels_counted() -> Iterator[None]:
+    """While open, LeRobot counts how often each of a pixel's 256 values occurs, instead of sorting every picture into 5000 bins.
+
+    Of bytes the counts hold every statistic exactly. LeRobot 0.6.1 spends 40 % of an episode's CPU time on its way.
+    """
+    from lerobot.datasets import compute_stats
+
+    theirs: type = compute_stats.RunningQuantileStats
+
+    class PixelStatistics(theirs):
+        """LeRobot's, but for bytes. Of a picture: (pixels, channels)."""
+
+        counts: np.ndarray | None = None
+
+        def update(self, batch: np.ndarray) -> None:
+            if batch.dtype != np.uint8:
+                super().update(batch)
+                return
+            pixels = np.ascontiguousarray(batch.reshape(-1, 1, batch.shape[-1]))
+            new = [cv2.calcHist([pixels], [c], None, [256], [0, 256])[:, 0] for c in range(batch.shape[-1])]
+            self.counts = np.array(new, np.int64) + (0 if self.counts is None else self.counts)
+            self._count += len(pixels)
+
+        def get_statistics(self) -> dict[str, np.ndarray]:
+            return super().get_statistics() if self.counts is None else stats_of_counts(self.counts)
+
+    compute_stats.RunningQuantileStats = PixelStatistics
+    try:
+        yield
+    finally:
+        compute_stats.RunningQuantileStats = theirs
+
+
+def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
+    """LeRobot's statistics, (channels,), of numbers of which value v occurs ``counts[channel, v]`` times; as ``exact_stats``."""
+    values, num = np.arange(counts.shape[1]), counts.sum(axis=1)
+    mean = counts @ values / num
+    stats = {
+        "min": (counts > 0).argmax(axis=1).astype(float),
+        "max": counts.shape[1] - 1.0 - (counts[:, ::-1] > 0).argmax(axis=1),
+        "mean": mean,
+        "std": np.sqrt(np.maximum((counts * (values - mean[:, None]) ** 2).sum(axis=1) / num, 0)),
+    }
+    for q in QUANTILES:  # the smallest value that a share q of them does not exceed
+        reached = counts.cumsum(axis=1) >= np.ceil(np.round(q * num, 6))[:, None]
+        stats[f"q{round(100 * q):02d}"] = reached.argmax(axis=1).astype(float)
+    return stats | {"count": num[:1]}
 
 
 @contextlib.contextmanager

@@ -20,7 +20,15 @@ from edited import SIZE
 from taccorl.data import lerobot_format
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode, Pictures
-from taccorl.data.lerobot_format import QUANTILES, exact_stats, lerobot_features, merge, quiet_lerobot, write_episodes
+from taccorl.data.lerobot_format import (
+    QUANTILES,
+    exact_stats,
+    lerobot_features,
+    merge,
+    quiet_lerobot,
+    stats_of_counts,
+    write_episodes,
+)
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
 from taccorl.demos.stand_in import read_frame_id
 from taccorl.demos.stand_in_frame_id import draw_frame_id
@@ -230,6 +238,39 @@ def test_exact_statistics_are_lerobots_within_one_histogram_bin() -> None:
     # by hand: of 0 … 199, half do not exceed 99 (the 100th), and 1 % (two of them) do not exceed 1
     assert (ours["q50"][8], ours["q01"][8], ours["q99"][8]) == (99, 1, 197)
     assert (ours["std"][7], ours["q99"][7]) == (0.0, 4.0)
+
+
+def test_statistics_of_counted_pixels_are_the_exact_ones() -> None:
+    rng = np.random.default_rng(4)
+    values = rng.integers(10, 200, (10_000, 3)).astype(np.uint8)
+    values[:, 2] = np.repeat([3, 250], 5000)
+    counts = np.stack([np.bincount(column, minlength=256) for column in values.T])
+    counted, exact = stats_of_counts(counts), exact_stats(values)
+    assert set(counted) == set(exact)
+    for name in exact:
+        np.testing.assert_allclose(counted[name], exact[name], rtol=1e-12, err_msg=name)
+    # by hand: half of them are 3 and do not exceed 3; the mean of 3 and 250 is 126.5, both are 123.5 away
+    assert (counted["q50"][2], counted["q90"][2], counted["mean"][2], counted["std"][2]) == (3, 250, 126.5, 123.5)
+
+
+def test_written_statistics_of_pictures_are_lerobots_but_for_its_bins(spec: DatasetSpec, tmp_path: Path) -> None:
+    from lerobot.datasets import compute_stats
+    from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
+
+    theirs = compute_stats.RunningQuantileStats
+    episode = made_up(spec, 5)
+    write_episodes([episode], tmp_path / "ds")
+    assert compute_stats.RunningQuantileStats is theirs
+    written = LeRobotDatasetMetadata("local/ds", root=tmp_path / "ds").stats
+    assert written is not None
+    assert episode.picture_keys
+    for key in episode.picture_keys:
+        lerobots = theirs()
+        for shown in episode.pictures():
+            lerobots.update(shown[key].reshape(-1, 3))
+        for name, expected in lerobots.get_statistics().items():
+            ours, scale = written[key][name].ravel(), 1 if name == "count" else 255
+            np.testing.assert_allclose(ours * scale, expected, atol=0.06, rtol=2e-4, err_msg=f"{key} {name}")
 
 
 def test_written_statistics_of_touch_are_the_exact_ones(spec: DatasetSpec, tmp_path: Path) -> None:
