@@ -2,9 +2,12 @@
 
 A few demonstrations out of the twin (``taccorl collect``) into a LeRobot dataset of many new, successful ones with touch and
 pictures: MimicGen for two hands, held objects carried over. Beside it a report: yield, coverage, failures and how to see them.
-The dataset is the same for any number of workers: --engine.workers=2, --engine.type=ray, --engine.type=slurm.
+The dataset is the same for any number of workers: --engine.workers=2, --engine.type=ray, --engine.type=slurm. An attempt that
+kills its process twice, or does not end within ten minutes, is then one that failed; --engine.workers=1 works in the command's
+own process, which nothing outlives.
 """
 
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +44,8 @@ class AugmentConfig:
     """Render the three cameras (needs OpenGL)."""
     seed: int = 0
     """Of all attempts, at least 0; another seed gives other scenes."""
+    stratify: bool = False
+    """After the first half, choose attempts that begin where episodes are few; the report says what that did."""
     engine: Engine = field(default_factory=LocalEngine)
     """Where to work: --engine.type=local --engine.workers=2, slurm, ray."""
 
@@ -51,7 +56,7 @@ def main(argv: list[str]) -> int:
     from taccorl.benchmark import cpu_s
     from taccorl.demos.mimicgen.augment import augment, check_out
     from taccorl.demos.mimicgen.coverage import Share
-    from taccorl.demos.mimicgen.report import pages_of, write_report
+    from taccorl.demos.mimicgen.report import Spent, pages_of, write_report
     from taccorl.lineage.store import Store
 
     plan = _plan(config)
@@ -60,14 +65,21 @@ def main(argv: list[str]) -> int:
     pages_of(out)
     store = Store(config.store)
     check_out(plan, config.source, out, store)
-    before, began_s = {path.name for path in store.artefacts()}, cpu_s(children=True)
+    before, began = {path.name for path in store.artefacts()}, Spent(cpu_s(children=True), time.perf_counter())
     report = augment(plan, config.source, out, store, config.engine)
-    spent_s = cpu_s(children=True) - began_s
+    spent = Spent(cpu_s(children=True) - began.cpu_s, time.perf_counter() - began.wall_s)
     made = sum(path.parent.name == "mimicgen" and path.name not in before for path in store.artefacts())
     known = isinstance(config.engine, LocalEngine) and made >= report["attempts"]
-    page = write_report(plan, config.source, out, store, report["attempts"], cpu_s=spent_s if known else None)
+    page = write_report(plan, config.source, out, store, report["attempts"], spent=spent if known else None)
     print(f"dataset: {out}  ({report['episodes']} episodes, {report['rows']} rows): {plan.origin}")
-    print(f"yield:   {Share(successes=report['episodes'], attempts=report['attempts'])}")
+    if (chosen := report.get("stratify")) is None:
+        print(f"yield:   {Share(successes=report['episodes'], attempts=report['attempts'])}")
+    else:
+        first = Share(successes=chosen["first_successes"], attempts=chosen["first_attempts"])
+        print(f"yield:   {first}, before any was chosen for its draw")
+        print(f"filled:  {report['attempts']} attempts in all, {chosen['passed_over']} passed over")
+    if known:
+        print(f"took:    {spent.wall_s / 60:.1f} min, {spent.cpu_s / report['episodes']:.1f} CPU-s for each episode")
     print(f"report:  {page}")
     print(f"next:    taccorl view {out} --episode=0")
     return 0
@@ -97,6 +109,7 @@ def _plan(config: AugmentConfig) -> "AugmentPlan":
         twin=config.twin,
         images=config.images,
         seed=config.seed,
+        stratify=config.stratify,
     )
     plan.twin_config()
     return plan

@@ -1,8 +1,8 @@
 """The same function on a Slurm or Ray cluster: datatrove's executors start the tasks, files carry items and results.
 
-A job is a folder that all nodes see: ``job.pkl`` (function and items), ``results/<index>.pkl`` (renamed into place),
-``logs/``. Task r of n works on the items r, r+n, r+2n, … A result that is not there when the job has ended means that
-its task was killed: the item is named.
+A job is a folder that all nodes see: ``job.pkl`` (function, items, care), ``results/<index>.pkl`` (renamed into place),
+``logs/``. Task r of n works on the items r, r+n, r+2n, … in a process of its own, so that an item that kills it, or hangs,
+costs no other. A result that is not there when the job has ended means that its task was killed: the item is named.
 """
 
 import importlib
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from taccorl.lineage.errors import EngineError
-from taccorl.lineage.processes import Done, Failed, attempt, pickled
+from taccorl.lineage.processes import NO_CARE, Care, Done, Failed, pickled, run_in_processes
 
 POLL_S = 5.0  # how often to look for new results of a Slurm job
 
@@ -27,13 +27,20 @@ Take = Callable[[int, Done | Failed], None]
 
 @dataclass(frozen=True)
 class Job:
-    """A function and its items, written down for tasks on other machines."""
+    """A function, its items and how to care for them, written down for tasks on other machines."""
 
     folder: Path
     num_items: int
 
     @classmethod
-    def create(cls, work_dir: Path, fn: Callable[[Any], Any], items: list[Any], name: Callable[[Any], str]) -> "Job":
+    def create(
+        cls,
+        work_dir: Path,
+        fn: Callable[[Any], Any],
+        items: list[Any],
+        name: Callable[[Any], str],
+        care: Care = NO_CARE,
+    ) -> "Job":
         """Write the job below ``work_dir``.
 
         Raises:
@@ -50,7 +57,7 @@ class Job:
             )
         for item in items:
             pickled(item, f"item {name(item)}")
-        content = pickled((fn, items), f"function {getattr(inner, '__qualname__', inner)}")
+        content = pickled((fn, items, care), f"function {getattr(inner, '__qualname__', inner)}")
         started = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
         folder = work_dir.absolute() / f"{started}-{os.getpid()}-{os.urandom(2).hex()}"
         (folder / "results").mkdir(parents=True)
@@ -79,13 +86,16 @@ class RankTask:
         self.folder = folder
 
     def __call__(self, data: Any = None, rank: int = 0, world_size: int = 1) -> None:
-        fn, items = pickle.loads((self.folder / "job.pkl").read_bytes())
-        for index in range(rank, len(items), world_size):
-            outcome = attempt(fn, items[index])
-            path = self.folder / "results" / f"{index:06d}.pkl"
+        fn, items, care = pickle.loads((self.folder / "job.pkl").read_bytes())
+        mine = range(rank, len(items), world_size)
+
+        def write(place: int, outcome: Done | Failed) -> None:
+            path = self.folder / "results" / f"{mine[place]:06d}.pkl"
             temp = path.with_suffix(".part")
-            temp.write_bytes(pickled(outcome, f"the result of item {index}"))
+            temp.write_bytes(pickle.dumps(outcome))
             temp.replace(path)
+
+        run_in_processes(fn, [items[index] for index in mine], 1, str, write, care)
 
 
 def require_datatrove() -> Any:

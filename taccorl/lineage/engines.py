@@ -17,7 +17,7 @@ import draccus
 
 from taccorl.lineage import cluster
 from taccorl.lineage.errors import EngineError
-from taccorl.lineage.processes import Done, Failed, attempt, run_in_processes
+from taccorl.lineage.processes import NO_CARE, Care, Done, Failed, attempt, run_in_processes
 from taccorl.lineage.store import Artefact, Stage, Store
 
 NAMED_FAILURES = 20  # in one message; the rest is counted
@@ -35,6 +35,8 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
         *,
         on_done: Callable[[Any, Any], None] | None = None,
         name: Callable[[Any], str] = str,
+        care: Care = NO_CARE,
+        instead: Callable[[Any, Failed], Any] | None = None,
     ) -> list[Any]:
         """``[fn(item) for item in items]``.
 
@@ -43,6 +45,9 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
             items: plain data such as paths.
             on_done: called here with (item, result) as each item is done, whatever the order.
             name: how an item is called in messages.
+            care: how patient to be with items that kill their process or never end; one process alone cannot tell.
+            instead: called here with (item, how its process ended) once patience has ended: what to take for the result.
+                But not if that is so of every one of several items: then the machine is at fault, not they.
 
         Raises:
             EngineError: names each item that failed and why; all other items were done.
@@ -59,7 +64,11 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
             return name(item)[:NAME_LENGTH]
 
         if items:
-            self._run(fn, items, short_name, take)
+            self._run(fn, items, short_name, take, care)
+        ended = {i: o for i, o in outcomes.items() if isinstance(o, Failed) and o.process}
+        if instead is not None and not len(ended) == len(items) > 1:
+            for index, outcome in sorted(ended.items()):
+                take(index, Done(instead(items[index], outcome)))
         failures = [(short_name(items[i]), o) for i, o in sorted(outcomes.items()) if isinstance(o, Failed)]
         if failures:
             raise EngineError(_failure_text(failures, len(items)))
@@ -72,6 +81,7 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
         items: list[Any],
         name: Callable[[Any], str],
         take: Callable[[int, Done | Failed], None],
+        care: Care,
     ) -> None:
         """Hand every item's index and outcome to ``take``."""
 
@@ -82,12 +92,13 @@ class LocalEngine(Engine):
     """This machine."""
 
     workers: int = 1
-    """Processes; 1 works in this process, one item after another, which is best for a debugger."""
+    """Processes; 1 works in this process, one item after another, which is best for a debugger. An item that kills its
+    process, or hangs, then ends the run."""
 
-    def _run(self, fn, items, name, take) -> None:
+    def _run(self, fn, items, name, take, care) -> None:
         workers = min(self.workers, len(items))
-        if workers > 1:
-            run_in_processes(fn, items, workers, name, take)
+        if workers > 1 or (self.workers > 1 and care != NO_CARE):
+            run_in_processes(fn, items, workers, name, take, care)
             return
         for index, item in enumerate(items):
             take(index, attempt(fn, item))
@@ -109,8 +120,8 @@ class SlurmEngine(Engine):
     cpus_per_task: int = 1
     mem_per_cpu_gb: int = 4
 
-    def _run(self, fn, items, name, take) -> None:
-        job = cluster.Job.create(self.work_dir, fn, items, name)
+    def _run(self, fn, items, name, take, care) -> None:
+        job = cluster.Job.create(self.work_dir, fn, items, name, care)
         cluster.run_on_slurm(
             job,
             take,
@@ -134,8 +145,8 @@ class RayEngine(Engine):
     cpus_per_task: int = 1
     mem_per_cpu_gb: int = 4
 
-    def _run(self, fn, items, name, take) -> None:
-        job = cluster.Job.create(self.work_dir, fn, items, name)
+    def _run(self, fn, items, name, take, care) -> None:
+        job = cluster.Job.create(self.work_dir, fn, items, name, care)
         cluster.run_on_ray(
             job,
             take,

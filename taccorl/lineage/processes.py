@@ -1,30 +1,32 @@
 """A pool of worker processes that names the item a worker died on, and whose workers die with their parent.
 
 The standard pool cannot say which item broke it, and gives up all others. Here each worker has its own pipe, so the
-parent knows what each one holds: a worker that is killed or crashes costs that one item, and is replaced.
+parent knows what each one holds: a worker that is killed, crashes or hangs costs that one item, and is replaced.
 """
 
 import contextlib
 import ctypes
+import math
 import multiprocessing
 import os
 import pickle
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import Any, Literal
 
 from taccorl.errors import TaccorlError
 from taccorl.lineage.errors import EngineError
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
-LOOK_S = 1.0  # how often to look for workers that died without closing their pipe
+LOOK_S = 1.0  # how often to look for workers that died without closing their pipe, or hang
 GRACE_S = 5.0  # how long a worker may tidy up before it is killed
 
 
@@ -42,6 +44,22 @@ class Failed:
     reason: str
     trace: str | None = None
     """The traceback, when it is the program's fault rather than the input's."""
+    process: Literal["", "crashed", "hung"] = ""
+    """What the process that had the item did, if it came to no end of its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Care:
+    """How patient to be with an item that kills its process, or never ends. It takes a process: in the caller's own there is
+    nobody to survive it."""
+
+    limit_s: float = math.inf
+    """Wall clock after which a worker is killed with its item."""
+    tries: int = 1
+    """Items whose process died go to a new one, after all others and one at a time, until this many have died of it."""
+
+
+NO_CARE = Care()
 
 
 def attempt(fn: Callable[[Any], Any], item: Any) -> Done | Failed:
@@ -74,6 +92,7 @@ def run_in_processes(
     workers: int,
     name: Callable[[Any], str],
     on_outcome: Callable[[int, Done | Failed], None],
+    care: Care = NO_CARE,
 ) -> None:
     """Run ``fn`` on every item in ``workers`` processes; ``on_outcome(index, outcome)`` is called as each one ends.
 
@@ -81,16 +100,30 @@ def run_in_processes(
         EngineError: ``fn`` or an item cannot be sent, or workers cannot start.
     """
     fn_bytes = pickled(fn, f"function {getattr(fn, '__qualname__', fn)}")
-    todo = deque((i, pickled(item, f"item {name(item)}")) for i, item in enumerate(items))
-    pool: list[_Worker] = []
+    todo = [(i, pickled(item, f"item {name(item)}")) for i, item in enumerate(items)]
+    for tries_left in reversed(range(care.tries)):
+        again = []
+        with contextlib.closing(_outcomes(fn_bytes, todo, workers, care.limit_s)) as outcomes:
+            for index, outcome in outcomes:
+                if tries_left and isinstance(outcome, Failed) and outcome.process == "crashed":
+                    again.append(index)
+                else:
+                    on_outcome(index, outcome)
+        todo, workers = [entry for entry in todo if entry[0] in again], 1
+
+
+def _outcomes(
+    fn_bytes: bytes, items: Sequence[tuple[int, bytes]], workers: int, limit_s: float
+) -> Generator[tuple[int, Done | Failed]]:
+    """Of each item, as it ends."""
+    todo, pool = deque(items), list[_Worker]()
     try:
         while todo or any(worker.index is not None for worker in pool):
             while len(pool) < workers and sum(not worker.ready for worker in pool) < len(todo):
                 pool.append(_Worker(fn_bytes))
             wait([worker.pipe for worker in pool], timeout=LOOK_S)
             for worker in list(pool):
-                for outcome in worker.news():
-                    on_outcome(outcome[0], outcome[1])
+                yield from worker.news(limit_s)
                 if worker.is_dead:
                     pool.remove(worker)
                 elif worker.ready and worker.index is None and todo:
@@ -119,22 +152,25 @@ class _Worker:
         self.process: BaseProcess = context.Process(target=_work, args=(far_end, fn_bytes, os.getpid()))
         self.process.start()
         far_end.close()
-        self.ready, self.index, self.is_dead = False, None, False
+        self.ready, self.index, self.is_dead, self.given_s = False, None, False, 0.0
 
     def give(self, index: int, item_bytes: bytes) -> None:
-        self.index = index
+        self.index, self.given_s = index, time.monotonic()
         with contextlib.suppress(OSError):  # it died just now: news() will tell
             self.pipe.send_bytes(item_bytes)
 
-    def news(self) -> list[tuple[int, Done | Failed]]:
-        """What became of the item, if anything did."""
+    def news(self, limit_s: float) -> list[tuple[int, Done | Failed]]:
+        """What became of the item, if anything did; one that has taken longer than ``limit_s`` ends here."""
         ended = self.process.exitcode is not None  # asked first: what it sent before it ended is still in the pipe
         try:
             message = pickle.loads(self.pipe.recv_bytes()) if self.pipe.poll() else None
         except (EOFError, OSError):
             message, ended = None, True
         if message is None:
-            return self._died() if ended else []
+            if ended:
+                return self._died()
+            hangs = self.index is not None and time.monotonic() - self.given_s > limit_s
+            return self._end_hung(limit_s) if hangs else []
         if not self.ready:
             if isinstance(message, Failed):
                 raise EngineError(
@@ -158,7 +194,17 @@ class _Worker:
                 f"a worker process {how} before it could start; what it printed above says why. "
                 f"A script that uses workers needs its start under `if __name__ == '__main__':`."
             )
-        return [] if self.index is None else [(self.index, Failed(f"the worker process {how} while it had this item"))]
+        reason = f"the worker process {how} while it had this item"
+        return [] if self.index is None else [(self.index, Failed(reason, process="crashed"))]
+
+    def _end_hung(self, limit_s: float) -> list[tuple[int, Done | Failed]]:
+        self.is_dead = True
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+        assert self.index is not None
+        reason = f"no end after {limit_s:g} s; the worker process was killed"
+        return [(self.index, Failed(reason, process="hung"))]
 
 
 def _exit_in_words(exitcode: int | None) -> str:

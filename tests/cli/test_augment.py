@@ -52,6 +52,7 @@ def test_the_report_tells_what_the_dataset_holds(place: Path) -> None:
     assert dataset.num_episodes == told["yield"]["successes"] == 2
     assert told["data"] == "MuJoCo twin, not a robot"
     assert len(told["failed"]) == told["yield"]["attempts"] - 2
+    assert told["cost"]["wall_s"] > 0
     assert told["cost"]["cpu_s_per_success"] > 0
     by_attempt = {draw["attempt"]: draw for draw in told["draws"]}
     for i in range(2):
@@ -136,6 +137,7 @@ def test_a_recording_without_simulator_state_is_refused_with_the_command_that_co
         ((*WORDS[:3], "--out=mine", "--store=store"), "mine is in the way: it is a folder of 1 entries without"),
         ((*WORDS, "--seed=1"), "new is in the way: it holds augmented v1"),
         ((*WORDS, "--episodes=3"), "new is in the way: it holds augmented v1"),
+        ((*WORDS, "--stratify=true"), "new is in the way: it holds augmented v1"),
         ((*WORDS, "--out=other"), "other.augment_report.html: is there already and no report of ours"),
         ((*WORDS, "--engine.workers=two"), "engine.workers"),
         ((*WORDS, "--egnine.workers=2"), "did you mean 'engine.workers'?"),

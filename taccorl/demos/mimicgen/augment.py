@@ -2,6 +2,7 @@
 
 An attempt's key is made of all that decides: the spec, the sources' content, the twin, the seed, its number. So a run that was
 killed goes on where it was, another spec or other sources never mix with it, and any number of workers gives the same dataset.
+An attempt that kills its process twice (``crashed``) or does not end (``hung``) is counted like any other that failed.
 """
 
 import dataclasses
@@ -24,17 +25,20 @@ from taccorl.data.dataset import PROVENANCE, episode_record
 from taccorl.data.episode import Episode
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.collect import REPORT, assemble, in_the_way
-from taccorl.demos.mimicgen.attempt import Attempted, Attempts
+from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
 from taccorl.demos.mimicgen.from_dataset import read_sources, simulation_told
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import MimicSpec, check_task
+from taccorl.demos.mimicgen.stratify import ResetSpace, first_attempts, next_round
 from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.errors import TaccorlError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
+from taccorl.lineage.processes import Care, Failed
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
+from taccorl.sim.randomize import Row, draw
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
@@ -46,6 +50,7 @@ _ROUND = (
 )
 _HOPELESS = 0.05  # of a hundred attempts
 _HUNDRED = 100
+_CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
 
 Progress = Callable[[str], None]
 
@@ -64,6 +69,8 @@ class AugmentPlan:
     """Share of the paper's ranges."""
     images: bool = True
     seed: int = 0
+    stratify: bool = False
+    """Fill the poor boxes of the reset space (``stratify.py``). An attempt does not depend on it, only which are made."""
     origin: str = field(default=ORIGIN)
 
     def __post_init__(self) -> None:
@@ -71,6 +78,25 @@ class AugmentPlan:
             raise TaccorlError(f"--episodes={self.episodes}: at least one")
         if self.seed < 0:
             raise TaccorlError(f"--seed={self.seed}: seeds are 0, 1, 2, …")
+        if self.stratify and not self.space.rows:
+            raise TaccorlError(f"--stratify=true: nothing is drawn at a reset of {self.spec.task}, no box can be poor")
+
+    @functools.cached_property
+    def space(self) -> ResetSpace:
+        """What attempts differ in; without rows where nothing is drawn."""
+        return ResetSpace(self._rows if self.randomization > 0 else (), self.randomization)
+
+    @functools.cached_property
+    def _rows(self) -> tuple[Row, ...]:
+        return tuple(tasks.get(self.spec.task)(self.difficulty).rows)
+
+    def scene_seed(self, k: int) -> int:
+        """Of attempt ``k``."""
+        return attempt_seeds(self.seed, self.spec.task, k)[0]
+
+    def draw(self, k: int) -> dict[str, np.ndarray]:
+        """What attempt ``k`` draws, as its simulation will."""
+        return draw(self._rows, np.random.default_rng(self.scene_seed(k)), self.randomization)
 
     def twin_config(self) -> TwinConfig:
         """The twin to generate in."""
@@ -115,12 +141,13 @@ def augment(
     sim = _attempts(plan, sources.path, sources.digest).sim
     spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=plan.images)
     fn = functools.partial(run_attempt, plan, sources, store)
+    lost = functools.partial(_lost_attempt, plan, sources, store)
 
     def told(k: int, artefact: Artefact) -> None:
         entry = _entry(artefact.path)
         progress(f"attempt {k}: {entry['outcome']} after {entry['seconds']:.1f} s")
 
-    while (successes := sum(e["outcome"] == "success" for e in entries)) < plan.episodes:
+    while (successes := _successes(entries)) < plan.episodes:
         if entries:
             progress(f"{successes} of {plan.episodes} after {len(entries)} attempts")
         if len(entries) >= _HUNDRED and successes < _HOPELESS * len(entries):
@@ -129,10 +156,9 @@ def augment(
                 f"{plan.spec.task}: {successes} of {len(entries)} attempts succeeded, nothing was written to {out}. Failures: "
                 f"{_outcomes(entries)}. Look at one: taccorl view {shlex.quote(str(failed))}"
             )
-        # Never fewer than are missing, so none of them is in vain but for the few at the end.
-        num = min(max(plan.episodes - successes, min(_ROUND, plan.episodes // 10)), _HUNDRED)
-        numbers = list(range(len(entries), len(entries) + num))
-        for artefact in engine.map(fn, numbers, on_done=told, name=lambda k: f"attempt {k}"):
+        for artefact in engine.map(
+            fn, _next_numbers(plan, entries), on_done=told, name=lambda k: f"attempt {k}", care=_CARE, instead=lost
+        ):
             entry = _entry(artefact.path)
             entries.append(entry)
             made.append(artefact)
@@ -146,10 +172,23 @@ def augment(
         assemble(spec, report, inputs, folder)
 
     stage = dataclasses.replace(_AUGMENTED, fn=collection)
-    store.run(
-        stage, {"task": plan.spec.task, "spec": plan.spec.digest, "attempts": len(entries)}, kept, destination=out
-    )
+    config = {"task": plan.spec.task, "spec": plan.spec.digest, "attempts": len(entries)}
+    store.run(stage, config | ({"stratify": True} if plan.stratify else {}), kept, destination=out)
     return report
+
+
+def _next_numbers(plan: AugmentPlan, entries: list[dict[str, Any]]) -> list[int]:
+    """Numbers of the attempts to make next, ascending; follows from the ``entries`` of the rounds before alone."""
+    if plan.stratify:
+        done = [(entry["attempt"], entry["outcome"] == "success") for entry in entries]
+        return next_round(plan.space, lambda k: plan.space.boxes(plan.draw(k)), plan.episodes, done)
+    # Never fewer than are missing, so none of them is in vain but for the few at the end.
+    num = min(max(plan.episodes - _successes(entries), min(_ROUND, plan.episodes // 10)), _HUNDRED)
+    return list(range(len(entries), len(entries) + num))
+
+
+def _successes(entries: list[dict[str, Any]]) -> int:
+    return sum(entry["outcome"] == "success" for entry in entries)
 
 
 def check_out(plan: AugmentPlan, source: Path, out: Path, store: Store) -> None:
@@ -168,24 +207,26 @@ def _may_be_of(plan: AugmentPlan, sources: Artefact, out: Path, store: Store) ->
     if not manifest or manifest["stage"] != _AUGMENTED.name or not report.is_file():
         return False
     told = json.loads(report.read_text(encoding="utf-8"))
-    if told["episodes"] != plan.episodes:
+    if told["episodes"] != plan.episodes or ("stratify" in told) != plan.stratify:
         return False
-    attempts = {store.key(_ATTEMPT, plan.config(k), [sources]) for k in range(told["attempts"])}
+    attempts = {store.key(_ATTEMPT, plan.config(entry["attempt"]), [sources]) for entry in told["entries"]}
     return {entry["key"] for entry in manifest["inputs"]} <= attempts
 
 
 def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> list[Path]:
-    """Folders of the attempts 0 … num − 1 in the store, each as ``run_attempt`` says; nothing is made.
+    """Folders of the plan's first ``num`` attempts in the store, each as ``run_attempt`` says; nothing is made.
 
     Raises:
         TaccorlError: one of them is not there.
     """
-    sources, found = store.source(source), []
-    for k in range(num):
-        artefact = store.find(_ATTEMPT, plan.config(k), [sources])
-        if artefact is None:
-            raise TaccorlError(f"{store.root}: attempt {k} is not there any more; augment again makes it again")
-        found.append(artefact.path)
+    sources, found, entries = store.source(source), [], []
+    while len(found) < num:
+        for k in _next_numbers(plan, entries)[: num - len(found)]:
+            artefact = store.find(_ATTEMPT, plan.config(k), [sources])
+            if artefact is None:
+                raise TaccorlError(f"{store.root}: attempt {k} is not there any more; augment again makes it again")
+            found.append(artefact.path)
+            entries.append(_entry(artefact.path))
     return found
 
 
@@ -194,6 +235,15 @@ def run_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int) -> A
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
         _build(plan, sources, k, config, folder)
+
+    return store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
+
+
+def _lost_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int, end: Failed) -> Artefact:
+    """Attempt ``k`` whose process did not come to an end of its own: what it leaves is how that was."""
+
+    def build(config: Any, inputs: list[Path], folder: Path) -> None:
+        _write(Attempted(k, plan.scene_seed(k), end.process, end.reason), folder)
 
     return store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
 
@@ -258,20 +308,21 @@ def _build(plan: AugmentPlan, sources: Artefact, k: int, config: dict[str, Any],
         where = traceback.extract_tb(error.__traceback__)[-1]
         reason = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
         done, recorder = Attempted(k, -1, "error", reason), None
-    entry = {
-        "attempt": k,
-        "outcome": done.outcome,
-        "rows": len(done.actions),
-        "seconds": len(done.actions) / CONTROL_HZ,
-    }
-    entry |= {"reason": done.reason, "scene_seed": done.scene_seed, "provenance": done.provenance}
-    np.save(folder / "actions.npy", done.actions)
     if done.success and recorder is not None:
         told = {key: value for key, value in config.items() if key != "spec"} | {"mimicgen": done.provenance}
         episode = recorder.episode(f"{plan.spec.task} attempt {k}", told | {"sources": sources.digest})
         episode = dataclasses.replace(episode, origin=plan.origin)
         write_episodes([episode], folder / "dataset")
         (folder / "episodes.json").write_text(json.dumps([episode_record(episode, sources.digest)]), encoding="utf-8")
+    _write(done, folder)
+
+
+def _write(done: Attempted, folder: Path) -> None:
+    """What every attempt leaves."""
+    rows = len(done.actions)
+    entry = {"attempt": done.k, "outcome": done.outcome, "rows": rows, "seconds": rows / CONTROL_HZ}
+    entry |= {"reason": done.reason, "scene_seed": done.scene_seed, "provenance": done.provenance}
+    np.save(folder / "actions.npy", done.actions)
     (folder / "entry.json").write_text(json.dumps(entry, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
@@ -293,12 +344,20 @@ def _outcomes(entries: list[dict[str, Any]]) -> dict[str, int]:
 
 
 def _report(plan: AugmentPlan, entries: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
+    report = {
         "task": plan.spec.task,
         "origin": plan.origin,
         "attempts": len(entries),
         "outcomes": _outcomes(entries),
-        "episodes": sum(e["outcome"] == "success" for e in entries),
+        "episodes": _successes(entries),
         "rows": sum(e["rows"] for e in entries if e["outcome"] == "success"),
         "entries": [{key: value for key, value in e.items() if key != "provenance"} for e in entries],
     }
+    if plan.stratify:
+        first = entries[: first_attempts(plan.episodes)]
+        report["stratify"] = {
+            "first_attempts": len(first),
+            "first_successes": _successes(first),
+            "passed_over": entries[-1]["attempt"] + 1 - len(entries),
+        }
+    return report

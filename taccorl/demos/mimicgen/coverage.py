@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from taccorl.demos.mimicgen.attempt import attempt_seeds
 from taccorl.demos.mimicgen.augment import AugmentPlan, made_attempts
+from taccorl.demos.mimicgen.stratify import first_attempts, given_up
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.store import Store
-from taccorl.sim.randomize import Row, draw
-from taccorl.sim.tasks import tasks
-
-_BINS = {1: 4, 2: 3}  # of each component, for rows of one and of two components
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +67,8 @@ class Attempt:
     scene_seed: int
     sources: frozenset[str]
     draw: dict[str, np.ndarray]
+    rows: int
+    """Actions that can be executed again."""
     process_s: float
     """Wall clock of the process that made it."""
     folder: Path
@@ -88,19 +86,20 @@ class Attempt:
 
 def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: int) -> list[Attempt]:
     """Out of the store. What was drawn follows from the seeds, of attempts that broke as well."""
-    rows, found = tasks.get(plan.spec.task)(plan.difficulty).rows, []
-    for k, folder in enumerate(made_attempts(plan, source, store, num_attempts)):
+    found = []
+    for folder in made_attempts(plan, source, store, num_attempts):
         entry = json.loads((folder / "entry.json").read_text(encoding="utf-8"))
-        scene_seed, _ = attempt_seeds(plan.seed, plan.spec.task, k)
+        k = entry["attempt"]
         used = entry["provenance"].get("subtasks", [])
         found.append(
             Attempt(
                 k=k,
                 outcome=entry["outcome"],
                 reason=entry["reason"],
-                scene_seed=scene_seed,
+                scene_seed=plan.scene_seed(k),
                 sources=frozenset(s["source"] for s in used),
-                draw=draw(rows, np.random.default_rng(scene_seed), plan.randomization),
+                draw=plan.draw(k),
+                rows=entry["rows"],
                 process_s=read_manifest(folder)["seconds"],
                 folder=folder,
             )
@@ -110,20 +109,16 @@ def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: i
 
 def bins_of(plan: AugmentPlan, attempts: Sequence[Attempt]) -> Iterator[Bin]:
     """Every row of the task's randomisation, cut into equal boxes. Rows of which nothing is drawn have none."""
-    for row in drawn_rows(plan):
-        low, high = _limits(row, plan.randomization)
-        num = _BINS.get(len(low), 1)
-        values = np.array([a.draw[row.name] for a in attempts]).reshape(-1, len(low))
-        place = np.clip(((values - low) / (high - low) * num).astype(int), 0, num - 1)
-        for box in np.ndindex(*(num,) * len(low)):
-            within = [a for a, p in zip(attempts, place, strict=True) if tuple(p) == box]
-            start, size = low + np.array(box) * (high - low) / num, (high - low) / num
+    places = [plan.space.boxes(a.draw) for a in attempts]
+    for r, row in enumerate(plan.space.rows):
+        for box in range(plan.space.num_boxes(row)):
+            low, high = plan.space.edges(row, box)
             yield Bin(
                 row=row.name,
                 unit=row.unit,
-                low=tuple(start.tolist()),
-                high=tuple((start + size).tolist()),
-                share=share_of(within),
+                low=tuple(low.tolist()),
+                high=tuple(high.tolist()),
+                share=share_of([a for a, place in zip(attempts, places, strict=True) if place[r] == box]),
             )
 
 
@@ -132,11 +127,47 @@ def share_of(attempts: Sequence[Attempt]) -> Share:
     return Share(successes=sum(a.success for a in attempts), attempts=len(attempts))
 
 
-def drawn_rows(plan: AugmentPlan) -> list[Row]:
-    """Of the paper's table, what attempts differ in."""
-    return list(tasks.get(plan.spec.task)(plan.difficulty).rows) if plan.randomization > 0 else []
+def evenness(plan: AugmentPlan, draws: Sequence[Mapping[str, np.ndarray]]) -> dict[str, Any]:
+    """How evenly episodes that drew this lie in the boxes, for JSON: the emptiest box, and how many are at least half full.
+    The fair share of a box: all episodes over the boxes of its row."""
+    counts = plan.space.count(plan.space.boxes(drawn) for drawn in draws)
+    shares = [count * len(count) / max(len(draws), 1) for count in counts]
+    r, box = min(((r, b) for r, row in enumerate(shares) for b in range(len(row))), key=lambda at: shares[at[0]][at[1]])
+    row, every = plan.space.rows[r], np.concatenate(shares)
+    low, high = plan.space.edges(row, box)
+    return {
+        "episodes": len(draws),
+        "emptiest": {
+            "row": row.name,
+            "unit": row.unit,
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "episodes": int(counts[r][box]),
+            "share_of_fair": float(shares[r][box]),
+        },
+        "boxes": len(every),
+        "boxes_half_full": int((every >= 0.5).sum()),
+    }
 
 
-def _limits(row: Row, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    low, high = (row.absent + scale * (np.array(ends) - row.absent) for ends in (row.low, row.high))
-    return low, high
+def stratified(plan: AugmentPlan, attempts: Sequence[Attempt]) -> dict[str, Any] | None:
+    """What filling the poor boxes did, for JSON; None where it was not asked for."""
+    if not plan.stratify:
+        return None
+    first = attempts[: first_attempts(plan.episodes)]
+    poor = []
+    for b in bins_of(plan, attempts):
+        kept, made = b.share.successes, b.share.attempts
+        row = next(row for row in plan.space.rows if row.name == b.row)
+        if given_up(np.array(kept), np.array(made - kept)) and kept * plan.space.num_boxes(row) < plan.episodes:
+            poor.append(asdict(b) | {"share": b.share.told()})
+    return {
+        "first_attempts": len(first),
+        "passed_over": attempts[-1].k + 1 - len(attempts),
+        "coverage": {
+            "first_attempts": evenness(plan, [a.draw for a in first if a.success]),
+            "first_draws_had_all_succeeded": evenness(plan, [plan.draw(k) for k in range(plan.episodes)]),
+            "dataset": evenness(plan, [a.draw for a in attempts if a.success]),
+        },
+        "given_up": poor,
+    }

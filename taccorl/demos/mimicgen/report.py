@@ -12,13 +12,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import taccorl
 from taccorl.demos.mimicgen.augment import AugmentPlan
-from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of, drawn_rows, read_attempts, share_of
+from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of, read_attempts, share_of, stratified
+from taccorl.demos.mimicgen.stratify import GIVE_UP_FAILED, GIVE_UP_YIELD
 from taccorl.errors import TaccorlError
 from taccorl.lineage.store import Store
 
@@ -26,6 +27,14 @@ GENERATOR = "taccorl augment report"
 _HEAD_BYTES = 2048
 _SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "°"), "kg": (1e3, "g"), "1": (1.0, "")}
 _GOOD, _BAD, _CELL = "#0072b2", "#d55e00", "#009e73"
+
+
+class Spent(NamedTuple):
+    """What a run of ``taccorl augment`` took."""
+
+    cpu_s: float
+    """Of all its processes."""
+    wall_s: float
 
 
 def pages_of(out: Path) -> tuple[Path, Path]:
@@ -42,14 +51,14 @@ def pages_of(out: Path) -> tuple[Path, Path]:
 
 
 def write_report(
-    plan: AugmentPlan, source: Path, out: Path, store: Store, num_attempts: int, *, cpu_s: float | None = None
+    plan: AugmentPlan, source: Path, out: Path, store: Store, num_attempts: int, *, spent: Spent | None = None
 ) -> Path:
-    """Both files of the attempts 0 … num_attempts − 1; returns the page. An earlier report of ours is replaced.
+    """Both files of the plan's first ``num_attempts`` attempts; returns the page. An earlier report of ours is replaced.
 
     Args:
-        cpu_s: what the whole run took, where all of its attempts were made in it.
+        spent: what the whole run took, where all of its attempts were made in it.
     """
-    told = numbers(plan, read_attempts(plan, source, store, num_attempts), cpu_s)
+    told = numbers(plan, read_attempts(plan, source, store, num_attempts), spent)
     told |= {"source": str(source), "dataset": str(out)}
     page, data = pages_of(out)
     for path, text in ((data, json.dumps(told, indent=1, ensure_ascii=False) + "\n"), (page, _page(plan, told))):
@@ -59,9 +68,11 @@ def write_report(
     return page
 
 
-def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], cpu_s: float | None) -> dict[str, Any]:
+def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None) -> dict[str, Any]:
     """Everything on the page, as JSON knows it."""
-    share = share_of(attempts)
+    share, chosen = share_of(attempts), stratified(plan, attempts)
+    # Attempts that were chosen for what they draw say nothing of the yield of the paper's randomisation.
+    plain = attempts[: chosen["first_attempts"]] if chosen else attempts
     bins = list(bins_of(plan, attempts))
     failed = [a for a in attempts if not a.success]
     return {
@@ -73,7 +84,11 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], cpu_s: float | None)
         "seed": plan.seed,
         "spec": plan.spec.digest,
         "retarget": plan.spec.datagen_config.retarget,
-        "yield": share.told(),
+        "contact_mode": plan.spec.datagen_config.contact_mode,
+        "yield": share_of(plain).told(),
+        "yield_of": f"attempts 0 … {len(plain) - 1}, the paper's randomisation",
+        "all_attempts": share.told(),
+        "stratify": chosen,
         "bins": [asdict(b) | {"share": b.share.told()} for b in bins],
         "draws": [
             {"attempt": a.k, "success": a.success} | {name: value.tolist() for name, value in a.draw.items()}
@@ -82,10 +97,11 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], cpu_s: float | None)
         "sources": _by_source(attempts, share.successes),
         "failures": dict(Counter(a.outcome for a in failed).most_common()),
         "failed": [
-            {"attempt": a.k, "outcome": a.outcome, "reason": a.reason, "seed": a.scene_seed, "command": a.command}
+            {"attempt": a.k, "outcome": a.outcome, "reason": a.reason, "seed": a.scene_seed}
+            | {"command": a.command if a.rows else None}
             for a in failed
         ],
-        "cost": _cost(attempts, cpu_s),
+        "cost": _cost(attempts, spent),
     }
 
 
@@ -97,14 +113,15 @@ def _by_source(attempts: Sequence[Attempt], successes: int) -> list[dict[str, An
     return found
 
 
-def _cost(attempts: Sequence[Attempt], cpu_s: float | None) -> dict[str, Any]:
+def _cost(attempts: Sequence[Attempt], spent: Spent | None) -> dict[str, Any]:
     successes = [a.process_s for a in attempts if a.success]
     failures = [a.process_s for a in attempts if not a.success]
     return {
         "process_s_per_success": sum(successes + failures) / max(len(successes), 1),
         "median_success_process_s": median(successes) if successes else None,
         "median_failure_process_s": median(failures) if failures else None,
-        "cpu_s_per_success": cpu_s / max(len(successes), 1) if cpu_s is not None else None,
+        "cpu_s_per_success": spent.cpu_s / max(len(successes), 1) if spent else None,
+        "wall_s": spent.wall_s if spent else None,
     }
 
 
@@ -126,19 +143,20 @@ code{background:#f1f5f9;padding:1px 4px;border-radius:3px;white-space:nowrap}
 
 
 def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
-    share = Share(successes=told["yield"]["successes"], attempts=told["yield"]["attempts"])
+    share, plain = Share(**_counts(told["all_attempts"])), Share(**_counts(told["yield"]))
     title = f"{plan.spec.task}: {share.successes} new episodes out of {told['source']}"
     parts = [
         f"<h1>{html.escape(title)}</h1>",
         f'<p class="data">{html.escape(plan.origin)}: simulated</p>',
-        f'<div class="verdict">Yield: {share}</div>',
+        f'<div class="verdict">Yield: {plain}{_of_which(told)}</div>',
         _table(
             ("", ""),
             [
                 [html.escape(name), html.escape(str(told[name]))]
-                for name in ("dataset", "source", "twin", "difficulty", "seed", "retarget", "spec")
+                for name in ("dataset", "source", "twin", "difficulty", "seed", "retarget", "contact_mode", "spec")
             ],
         ),
+        *_filled(told),
         "<h2>Where in the reset space</h2>",
         *_where(plan, told, share),
         "<h2>Sources</h2>",
@@ -165,6 +183,48 @@ def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
         f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
         f"</head><body><main>{chr(10).join(parts)}</main></body></html>\n"
     )
+
+
+def _of_which(told: dict[str, Any]) -> str:
+    if not told["stratify"]:
+        return ""
+    every = Share(**_counts(told["all_attempts"]))
+    return html.escape(
+        f" — {told['yield_of']}. The later ones were chosen for poor boxes; all together: {every.successes} of {every.attempts}, "
+        "which is no yield of that randomisation."
+    )
+
+
+def _filled(told: dict[str, Any]) -> Iterator[str]:
+    """What --stratify did."""
+    if not (chosen := told["stratify"]):
+        return
+    yield "<h2>Poor boxes filled</h2>"
+    yield _note(
+        f"After the first {chosen['first_attempts']} attempts, those were made whose draws lie in boxes with few episodes; "
+        f"{chosen['passed_over']} were passed over, not simulated. Fair share of a box: episodes over the boxes of its row. "
+        "The fewer the episodes, the more uneven they are by chance alone: the second line has as many as the dataset."
+    )
+    words = {
+        "first_attempts": f"kept of the first {chosen['first_attempts']} attempts",
+        "first_draws_had_all_succeeded": "the first draws, had every attempt succeeded",
+        "dataset": "this dataset",
+    }
+    rows = []
+    for key, word in words.items():
+        c = chosen["coverage"][key]
+        box = c["emptiest"]
+        where = f"{html.escape(box['row'])} {_range_words(box)}: {box['episodes']}"
+        half = f"{c['boxes_half_full']} of {c['boxes']}"
+        rows.append([word, str(c["episodes"]), where, f"{100 * box['share_of_fair']:.0f} %", half])
+    heads = ("", "episodes", "emptiest box: episodes", "of its fair share", "boxes at least half full")
+    yield _table(heads, rows, right=(1, 3, 4))
+    if chosen["given_up"]:
+        yield _note(
+            f"Given up: at least {GIVE_UP_FAILED} attempts failed there and fewer than {100 * GIVE_UP_YIELD:.0f} % succeeded."
+        )
+        rows = [[b["row"], _range_words(b), str(Share(**_counts(b["share"])))] for b in chosen["given_up"]]
+        yield _table(("row", "range", "attempts there"), rows, right=(2,))
 
 
 def _where(plan: AugmentPlan, told: dict[str, Any], share: Share) -> Iterator[str]:
@@ -200,7 +260,7 @@ def _counts(told: dict[str, Any]) -> dict[str, int]:
 def _range_words(b: dict[str, Any]) -> str:
     scale, unit = _SHOWN[b["unit"]]
     return ", ".join(
-        f"{low * scale:.3g} … {high * scale:.3g} {unit}" for low, high in zip(b["low"], b["high"], strict=True)
+        f"{low * scale:.3g} … {high * scale:.3g} {unit}".rstrip() for low, high in zip(b["low"], b["high"], strict=True)
     )
 
 
@@ -218,7 +278,9 @@ def _failures(told: dict[str, Any], attempts: int) -> Iterator[str]:
             str(f["attempt"]),
             html.escape(f["outcome"]),
             html.escape(f["reason"]),
-            f"<code>{html.escape(f['command'])}</code>",
+            f"<code>{html.escape(f['command'])}</code>"
+            if f["command"]
+            else "nothing: it broke before an action was kept",
         ]
         for f in told["failed"]
     ]
@@ -227,6 +289,7 @@ def _failures(told: dict[str, Any], attempts: int) -> Iterator[str]:
 
 def _costs(cost: dict[str, Any]) -> Iterator[str]:
     words = {
+        "wall_s": "the whole run, by the clock on the wall [s]",
         "cpu_s_per_success": "CPU time of the whole run for each new episode [CPU-s]",
         "process_s_per_success": "attempts, failed ones too, for each new episode, wall clock of one process [s]",
         "median_success_process_s": "median attempt that succeeded: physics, again with touch, pictures, files [s]",
@@ -234,7 +297,9 @@ def _costs(cost: dict[str, Any]) -> Iterator[str]:
     }
     yield _table(("", ""), [[w, f"{cost[k]:.2f}"] for k, w in words.items() if cost[k] is not None], right=(1,))
     if cost["cpu_s_per_success"] is None:
-        yield _note("CPU time is not known: attempts lay in the store already, or other machines made them.")
+        yield _note(
+            "What the whole run took is not known: attempts lay in the store already, or other machines made them."
+        )
 
 
 def _note(text: str) -> str:
@@ -255,7 +320,7 @@ def coverage_figure(plan: AugmentPlan, told: dict[str, Any]) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = drawn_rows(plan)
+    rows = plan.space.rows
     columns = min(4, len(rows))
     lines = -(-len(rows) // columns)
     figure = Figure(figsize=(3.1 * columns, 3.0 * lines + 0.7), layout="constrained", dpi=110)

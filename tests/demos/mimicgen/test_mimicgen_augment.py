@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,12 +13,16 @@ import pytest
 
 from taccorl.data.dataset import Dataset
 from taccorl.demos.mimicgen import augment as module
-from taccorl.demos.mimicgen.augment import AugmentPlan, augment
+from taccorl.demos.mimicgen.augment import AugmentPlan, attempt_episode, augment, made_attempts, run_attempt
+from taccorl.demos.mimicgen.coverage import read_attempts
 from taccorl.demos.mimicgen.from_dataset import read_sources
+from taccorl.demos.mimicgen.report import numbers
 from taccorl.demos.mimicgen.spec import load_mimic_spec, with_options
 from taccorl.errors import InTheWayError, TaccorlError
-from taccorl.lineage.engines import LocalEngine
+from taccorl.lineage.engines import LocalEngine, RayEngine
+from taccorl.lineage.processes import Failed
 from taccorl.lineage.store import Store
+from taccorl.sim.simulation import Simulation
 
 PARQUET = "data/chunk-000/file-000.parquet"
 
@@ -88,6 +93,69 @@ def test_an_attempt_that_breaks_is_counted_and_the_others_go_on(collected, tmp_p
     assert report["episodes"] == 1
 
 
+def test_physics_that_ends_in_nan_is_counted_and_leaves_no_trace_in_the_next_attempt(
+    augmented, collected, tmp_path, monkeypatch
+):
+    folder, _ = augmented
+    step, steps = Simulation.step, []
+
+    def poisoned(self, action, **words):
+        steps.append(1)
+        if len(steps) == 40:
+            self.arrays["qvel"][0, 0] = np.nan
+        step(self, action, **words)
+
+    monkeypatch.setattr(Simulation, "step", poisoned)
+    report = augment(plan(episodes=1), collected, tmp_path / "new", Store(tmp_path / "store"), progress=lambda _: None)
+    assert report["outcomes"] == {"diverged": 1, "success": 1}
+    assert report["entries"][0]["rows"] == 40
+    actions = [np.load(path / "actions.npy") for path in made_attempts(plan(), collected, Store(folder / "store"), 2)]
+    mine = [np.load(path / "actions.npy") for path in made_attempts(plan(), collected, Store(tmp_path / "store"), 2)]
+    assert np.array_equal(mine[1], actions[1])
+    assert np.isfinite(mine[0]).all()
+    assert np.isfinite(Dataset(tmp_path / "new").episode(0).arrays["sim.state"]).all()
+
+
+def deadly_attempt(some, sources, store, k):
+    """Attempt 0 kills its process, whatever process that is."""
+    if k == 0:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return run_attempt(some, sources, store, k)
+
+
+def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again(
+    augmented, collected, tmp_path, monkeypatch
+):
+    shutil.copytree(augmented[0] / "store", tmp_path / "store")  # it holds attempt 1, which succeeds
+    monkeypatch.setattr(module, "run_attempt", deadly_attempt)
+    store, some, engine = Store(tmp_path / "store"), plan(episodes=1), LocalEngine(workers=2)
+    shutil.rmtree(made_attempts(some, collected, store, 1)[0])
+    report = augment(some, collected, tmp_path / "new", store, engine, progress=lambda _: None)
+    assert report["outcomes"] == {"crashed": 1, "success": 1}
+    crashed = report["entries"][0]
+    assert crashed["reason"] == "the worker process was killed by SIGSEGV while it had this item"
+    assert crashed["scene_seed"] == some.scene_seed(0)
+    (folder, _) = made_attempts(some, collected, store, 2)
+    with pytest.raises(
+        TaccorlError, match="attempt 0 has no actions to show: crashed: the worker process was killed by SIGSEGV"
+    ):
+        attempt_episode(folder)
+    monkeypatch.setattr(module, "run_attempt", run_attempt)
+    assert augment(some, collected, tmp_path / "new", store, progress=lambda _: None) == report
+    told = numbers(some, read_attempts(some, collected, store, 2), None)
+    assert told["failures"] == {"crashed": 1}
+    assert told["failed"][0]["command"] is None
+
+
+def test_an_attempt_that_hung_is_counted_with_the_limit(collected, tmp_path):
+    store, some = Store(tmp_path / "store"), plan(episodes=1)
+    end = Failed("no end after 600 s; the worker process was killed", process="hung")
+    module._lost_attempt(some, store.source(collected), store, 0, end)
+    report = augment(some, collected, tmp_path / "new", store, progress=lambda _: None)
+    assert report["outcomes"] == {"hung": 1, "success": 1}
+    assert report["entries"][0]["reason"] == "no end after 600 s; the worker process was killed"
+
+
 def test_what_hardly_ever_succeeds_is_stopped(collected, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_HUNDRED", 4)
     monkeypatch.setattr("taccorl.demos.mimicgen.attempt.Attempts.run", lambda self, k: 1 / 0)
@@ -101,6 +169,22 @@ def test_two_workers_give_the_bytes_of_one(augmented, collected, tmp_path):
     folder, report = augmented
     engine = LocalEngine(workers=2)
     told = augment(plan(), collected, tmp_path / "new", Store(tmp_path / "store"), engine, progress=lambda _: None)
+    assert told == report
+    assert (tmp_path / "new" / PARQUET).read_bytes() == (folder / "new" / PARQUET).read_bytes()
+
+
+@pytest.mark.slow
+def test_ray_gives_the_bytes_of_this_process(augmented, collected, tmp_path, monkeypatch):
+    ray = pytest.importorskip("ray", reason="extra cluster: ray")
+    pytest.importorskip("datatrove.executor", reason="extra cluster: datatrove")
+    folder, report = augmented
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    ray.init(address="local", num_cpus=2, include_dashboard=False)
+    try:
+        engine = RayEngine(work_dir=tmp_path / "work", mem_per_cpu_gb=2)
+        told = augment(plan(), collected, tmp_path / "new", Store(tmp_path / "store"), engine, progress=lambda _: None)
+    finally:
+        ray.shutdown()
     assert told == report
     assert (tmp_path / "new" / PARQUET).read_bytes() == (folder / "new" / PARQUET).read_bytes()
 

@@ -10,7 +10,7 @@ import pytest
 
 from taccorl.demos.mimicgen.augment import AugmentPlan
 from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of
-from taccorl.demos.mimicgen.report import _page, coverage_figure, numbers, pages_of
+from taccorl.demos.mimicgen.report import Spent, _page, coverage_figure, numbers, pages_of
 from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.randomize import PAPER_ROWS, draw
@@ -20,7 +20,7 @@ def plan(task="assembly_2", **changes):
     return AugmentPlan(spec=load_mimic_spec(task), **changes)
 
 
-def attempts_of(task, num, failed=(), **drawn):
+def attempts_of(task, num, failed=(), unseen=(), **drawn):
     """Attempts with draws of the paper's ranges, but for what is given."""
     rng = np.random.default_rng(0)
     return [
@@ -31,6 +31,7 @@ def attempts_of(task, num, failed=(), **drawn):
             scene_seed=100 + k,
             sources=frozenset({f"demo {k % 2}"}),
             draw=draw(PAPER_ROWS[task], rng) | {name: np.array(values[k]) for name, values in drawn.items()},
+            rows=0 if k in unseen else 300,
             process_s=2.0 if k in failed else 3.0,
             folder=Path(f"/a store/mimicgen/{k:016x}"),
         )
@@ -75,14 +76,16 @@ def test_where_less_is_drawn_the_boxes_are_smaller():
 
 
 def test_sources_failures_and_cost_are_counted():
-    told = numbers(plan(), attempts_of("assembly_2", 6, failed={0, 2}), cpu_s=24.0)
+    told = numbers(plan(), attempts_of("assembly_2", 6, failed={0, 2}, unseen={0}), Spent(24.0, 90.0))
     assert told["yield"]["successes"] == 4
     shares = {s["source"]: (s["successes"], s["attempts"], s["share_of_successes"]) for s in told["sources"]}
     assert shares == {"demo 0": (1, 3, 0.25), "demo 1": (3, 3, 0.75)}
     assert told["failures"] == {"dropped": 2}
+    assert told["failed"][0]["command"] is None
     assert told["failed"][1]["command"] == "taccorl view '/a store/mimicgen/0000000000000002'"
     assert told["cost"]["process_s_per_success"] == pytest.approx((4 * 3.0 + 2 * 2.0) / 4)
     assert told["cost"]["cpu_s_per_success"] == pytest.approx(6.0)
+    assert told["cost"]["wall_s"] == 90.0
     json.dumps(told)
 
 
@@ -92,11 +95,13 @@ def test_the_page_names_poor_boxes_and_every_failure_and_needs_no_other_file():
     attempts = attempts_of("assembly_2", 80, failed=set(range(20)), friction=frictions)
     told = numbers(plan(), attempts, None) | {"source": "old", "dataset": "new"}
     page = _page(plan(), told)
-    assert "<td>friction</td><td>0.3 … 0.4 </td><td class=n>0 of 20: 0 % (95 %: 0 … 16)</td>" in page
+    assert "<td>friction</td><td>0.3 … 0.4</td><td class=n>0 of 20: 0 % (95 %: 0 … 16)</td>" in page
     assert page.count("taccorl view ") == 20
     assert "it &lt;fell&gt;" in page
     assert "MuJoCo twin, not a robot: simulated" in page
-    assert "CPU time is not known" in page
+    assert "What the whole run took is not known" in page
+    for name in ("retarget", "contact_mode"):
+        assert f"<tr><td>{name}</td><td>{getattr(plan().spec.datagen_config, name)}</td></tr>" in page
     assert not [part for part in ("http:", "https:", "<script", "<link") if part in page]
 
 
