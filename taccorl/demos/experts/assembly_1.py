@@ -24,6 +24,9 @@ _LONGEST_REGAIN_S = 1.0
 class AirAssembly(ScriptedExpert):
     """Both hands lift; the left one waits where they meet, the right one inserts and lets go."""
 
+    _held_like: np.ndarray | None = None
+    """(3, 3) how the left hand has come to hold the hole; level until then."""
+
     @abstractmethod
     def holder(self) -> tuple[Part, str, str]:
         """The part with the hole, its grasp, the hole."""
@@ -43,6 +46,9 @@ class AirAssembly(ScriptedExpert):
     def script(self, arm: str) -> Script:
         return self._left() if arm == "left" else self._right()
 
+    def finish(self, arm: str, subtask: str) -> Script:
+        return self._hold(self._hole()) if arm == "left" else self._join()
+
     def _lift(self, arm: str, part: Part, grasp: str) -> Script:
         goal = self.grasp(part, grasp, lean_rad=_LEAN_RAD, lift_m=0.004, pivot_m=_GRIP_M)
         above = goal.copy()
@@ -60,20 +66,28 @@ class AirAssembly(ScriptedExpert):
         hole_from_tcp = inverse(self.body(part.name) @ part.holes[hole_name].part_from_hole) @ self.tcp("left")
         mouth = transform(self.near(transform(_MEET_M))[:3, 3], self.world_from_level())
         yield from self.move("left", mouth @ hole_from_tcp, speed_mps=_LIFT_MPS, settle=True)
-        self.hands["left"].steadiness, self.hands["left"].learns = _LEFT_STEADINESS, False
         self.flags.add("holder waits")
+        yield from self._hold(mouth)
+
+    def _hold(self, mouth: np.ndarray) -> Script:
+        """Hold the hole still at ``mouth`` (4, 4) until the plug is in."""
+        self.hands["left"].steadiness, self.hands["left"].learns = _LEFT_STEADINESS, False
+        self._held_like = mouth[:3, :3]
         while "plug is in" not in self.flags:
             if self._askew_rad() > _LEVEL_RAD and np.linalg.norm(self.pushed("left")[:3]) < _FREE_M:
-                hole = self.body(part.name) @ part.holes[hole_name].part_from_hole
-                yield from self.move("left", mouth @ inverse(hole) @ self.tcp("left"))
+                yield from self.move("left", mouth @ inverse(self._hole()) @ self.tcp("left"))
                 yield from self.settle("left")
             yield
 
+    def _hole(self) -> np.ndarray:
+        """World-from-hole (4, 4) now."""
+        part, _, hole_name = self.holder()
+        return self.body(part.name) @ part.holes[hole_name].part_from_hole
+
     def _askew_rad(self) -> float:
         """How far the hole is turned from how it is to be held."""
-        part, _, hole_name = self.holder()
-        hole = self.body(part.name) @ part.holes[hole_name].part_from_hole
-        return float(np.linalg.norm(rotvec(self.world_from_level(), hole)))
+        held_like = self.world_from_level() if self._held_like is None else self._held_like
+        return float(np.linalg.norm(rotvec(held_like, self._hole())))
 
     def regain(self, arm: str) -> Script:
         """Wait until the left hand has brought the hole back to level."""
@@ -84,12 +98,15 @@ class AirAssembly(ScriptedExpert):
             yield
 
     def _right(self) -> Script:
-        plug, grasp = self.plug()
-        holder, _, hole = self.holder()
         yield from self.pause("right", 0.0, 0.4)
-        yield from self._lift("right", plug, grasp)
+        yield from self._lift("right", *self.plug())
         yield from self.wait_for("holder waits")
-        yield from self.push_in(Mating.of(plug, holder, hole))
+        yield from self._join()
+
+    def _join(self) -> Script:
+        """From the plug held to the hand away from it."""
+        holder, _, hole = self.holder()
+        yield from self.push_in(Mating.of(self.plug()[0], holder, hole))
         yield from self.open("right")
         away = self.hands["right"].pose.copy()
         away[:3, 3] -= 0.08 * away[:3, 2]

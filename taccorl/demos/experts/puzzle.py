@@ -35,6 +35,14 @@ class PuzzleExpert(ScriptedExpert):
     def script(self, arm: str) -> Script:
         return self._left() if arm == "left" else self._right()
 
+    def finish(self, arm: str, subtask: str) -> Script:
+        own = self._task.subtasks()[arm]
+        shape = next(s.held for s in own if s.name == subtask)
+        assert shape is not None
+        yield from self._place(arm, shape, is_near=True)
+        if arm == "right" and subtask == own[-1].name:
+            yield from self._retreat(arm)
+
     def _left(self) -> Script:
         yield from self.pause("left", 0.0, 1.0)
         yield from self._lift("left", "circle")
@@ -63,22 +71,24 @@ class PuzzleExpert(ScriptedExpert):
         yield from self.close(arm, self._part(shape).grasps["knob"].width_m)
         yield from self.move(arm, raised(self.hands[arm].pose, height_m), speed_mps=_NEAR_MPS)
 
-    def _place(self, arm: str, shape: str) -> Script:
-        """Carry a held piece to its hole, feel it in, let go, look; grip it again where it rests on the rim."""
+    def _place(self, arm: str, shape: str, *, is_near: bool = False) -> Script:
+        """Carry a held piece to its hole, where it may be already, feel it in, let go, look; grip it again where it rests on
+        the rim."""
         mating = Mating.of(self._part(shape), self._task.tray, shape)
         for attempt in range(_MOST_TRIES):
             if attempt:
                 self.felt(arm, f"{shape} rests on the rim")
                 yield from self._lift(arm, shape, height_m=0.02)
-            yield from self._press(arm, mating)
+            yield from self._press(arm, mating, carry=bool(attempt) or not is_near)
             yield from self.open(arm, _LET_GO_M)
             yield from self.move(arm, raised(self.hands[arm].pose, 0.035), speed_mps=_NEAR_MPS)
             self.hands[arm].learns, self.hands[arm].steadiness = True, 1.0
             if self._task.placed(self.sim, shape)[0]:
                 return
 
-    def _press(self, arm: str, mating: Mating) -> Script:
-        """Press a held piece down; where the rim stops it, slide it on lightly until it drops in; push it to the floor.
+    def _press(self, arm: str, mating: Mating, *, carry: bool) -> Script:
+        """Carry a held piece over its hole and press it down; where the rim stops it, slide it on lightly until it drops in;
+        push it to the floor.
 
         The hole is seen with an error, of which each slide takes a part away. After a slide in vain the hand lifts a little,
         looks at the piece in its fingers, which may have turned, and presses again.
@@ -90,7 +100,8 @@ class PuzzleExpert(ScriptedExpert):
             part_from_tcp=inverse(self.body(mating.held)) @ self.tcp(arm),
             turned=mating.turned(self),
         )
-        yield from self.move(arm, lambda: aim.pose(self, mating, -_CARRY_M), speed_mps=_CARRY_MPS)
+        if carry:
+            yield from self.move(arm, lambda: aim.pose(self, mating, -_CARRY_M), speed_mps=_CARRY_MPS)
         yield from self.move(arm, lambda: aim.pose(self, mating, -_HOVER_M), speed_mps=_NEAR_MPS, settle=True)
         hand.learns, hand.steadiness = False, 0.3
         aim, depth = (yield from self._align(arm, mating, aim, -_HOVER_M)), -_HOVER_M

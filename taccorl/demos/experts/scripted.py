@@ -137,8 +137,27 @@ class ScriptedExpert(ABC):
     def script(self, arm: str) -> Script:
         """The arm's work, one yield a control step."""
 
+    def finish(self, arm: str, subtask: str) -> Script:
+        """The rest of a subtask, from what is held close before its mate. An arm's last subtask ends with its retreat.
+
+        Raises:
+            TaccorlError: this demonstrator can only begin at the beginning.
+        """
+        raise TaccorlError(f"expert of {self.task}: cannot begin in the middle of {subtask!r}; write its finish()")
+
+    @classmethod
+    def can_finish(cls) -> bool:
+        """Whether it can begin in the middle."""
+        return cls.finish is not ScriptedExpert.finish
+
     def start(self) -> None:
         """After a reset of the simulation."""
+        self.stand_by()
+        self._scripts = {arm: self.script(arm) for arm in ARMS}
+        self.running = set(ARMS)
+
+    def stand_by(self) -> None:
+        """After a reset of the simulation, where another moves the arms until ``take_over``."""
         command = self.sim.arrays["ctrl"][0, self.sim.action_actuators]
         self.hands = {}
         for a, arm in enumerate(ARMS):
@@ -152,25 +171,40 @@ class ScriptedExpert(ABC):
                 predicted_rad=joints,
                 goal=pose,
             )
-        self._scripts = {arm: self.script(arm) for arm in ARMS}
-        self._running = set(ARMS)
+        self._scripts: dict[str, Script] = {}
+        self.running: set[str] = set()
+        """Arms that it moves."""
         self.step_count = 0
         self.flags, self.events = set(), []
+
+    def take_over(self, arm: str, subtask: str, pose: np.ndarray, opening_m: float) -> None:
+        """Finish ``subtask`` with an arm that another has sent to ``pose`` (4, 4) last, in free motion."""
+        joints = self.sim.proprioception()[0, 7 * ARMS.index(arm) :][:6].copy()
+        self.hands[arm] = Hand(
+            pose=pose,
+            opening_m=opening_m,
+            joints_rad=self.kinematics[arm].solve(pose, joints)[0],
+            bias_rad=np.zeros(6),
+            predicted_rad=joints,
+            goal=pose,
+        )
+        self._scripts[arm] = self.finish(arm, subtask)
+        self.running.add(arm)
 
     @property
     def done(self) -> bool:
         """Both arms have nothing left to do."""
-        return not self._running
+        return not self.running
 
     def act(self) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m] of the next control step."""
         action = np.empty(14)
         for a, arm in enumerate(ARMS):
-            if arm in self._running:
+            if arm in self.running:
                 try:
                     next(self._scripts[arm])
                 except StopIteration:
-                    self._running.discard(arm)
+                    self.running.discard(arm)
             action[7 * a : 7 * a + 6] = self._joints(a, arm)
             action[7 * a + 6] = self.hands[arm].opening_m
         self.step_count += 1

@@ -37,23 +37,34 @@ class TestTubeExpert(ScriptedExpert):
     def script(self, arm: str) -> Script:
         return self._left() if arm == "left" else self._right()
 
+    def finish(self, arm: str, subtask: str) -> Script:
+        return self._hold() if arm == "left" else self._insert()
+
     def _left(self) -> Script:
-        rack, hand = self._task.rack, self.hands["left"]
+        rack = self._task.rack
         goal = self.grasp(rack, "handle", lean_rad=_LEAN_LEFT_RAD, lift_m=0.004, pivot_m=_TIPS_M)
         yield from self.move("left", self.near(goal @ transform((0, 0, -0.07))))
         yield from self.move("left", goal, speed_mps=0.1, settle=True)
         yield from self.close("left", rack.grasps["handle"].width_m)
-        hand.steadiness, hand.learns = 0.4, False
         self.flags.add("rack is held")
+        yield from self._hold()
+
+    def _hold(self) -> Script:
+        """Keep the rack where it is until the tube is in."""
+        hand = self.hands["left"]
+        hand.steadiness, hand.learns = 0.4, False
         yield from self.wait_for("tube is in")
 
     def _right(self) -> Script:
-        task = self._task
         yield from self.pause("right", 0.0, 0.4)
         yield from self._lift()
         yield from self._turn_upright()
         yield from self.wait_for("rack is held")
-        mating = Mating.of(task.tube, task.rack, "middle")
+        yield from self._insert()
+
+    def _insert(self) -> Script:
+        """From the tube upright and held to the hand away from it."""
+        mating = Mating.of(self._task.tube, self._task.rack, "middle")
         yield from self.insert("right", mating, depth_m=0.0445, enough_m=0.0425)
         yield from self.open("right", _OPEN_M)
         away = self.hands["right"].pose @ transform((0, 0, -0.08))

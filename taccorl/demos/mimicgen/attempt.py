@@ -4,6 +4,7 @@ An attempt that succeeds is executed a second time from its stored actions: that
 what the gates judge, and gives the rows with touch. So physics comes first, and touch and pictures only for what is kept.
 """
 
+import functools
 import time
 import zlib
 from collections.abc import Mapping
@@ -14,10 +15,12 @@ import numpy as np
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.mimicgen.director import Director, Wish
+from taccorl.demos.mimicgen.expert_contact import ExpertContact
 from taccorl.demos.mimicgen.gates import GateKeeper, Measured, foreign_contact
 from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
 from taccorl.demos.mimicgen.schedule import DeadlockError
 from taccorl.demos.mimicgen.source import SourcePool
+from taccorl.demos.mimicgen.spec import check_closed_loop
 from taccorl.demos.recorder import EpisodeRecorder
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.robot import ARMS
@@ -79,9 +82,9 @@ class TwinScene:
 class Hands:
     """Wishes into joint targets: inverse kinematics, and what the joints rest off."""
 
-    def __init__(self, sim: Simulation, kinematics: Mapping[str, ArmKinematics]) -> None:
-        """After a reset."""
-        self.sim, self.kinematics = sim, kinematics
+    def __init__(self, sim: Simulation, kinematics: Mapping[str, ArmKinematics], *, learn: bool = True) -> None:
+        """After a reset. ``learn``: wishes are where the joints are to be, not what to send."""
+        self.sim, self.kinematics, self.learn = sim, kinematics, learn
         self.joints_rad, self._rest = {}, {}
         self._joints = {arm: joint_addresses(sim.model, arm) for arm in ARMS}
         self.unreached_m, self.unreached = 0.0, ""
@@ -110,7 +113,7 @@ class Hands:
             else:
                 joints = wish.joints_rad
             self.joints_rad[arm] = joints
-            action[7 * a : 7 * a + 6] = rest.command(joints)
+            action[7 * a : 7 * a + 6] = rest.command(joints) if self.learn else joints
             action[7 * a + 6] = wish.opening_m
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 
@@ -121,16 +124,28 @@ class Attempts:
     def __init__(self, pool: SourcePool, sim: Simulation, seed: int) -> None:
         self.pool, self.spec, self.sim, self.seed = pool, pool.spec, sim, seed
         self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+        self._feels = self.spec.datagen_config.contact_mode == "closed_loop_expert"
+        if self._feels:
+            check_closed_loop(self.spec)
 
     def run(self, k: int) -> Attempted:
         """Attempt ``k``, physics only."""
         began_s = time.process_time()
         sim, (scene_seed, rng) = self.sim, attempt_seeds(self.seed, self.spec.task, k)
         sim.reset([scene_seed])
-        scene, hands = TwinScene(sim), Hands(sim, self.kinematics)
+        commanded = self.spec.datagen_config.retarget == "eef_command"
+        scene, hands = TwinScene(sim), Hands(sim, self.kinematics, learn=not commanded)
         command = sim.arrays["ctrl"][0, sim.action_actuators]
         openings = {arm: float(command[7 * a + 6]) for a, arm in enumerate(ARMS)}
-        director = Director(self.pool, scene, openings, rng, hz=CONTROL_HZ, kinematics=self.kinematics)
+        director = Director(
+            self.pool,
+            scene,
+            openings,
+            rng,
+            hz=CONTROL_HZ,
+            kinematics=self.kinematics,
+            contact_hands=functools.partial(ExpertContact, sim) if self._feels else None,
+        )
         done = Attempted(k, scene_seed, "unfinished")
         actions, after = [], 0
         while after < _AFTER_STEPS and not sim.judge.outcome.over[0]:
@@ -190,7 +205,8 @@ class Attempts:
                     "in_hand_correction": np.round(choice.correction, 9).tolist(),
                 }
             )
-        generation = self.spec.datagen_config
+        generation, feels = self.spec.datagen_config, director.contact_hands
+        felt = {"corrections": [list(event) for event in feels.corrections]} if feels else {}
         return {
             "attempt": k,
             "seed": self.seed,
@@ -198,6 +214,7 @@ class Attempts:
             "spec": self.spec.digest,
             "retarget": generation.retarget,
             "contact_mode": generation.contact_mode,
+            **felt,
             "draw": {name: np.asarray(value).tolist() for name, value in self.sim.draws[0].items()},
             "subtasks": choices,
         }

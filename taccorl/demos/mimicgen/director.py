@@ -5,7 +5,7 @@ test's ideal hands) shows the scene that came of it in the next step.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -24,12 +24,13 @@ from taccorl.demos.mimicgen.carry import (
     shaken,
     translation,
 )
-from taccorl.demos.mimicgen.schedule import Place, Schedule
+from taccorl.demos.mimicgen.schedule import Cue, Place, Schedule
 from taccorl.demos.mimicgen.source import ArmTrack, Segment, SourcePool, contact_row
 from taccorl.demos.mimicgen.spec import ConstraintSpec, SubtaskSpec
 
 _SETTLED_M, _SETTLED_RAD = 0.0004, 0.004  # a hand that moves less in a control step is at rest
 _REACH_M = 0.4  # of a joint to the hand: how far noise of the joints moves it
+_HANDED_OVER_STEPS = 2  # of a path: one in which another takes over, one when it has finished
 
 
 class SeenPoses(Protocol):
@@ -74,6 +75,23 @@ class Wish:
     noisy: bool = True
 
 
+class ContactHands(Protocol):
+    """Moves hands in contact in the source's stead."""
+
+    @property
+    def corrections(self) -> list[tuple[int, str]]:
+        """(row of the action, what was felt)."""
+        ...
+
+    def take(self, arm: str, subtask: str, wish: Wish) -> None:
+        """From the coming control step to the end of that subtask; ``wish`` was the arm's last."""
+        ...
+
+    def step(self) -> Mapping[str, Wish]:
+        """Once a control step: what each arm that has not finished is to do."""
+        ...
+
+
 @dataclass
 class Choice:
     """What an attempt does in one subtask; goes into the provenance."""
@@ -88,7 +106,7 @@ class Choice:
 
 @dataclass
 class _Path:
-    """One subtask of one arm: a bridge, then rows of a source."""
+    """One subtask of one arm: a bridge, then rows of a source; in contact another may move the hand."""
 
     bridge: list[Wish]
     choice: Choice
@@ -101,13 +119,20 @@ class _Path:
     """First row that counts as contact."""
     joints_rad: np.ndarray | None
     """(steps after the bridge, 6) where joints are told."""
+    is_handed_over: bool = False
+    """Another moves the hand in contact, for as long as it takes."""
 
     def __len__(self) -> int:
+        return self.num_own + self.is_handed_over * _HANDED_OVER_STEPS
+
+    @property
+    def num_own(self) -> int:
+        """Steps before another takes over."""
         return len(self.bridge) + len(self.rows)
 
     def row(self, step: int) -> int | None:
-        """Of the source; None on the bridge."""
-        return int(self.rows[step - len(self.bridge)]) if step >= len(self.bridge) else None
+        """Of the source; None on the bridge, and where another moves the hand."""
+        return int(self.rows[step - len(self.bridge)]) if len(self.bridge) <= step < self.num_own else None
 
 
 @dataclass
@@ -133,14 +158,19 @@ class Director:
         *,
         hz: float,
         kinematics: Mapping[str, Kinematics] | None = None,
+        contact_hands: Callable[[np.random.Generator], ContactHands] | None = None,
     ) -> None:
         """
         Args:
             openings_m: of the grippers now.
             kinematics: arm → its own; only subtasks without an object_ref need it.
+            contact_hands: what moves the hands in contact, made with a generator of its own; None: the source.
         """
         self.pool, self.spec, self.hz, self.kinematics = pool, pool.spec, hz, kinematics or {}
         self._rng, self._noise_rng = rng.spawn(2)
+        self.contact_hands = contact_hands(rng.spawn(1)[0]) if contact_hands else None
+        self._handed_over: set[str] = set()
+        """Arms that they move now."""
         self.schedule = Schedule(self.spec.signals, self.spec.constraints)
         self.choices: dict[Place, Choice] = {}
         self._hands = {
@@ -170,11 +200,13 @@ class Director:
             self._hands[arm].joints_rad = joints
         for arm in self.schedule.to_plan():
             self._plan(arm, scene)
-        held = [arm for arm in self._hands if self._is_to_settle(arm, scene)]
+        held = [arm for arm in self._hands if arm in self._handed_over or self._is_to_settle(arm, scene)]
         cues = self.schedule.tick(held) if not self.done else {}
-        wishes = {}
+        felt, wishes = self._in_contact(cues), {}
         for arm, hand in self._hands.items():
-            if arm in cues:
+            if arm in felt:
+                hand.last = wishes[arm] = felt[arm]
+            elif arm in cues:
                 hand.last, hand.waited = self._wish(arm, cues[arm].step, scene), 0
                 wishes[arm] = self._shaken(hand.last)
             else:
@@ -183,6 +215,19 @@ class Director:
                 wishes[arm] = hand.last
             hand.seen = scene.tcp(arm)
         return wishes
+
+    def _in_contact(self, cues: Mapping[str, Cue]) -> Mapping[str, Wish]:
+        """What others wish for the arms that they move now."""
+        if self.contact_hands is None:
+            return {}
+        for arm, cue in cues.items():
+            hand = self._hands[arm]
+            assert hand.path is not None
+            if hand.path.is_handed_over and cue.step == hand.path.num_own:
+                self.contact_hands.take(arm, self.spec.signals[arm][cue.subtask], hand.last)
+        felt = self.contact_hands.step()
+        self._handed_over = set(felt)
+        return felt
 
     # settling and noise -----------------------------------------------------------------------------------------------
 
@@ -232,6 +277,7 @@ class Director:
             joints_rad=None,
         )
         self._look_into_hand(arm, path, segment.start, scene)
+        num_together = segment.num_together
         if subtask.object_ref is None and coordination is None:
             path.rows, path.joints_rad = self._along_joints(arm, track, segment, choice.correction)
         else:
@@ -239,15 +285,27 @@ class Director:
             first = delta @ before @ choice.correction
             goals = bridge(hand.last.goal, first, self.spec.datagen_config.bridge, self.hz)
             path.bridge = [Wish(goal=goal, opening_m=hand.last.opening_m) for goal in goals]
-        self.schedule.plan(arm, len(path), segment.num_together)
+        if self.contact_hands is not None and path.contact < segment.end:
+            num_together = self._hand_over(path, coordination)
+        self.schedule.plan(arm, len(path), num_together)
+
+    def _hand_over(self, path: _Path, coordination: ConstraintSpec | None) -> int:
+        """Cut a path where another takes over: at contact, but two hands that work together in the same row. Gives the number of
+        its last steps that they do side by side."""
+        places, i = coordination.eef_subtask_constraint_tuple if coordination else (), path.choice.source
+        together = max((self.pool.segment(i, *p, self._offsets).start for p in places), default=path.contact)
+        row = max(path.contact, together)
+        path.rows, path.is_handed_over = path.rows[path.rows < row], True
+        return row - together + _HANDED_OVER_STEPS
 
     def _wish(self, arm: str, step: int, scene: SeenPoses) -> Wish:
         """Of a step of the arm's path, without noise."""
-        path = self._hands[arm].path
+        hand = self._hands[arm]
+        path = hand.path
         assert path is not None
         row = path.row(step)
         if row is None:
-            return path.bridge[step]
+            return path.bridge[step] if step < len(path.bridge) else replace(hand.last, noisy=False)
         choice, told = path.choice, None
         if path.joints_rad is not None:
             told = path.joints_rad[step - len(path.bridge)]

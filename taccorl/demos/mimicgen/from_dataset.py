@@ -118,9 +118,9 @@ class SourceReader:
             commands = actions[:, 7 * a : 7 * a + 6]
             joints = np.stack([look.joints_rad[arm] for look in seen])
             goals = self._goals(arm, joints, commands, rest_command[7 * a : 7 * a + 6], touched)
-            goal = np.stack([self.kinematics[arm].pose(row) for row in goals])
+            goal, command = (np.stack([self.kinematics[arm].pose(row) for row in rows]) for rows in (goals, commands))
             tcp = np.stack([look.tcp[arm] for look in seen])
-            arms[arm] = ArmTrack(tcp, goal, goals, actions[:, 7 * a + 6])
+            arms[arm] = ArmTrack(tcp, goal, goals, actions[:, 7 * a + 6], command, commands)
         subtask = episode.arrays["sim.subtask"]
         signals = {
             arm: {s.name: subtask[:, a] > k for k, s in enumerate(self.sim.task.subtasks()[arm])}

@@ -5,7 +5,7 @@ Letters in shapes: T rows. Row t holds the scene before action t.
 
 import functools
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,10 @@ class ArmTrack:
     """(T, 6) of that."""
     opening_m: np.ndarray
     """(T,) gripper command of action t."""
+    command: np.ndarray
+    """(T, 4, 4) TCP of the joints that action t commands: the goal, and what the arm rests off it."""
+    command_rad: np.ndarray
+    """(T, 6) of that."""
 
     @functools.cached_property
     def gripper_acts(self) -> np.ndarray:
@@ -54,6 +58,14 @@ class Source:
     @property
     def num_rows(self) -> int:
         return len(next(iter(self.arms.values())).opening_m)
+
+    @property
+    def as_commanded(self) -> "Source":
+        """With commands for goals."""
+        arms = {
+            arm: replace(track, goal=track.command, joints_rad=track.command_rad) for arm, track in self.arms.items()
+        }
+        return replace(self, arms=arms)
 
 
 @dataclass(frozen=True)
@@ -118,7 +130,8 @@ class SourcePool:
         """
         if not sources:
             raise DatasetError(f"mimicgen of {spec.task}: no sources; taccorl collect --task={spec.task} makes some")
-        self.spec, self.sources = spec, list(sources)
+        commanded = spec.datagen_config.retarget == "eef_command"
+        self.spec, self.sources = spec, [source.as_commanded if commanded else source for source in sources]
         self._ends = [{arm: subtask_ends(s, arm, names) for arm, names in spec.signals.items()} for s in self.sources]
         for i, source in enumerate(self.sources):
             self._check_objects(source)

@@ -9,10 +9,11 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from taccorl.data.spec import SPEC_VERSION, find_spec
 from taccorl.data.strict_yaml import Document
+from taccorl.demos.experts import experts
 from taccorl.demos.mimicgen.schedule import Constraint, DeadlockError, rehearse
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.robot import ARMS
@@ -20,8 +21,8 @@ from taccorl.sim.tasks.task import Task
 
 UNTIL_THE_END = "until the end"
 """Name of a last subtask without a signal."""
-Retarget = Literal["held_object", "eef"]
-ContactMode = Literal["replay"]
+Retarget = Literal["held_object", "eef", "eef_command"]
+ContactMode = Literal["replay", "closed_loop_expert"]
 Strategy = Literal["random", "nearest_neighbor_object", "nearest_neighbor_robot_distance"]
 
 
@@ -105,7 +106,8 @@ class SplitNoiseSpec:
     transport: NoiseSpec = field(default_factory=NoiseSpec)
     """Everywhere else: in free motion and while it grips."""
     contact: NoiseSpec = field(default_factory=NoiseSpec)
-    """From ``contact_lead_steps`` before what it holds first touches its mate in the source."""
+    """From ``contact_lead_steps`` before what it holds first touches its mate in the source. Not for closed_loop_expert, whose
+    hands tremble by themselves."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,9 +119,13 @@ class GenerationSpec:
     generation_select_src_per_arm: bool = False
     """Each arm chooses its own; coordinated subtasks always share one."""
     retarget: Retarget = "held_object"
-    """What keeps its path: T' = Δ · T_src · G_src · G_new⁻¹ with the object's pose G in the hand; eef: T' = Δ · T_src."""
+    """What keeps its path: T' = Δ · T_src · G_src · G_new⁻¹ with the object's pose G in the hand; eef: T' = Δ · T_src. Both
+    carry over where the hand was to be, and learn how far from its command this twin lets it rest. eef_command: as MimicGen and
+    IsaacLab Mimic do, Δ · T_src of the poses that were commanded, sent as they are."""
     contact_mode: ContactMode = "replay"
-    """Who moves the hands in contact: the source's motion. Kept in the provenance."""
+    """Who moves the hands from where what they hold is about to touch its mate to the end of that subtask. replay: the source's
+    motion, which feels nothing. closed_loop_expert: the task's scripted expert, which feels a block, backs off and aims again,
+    with a human aiming error and tremor of its own. Kept in the provenance, there with its corrections."""
     bridge: BridgeSpec = field(default_factory=BridgeSpec)
     num_settle_steps_before_gripper: int = 12
     """At most so many steps, without noise, an arm waits to come to rest before its gripper opens or closes; its partner in a
@@ -269,6 +275,24 @@ def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
                 f"datagen_config/{name}",
                 f"{value:g} is not wanted; give a number {'> 0' if name in positive else '≥ 0'}",
             )
+    yield from _closed_loop_mistakes(generation)
+
+
+def _closed_loop_mistakes(generation: GenerationSpec) -> Iterator[tuple[str, str]]:
+    if generation.contact_mode != "closed_loop_expert":
+        return
+    if generation.retarget == "eef_command":
+        yield (
+            "datagen_config/retarget",
+            "eef_command sends poses as they were commanded, but closed_loop_expert says where the hands are to be; take "
+            "held_object or eef, or contact_mode: replay",
+        )
+    if generation.noise.contact != NoiseSpec():
+        yield (
+            "datagen_config/noise/contact",
+            "has no effect with closed_loop_expert, whose hands tremble by themselves; leave it out, or take contact_mode: "
+            "replay",
+        )
 
 
 def _counts(spec: MimicSpec) -> str:
@@ -305,16 +329,38 @@ def check_task(spec: MimicSpec, task: Task) -> None:
     for body in spec.symmetry:
         if body not in bodies:
             raise SpecError(f"{where}: symmetry: no {body!r}; {nearest(body, bodies)}")
+    check_closed_loop(spec)
+
+
+def check_closed_loop(spec: MimicSpec) -> None:
+    """An expert that is to move the hands in contact can.
+
+    Raises:
+        SpecError: the task's expert cannot begin in the middle, or other options contradict it.
+    """
+    where = f"mimicgen spec of {spec.task}"
+    for key, text in _closed_loop_mistakes(spec.datagen_config):
+        raise SpecError(f"{where}: {key.replace('/', ' → ')}: {text}")
+    if spec.datagen_config.contact_mode == "closed_loop_expert" and not experts.get(spec.task).can_finish():
+        raise SpecError(
+            f"{where}: datagen_config → contact_mode: closed_loop_expert, but the expert of {spec.task} cannot begin in the "
+            "middle of a subtask: write its finish(), or take contact_mode: replay"
+        )
 
 
 def with_options(spec: MimicSpec, **changes: object) -> MimicSpec:
     """The spec with other ``datagen_config`` fields.
 
     Raises:
-        TaccorlError: there is no such field.
+        TaccorlError: there is no such field, or it does not take that word.
     """
     known = [f.name for f in dataclasses.fields(GenerationSpec)]
-    for name in changes:
+    words = {"retarget": get_args(Retarget), "contact_mode": get_args(ContactMode)}
+    for name, value in changes.items():
         if name not in known:
             raise TaccorlError(f"datagen_config: no {name!r}; {nearest(name, known)}")
+        if name in words and value not in words[name]:
+            raise TaccorlError(
+                f"datagen_config: {name}: {value!r} is none of {', '.join(words[name])}; {nearest(str(value), words[name])}"
+            )
     return dataclasses.replace(spec, datagen_config=dataclasses.replace(spec.datagen_config, **changes))  # pyright: ignore[reportArgumentType]

@@ -17,6 +17,8 @@ NUM_ROWS, GRIP_ROW, LIFTED_ROW, LET_GO_ROW, TOUCH_ROW = 60, {"left": 18, "right"
 BOX = {"left": "cradle", "right": "plug"}
 OTHER = {"left": "plug", "right": "cradle"}
 HZ = 30.0
+REST = transform((0, 0, 0.003))
+"""From a hand's goal to what is commanded for it: an arm hangs."""
 
 
 def pose(x: float, y: float, z: float, *rotvec: float) -> np.ndarray:
@@ -85,7 +87,14 @@ def demonstration(start: IdealHands, name: str = "demo 0") -> Source:
     t = np.arange(NUM_ROWS)
     signals = {arm: {f"grasp {BOX[arm]}": t >= LIFTED_ROW[arm], f"join {BOX[arm]}": t >= LET_GO_ROW + 2} for arm in BOX}
     arms = {
-        arm: ArmTrack(np.stack(v["tcp"]), np.stack(v["goal"]), np.zeros((NUM_ROWS, 6)), np.array(v["opening"]))
+        arm: ArmTrack(
+            tcp=np.stack(v["tcp"]),
+            goal=np.stack(v["goal"]),
+            joints_rad=np.zeros((NUM_ROWS, 6)),
+            opening_m=np.array(v["opening"]),
+            command=np.stack(v["goal"]) @ REST,
+            command_rad=np.zeros((NUM_ROWS, 6)),
+        )
         for arm, v in tracks.items()
     }
     touching = t >= TOUCH_ROW

@@ -13,6 +13,7 @@ from ideal_hands import (
     LET_GO_ROW,
     NUM_ROWS,
     OPEN_M,
+    REST,
     TOUCH_ROW,
     demonstration,
     generate,
@@ -78,6 +79,15 @@ def test_hand_replay_carries_the_slip_over_to_what_is_held():
     np.testing.assert_allclose(made.goals["right"], source.arms["right"].goal, atol=1e-12)
     off = inverse(source.objects["plug"][LET_GO_ROW]) @ made.objects["plug"][LET_GO_ROW]
     np.testing.assert_allclose(off, SLIP["right"], atol=1e-12)
+
+
+def test_replay_of_commands_is_the_source_s_commands_carried_over():
+    source, g = demonstration(scene()), pose(0.03, 0.01, 0)
+    pool = pool_of(mimic_spec("transform", retarget="eef_command"), source)
+    made = generate(pool, scene().moved(g))
+    for arm in BOX:
+        sent = made.goals[arm][-NUM_ROWS + GRIP_ROW[arm] :]  # after the bridge onto what was commanded
+        np.testing.assert_allclose(sent, g @ source.arms[arm].goal[GRIP_ROW[arm] :] @ REST, atol=1e-12)
 
 
 def test_a_grasp_of_a_displaced_object_is_the_displaced_grasp_and_the_bridge_keeps_its_speed():
@@ -223,5 +233,6 @@ def test_the_same_generator_gives_the_same_motion_and_another_one_another():
 
 def test_a_gripper_acts_where_it_was_still_before():
     opening = np.array([7, 7, 7, 7, 7, 6, 5, 4, 4, 4, 4, 4, 4, 7.0])
-    track = ArmTrack(np.zeros((14, 4, 4)), np.zeros((14, 4, 4)), np.zeros((14, 6)), opening)
+    poses, joints = np.zeros((14, 4, 4)), np.zeros((14, 6))
+    track = ArmTrack(poses, poses, joints, opening, poses, joints)
     assert np.flatnonzero(track.gripper_acts).tolist() == [5, 13]
