@@ -20,6 +20,7 @@ VERBS = {
     "data": {
         "ingest": "recordings → LeRobot dataset with touch; `ingest inspect FILE` looks into one",
         "check": "what is wrong with a recording or a dataset",
+        "merge": "real and simulated datasets → one for co-training, each row told apart, with exact statistics",
         "view": "an episode in Rerun: pictures, touch, joints, arms",
     },
     "store": {"lineage": "what was made from what: `lineage explain PATH`, `lineage prune`"},

@@ -6,7 +6,9 @@ one frame a row at its time; a dataset that fails is written again the slow way,
 """
 
 import contextlib
+import json
 import logging
+import math
 import os
 import shutil
 import sys
@@ -20,8 +22,9 @@ import av.logging
 import cv2
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from taccorl.data.dataset import Dataset
+from taccorl.data.dataset import BOOKKEEPING, Dataset
 from taccorl.data.episode import Episode
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
@@ -325,6 +328,9 @@ def _wait_for_room(dataset: Any) -> None:
 def merge(roots: Sequence[Path], destination: Path) -> None:
     """Datasets into one, by LeRobot's ``aggregate_datasets``; a single one is copied. Proved like a written one.
 
+    Statistics of joints and actions are those of all rows: LeRobot 0.6.1 takes the mean of the datasets' quantiles, which is no
+    quantile of theirs together.
+
     Raises:
         DatasetError: they differ in features, fps or robot, or the merged videos do not hold one frame a row.
     """
@@ -334,9 +340,39 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
         shutil.copytree(roots[0], destination, dirs_exist_ok=True)
     else:
         _aggregate(roots, destination)
+        write_exact_statistics(destination, smaller_than=LARGE_FEATURE)
     problems = Dataset(destination).video_problems()
     if problems:
         raise DatasetError(f"{destination}: {len(problems)} problems after merging, first: {problems[0]}")
+
+
+def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> None:
+    """Replace what ``meta/stats.json`` says of features that are numbers: over all rows, quantiles too.
+
+    Args:
+        root: a dataset.
+        smaller_than: leave features with as many elements as they are.
+    """
+    with quiet_lerobot():
+        from lerobot.datasets.io_utils import load_stats, write_stats
+
+        stats = dict(load_stats(root) or {})
+        features = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["features"]
+        for key, feature in features.items():
+            is_number = key not in BOOKKEEPING and feature["dtype"] not in ("video", "image", "string")
+            if is_number and math.prod(feature["shape"]) < smaller_than:
+                stats[key] = exact_stats(_all_rows(root, key))
+        write_stats(stats, root)
+
+
+def _all_rows(root: Path, key: str) -> np.ndarray:
+    """(rows, size) of the whole dataset."""
+    pieces = []
+    for path in sorted((root / "data").glob("*/*.parquet")):
+        for chunk in pq.read_table(path, columns=[key]).column(key).chunks:
+            flat = chunk.flatten() if hasattr(chunk, "flatten") and chunk.type.num_fields else chunk
+            pieces.append(flat.to_numpy(zero_copy_only=False).reshape(len(chunk), -1))
+    return np.concatenate(pieces)
 
 
 def _aggregate(roots: Sequence[Path], destination: Path) -> None:

@@ -3,6 +3,8 @@
 Weights are random and observations made up: what is measured is time and memory, not how well it acts.
 """
 
+import gc
+import math
 import time
 from collections.abc import Callable, Iterator
 from statistics import mean, median
@@ -20,16 +22,16 @@ def touch_cost() -> Iterator[Row]:
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    rows = 32 if device == "cuda" else 2
+    rows, repeats = (32, 4 * REPEATS) if device == "cuda" else (2, REPEATS)  # there they take 50 ms, as Python likes
     feeling, blind = (_policy("small", device, tactile=tactile) for tactile in (True, False))
     batch = _batch(rows, device, prompt_tokens=200)
     for label, of in (("training step", _training_step), ("chunk", _chunk)):
         with_touch, without = (of(policy, batch) for policy in (feeling, blind))
-        pairs = [(_time_s(with_touch, device), _time_s(without, device)) for _ in range(REPEATS + 1)][1:]
+        pairs = [(_time_s(with_touch, device), _time_s(without, device)) for _ in range(repeats + 2)][2:]
         added = [100 * (a / b - 1) for a, b in pairs]
         yield Row(
             name=f"touch in a {label} of the small preset, {rows} rows, {device}",
-            value=median(added), unit="% more time", goal="≤ 15", n=REPEATS, spread=spread(added),
+            value=median(added), unit="% more time", goal="≤ 15", n=repeats, spread=spread(added),
             rival="the same without touch, s", rival_value=mean([b for _, b in pairs]),
         )  # fmt: skip
 
@@ -42,16 +44,19 @@ def full_size() -> Iterator[Row]:
     if not torch.cuda.is_available():
         print("  full_size needs a GPU: nothing measured")
         return
-    torch.backends.cuda.matmul.allow_tf32 = True  # as lerobot-train sets it
-    policy = _policy("full", "cuda", tactile=True)
-    gpu = torch.cuda.get_device_name()
-    batch = _batch(1, "cuda", prompt_tokens=200)
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.benchmark = True  # as lerobot-train sets them
+    yield from _chunk_rows(torch.cuda.get_device_name())
+    yield from _training_rows(torch.cuda.get_device_name())
+
+
+def _chunk_rows(gpu: str) -> Iterator[Row]:
+    policy, batch = _policy("full", "cuda", tactile=True), _batch(1, "cuda", prompt_tokens=200)
     graphed, eager = _chunk(policy, batch), _chunk(policy, batch, cuda_graph=False)
     ours, theirs = graphed(), eager()
     difference = float((ours - theirs).abs().max() / theirs.abs().max())
     yield Row(
         name=f"chunk as a graph against step by step, bf16, {gpu}: largest difference / largest action",
-        value=difference, unit="", goal="≤ 0.02", n=1, spread=0.0,
+        value=difference, unit="1", goal="≤ 0.02", n=1, spread=0.0,
     )  # fmt: skip
     for label, compute, goal in (("as one CUDA graph", graphed, "≤ 60"), ("step by step", eager, "")):
         times_ms = [1e3 * _time_s(compute, "cuda") for _ in range(REPEATS + 1)][1:]
@@ -59,15 +64,36 @@ def full_size() -> Iterator[Row]:
             name=f"one chunk, 4 denoising steps, batch 1, bf16, {label}, {gpu}",
             value=median(times_ms), unit="ms", goal=goal, n=REPEATS, spread=spread(times_ms),
         )  # fmt: skip
+
+
+def _training_rows(gpu: str) -> Iterator[Row]:
+    import torch
+
+    policy, batch = _policy("full", "cuda", tactile=True), _batch(8, "cuda", prompt_tokens=200)
     torch.cuda.reset_peak_memory_stats()
-    step = _training_step(policy, _batch(8, "cuda", prompt_tokens=200))
-    times_s = [_time_s(step, "cuda") for _ in range(REPEATS + 2)][2:]
+    times_s = _step_times_s(policy, batch)
+    peak_gb = torch.cuda.max_memory_allocated() / 1e9
+    ours, theirs = _gradient_errors(policy, _contact_in_every_other({k: v[:2] for k, v in batch.items()}))
+    del policy
+    blind_s = median(_step_times_s(_policy("full", "cuda", tactile=False), batch))
+    lerobots_s = median(_step_times_s(_lerobots_pi05(), batch))
     yield Row(
         name=f"training step, batch 8, bf16, AdamW, {gpu}",
         value=median(times_s), unit="s", goal="≤ 0.36", n=REPEATS, spread=spread(times_s),
+        rival="LeRobot's pi05, without touch or image randomisation, s", rival_value=lerobots_s,
     )  # fmt: skip
-    peak = torch.cuda.max_memory_allocated() / 1e9
-    yield Row(name=f"weights, gradients, AdamW and activations of it, {gpu}", value=peak, unit="GB", n=1, spread=0.0)
+    yield Row(name=f"weights, gradients, AdamW and activations of it, {gpu}", value=peak_gb, unit="GB", n=1, spread=0.0)
+    added = [100 * (t / blind_s - 1) for t in times_s]
+    yield Row(
+        name=f"touch in that step, {gpu}",
+        value=median(added), unit="% more time", goal="≤ 15", n=REPEATS, spread=spread(added),
+        rival="the same without touch, s", rival_value=blind_s,
+    )  # fmt: skip
+    yield Row(
+        name=f"gradient of a step, 2 rows, bf16 against float32, {gpu}: error of compiled layers / of LeRobot's forward",
+        value=ours / theirs, unit="1", goal="≤ 1.1", n=1, spread=0.0,
+        rival="norm of the latter / of the gradient", rival_value=theirs,
+    )  # fmt: skip
 
 
 def _policy(backbone: str, device: str, *, tactile: bool) -> Any:
@@ -77,6 +103,7 @@ def _policy(backbone: str, device: str, *, tactile: bool) -> Any:
     from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TACTILE, TactileFormat, TactilePI05Config
     from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 
+    known = _features()
     pads = ("left_a", "left_b", "right_a", "right_b")
     config = TactilePI05Config(
         backbone=backbone,
@@ -84,16 +111,35 @@ def _policy(backbone: str, device: str, *, tactile: bool) -> Any:
         dtype="bfloat16" if device == "cuda" else "float32",
         tactile=tactile,
         tactile_format=TactileFormat("flexitac_v2", pads, 32, 12, "fixed_scale", 1 / 75),
-        input_features={
-            "observation.state": PolicyFeature(FeatureType.STATE, (14,)),
-            TACTILE: PolicyFeature(FeatureType.STATE, (1536,)),
-            **{f"observation.images.{c}": PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for c in CAMERAS},
-        },
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (14,))},
+        input_features={**known["input_features"], TACTILE: PolicyFeature(FeatureType.STATE, (1536,))},
+        output_features=known["output_features"],
     )
     torch.manual_seed(0)
     with torch.device(device):
         return TactilePI05Policy(config)
+
+
+def _lerobots_pi05() -> Any:
+    """LeRobot's own policy in the same size, untouched."""
+    import torch
+    from lerobot.policies.pi05.configuration_pi05 import PI05Config
+    from lerobot.policies.pi05.modeling_pi05 import PI05Policy
+
+    config = PI05Config(device="cuda", dtype="bfloat16", chunk_size=10, n_action_steps=10, **_features())
+    torch.manual_seed(0)
+    with torch.device("cuda"):
+        return PI05Policy(config)
+
+
+def _features() -> dict[str, Any]:
+    """State, three cameras and actions."""
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    images = {f"observation.images.{c}": PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for c in CAMERAS}
+    return {
+        "input_features": {"observation.state": PolicyFeature(FeatureType.STATE, (14,)), **images},
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (14,))},
+    }
 
 
 def _batch(rows: int, device: str, *, prompt_tokens: int) -> dict[str, Any]:
@@ -112,11 +158,18 @@ def _batch(rows: int, device: str, *, prompt_tokens: int) -> dict[str, Any]:
         }
 
 
+def _contact_in_every_other(batch: dict[str, Any]) -> dict[str, Any]:
+    touch = batch["observation.tactile"].clone()
+    touch[1::2] *= 0.1  # below the gate's threshold
+    return {**batch, "observation.tactile": touch}
+
+
 def _training_step(policy: Any, batch: dict[str, Any]) -> Callable[[], Any]:
-    """Forward, backward, clipping and AdamW, under the autocast that lerobot-train uses for the policy's dtype."""
+    """What ``update_policy`` of lerobot-train does: under autocast for the policy's dtype, numbers read for the log."""
     import torch
 
     optimizer = policy.config.get_optimizer_preset().build(policy.parameters())
+    scheduler = policy.config.get_scheduler_preset().build(optimizer, 3000)
     bfloat16 = policy.config.dtype == "bfloat16"
 
     def step() -> None:
@@ -124,11 +177,56 @@ def _training_step(policy: Any, batch: dict[str, Any]) -> Callable[[], Any]:
         with torch.autocast(policy.config.device, torch.bfloat16, enabled=bfloat16):
             loss, _ = policy.forward(batch)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimizer.step()
         optimizer.zero_grad()
+        scheduler.step()
+        loss.item()
+        norm.item()
 
     return step
+
+
+def _step_times_s(policy: Any, batch: dict[str, Any]) -> list[float]:
+    """Of ``REPEATS`` training steps after three; the GPU's memory is free again when the policy is."""
+    import torch
+
+    step = _training_step(policy, batch)
+    times_s = [_time_s(step, "cuda") for _ in range(REPEATS + 3)][3:]
+    del step
+    gc.collect()
+    torch.cuda.empty_cache()
+    return times_s
+
+
+def _gradient_errors(policy: Any, batch: dict[str, Any]) -> tuple[float, float]:
+    """Of compiled layers and of LeRobot's forward, both in bfloat16, against float32; the policy is in float32 after it."""
+    import torch
+
+    policy._change_images = None
+    backbone = policy.model.paligemma_with_expert
+
+    def gradient(*, compiled: bool) -> dict[str, Any]:
+        backbone.compiles_layers = compiled
+        torch.manual_seed(0)
+        with torch.autocast("cuda", torch.bfloat16, enabled=policy.config.dtype == "bfloat16"):
+            loss, _ = policy.train().forward(batch)
+        loss.backward()
+        gradients = {k: p.grad.float() for k, p in policy.named_parameters() if p.grad is not None}
+        policy.zero_grad()
+        return gradients
+
+    ours, theirs = gradient(compiled=True), gradient(compiled=False)
+    policy.float().config.dtype = "float32"
+    torch.backends.cuda.matmul.allow_tf32 = False
+    exact = gradient(compiled=False)
+    torch.backends.cuda.matmul.allow_tf32 = True
+    size = math.sqrt(sum(float(g.square().sum()) for g in exact.values()))
+
+    def error(of: dict[str, Any]) -> float:  # a weight that nothing needs has a gradient of zeros, or none
+        return math.sqrt(sum(float((g - of.get(k, 0)).square().sum()) for k, g in exact.items())) / size
+
+    return error(ours), error(theirs)
 
 
 def _chunk(policy: Any, batch: dict[str, Any], *, cuda_graph: bool = True) -> Callable[[], Any]:

@@ -1,6 +1,6 @@
 """Domain randomisation at reset: the physical rows of the paper's table (App. E), drawn per simulation.
 
-Image rows are a transform that training applies (taccorl/training/image_randomization.py).
+Image rows are a transform that training applies (taccorl/policies/tactile_pi05/image_randomization.py).
 """
 
 import math

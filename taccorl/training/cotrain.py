@@ -1,8 +1,10 @@
 """The dataset of co-training: real and simulated episodes in one, each row told apart, with exact statistics.
 
-``lerobot-train --policy.type=tactile_pi05 --policy.sim_weight=…`` weighs its rows (``taccorl.policies.tactile_pi05.mixture``).
+``taccorl merge`` makes it, ``lerobot-train --policy.type=tactile_pi05 --policy.sim_weight=…`` weighs its rows
+(``taccorl.policies.tactile_pi05.mixture``).
 """
 
+import dataclasses
 import json
 import tempfile
 from collections.abc import Sequence
@@ -11,15 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
-from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, Dataset
-from taccorl.data.lerobot_format import exact_stats, merge, quiet_lerobot
+from taccorl.data.dataset import PROVENANCE, Dataset, dataset_spec_to_json, episode_record
+from taccorl.data.lerobot_format import merge, quiet_lerobot, write_exact_statistics
+from taccorl.data.spec import DatasetSpec, FeatureSpec
+from taccorl.demos.recorder import ORIGIN
 from taccorl.errors import DatasetError, InTheWayError
+from taccorl.lineage.stage import Stage
+from taccorl.lineage.store import Store
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 
 IS_SIM_FEATURE = {"dtype": "float32", "shape": (1,), "names": None, "unit": "1", "range": [0, 1]}
 RECORD = PROVENANCE / "cotrain.json"
+VERSION = 1  # of the stage
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,49 @@ class Part:
     """What its episodes say they are from, such as a surrogate robot; empty: they do not say."""
 
 
+def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) -> list[Part]:
+    """``merge_domains`` as a stage: not done again where it has been done, and ``taccorl lineage explain`` tells of it.
+
+    Raises:
+        DatasetError: as ``merge_domains``.
+        InTheWayError: ``out`` holds something else.
+    """
+    check_domains(real, sim)
+
+    def build(_: Any, inputs: list[Path], folder: Path) -> None:
+        folder.rmdir()  # LeRobot wants to make it
+        merge_domains(inputs[: len(real)], inputs[len(real) :], folder)
+
+    stage = Stage("cotraining", build, VERSION, manifest=f"{PROVENANCE}/manifest.json")
+    config = {"real": [str(root) for root in real], "sim": [str(root) for root in sim]}
+    store.run(stage, config, [store.source(root) for root in (*real, *sim)], destination=out)
+    told = json.loads((out / RECORD).read_text(encoding="utf-8"))
+    return [Part(**{**part, "origins": tuple(part["origins"])}) for part in told]
+
+
+def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
+    """Features that all datasets have, if they can be merged.
+
+    Raises:
+        DatasetError: as ``merge_domains``.
+    """
+    datasets = [Dataset(root) for root in (*real, *sim)]
+    if not datasets:
+        raise DatasetError(
+            "co-training: no dataset given: --real=FOLDER, --sim=FOLDER, each as often as there are some"
+        )
+    for d in datasets:
+        if IS_SIM in d.info["features"]:
+            raise DatasetError(f"{d.root} has {IS_SIM}, it is merged already: give the datasets that it was made of")
+    for d in datasets[: len(real)]:
+        if ORIGIN in _origins(d):
+            raise DatasetError(
+                f"--real={d.root}: its episodes say {ORIGIN!r}: --sim={d.root}. Where the twin plays the robot, collect with "
+                "--origin='surrogate: …'"
+            )
+    return _shared_features(datasets)
+
+
 def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[Part]:
     """Datasets of both domains → one at ``out``, with ``observation.is_sim`` and what all of them hold.
 
@@ -45,16 +94,14 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
         sim: datasets of the twin.
 
     Raises:
-        DatasetError: none given, or they differ in a feature, fps or robot.
+        DatasetError: none given, or they differ in a feature, fps or robot, or are merged already; episodes that say that
+            they come from the twin are given as real.
         InTheWayError: something is at ``out``.
     """
-    roots = [*real, *sim]
-    if not roots:
-        raise DatasetError("co-training: no dataset given")
     if out.exists():
         raise InTheWayError(f"{out} exists already; nothing was touched: give another folder")
-    datasets = [Dataset(root) for root in roots]
-    shared = _shared_features(datasets)
+    shared = check_domains(real, sim)
+    datasets = [Dataset(root) for root in (*real, *sim)]
     with tempfile.TemporaryDirectory(prefix="cotrain_", dir=out.resolve().parent) as name:
         copies = [_with_domain(d, k >= len(real), shared, Path(name) / f"part_{k}") for k, d in enumerate(datasets)]
         merge(copies, out)
@@ -63,34 +110,12 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
         Part(str(d.root), k >= len(real), d.num_episodes, int(d.info["total_frames"]), _origins(d))
         for k, d in enumerate(datasets)
     ]
-    record = out / RECORD
-    record.parent.mkdir(parents=True, exist_ok=True)
-    record.write_text(json.dumps([asdict(part) for part in parts], indent=1, ensure_ascii=False) + "\n")
+    _dump(out / RECORD, [asdict(part) for part in parts])
+    _dump(out / PROVENANCE / "episodes.json", [record for d in datasets for record in _records(d, shared)])
+    described = [d for d in datasets if (d.root / PROVENANCE / "dataset_spec.json").is_file()]
+    if described:
+        _dump(out / PROVENANCE / "dataset_spec.json", dataset_spec_to_json(_spec(described[0], shared)))
     return parts
-
-
-def write_exact_statistics(root: Path) -> None:
-    """Replace what ``meta/stats.json`` says of features that are numbers: over all rows, quantiles too."""
-    with quiet_lerobot():
-        from lerobot.datasets.io_utils import load_stats, write_stats
-
-        stats = dict(load_stats(root) or {})
-        features = json.loads((root / "meta/info.json").read_text())["features"]
-        for key, feature in features.items():
-            if key in BOOKKEEPING or feature["dtype"] in ("video", "image", "string"):
-                continue
-            stats[key] = exact_stats(_values(root, key))
-        write_stats(stats, root)
-
-
-def _values(root: Path, key: str) -> np.ndarray:
-    """(rows, size) of the whole dataset."""
-    pieces = []
-    for path in sorted((root / "data").glob("*/*.parquet")):
-        for chunk in pq.read_table(path, columns=[key]).column(key).chunks:
-            flat = chunk.flatten() if hasattr(chunk, "flatten") and chunk.type.num_fields else chunk
-            pieces.append(flat.to_numpy(zero_copy_only=False).reshape(len(chunk), -1))
-    return np.concatenate(pieces)
 
 
 def _shared_features(datasets: Sequence[Dataset]) -> set[str]:
@@ -137,6 +162,35 @@ def _with_domain(dataset: Dataset, is_sim: bool, keep: set[str], copy: Path) -> 
             repo_id=f"local/{copy.name}",
         )
     return copy
+
+
+def _records(dataset: Dataset, shared: set[str]) -> list[dict[str, Any]]:
+    """What ingest or the twin wrote down of each episode, its origin above all; of other people's datasets what there is."""
+    path = dataset.root / PROVENANCE / "episodes.json"
+    if not path.is_file():
+        return [episode_record(dataset.episode(k), "") for k in range(dataset.num_episodes)]
+    records = json.loads(path.read_text(encoding="utf-8"))
+    return [{**r, "baselines": {k: v for k, v in r["baselines"].items() if k in shared}} for r in records]
+
+
+def _spec(dataset: Dataset, shared: set[str]) -> DatasetSpec:
+    spec, told = dataset.spec, IS_SIM_FEATURE
+    features = {key: f for key, f in spec.features.items() if key in shared}
+    features[IS_SIM] = FeatureSpec(
+        dtype=told["dtype"],
+        shape=told["shape"],
+        unit=told["unit"],
+        frame="none",
+        rate_hz=float(spec.fps),
+        range=tuple(told["range"]),
+    )
+    sensors = {key: sensor for key, sensor in spec.sensors.items() if key in shared}
+    return dataclasses.replace(spec, features=features, sensors=sensors)
+
+
+def _dump(path: Path, value: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _origins(dataset: Dataset) -> tuple[str, ...]:

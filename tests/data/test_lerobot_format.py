@@ -336,6 +336,10 @@ def test_merging_keeps_rows_touch_pictures_and_feature_words(
         for key, values in dataset.episode(number).arrays.items():
             np.testing.assert_array_equal(merged.episode(index).arrays[key], values)
         assert row_ids(merged.root, index) == row_ids(dataset.root, number)
+    stats = json.loads((merged.root / "meta/stats.json").read_text())["action"]
+    rows = np.concatenate([dataset.episode(number).arrays["action"] for dataset, number in sources])
+    for name, expected in exact_stats(rows).items():  # of all rows, not the mean of the datasets' quantiles
+        np.testing.assert_allclose(stats[name], expected, rtol=1e-12, err_msg=name)
     assert merged.info["features"][TOUCH]["tactile"]["pads"] == ["tip"]
     assert merged.info["features"]["observation.state"]["unit"] == ["rad", "m"]
     assert merged.video_problems() == []

@@ -1,13 +1,17 @@
 """Touch on its way into the policy: windows, formats, processors, weights, and what is said when they do not fit."""
 
 import copy
+import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
+import draccus
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
+from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, load_optimizer_state, save_optimizer_state
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from safetensors.torch import save_file
 from tiny_policies import FORMAT, TACTILE, batch_of, chunk, plain_pi05, readings, tiny_config, tiny_policy
 
@@ -42,7 +46,7 @@ def test_defaults_are_the_papers_table():
     assert (config.tactile_history, config.prefix_tokens, config.suffix_tokens) == (10, 8, 8)
     assert (config.contact_threshold, config.contact_min_active) == (0.4, 1)
     assert (config.chunk_size, config.num_inference_steps, config.sim_weight) == (10, 4, 0.5)
-    assert config.get_optimizer_preset().lr == 2.5e-5 and config.get_optimizer_preset().type == "adamw"
+    assert config.get_optimizer_preset().lr == 2.5e-5 and config.get_optimizer_preset().type == "fused_adamw"
     optimizer = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=2.5e-5)
     for steps in (1000, 3000):
         scheduler = config.get_scheduler_preset().build(optimizer, steps)
@@ -238,7 +242,6 @@ def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
         ({"base_checkpoint": "lerobot/pi05_base"}, "fit --policy.backbone=full only, not tiny"),
         ({"tactile_history": 0}, "--policy.tactile_history=0: at least 1"),
         ({"contact_threshold": float("nan")}, "--policy.contact_threshold=nan"),
-        ({"compile_model": True}, "--policy.compile_model=true"),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, said):
@@ -271,6 +274,28 @@ def test_two_steps_stop_resume_are_the_numbers_of_four_steps(tmp_path):
     torch.set_rng_state(generator)
     assert train(resumed, optimizer, range(2, 4)) == straight
     assert all(torch.equal(resumed.state_dict()[k], v) for k, v in policy.state_dict().items())
+
+
+def test_the_optimizer_is_lerobots_adamw_and_its_files_are_read_again(tmp_path):
+    def stepped(config: AdamWConfig) -> tuple[torch.Tensor, torch.optim.Optimizer]:
+        weight = torch.nn.Parameter(torch.linspace(-1, 1, 12))
+        optimizer = config.build([weight])
+        for scale in (1.0, 0.1, 0.7):
+            weight.grad = scale * torch.linspace(-3, 5, 12)
+            optimizer.step()
+        return weight.detach(), optimizer
+
+    ours = tiny_config().get_optimizer_preset()
+    settings = dataclasses.asdict(ours)
+    assert draccus.decode(OptimizerConfig, draccus.encode(ours, OptimizerConfig)) == ours
+    assert settings == dataclasses.asdict(PI05Config().get_optimizer_preset())
+    (weight, optimizer), (theirs, _) = stepped(ours), stepped(AdamWConfig(**settings))
+    assert torch.equal(weight, theirs)
+    save_optimizer_state(optimizer, tmp_path)
+    again = load_optimizer_state(ours.build([torch.nn.Parameter(torch.zeros(12))]), tmp_path)
+    assert again.state_dict()["param_groups"] == optimizer.state_dict()["param_groups"]
+    state, stored = again.state_dict()["state"][0], optimizer.state_dict()["state"][0]
+    assert state.keys() == stored.keys() and all(torch.equal(state[k], v) for k, v in stored.items())
 
 
 def test_every_backbone_that_can_be_named_has_a_size():

@@ -13,8 +13,11 @@ from lerobot.policies.pi05.modeling_pi05 import (
     PaliGemmaForConditionalGenerationWithPiGemma,
     PaliGemmaWithExpertModel,
     PiGemmaForCausalLM,
+    get_gemma_config,
 )
 from torch import nn
+
+from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
 
 _HEADS, _KV_HEADS = 8, 1
 
@@ -51,7 +54,27 @@ SIZES = {
 }  # fmt: skip
 
 
-class SmallBackbone(PaliGemmaWithExpertModel):
+class FullBackbone(CompiledBackbone):
+    """LeRobot's PaliGemma with its action expert, without language heads."""
+
+    def __init__(self, config: Any) -> None:
+        """
+        Args:
+            config: LeRobot's ``PI05Config``.
+        """
+        super().__init__(
+            get_gemma_config(config.paligemma_variant),
+            get_gemma_config(config.action_expert_variant),
+            use_adarms=[False, True],
+            precision=config.dtype,
+            image_size=config.image_resolution[0],
+            freeze_vision_encoder=config.freeze_vision_encoder,
+            train_expert_only=config.train_expert_only,
+        )
+        without_language_heads(self)
+
+
+class SmallBackbone(CompiledBackbone):
     """LeRobot's PaliGemma with its action expert, in another size and without language heads."""
 
     def __init__(

@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, OptimizerParams
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig, LRSchedulerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.utils.constants import OBS_STATE
-from torch.optim import Optimizer
+from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
+from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
 
 TACTILE = "observation.tactile"
 _PALIGEMMA = "google/paligemma-3b-pt-224"
@@ -35,6 +37,17 @@ class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
             peak_lr=self.peak_lr,
             decay_lr=self.decay_lr,
         ).build(optimizer, num_training_steps)
+
+
+@OptimizerConfig.register_subclass("fused_adamw")
+@dataclass
+class FusedAdamW(AdamWConfig):
+    """LeRobot's AdamW; on a GPU PyTorch's fused kernel, half the time, and bfloat16 weights are rounded once a step."""
+
+    def build(self, params: OptimizerParams) -> AdamW:
+        groups: Any = super().build(params).param_groups
+        fused = all(p.is_cuda for group in groups for p in group["params"])
+        return AdamW([{**group, "fused": fused} for group in groups], fused=fused)
 
 
 @dataclass(frozen=True)
@@ -113,8 +126,16 @@ class TactilePI05Config(PI05Config):
     sim_weight: float = 0.5
     """α: how much simulated rows count against real ones. Used where the dataset tells them apart (``observation.is_sim``)."""
 
+    image_randomization: bool = True
+    """In training, crop, turn and recolour every image by chance: the image rows of the paper's domain randomisation."""
+    image_noise_std: float = COTRAINING_NOISE_STD
+    """σ_v: normal noise on training images in [0, 1], after that. 0: none."""
+
     cuda_graph: bool = True
     """On a GPU, record a chunk's computation once and replay it (see ``graphed``). False: step by step, as LeRobot does."""
+
+    compile_model: bool = True
+    """On a GPU, train with compiled layers (see ``compiled``; ``compile_mode`` is not used). False: LeRobot's own forward."""
 
     chunk_size: int = 10
     """H: actions that are predicted."""
@@ -151,10 +172,20 @@ class TactilePI05Config(PI05Config):
             raise TaccorlError(
                 f"--policy.contact_threshold={self.contact_threshold}: 0 or more, in normalised readings"
             )
-        if self.compile_model:
-            raise TaccorlError(
-                "--policy.compile_model=true: LeRobot's compilation does not know of touch; leave it out"
-            )
+
+        self.image_changes()
+
+    def image_changes(self) -> ImageRandomizationConfig | None:
+        """What training does to images; None: nothing.
+
+        Raises:
+            TaccorlError: the noise is negative.
+        """
+        if not self.image_randomization and not self.image_noise_std:
+            return None
+        if self.image_randomization:
+            return ImageRandomizationConfig(noise_std=self.image_noise_std)
+        return ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
 
     @property
     def tokenizer_name(self) -> str:
@@ -165,6 +196,9 @@ class TactilePI05Config(PI05Config):
     def window_delta_indices(self) -> dict[str, list[int]]:
         """Features that come with their last rows, −(L−1) … 0. Read by ``taccorl.training.reading``."""
         return {TACTILE: list(range(1 - self.tactile_history, 1))} if self.tactile and self.tactile_history > 1 else {}
+
+    def get_optimizer_preset(self) -> FusedAdamW:
+        return FusedAdamW(**dataclasses.asdict(super().get_optimizer_preset()))
 
     def get_scheduler_preset(self) -> WarmupThenCosine:
         return WarmupThenCosine(

@@ -6,7 +6,8 @@
 
 Without contact neither exists for the row: attention masks the tokens, positions do not count them and the sum is left out.
 So a row without contact is what plain pi05 makes of it, bit by bit: when the whole batch is without, and on a CPU also beside
-rows with contact (``_by_contact``).
+rows with contact (``_by_contact``). Where a GPU computes by other kernels than LeRobot's (``compiled`` in training, ``graphed``
+for a chunk), it is so up to rounding.
 """
 
 import logging
@@ -22,7 +23,8 @@ from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LAN
 from torch import Tensor, nn
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.backbone import SIZES, SmallBackbone, without_language_heads
+from taccorl.policies.tactile_pi05.backbone import SIZES, FullBackbone, SmallBackbone
+from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TACTILE, TactilePI05Config
 from taccorl.policies.tactile_pi05.encoder import TactileEncoder, TouchIntoContext
 from taccorl.policies.tactile_pi05.gate import contact
@@ -73,41 +75,25 @@ class TactileConditioning(nn.Module):
 class TactilePI05Pytorch(PI05Pytorch):
     """LeRobot's model; only ``embed_prefix`` and ``embed_suffix`` know of touch."""
 
+    paligemma_with_expert: CompiledBackbone
+
     def __init__(self, config: TactilePI05Config, rtc_processor: Any = None) -> None:
-        if config.backbone == "full":
-            super().__init__(config, rtc_processor)
-            without_language_heads(self.paligemma_with_expert)
-        else:
-            self._init_small(config, rtc_processor)
+        """As ``PI05Pytorch.__init__``, around a backbone of ours."""
+        nn.Module.__init__(self)
+        self.config, self.rtc_processor = config, rtc_processor
+        self.paligemma_with_expert = _backbone(config)
+        self.paligemma_with_expert.compiles_layers = config.compile_model
+        expert_config: Any = self.paligemma_with_expert.gemma_expert.config
+        width = expert_config.hidden_size
+        self.action_in_proj = nn.Linear(config.max_action_dim, width)
+        self.action_out_proj = nn.Linear(width, config.max_action_dim)
+        self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
+        self.gradient_checkpointing_enabled = False
         if config.tactile:
             text_config: Any = self.paligemma_with_expert.paligemma.config.text_config
             prefix_width = text_config.hidden_size
             self.tactile = TactileConditioning(config, prefix_width, self.action_in_proj.out_features)
         self._touch: Touch | None = None
-
-    def _init_small(self, config: TactilePI05Config, rtc_processor: Any) -> None:
-        """As ``PI05Pytorch.__init__``, around another backbone."""
-        nn.Module.__init__(self)
-        self.config, self.rtc_processor = config, rtc_processor
-        size = SIZES[config.backbone]
-        image_px = config.image_resolution[0]
-        if config.image_resolution != (image_px, image_px) or image_px % size.patch_px:
-            raise TaccorlError(
-                f"--policy.image_resolution={config.image_resolution}: --policy.backbone={config.backbone} takes squares of a "
-                f"multiple of {size.patch_px} pixels, such as [224, 224]"
-            )
-        self.paligemma_with_expert = SmallBackbone(
-            size,
-            precision=config.dtype,
-            image_px=image_px,
-            freeze_vision_encoder=config.freeze_vision_encoder,
-            train_expert_only=config.train_expert_only,
-        )
-        width = size.expert_width
-        self.action_in_proj = nn.Linear(config.max_action_dim, width)
-        self.action_out_proj = nn.Linear(width, config.max_action_dim)
-        self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
-        self.gradient_checkpointing_enabled = False
 
     @contextmanager
     def feeling(
@@ -119,14 +105,20 @@ class TactilePI05Pytorch(PI05Pytorch):
             masked: tokens are there, masked, even if contact is nowhere; so that nothing is read back from a GPU.
         """
         if readings_BLPRC is not None and contact_B is not None and (masked or bool(contact_B.any())):
-            self._touch = self.tactile(readings_BLPRC, contact_B)
+            # Float32 in training, too, as in a chunk: casting the encoder's many small weights takes longer than using them.
+            with torch.autocast(contact_B.device.type, enabled=False):
+                self._touch = self.tactile(readings_BLPRC, contact_B)
         try:
             yield
         finally:
             self._touch = None
 
-    def embed_prefix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor]:
-        context_BTD, valid_BT, starts_block_BT = super().embed_prefix(*args, **kwargs)
+    def embed_prefix(
+        self, images: list[Tensor], image_masks: list[Tensor], tokens: Tensor, token_mask: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        if self.paligemma_with_expert.fuses(tokens.device):
+            images = self.paligemma_with_expert.embed_images(images)
+        context_BTD, valid_BT, starts_block_BT = super().embed_prefix(images, image_masks, tokens, token_mask)
         if self._touch is None:
             return context_BTD, valid_BT, starts_block_BT
         tokens_BMD, contact_B = self._touch.prefix_BMD, self._touch.contact_B
@@ -154,6 +146,30 @@ class TactilePI05Pytorch(PI05Pytorch):
             torch.cat([starts_block_BM, starts_block_BH], dim=1),
             condition_BD,
         )
+
+
+def _backbone(config: TactilePI05Config) -> CompiledBackbone:
+    """
+    Raises:
+        TaccorlError: pictures of a size that the vision tower does not take.
+    """
+    size = SIZES.get(config.backbone)
+    image_px = config.image_resolution[0]
+    if config.image_resolution != (image_px, image_px) or (size is not None and image_px % size.patch_px):
+        patches = f" of a multiple of {size.patch_px} pixels" if size is not None else ""
+        raise TaccorlError(
+            f"--policy.image_resolution={config.image_resolution}: --policy.backbone={config.backbone} takes squares{patches}, "
+            "such as [224, 224]"
+        )
+    if size is None:
+        return FullBackbone(config)
+    return SmallBackbone(
+        size,
+        precision=config.dtype,
+        image_px=image_px,
+        freeze_vision_encoder=config.freeze_vision_encoder,
+        train_expert_only=config.train_expert_only,
+    )
 
 
 class TactilePI05Policy(PI05Policy):
@@ -186,6 +202,11 @@ class TactilePI05Policy(PI05Policy):
             config.match_dataset(dataset_meta)
         self.mixture = Mixture.of_statistics(dataset_stats, config.sim_weight)
         if dataset_meta is not None and self.mixture is None:
+            if config.sim_weight not in (0, 1, TactilePI05Config.sim_weight):
+                raise TaccorlError(
+                    f"--policy.sim_weight={config.sim_weight:g}: dataset {dataset_meta.repo_id} ({dataset_meta.root}) has no "
+                    f"{IS_SIM}, it is of one domain: taccorl merge --real=… --sim=… makes one of both; else leave the weight out"
+                )
             _log.info("dataset %s has no %s: one domain, sim_weight is not used", dataset_meta.repo_id, IS_SIM)
         config.validate_features()
         self.config: TactilePI05Config = config
@@ -196,6 +217,8 @@ class TactilePI05Policy(PI05Policy):
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.model.to(config.device)
+        changes = config.image_changes()
+        self._change_images = changes.build() if changes else None
         self.reset()
 
     @classmethod
@@ -256,8 +279,10 @@ class TactilePI05Policy(PI05Policy):
     def flow_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
         """(B, H, 32) squared errors of the velocity at a random time, and (B,) contact (None: vision only).
 
-        Draws noise and time from torch's generator as LeRobot's pi05 does.
+        Draws noise and time from torch's generator as LeRobot's pi05 does; in training, first what changes the images.
         """
+        if self.training and self._change_images is not None:
+            batch = {**batch, **{k: self._change_images(batch[k]) for k in self.config.image_features if k in batch}}
         images, image_masks = self._preprocess_images(batch)
         actions = self.prepare_action(batch)
         noise = self.model.sample_noise(actions.shape, actions.device)
@@ -290,8 +315,12 @@ class TactilePI05Policy(PI05Policy):
             together: on a CPU, too.
         """
         readings, contact_B = self._readings(batch)
-        if readings is None or contact_B is None or together or contact_B.device.type != "cpu" or contact_B.all():
-            with self.model.feeling(readings, contact_B):
+        if readings is None or contact_B is None:
+            return compute(slice(None)), contact_B
+        # Compiled layers are compiled for a number of tokens, with those of touch.
+        masked = self.model.paligemma_with_expert.fuses(contact_B.device)
+        if masked or together or contact_B.device.type != "cpu" or contact_B.all():
+            with self.model.feeling(readings, contact_B, masked=masked):
                 return compute(slice(None)), contact_B
         kinds = [rows for rows in (contact_B.nonzero()[:, 0], (~contact_B).nonzero()[:, 0]) if len(rows)]
         parts = []
@@ -371,10 +400,10 @@ class TactilePI05Policy(PI05Policy):
         return self._graph(*images, *image_masks, tokens, token_mask, noise, *felt)
 
     def train(self, mode: bool = True) -> "TactilePI05Policy":
-        if not mode and not self.training:
-            return self  # LeRobot says so at every step; going through all modules takes longer than touch does
         if mode:
             self._graph = None  # its memory is training's
+        if mode == self.training:
+            return self  # LeRobot says so at every step; going through all modules takes longer than touch does
         return super().train(mode)
 
     def _remember(self, reading_BK: Tensor) -> Tensor:

@@ -1,12 +1,20 @@
-"""Each row against arithmetic done beforehand; all rows absent against the identity."""
+"""Each row against arithmetic done beforehand and against torchvision; all rows absent against the identity; in the policy."""
 
 import math
+from itertools import permutations
 
 import pytest
 import torch
+from tiny_policies import batch_of, chunk, losses, plain_pi05, tiny_config, tiny_policy
+from torchvision.transforms import InterpolationMode
+from torchvision.transforms.v2 import functional
 
 from taccorl.errors import TaccorlError
-from taccorl.training.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
+from taccorl.policies.tactile_pi05.image_randomization import (
+    COTRAINING_NOISE_STD,
+    ImageRandomizationConfig,
+    _jittered,
+)
 
 ABSENT = {"crop": 1.0, "rotation_deg": 0.0, "brightness": (1, 1), "contrast": (1, 1), "saturation": (1, 1)}
 
@@ -153,3 +161,104 @@ def test_values_that_mean_nothing_are_refused_by_name(fields: dict, named: str):
 def test_counts_and_colours_in_the_wrong_place_are_refused(images: torch.Tensor):
     with pytest.raises(TaccorlError, match="float in"):
         ImageRandomizationConfig().build()(images)
+
+
+# what torchvision makes of an image -----------------------------------------------------------------------------------
+
+
+def smooth_image(size: int = 224) -> torch.Tensor:
+    v, u = torch.meshgrid(torch.arange(float(size)), torch.arange(float(size)), indexing="ij")
+    return (
+        torch.stack([torch.sin(v / 17) * torch.cos(u / 23), torch.cos(v / 29 + 1), torch.sin((v + u) / 31)]) * 0.4 + 0.5
+    )
+
+
+@pytest.mark.parametrize(
+    ("down", "right", "turn", "tolerance"),
+    [(0.0, 0.0, 0.5, 1e-6), (0.99, 0.5, 0.5, 1e-6), (0.0, 0.99, 1.0, 1e-3), (0.7, 0.2, 0.1, 1e-3)],
+)
+def test_crop_and_rotation_are_torchvisions_within_the_stated_tolerance(down, right, turn, tolerance):
+    image, draws = smooth_image(), [torch.tensor([draw]) for draw in (down, right, turn)]
+    ours = ImageRandomizationConfig().build()._cut_and_turned(image[None], *draws)[0]
+    top, left, angle_deg = int(13 * down), int(13 * right), 10 * turn - 5  # 224 − 212 + 1 = 13 places
+    cut = functional.resized_crop(image, top, left, 212, 212, [224, 224], antialias=True)
+    theirs = functional.rotate(cut, angle_deg, interpolation=InterpolationMode.BILINEAR)
+    assert (ours - theirs).abs().max() <= tolerance
+    assert (ours - image).abs().max() > 0.02
+
+
+def test_crop_and_rotation_of_a_picture_that_is_not_square_are_torchvisions():
+    image, draws = smooth_image()[:, :120, :200], [torch.tensor([draw]) for draw in (0.5, 0.5, 0.9)]
+    ours = ImageRandomizationConfig().build()._cut_and_turned(image[None], *draws)[0]
+    cut = functional.resized_crop(image, 3, 5, 114, 190, [120, 200], antialias=True)  # ⌊0.5 · 7⌋, ⌊0.5 · 11⌋
+    theirs = functional.rotate(cut, 4.0, interpolation=InterpolationMode.BILINEAR)
+    assert (ours - theirs).abs().max() <= 1e-3
+
+
+def test_colours_are_torchvisions_in_each_order():
+    torch.manual_seed(0)
+    image = torch.rand(3, 24, 32)
+    changes = [functional.adjust_brightness, functional.adjust_contrast, functional.adjust_saturation]
+    factors = torch.tensor([1.25, 0.65, 1.4])
+    found = []
+    for number, order in enumerate(permutations(range(3))):
+        theirs = image
+        for which in order:
+            theirs = changes[which](theirs, factors[which].item())
+        ours = _jittered(image[None], factors[:, None], torch.tensor([number]))[0]
+        assert (ours - theirs).abs().max() <= 1e-6
+        found.append(ours)
+    assert all((a - b).abs().max() > 1e-3 for k, a in enumerate(found) for b in found[:k])  # the order matters
+
+
+def test_a_batch_at_once_as_on_a_gpu_is_what_its_images_are_one_by_one():
+    torch.manual_seed(0)
+    images, change = torch.rand(5, 3, 40, 48), ImageRandomizationConfig().build()
+    draws, factors, orders = torch.rand(3, 5), 0.5 + torch.rand(3, 5), torch.tensor([0, 5, 2, 4, 1])
+    turned = change._cut_and_turned(images, *draws)
+    together = _jittered(turned, factors, orders)
+    for k in range(5):
+        alone = change._cut_and_turned(images[k : k + 1], *draws[:, k : k + 1])
+        torch.testing.assert_close(turned[k : k + 1], alone, rtol=0, atol=1e-6)
+        alone = _jittered(alone, factors[:, k : k + 1], orders[k : k + 1])
+        torch.testing.assert_close(together[k : k + 1], alone, rtol=0, atol=1e-6)
+    assert change._changed(images).shape == images.shape
+
+
+# in the policy --------------------------------------------------------------------------------------------------------
+
+
+def test_the_policy_changes_images_in_training_and_never_else():
+    policy, batch = tiny_policy(), batch_of(True, False)
+    seen = losses(policy.eval(), batch)
+    first, second = losses(policy.train(), batch), losses(policy.train(), batch, seed=8)
+    assert not torch.equal(first, seen) and torch.equal(first, losses(policy.train(), batch))
+    assert not torch.equal(first, second)
+    assert torch.equal(chunk(policy.train(), batch), chunk(policy.eval(), batch))
+    assert torch.equal(losses(policy.eval(), batch), seen)
+
+
+def test_the_training_loss_is_that_of_images_changed_beforehand():
+    policy, batch = tiny_policy().train(), batch_of(True, False)
+    on = losses(policy, batch)
+    torch.manual_seed(7)
+    change = ImageRandomizationConfig(noise_std=0.03).build()
+    keys = list(policy.config.image_features)
+    changed = {**batch, **{key: change(batch[key]) for key in keys}}
+    assert torch.equal(policy.eval().forward(changed, "none")[0], on)
+    assert all(torch.equal(batch[k], v) for k, v in batch_of(True, False).items())  # the batch itself stays
+
+
+def test_switched_off_the_training_loss_is_lerobots_pi05s_bit_by_bit(monkeypatch):
+    policy = tiny_policy(image_randomization=False, image_noise_std=0.0).train()
+    batch = batch_of(False, False)
+    assert torch.equal(losses(policy, batch), losses(plain_pi05(policy, monkeypatch).train(), batch))
+
+
+def test_noise_alone_and_rows_alone_can_be_asked_for():
+    assert tiny_config().image_changes() == ImageRandomizationConfig(noise_std=0.03)
+    assert tiny_config(image_noise_std=0).image_changes() == ImageRandomizationConfig()
+    noise = tiny_config(image_randomization=False).image_changes()
+    assert noise is not None and noise == ImageRandomizationConfig(**ABSENT, noise_std=0.03)
+    with pytest.raises(TaccorlError, match="noise_std is -1"):
+        tiny_config(image_noise_std=-1)

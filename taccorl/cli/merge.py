@@ -1,0 +1,67 @@
+"""``taccorl merge --real=outputs/recorded --sim=outputs/sources --sim=outputs/many --out=outputs/both``
+
+Datasets of the robot and of the twin into one for co-training: every row says where it is from (``observation.is_sim``), so that
+``lerobot-train --policy.type=tactile_pi05 --policy.sim_weight=0.5`` weighs them. Statistics are computed anew over all rows.
+"""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from taccorl.cli.parse import parse
+from taccorl.errors import DatasetError
+
+
+@dataclass(kw_only=True)
+class MergeConfig:
+    """Datasets of both domains in one."""
+
+    out: Path
+    """The dataset's folder. It must not hold anything else."""
+    real: list[Path] = field(default_factory=list)
+    """Dataset of the robot, or of a surrogate that stands for it; once for each."""
+    sim: list[Path] = field(default_factory=list)
+    """Dataset of the twin: collected, augmented; once for each."""
+    store: Path = Path("outputs/store")
+    """Remembers what was made from what."""
+
+
+def main(argv: list[str]) -> int:
+    """0: merged."""
+    config = parse(MergeConfig, argv, positional=None)
+    os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
+    from taccorl.lineage.store import Store
+    from taccorl.training.cotrain import Part, publish
+
+    _check_places(config)
+    parts = publish(config.real, config.sim, config.out, Store(config.store))
+
+    def told(of: list[Part]) -> str:
+        origins = sorted({origin for part in of for origin in part.origins})
+        said = f" ({'; '.join(origins)})" if origins else ""
+        return f"{sum(p.episodes for p in of)} episodes, {sum(p.rows for p in of)} rows{said}"
+
+    domains = {"real": [p for p in parts if not p.is_sim], "simulated": [p for p in parts if p.is_sim]}
+    print(f"dataset:   {config.out}")
+    for name, of in domains.items():
+        print(f"{name + ':':11s}{told(of)}")
+    alone = "" if all(domains.values()) else f" --policy.sim_weight={1 if domains['simulated'] else 0}"
+    print(
+        f"next:      lerobot-train --policy.type=tactile_pi05 --policy.backbone=tiny --policy.push_to_hub=false{alone} "
+        f"--dataset.repo_id=local/{config.out.name} --dataset.root={config.out}"
+    )
+    return 0
+
+
+def _check_places(config: MergeConfig) -> None:
+    """Places that lie in one another would change while they are read."""
+    from taccorl.data.lerobot_format import check_path
+
+    check_path(config.out)
+    out = config.out.resolve()
+    for place in (*config.real, *config.sim):
+        if out.is_relative_to(place.resolve()) or place.resolve().is_relative_to(out):
+            raise DatasetError(f"--out={config.out} and {place} lie in one another: choose another --out")
+    given = [place.resolve() for place in (*config.real, *config.sim)]
+    if twice := [str(place) for place in given if given.count(place) > 1]:
+        raise DatasetError(f"{twice[0]} is given twice: each dataset once")

@@ -1,0 +1,158 @@
+"""The image rows of the paper's domain randomisation (App. E): crop-resize, rotation, brightness, contrast, saturation.
+
+They are those of π0.5's own training (its App. E). openpi's code turns and crops only the fixed camera and gives wrist
+cameras the colours alone; the paper says "camera" without exception, so every image gets every row here.
+
+What is computed is what torchvision's RandomCrop, Resize, RandomRotation and ColorJitter make of an image, for a whole batch on
+its device, with two differences: crop and rotation are one sampling instead of two, which blurs less (0.001 off on a picture
+without edges), and the seam of the black corners is as bright as its share of the picture, not the square of it.
+"""
+
+import math
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample
+from torchvision.transforms.v2.functional import rgb_to_grayscale
+
+from taccorl.errors import TaccorlError
+
+# N images, R rows, C columns
+COTRAINING_NOISE_STD = 0.03  # σ_v, paper's co-training table; images in [0, 1]
+_ORDERS = tuple(permutations(range(3)))  # of brightness, contrast and saturation
+
+
+@dataclass(kw_only=True)
+class ImageRandomizationConfig:
+    """How far an image may be changed. Every row applies to every image (the paper's probability is 1.0)."""
+
+    crop: float = 0.95
+    """f_crop: side of the random crop as a part of the image's side; scaled back to full size. 1: absent."""
+    rotation_deg: float = 5.0
+    """Δθ ~ U(±this), about the middle; corners that come in are black. 0: absent."""
+    brightness: tuple[float, float] = (0.7, 1.3)
+    """j_b ~ U(range): image · j_b. (1, 1): absent."""
+    contrast: tuple[float, float] = (0.6, 1.4)
+    """j_c ~ U(range): distance from the image's mean grey · j_c. (1, 1): absent."""
+    saturation: tuple[float, float] = (0.5, 1.5)
+    """j_s ~ U(range): distance of each pixel from its own grey · j_s. (1, 1): absent."""
+    noise_std: float = 0.0
+    """Normal noise on every value, after all else: 0.03 (σ_v) in the paper's co-training, none in its randomisation."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.crop <= 1:
+            raise TaccorlError(f"image randomisation: crop is {self.crop}; a part of the side, above 0 and at most 1")
+        if not 0 <= self.rotation_deg <= 180:
+            raise TaccorlError(f"image randomisation: rotation_deg is {self.rotation_deg}; 0 … 180 in either direction")
+        if not 0 <= self.noise_std < math.inf:
+            raise TaccorlError(f"image randomisation: noise_std is {self.noise_std}; 0 or more")
+        for row in ("brightness", "contrast", "saturation"):
+            low, high = getattr(self, row)
+            if not 0 <= low <= high < math.inf:
+                raise TaccorlError(
+                    f"image randomisation: {row} is ({low}, {high}); factors, the lower first, none negative"
+                )
+
+    @classmethod
+    def absent(cls, **rows: Any) -> "ImageRandomizationConfig":
+        """With no rows but these."""
+        one = (1.0, 1.0)
+        return cls(**{"crop": 1.0, "rotation_deg": 0.0, "brightness": one, "contrast": one, "saturation": one, **rows})
+
+    def build(self) -> "ImageRandomization":
+        """The transform itself; LeRobot takes it as a dataset's ``image_transforms``, too."""
+        return ImageRandomization(self)
+
+
+class ImageRandomization(nn.Module):
+    """Draws anew for each image, from torch's global generator (``torch.manual_seed``)."""
+
+    def __init__(self, config: ImageRandomizationConfig) -> None:
+        super().__init__()
+        self.config = config
+
+    @torch.no_grad()
+    def forward(self, images: Tensor) -> Tensor:
+        """Images (…, 3, rows, columns) of float in [0, 1] → the same shape; each of the leading ones is drawn for itself.
+
+        Raises:
+            TaccorlError: another type or number of channels.
+        """
+        if not images.is_floating_point() or images.ndim < 3 or images.shape[-3] != 3:
+            raise TaccorlError(
+                f"image randomisation: images are {images.dtype} {tuple(images.shape)}; (…, 3, rows, columns) of float in "
+                "[0, 1] are changed: divide counts by 255, move colours to the front"
+            )
+        flat = images.reshape(-1, *images.shape[-3:]).to(torch.float32)
+        if not len(flat):
+            return images
+        # A CPU's cache holds one image, a GPU wants them all at once.
+        parts = flat.split(1) if images.device.type == "cpu" else [flat]
+        return torch.cat([self._changed(part) for part in parts]).reshape(images.shape).to(images.dtype)
+
+    def _changed(self, images_N3RC: Tensor) -> Tensor:
+        config = self.config
+        draws = torch.rand(7, len(images_N3RC), device=images_N3RC.device)
+        if config.crop < 1 or config.rotation_deg:
+            images_N3RC = self._cut_and_turned(images_N3RC, *draws[:3])
+        colours = (config.brightness, config.contrast, config.saturation)
+        if any(row != (1, 1) for row in colours):
+            factors = [low + (high - low) * draw for (low, high), draw in zip(colours, draws[3:6], strict=True)]
+            images_N3RC = _jittered(images_N3RC, torch.stack(factors), (draws[6] * len(_ORDERS)).long())
+        if config.noise_std:
+            noise_N3RC = torch.randn_like(images_N3RC)
+            images_N3RC = noise_N3RC.mul_(config.noise_std).add_(images_N3RC).clamp_(0, 1)
+        return images_N3RC
+
+    def _cut_and_turned(self, images_N3RC: Tensor, down_N: Tensor, right_N: Tensor, turn_N: Tensor) -> Tensor:
+        """Crops of whole pixels, rounded down as openpi does (212 of 224), back at full size, turned about the middle.
+
+        Args:
+            down_N, right_N, turn_N: draws from 0 to 1.
+        """
+        rows, columns = images_N3RC.shape[-2:]
+        height, width = max(1, int(self.config.crop * rows)), max(1, int(self.config.crop * columns))
+        angle_N11 = torch.deg2rad(self.config.rotation_deg * (2 * turn_N - 1))[:, None, None]
+        u_1C = torch.arange(columns, device=images_N3RC.device)[None] - (columns - 1) / 2
+        v_R1 = torch.arange(rows, device=images_N3RC.device)[:, None] - (rows - 1) / 2
+        # Where each pixel comes from, counted from the middle: that of the crop is that of the picture.
+        u_NRC = angle_N11.cos() * u_1C - angle_N11.sin() * v_R1
+        v_NRC = angle_N11.cos() * v_R1 + angle_N11.sin() * u_1C
+        seen_NRC = _inside(u_NRC, columns).mul_(_inside(v_NRC, rows))
+        left_N11 = (right_N * (columns - width + 1)).floor()[:, None, None]
+        top_N11 = (down_N * (rows - height + 1)).floor()[:, None, None]
+        grid_NRC2 = torch.stack(
+            [_sampled_at(u_NRC, width, columns, left_N11), _sampled_at(v_NRC, height, rows, top_N11)], dim=-1
+        )
+        sampled_N3RC = grid_sample(images_N3RC, grid_NRC2, padding_mode="border", align_corners=False)
+        return sampled_N3RC.mul_(seen_NRC[:, None])
+
+
+def _inside(from_middle: Tensor, size: int) -> Tensor:
+    """Share of a pixel that lies on a picture of ``size`` pixels; beyond there is black."""
+    return ((size + 1) / 2 - from_middle.abs()).clamp_(0, 1)
+
+
+def _sampled_at(from_middle: Tensor, cut: int, size: int, start: Tensor) -> Tensor:
+    """In a picture of ``size`` pixels, −1 to 1 from edge to edge, for a crop of ``cut`` pixels from ``start`` on.
+
+    Within half a pixel of the crop's edge it is the edge's own colour, as in torchvision's resize.
+    """
+    pixel = (from_middle * (cut / size)).clamp_((1 - cut) / 2, (cut - 1) / 2)
+    return pixel.mul_(2 / size).add_((2 * start + cut) / size - 1)
+
+
+def _jittered(images_N3RC: Tensor, factors_3N: Tensor, orders_N: Tensor) -> Tensor:
+    """Brightness, contrast and saturation in an order of each image's own: image · f + (1 − f) · (0, mean grey, grey)."""
+    orders_3N = torch.tensor(_ORDERS, device=orders_N.device)[orders_N].T
+    images_N3RC = images_N3RC.clone()
+    for which_N in orders_3N:
+        factor_N111 = factors_3N.gather(0, which_N[None])[0][:, None, None, None]
+        grey_N1RC = rgb_to_grayscale(images_N3RC)
+        is_contrast, is_saturation = (which_N == 1)[:, None, None, None], (which_N == 2)[:, None, None, None]
+        base_N1RC = is_saturation * grey_N1RC + is_contrast * grey_N1RC.mean(dim=(-2, -1), keepdim=True)
+        images_N3RC.mul_(factor_N111).add_(base_N1RC.mul_(1 - factor_N111)).clamp_(0, 1)
+    return images_N3RC

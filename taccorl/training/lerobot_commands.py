@@ -1,0 +1,92 @@
+"""LeRobot's own commands as steps of a pipeline: what is finished is not done again, what was stopped goes on."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from hashlib import sha256
+from pathlib import Path
+
+from taccorl.data.dataset import PROVENANCE
+from taccorl.errors import DatasetError
+from taccorl.lineage.manifest import read_manifest
+
+FIRST_SEED = 1000
+"""Of the episodes that lerobot-eval scores: its default. The next one has the next."""
+
+
+class Training:
+    """One run of lerobot-train.
+
+    Its folder is named after all that decides, so that other data or another recipe never finds this run's policy.
+    """
+
+    def __init__(self, recipe: Path, dataset: Path, words: Sequence[str], out: Path) -> None:
+        """
+        Args:
+            recipe: a file for ``--config_path``, such as those of configs/cotrain.
+            dataset: made by ``taccorl merge``.
+            words: more options, which count more than the recipe.
+            out: the run's folder lies in it.
+
+        Raises:
+            DatasetError: the dataset was not published by a taccorl verb.
+        """
+        manifest = read_manifest(dataset)
+        if not manifest:
+            raise DatasetError(f"{dataset}: has no {PROVENANCE}/manifest.json; merge it with taccorl merge")
+        decides = [manifest["digest"], recipe.read_text(encoding="utf-8"), *words]
+        self.folder = out / f"policy_{sha256('\n'.join(decides).encode()).hexdigest()[:8]}"
+        self._recipe, self._dataset, self._words = recipe, dataset, words
+
+    @property
+    def policy(self) -> Path:
+        """The last checkpoint, for ``--policy.path``."""
+        return self.folder / "checkpoints/last/pretrained_model"
+
+    @property
+    def steps(self) -> int:
+        """Done so far."""
+        told = self.folder / "checkpoints/last/training_state/training_step.json"
+        return int(json.loads(told.read_text(encoding="utf-8"))["step"]) if told.is_file() else 0
+
+    def command(self) -> list[str]:
+        """What is left to be run; nothing if it is finished. A run that ended before its first checkpoint is cleared away."""
+        begun = self.policy / "train_config.json"
+        if not begun.is_file():
+            shutil.rmtree(self.folder, ignore_errors=True)
+            data = f"--dataset.repo_id=local/{self._dataset.name}", f"--dataset.root={self._dataset}"
+            return [
+                "lerobot-train",
+                f"--config_path={self._recipe}",
+                *data,
+                *self._words,
+                f"--output_dir={self.folder}",
+            ]
+        if self.steps < json.loads(begun.read_text(encoding="utf-8"))["steps"]:
+            return ["lerobot-train", f"--config_path={begun}", "--resume=true", f"--output_dir={self.folder}"]
+        return []
+
+
+class Scoring:
+    """One run of lerobot-eval in the twin; its folder lies beside the policy's checkpoints."""
+
+    def __init__(self, training: Training, words: Sequence[str], episodes: int) -> None:
+        """
+        Args:
+            words: options that say where: ``--env.task=…``, ``--env.twin=…``.
+        """
+        self._words = [*words, f"--eval.n_episodes={episodes}", f"--eval.batch_size={min(episodes, 10)}"]
+        self._policy, key = training.policy, sha256("\n".join([*self._words, str(training.steps)]).encode()).hexdigest()
+        self.folder = training.folder / f"scored_{key[:8]}"
+
+    def command(self) -> list[str]:
+        """What is left to be run; nothing if it is finished."""
+        if (self.folder / "eval_info.json").is_file():
+            return []
+        env = "--env.type=taccorl", "--eval.use_async_envs=false", f"--seed={FIRST_SEED}"
+        return ["lerobot-eval", f"--policy.path={self._policy}", *env, *self._words, f"--output_dir={self.folder}"]
+
+    def successes(self) -> list[bool]:
+        """Of each episode, in the order of their seeds."""
+        told = json.loads((self.folder / "eval_info.json").read_text(encoding="utf-8"))
+        return [bool(success) for run in told["per_task"] for success in run["metrics"]["successes"]]

@@ -1,0 +1,56 @@
+"""A surrogate of the robot for co-training: the twin with effects that the user's twin lacks, other cameras and another gain.
+
+It is simulated, and what is collected in it has to say so (``ORIGIN``). For finding missing effects there is a surrogate of its
+own physics, ``taccorl surrogate``; it has no scene to demonstrate in.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.sensors.flexitac import FlexiTacConfig
+from taccorl.sim.twin import TwinConfig
+
+ORIGIN = "surrogate robot: the twin with hidden effects and other cameras, not a robot"
+FRICTION_NM = (0.1, 0.5)
+GRAVITY_SHARE = (0.85, 1.1)
+DELAY_S = (0.005, 0.02)
+GAIN_LOG_STD = (0.1, 0.2)
+GAIN_RATIO = (0.85, 1.15)
+"""Counts for a reading of 1, over the nominal pads'."""
+CAMERA_TURN_RAD, CAMERA_SHIFT_M = 0.02, 0.01
+"""Standard deviations about and along each axis: a bracket screwed on by hand."""
+
+
+def draw_surrogate_twin(secret: int) -> TwinConfig:
+    """Another robot for each ``secret``; ranges are choices, about what the effects call typical.
+
+    Raises:
+        TaccorlError: the secret is negative.
+    """
+    if secret < 0:
+        raise TaccorlError(f"secret {secret}: seeds are 0, 1, 2, …")
+    rng, nominal = np.random.default_rng([secret, 0x5A11]), TwinConfig()
+    hidden: list[Effect] = []
+    for arm in ("left", "right"):
+        hidden += [
+            make_effect("coulomb_friction", arm=arm, torque_nm=rng.uniform(*FRICTION_NM)),
+            make_effect("gravity_mismatch", arm=arm, share=rng.uniform(*GRAVITY_SHARE)),
+            make_effect("command_delay", arm=arm, delay_s=rng.uniform(*DELAY_S)),
+        ]
+    hidden.append(make_effect("taxel_gain_spread", log_std=rng.uniform(*GAIN_LOG_STD), seed=secret))
+    for camera in nominal.cameras:
+        turn, shift = rng.normal(0, CAMERA_TURN_RAD, 3), rng.normal(0, CAMERA_SHIFT_M, 3)
+        values = {f"turn_{axis}_rad": float(x) for axis, x in zip("xyz", turn, strict=True)}
+        values |= {f"shift_{axis}_m": float(x) for axis, x in zip("xyz", shift, strict=True)}
+        hidden.append(make_effect("camera_pose", cameras=[camera.name], **values))
+    for effect in hidden:
+        effect.evidence = f"{ORIGIN}; secret {secret}"
+    assert isinstance(nominal.sensor, FlexiTacConfig), "the nominal twin's pads"
+    gain_count = nominal.sensor.gain_count * rng.uniform(*GAIN_RATIO)
+    return dataclasses.replace(
+        nominal, effects=hidden, sensor=dataclasses.replace(nominal.sensor, gain_count=gain_count)
+    )

@@ -1,0 +1,143 @@
+"""``taccorl merge`` as a user types it, on small datasets of random numbers (no robot)."""
+
+import dataclasses
+import json
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taccorl.cli.main import main
+from taccorl.data.dataset import Dataset
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "training"))
+
+IS_SIM = "observation.is_sim"
+WORDS = ("--real=surrogate", "--sim=twin", "--out=both", "--store=store")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a surrogate's dataset and the twin's, in which they were merged once."""
+    from tiny_dataset import tiny_episode, tiny_spec, write_tiny
+
+    from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record
+    from taccorl.data.lerobot_format import write_episodes
+    from taccorl.demos.recorder import ORIGIN
+
+    folder = tmp_path_factory.mktemp("merge_cli")
+    write_tiny(folder / "foreign", rows=(16,))  # without what taccorl writes down of a dataset
+    for name, seeds, origin in (("surrogate", (0, 1), "surrogate: made up"), ("twin", (2,), ORIGIN)):
+        episodes = [
+            dataclasses.replace(tiny_episode(tiny_spec(), 20 + seed, seed), origin=origin, success=True)
+            for seed in seeds
+        ]
+        write_episodes(episodes, folder / name)
+        meta = folder / name / PROVENANCE
+        meta.mkdir()
+        (meta / "episodes.json").write_text(json.dumps([episode_record(e, "") for e in episodes]))
+        (meta / "dataset_spec.json").write_text(json.dumps(dataset_spec_to_json(tiny_spec())))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main(["merge", *WORDS]) == 0
+    return folder
+
+
+@pytest.fixture
+def said(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs a verb there; (exit code, all that was said)."""
+    monkeypatch.chdir(place)
+
+    def run(*words: Any) -> tuple[int, str]:
+        code = main(list(map(str, words)))
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, shown.out + shown.err
+
+    return run
+
+
+def test_every_episode_keeps_its_origin_and_every_row_its_domain(place: Path) -> None:
+    both = Dataset(place / "both")
+    episodes = [both.episode(k) for k in range(both.num_episodes)]
+    assert [e.origin for e in episodes] == ["surrogate: made up"] * 2 + ["MuJoCo twin, not a robot"]
+    assert [e.num_rows for e in episodes] == [20, 21, 22] and all(e.success for e in episodes)
+    assert [set(e.arrays[IS_SIM].ravel().tolist()) for e in episodes] == [{0.0}, {0.0}, {1.0}]
+    assert both.spec.features[IS_SIM].range == (0, 1) and "observation.tactile" in both.spec.sensors
+
+
+def test_the_same_command_again_does_nothing_and_lineage_tells_what_it_was_made_of(place: Path, said: Any) -> None:
+    made_ns = (place / "both/meta/info.json").stat().st_mtime_ns
+    code, text = said("merge", *WORDS)
+    assert code == 0 and (place / "both/meta/info.json").stat().st_mtime_ns == made_ns
+    assert "real:      2 episodes, 41 rows (surrogate: made up)" in text
+    assert "simulated: 1 episodes, 22 rows (MuJoCo twin, not a robot)" in text
+    assert "--dataset.repo_id=local/both --dataset.root=both" in text and "sim_weight" not in text
+    code, text = said("lineage", "explain", "both", "--store=store")
+    assert code == 0 and "cotraining" in text and "surrogate" in text and "twin" in text
+
+
+def test_the_command_it_names_next_is_one_that_lerobot_takes(said: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lerobot.configs import parser
+    from lerobot.configs.train import TrainPipelineConfig
+
+    import taccorl.lerobot_plugin  # noqa: F401
+
+    code, text = said("merge", "--sim=twin", "--out=simulated", "--store=store")
+    assert code == 0 and "real:      0 episodes, 0 rows" in text
+    command = shlex.split(text.rpartition("next:")[2].splitlines()[0])
+    assert command[0] == "lerobot-train"
+    monkeypatch.setattr(sys, "argv", command)
+
+    @parser.wrap()
+    def train(cfg: TrainPipelineConfig) -> TrainPipelineConfig:
+        return cfg
+
+    config: Any = train()  # pyright: ignore[reportCallIssue]
+    assert config.policy.sim_weight == 1.0 and config.dataset.root == "simulated"  # α that one domain can have
+
+
+def test_a_dataset_that_says_nothing_of_itself_is_merged_too(place: Path, said: Any) -> None:
+    code, text = said("merge", "--real=foreign", "--sim=twin", "--out=mixed", "--store=store")
+    assert code == 0, text
+    mixed = Dataset(place / "mixed")
+    assert [mixed.episode(k).origin for k in range(2)] == ["", "MuJoCo twin, not a robot"]
+    assert said("check", "mixed")[0] in (0, 1)  # random numbers, but it can be read
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--real=surrogate",), "missing --out="),
+        (("--out=x",), "no dataset given: --real=FOLDER, --sim=FOLDER"),
+        (("--real=surogate", "--sim=twin", "--out=x"), "surogate: no such folder; did you mean 'surrogate'?"),
+        (
+            ("--real=twin", "--sim=surrogate", "--out=x"),
+            "--real=twin: its episodes say 'MuJoCo twin, not a robot': --sim=twin",
+        ),
+        (("--real=surrogate", "--sim=both", "--out=x"), "both has observation.is_sim, it is merged already"),
+        (("--sim=twin", "--sim=twin", "--out=x"), "twin is given twice"),
+        (("--real=surrogate", "--sim=twin", "--out=twin/x"), "lie in one another"),
+        (("--real=surrogate", "--sim=twin", "--out=mine"), "mine is in the way: it is a folder of 1 entries without"),
+        (("--real=foreign", "--sim=twin", "--out=both"), "both is in the way: it holds cotraining v1"),
+        (("--real=blind", "--sim=twin", "--out=x"), "twin has observation.images.front, blind has not: ingest"),
+        (("--rael=surrogate", "--out=x"), "did you mean 'real'?"),
+    ],
+)
+def test_what_cannot_work_is_named_and_nothing_is_left(
+    words: tuple[str, ...], expected: str, place: Path, said: Any
+) -> None:
+    from tiny_dataset import write_tiny
+
+    (place / "mine").mkdir(exist_ok=True)
+    (place / "mine/work.txt").write_text("x")
+    if not (place / "blind").exists():
+        write_tiny(place / "blind", rows=(12,), cameras=0)
+    before = sorted(path.name for path in place.iterdir())
+    code, text = said("merge", *words, *(["--store=store"] if "--out=x" in words or "--out=both" in words else []))
+    shutil.rmtree(place / "outputs", ignore_errors=True)
+    assert code == 2 and expected in text
+    assert sorted(path.name for path in place.iterdir()) == before

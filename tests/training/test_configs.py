@@ -1,0 +1,86 @@
+"""Every file of configs/ can be loaded by what reads it; those of the paper's co-training hold its table."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from taccorl.diagnosis.axis_problem import load_axis
+from taccorl.sim.twin_file import load_twin
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+ALL = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.*"))
+TRAINING = [name for name in ALL if name.startswith(("cotrain/", "small/"))]
+
+
+def lerobot_train(path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:
+    """The configuration that ``lerobot-train --config_path=PATH`` would run."""
+    from lerobot.configs import parser
+    from lerobot.configs.train import TrainPipelineConfig
+
+    import taccorl.lerobot_plugin  # noqa: F401
+
+    @parser.wrap()
+    def main(cfg: TrainPipelineConfig) -> TrainPipelineConfig:
+        cfg.validate()
+        return cfg
+
+    given = ("--dataset.repo_id=local/both", "--dataset.root=both", "--output_dir=outputs/not_there")
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", f"--config_path={path}", *given, *words])
+    return main()  # pyright: ignore[reportCallIssue]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_file_is_loaded_by_what_reads_it(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    readers = {
+        "twin.yaml": load_twin,
+        "diagnose": load_axis,
+        "cotrain": lambda path: lerobot_train(path, monkeypatch),
+        "small": lambda path: lerobot_train(path, monkeypatch),
+    }
+    assert readers[name.split("/")[0]](CONFIGS / name) is not None
+
+
+@pytest.mark.parametrize("name", TRAINING)
+def test_a_training_file_holds_differences_from_the_defaults_only(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lerobot.configs.train import TrainPipelineConfig
+
+    from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+
+    written = yaml.safe_load((CONFIGS / name).read_text(encoding="utf-8"))
+    policy = written.pop("policy")
+    assert policy.pop("type") == "tactile_pi05"
+    for given, default in ((written, TrainPipelineConfig), (policy, TactilePI05Config)):
+        for key, value in given.items():
+            assert default.__dataclass_fields__[key].default != value, f"{name}: {key} is the default"
+    assert f"--config_path=configs/{name}" in (CONFIGS / name).read_text(encoding="utf-8")  # the line to type
+
+
+@pytest.mark.parametrize(
+    ("task", "steps"), [("assembly_1", 1000), ("assembly_2", 1000), ("puzzle", 3000), ("test_tube", 3000)]
+)
+def test_the_papers_co_training_is_the_papers_table(task: str, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = lerobot_train(CONFIGS / "cotrain" / f"{task}.yaml", monkeypatch)
+    policy = config.policy
+    assert (config.steps, config.batch_size) == (steps, 192)  # T_co, B
+    assert policy.base_checkpoint == "lerobot/pi05_base" and policy.backbone == "full"  # θ₀
+    assert (policy.tactile_history, policy.prefix_tokens, policy.suffix_tokens) == (10, 8, 8)  # L, M_pre, M_suf
+    assert (policy.contact_threshold, policy.contact_min_active) == (0.4, 1)  # λ_f, m
+    assert (policy.chunk_size, policy.sim_weight) == (10, 0.5)  # H, α
+    assert policy.image_noise_std == 0.03 and policy.image_randomization  # σ_v, image rows of App. E
+    assert config.optimizer.lr == 2.5e-5 and "adamw" in config.optimizer.type  # η_max, O
+    scheduler = config.scheduler
+    assert (scheduler.num_warmup_steps, scheduler.peak_lr, scheduler.decay_lr) == (
+        100,
+        2.5e-5,
+        5e-6,
+    )  # T_warm, η_max, η_min
+
+
+def test_words_after_the_file_count_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ("--steps=7", "--policy.sim_weight=0.95", "--policy.image_randomization=false")
+    config = lerobot_train(CONFIGS / "small" / "tiny.yaml", monkeypatch, *words)
+    assert (config.steps, config.policy.sim_weight, config.policy.image_randomization) == (7, 0.95, False)
+    assert config.policy.backbone == "tiny" and config.policy.optimizer_lr == 5e-4
