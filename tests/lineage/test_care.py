@@ -1,6 +1,8 @@
 """Items that kill their process or never end: tried again, given up with the reason, at no cost to others; on clusters too."""
 
+import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import time
@@ -14,7 +16,7 @@ import pytest
 from taccorl.lineage import cluster
 from taccorl.lineage.engines import LocalEngine, RayEngine
 from taccorl.lineage.errors import EngineError
-from taccorl.lineage.processes import Care, Failed
+from taccorl.lineage.processes import Care, Failed, _work
 
 from . import toys
 
@@ -123,3 +125,15 @@ def test_the_same_on_ray_itself(tmp_path, monkeypatch):
         assert on_ray(tmp_path) == ON_A_CLUSTER
     finally:
         ray.shutdown()
+
+
+def test_a_worker_that_is_ready_after_all_work_is_done_ends_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+    context = multiprocessing.get_context("spawn")
+    near, far = context.Pipe()
+    near.close()
+    worker = context.Process(target=_work, args=(far, pickle.dumps(fate), os.getpid()))
+    worker.start()
+    far.close()
+    worker.join(timeout=60)
+    assert worker.exitcode == 0
+    assert "Traceback" not in capfd.readouterr().err
