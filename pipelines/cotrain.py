@@ -53,7 +53,6 @@ class CotrainConfig:
     episode_length: int | None = None
     """Control steps after which a scored episode is cut off; the task's own limit if not given."""
     out: Path = Path("outputs/cotrain")
-    """Everything lands there."""
 
 
 def run(*words: str) -> None:
@@ -72,20 +71,29 @@ def main(words: list[str]) -> None:
     except TaccorlError as error:
         raise SystemExit(str(error)) from None
     out, task, store = config.out / config.task, f"--task={config.task}", f"--store={config.out / 'store'}"
-    robot, real, sources, augmented = (out / name for name in ("surrogate.yaml", "surrogate", "sources", "augmented"))
+    recipe, name = config.train or Path(f"configs/cotrain/{config.task}.yaml"), f"surrogate_{config.secret}"
+    if not recipe.is_file():  # before hours of collecting
+        raise SystemExit(f"--train={recipe}: no such file")
+    robot, real, sources, augmented = (out / part for part in (f"{name}.yaml", name, "sources", "augmented"))
     out.mkdir(parents=True, exist_ok=True)
     save_twin(draw_surrogate_twin(config.secret), robot)
-    # Another seed than the twin's: the two domains do not share their scenes.
-    where = ("--seed=1", f"--twin={robot}", f"--origin={ORIGIN}")
+    where = ("--seed=1", f"--twin={robot}", f"--origin={ORIGIN}")  # the two domains do not share their scenes
     run("taccorl", "collect", task, f"--episodes={config.real}", *where, f"--out={real}", store)
     run("taccorl", "collect", task, f"--episodes={config.sources}", f"--out={sources}", store)
-    many = (f"--episodes={config.augmented}", f"--out={augmented}")
-    run("taccorl", "augment", task, f"--source={sources}", *many, store)
-    both = out / "surrogate_and_twin"
-    run("taccorl", "merge", f"--real={real}", f"--sim={sources}", f"--sim={augmented}", f"--out={both}", store)
+    run(
+        "taccorl", "augment", task, f"--source={sources}", f"--episodes={config.augmented}", f"--out={augmented}", store
+    )
+    run(
+        "taccorl",
+        "merge",
+        f"--real={real}",
+        f"--sim={sources}",
+        f"--sim={augmented}",
+        f"--out={(both := out / f'{name}_and_twin')}",
+        store,
+    )
     options = [f"--{name}={n}" for name in ("steps", "batch_size") if (n := getattr(config, name)) is not None]
-    training = Training(config.train or Path(f"configs/cotrain/{config.task}.yaml"), both, options, out)
-    if command := training.command():
+    if command := (training := Training(recipe, both, options, out)).command():
         run(*command)
     limit = [f"--env.episode_length={config.episode_length}"] if config.episode_length else []
     scored = {"twin": [f"--env.task={config.task}", *limit]}

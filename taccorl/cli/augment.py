@@ -54,7 +54,7 @@ def main(argv: list[str]) -> int:
     """0: augmented."""
     config = parse(AugmentConfig, argv, positional=None)
     from taccorl.benchmark import cpu_s
-    from taccorl.demos.mimicgen.augment import augment, check_out
+    from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts
     from taccorl.demos.mimicgen.coverage import Share
     from taccorl.demos.mimicgen.report import Spent, pages_of, write_report
     from taccorl.lineage.store import Store
@@ -68,8 +68,8 @@ def main(argv: list[str]) -> int:
     before, began = {path.name for path in store.artefacts()}, Spent(cpu_s(children=True), time.perf_counter())
     report = augment(plan, config.source, out, store, config.engine)
     spent = Spent(cpu_s(children=True) - began.cpu_s, time.perf_counter() - began.wall_s)
-    made = sum(path.parent.name == "mimicgen" and path.name not in before for path in store.artefacts())
-    known = isinstance(config.engine, LocalEngine) and made >= report["attempts"]
+    used = made_attempts(plan, config.source, store, report["attempts"])
+    known = isinstance(config.engine, LocalEngine) and not any(folder.name in before for folder in used)
     page = write_report(plan, config.source, out, store, report["attempts"], spent=spent if known else None)
     print(f"dataset: {out}  ({report['episodes']} episodes, {report['rows']} rows): {plan.origin}")
     if (chosen := report.get("stratify")) is None:

@@ -381,7 +381,7 @@ def _aggregate(roots: Sequence[Path], destination: Path) -> None:
     with quiet_lerobot():
         from lerobot.datasets import aggregate
 
-    with tempfile.TemporaryDirectory(prefix=".merge_", dir=destination.resolve().parent) as name:
+    with tempfile.TemporaryDirectory(prefix=f"{destination.name}.merge_", dir=destination.resolve().parent) as name:
         while len(roots) > MERGED_AT_ONCE:
             groups = [roots[k : k + MERGED_AT_ONCE] for k in range(0, len(roots), MERGED_AT_ONCE)]
             level = Path(tempfile.mkdtemp(dir=name))

@@ -95,6 +95,10 @@ class LocalEngine(Engine):
     """Processes; 1 works in this process, one item after another, which is best for a debugger. An item that kills its
     process, or hangs, then ends the run."""
 
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise EngineError(f"--engine.workers={self.workers}: at least one process works")
+
     def _run(self, fn, items, name, take, care) -> None:
         workers = min(self.workers, len(items))
         if workers > 1 or (self.workers > 1 and care != NO_CARE):

@@ -121,8 +121,11 @@ def _outcomes(
         while todo or any(worker.index is not None for worker in pool):
             while len(pool) < workers and sum(not worker.ready for worker in pool) < len(todo):
                 pool.append(_Worker(fn_bytes))
+            looked_s = time.monotonic()
             wait([worker.pipe for worker in pool], timeout=LOOK_S)
+            passed_s = min(time.monotonic() - looked_s, 2 * LOOK_S)  # not what all of us were stopped for
             for worker in list(pool):
+                worker.busy_s += passed_s
                 yield from worker.news(limit_s)
                 if worker.is_dead:
                     pool.remove(worker)
@@ -152,10 +155,10 @@ class _Worker:
         self.process: BaseProcess = context.Process(target=_work, args=(far_end, fn_bytes, os.getpid()))
         self.process.start()
         far_end.close()
-        self.ready, self.index, self.is_dead, self.given_s = False, None, False, 0.0
+        self.ready, self.index, self.is_dead, self.busy_s = False, None, False, 0.0
 
     def give(self, index: int, item_bytes: bytes) -> None:
-        self.index, self.given_s = index, time.monotonic()
+        self.index, self.busy_s = index, 0.0
         with contextlib.suppress(OSError):  # it died just now: news() will tell
             self.pipe.send_bytes(item_bytes)
 
@@ -169,8 +172,7 @@ class _Worker:
         if message is None:
             if ended:
                 return self._died()
-            hangs = self.index is not None and time.monotonic() - self.given_s > limit_s
-            return self._end_hung(limit_s) if hangs else []
+            return self._end_hung(limit_s) if self.index is not None and self.busy_s > limit_s else []
         if not self.ready:
             if isinstance(message, Failed):
                 raise EngineError(
@@ -190,10 +192,11 @@ class _Worker:
             self.process.join()
         how = _exit_in_words(self.process.exitcode)
         if not self.ready:
-            raise EngineError(
-                f"a worker process {how} before it could start; what it printed above says why. "
-                f"A script that uses workers needs its start under `if __name__ == '__main__':`."
-            )
+            why = "Is there enough memory? Fewer workers need less; run it again, it goes on where it was."
+            if (self.process.exitcode or 0) >= 0:
+                why = "What it printed above says why. "
+                why += "A script that uses workers needs its start under `if __name__ == '__main__':`."
+            raise EngineError(f"a worker process {how} before it could start. {why}")
         reason = f"the worker process {how} while it had this item"
         return [] if self.index is None else [(self.index, Failed(reason, process="crashed"))]
 

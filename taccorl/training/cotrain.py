@@ -54,7 +54,7 @@ def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) 
         merge_domains(inputs[: len(real)], inputs[len(real) :], folder)
 
     stage = Stage("cotraining", build, VERSION, manifest=f"{PROVENANCE}/manifest.json")
-    config = {"real": [str(root) for root in real], "sim": [str(root) for root in sim]}
+    config = {"real": len(real), "sim": len(sim)}  # which they are, their content says
     store.run(stage, config, [store.source(root) for root in (*real, *sim)], destination=out)
     told = json.loads((out / RECORD).read_text(encoding="utf-8"))
     return [Part(**{**part, "origins": tuple(part["origins"])}) for part in told]
@@ -75,10 +75,17 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
         if IS_SIM in d.info["features"]:
             raise DatasetError(f"{d.root} has {IS_SIM}, it is merged already: give the datasets that it was made of")
     for d in datasets[: len(real)]:
-        if ORIGIN in _origins(d):
+        origins = _origins(d)
+        is_nameless = not origins and any(key.startswith("sim.") for key in d.info["features"])
+        if ORIGIN in origins or is_nameless:
+            said = "it holds a simulator's state" if is_nameless else f"its episodes say {ORIGIN!r}"
             raise DatasetError(
-                f"--real={d.root}: its episodes say {ORIGIN!r}: --sim={d.root}. Where the twin plays the robot, collect with "
-                "--origin='surrogate: …'"
+                f"--real={d.root}: {said}: --sim={d.root}. Where the twin plays the robot, collect with --origin='surrogate: …'"
+            )
+    for d in datasets[len(real) :]:
+        if stands_in := [origin for origin in _origins(d) if origin.startswith("surrogate")]:
+            raise DatasetError(
+                f"--sim={d.root}: its episodes stand for the robot's ({stands_in[0]!r}): --real={d.root}"
             )
     return _shared_features(datasets)
 
@@ -102,7 +109,7 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
         raise InTheWayError(f"{out} exists already; nothing was touched: give another folder")
     shared = check_domains(real, sim)
     datasets = [Dataset(root) for root in (*real, *sim)]
-    with tempfile.TemporaryDirectory(prefix="cotrain_", dir=out.resolve().parent) as name:
+    with tempfile.TemporaryDirectory(prefix=f"{out.name}.parts_", dir=out.resolve().parent) as name:
         copies = [_with_domain(d, k >= len(real), shared, Path(name) / f"part_{k}") for k, d in enumerate(datasets)]
         merge(copies, out)
     write_exact_statistics(out)
@@ -133,7 +140,7 @@ def _shared_features(datasets: Sequence[Dataset]) -> set[str]:
                 [d.root.name for d in datasets if (key in d.info["features"]) is there] for there in (True, False)
             )
             raise DatasetError(
-                f"co-training: {', '.join(has)} has {key}, {', '.join(lacks)} has not: ingest them with the same data spec"
+                f"co-training: {', '.join(has)} has {key}, {', '.join(lacks)} has not: ingest or collect them alike"
             )
     for d in datasets[1:]:
         for what in ("fps", "robot_type"):

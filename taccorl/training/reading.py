@@ -121,11 +121,12 @@ class FastReader(DatasetReader):
     def _build_index_mapping(self) -> None:
         super()._build_index_mapping()
         self._columns = None
-        if self.episodes is not None and self.hf_dataset is not None and IS_SIM in self.hf_dataset.column_names:
-            # Which rows the share p of the loss's weights counts: those that are trained on.
+        if self.hf_dataset is not None and IS_SIM in self.hf_dataset.column_names:
+            # Which rows the share p of the loss's weights counts: those that are trained on. LeRobot's editing of a dataset
+            # loses the statistics of what it does not know.
             share = np.asarray(self.hf_dataset.data.column(IS_SIM).to_numpy(), dtype=np.float64).mean()
             assert self._meta.stats is not None, "LeRobot writes statistics with every dataset"
-            self._meta.stats[IS_SIM]["mean"] = np.array([share])
+            self._meta.stats.setdefault(IS_SIM, {})["mean"] = np.array([share])
 
     def columns(self) -> dict[str, Column]:
         """Feature → its column; empty: a dataset that is left to LeRobot."""

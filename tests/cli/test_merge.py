@@ -46,6 +46,14 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_who_stands_for_the_robot_is_not_the_twin_and_the_reverse(place: Path, said: Any) -> None:
+    code, shown = said("merge", "--real=surrogate", "--sim=surrogate", "--out=nothing", "--store=store")
+    assert code != 0 and "twice" in shown
+    code, shown = said("merge", "--sim=surrogate", "--out=nothing", "--store=store")
+    assert code != 0 and "its episodes stand for the robot's ('surrogate: made up'): --real=surrogate" in shown
+    assert not (place / "nothing").exists()
+
+
 @pytest.fixture
 def said(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
     """Runs a verb there; (exit code, all that was said)."""

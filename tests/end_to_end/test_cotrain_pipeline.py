@@ -25,7 +25,7 @@ def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(
     cotrain.main(words)
     out = tmp_path / "assembly_2"
 
-    both = Dataset(out / "surrogate_and_twin")
+    both = Dataset(out / "surrogate_7_and_twin")
     origins = [both.episode(k).origin for k in range(both.num_episodes)]
     assert len(origins) == 3 and "surrogate" in origins[0] and origins[1:] == [TWIN, TWIN]
     is_sim = [both.values(k, ["observation.is_sim"])["observation.is_sim"].mean() for k in range(3)]

@@ -1,13 +1,16 @@
 """Datasets that do not fit a policy, on disk and by the way that lerobot-train goes: both sides are named, and the way out."""
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import lerobot_dataset
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy
 from tiny_dataset import IS_SIM, TOUCH, tiny_episode, tiny_spec, write_tiny
 
@@ -16,6 +19,7 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.training.cotrain import merge_domains
+from taccorl.training.reading import FastReader
 
 TINY: dict[str, Any] = {"device": "cpu", "backbone": "tiny", "image_resolution": (56, 56)}
 
@@ -27,6 +31,15 @@ def of(root: Path) -> LeRobotDatasetMetadata:
 def policy_for(root: Path, **settings: Any) -> Any:
     """As ``lerobot-train --policy.type=tactile_pi05 --dataset.root=ROOT`` makes it."""
     return make_policy(TactilePI05Config(**TINY, **settings), ds_meta=of(root))
+
+
+def read_fast(root: Path, **words: Any) -> LeRobotDataset:
+    """As LeRobot reads it where taccorl.lerobot_plugin is at work."""
+    before, lerobot_dataset.DatasetReader = lerobot_dataset.DatasetReader, FastReader
+    try:
+        return LeRobotDataset(f"local/{root.name}", root=root, **words)
+    finally:
+        lerobot_dataset.DatasetReader = before
 
 
 def write(root: Path, spec: DatasetSpec) -> Path:
@@ -99,19 +112,41 @@ def test_the_ways_out_lead_out(place: Path) -> None:
     assert make_policy(config, ds_meta=of(place / "sim")).config.fps == 30
 
 
+def test_the_share_of_simulated_rows_is_counted_where_statistics_have_lost_it(place: Path, tmp_path: Path) -> None:
+    merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
+    path = tmp_path / "both/meta/stats.json"
+    stats = json.loads(path.read_text())
+    assert stats.pop(IS_SIM)["mean"] == [pytest.approx(13 / 39)]
+    path.write_text(json.dumps(stats))  # as lerobot-edit-dataset leaves it
+    with pytest.raises(TaccorlError, match=r"statistics do not say how many rows are simulated.*taccorl merge"):
+        policy_for(tmp_path / "both")
+    dataset = read_fast(tmp_path / "both")
+    policy = make_policy(TactilePI05Config(**TINY), ds_meta=dataset.meta)
+    assert policy.mixture.sim_share == pytest.approx(13 / 39) and policy.config.sim_share == policy.mixture.sim_share
+
+
+def test_a_co_trained_checkpoint_is_not_trained_on_one_domain_unless_that_is_said(place: Path, tmp_path: Path) -> None:
+    merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
+    policy_for(tmp_path / "both").save_pretrained(tmp_path / "co_trained")
+
+    def goes_on(**settings: Any) -> Any:
+        config = PreTrainedConfig.from_pretrained(tmp_path / "co_trained")
+        config.pretrained_path = tmp_path / "co_trained"
+        for name, value in settings.items():
+            setattr(config, name, value)
+        return make_policy(config, ds_meta=of(place / "plain"))
+
+    with pytest.raises(
+        TaccorlError, match=r"local/plain .*no observation\.is_sim.*33 % of rows simulated.*sim_weight=0"
+    ):
+        goes_on()
+    assert goes_on(sim_weight=0.0).config.sim_share is None
+
+
 def test_one_domain_left_by_a_choice_of_episodes_is_noticed(place: Path, tmp_path: Path) -> None:
     """As ``--dataset.episodes=[0]`` of a merged dataset: the share p is that of the rows that are read."""
-    from lerobot.datasets import lerobot_dataset
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    from taccorl.training.reading import FastReader
-
     merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
-    before, lerobot_dataset.DatasetReader = lerobot_dataset.DatasetReader, FastReader
-    try:
-        dataset = LeRobotDataset("local/both", root=tmp_path / "both", episodes=[2])
-    finally:
-        lerobot_dataset.DatasetReader = before
+    dataset = read_fast(tmp_path / "both", episodes=[2])
     assert np.ravel(dataset.meta.stats[IS_SIM]["mean"])[0] == 1
     with pytest.raises(TaccorlError, match=r"gives real rows the weight 0\.5"):
         make_policy(TactilePI05Config(**TINY), ds_meta=dataset.meta)

@@ -125,6 +125,8 @@ class TactilePI05Config(PI05Config):
     """Rows a second that the window and the actions count in. None: read from the dataset likewise."""
     sim_weight: float = 0.5
     """α: how much simulated rows count against real ones. Used where the dataset tells them apart (``observation.is_sim``)."""
+    sim_share: float | None = None
+    """Of the rows that it was trained on, how many were simulated. Written by training."""
 
     image_randomization: bool = True
     """In training, crop, turn and recolour every image by chance: the image rows of the paper's domain randomisation."""

@@ -202,12 +202,26 @@ class TactilePI05Policy(PI05Policy):
             config.match_dataset(dataset_meta)
         self.mixture = Mixture.of_statistics(dataset_stats, config.sim_weight)
         if dataset_meta is not None and self.mixture is None:
+            if IS_SIM in dataset_meta.features:
+                raise TaccorlError(
+                    f"dataset {dataset_meta.repo_id} ({dataset_meta.root}) has {IS_SIM}, but its statistics do not say how many "
+                    "rows are simulated, and the reader that counts them is not at work (TACCORL_NO_PATCH=1, or "
+                    "--dataset.streaming=true): leave that out, or merge the datasets again with taccorl merge"
+                )
+            if config.sim_share is not None and config.sim_weight not in (0, 1):
+                raise TaccorlError(
+                    f"dataset {dataset_meta.repo_id} ({dataset_meta.root}) has no {IS_SIM}, the checkpoint was trained on both "
+                    f"domains ({100 * config.sim_share:.0f} % of rows simulated): give the merged dataset; to go on with one "
+                    "domain, say which: --policy.sim_weight=0 for real rows, 1 for simulated ones"
+                )
             if config.sim_weight not in (0, 1, TactilePI05Config.sim_weight):
                 raise TaccorlError(
                     f"--policy.sim_weight={config.sim_weight:g}: dataset {dataset_meta.repo_id} ({dataset_meta.root}) has no "
                     f"{IS_SIM}, it is of one domain: taccorl merge --real=… --sim=… makes one of both; else leave the weight out"
                 )
             _log.info("dataset %s has no %s: one domain, sim_weight is not used", dataset_meta.repo_id, IS_SIM)
+        if dataset_meta is not None:
+            config.sim_share = self.mixture.sim_share if self.mixture else None
         config.validate_features()
         self.config: TactilePI05Config = config
         self.init_rtc_processor()
