@@ -74,24 +74,15 @@ def main(words: list[str]) -> None:
     recipe, name = config.train or Path(f"configs/cotrain/{config.task}.yaml"), f"surrogate_{config.secret}"
     if not recipe.is_file():  # before hours of collecting
         raise SystemExit(f"--train={recipe}: no such file")
-    robot, real, sources, augmented = (out / part for part in (f"{name}.yaml", name, "sources", "augmented"))
+    robot, real, both = (out / part for part in (f"{name}.yaml", name, f"{name}_and_twin"))
+    sources, many = out / "sources", out / "augmented"
     out.mkdir(parents=True, exist_ok=True)
     save_twin(draw_surrogate_twin(config.secret), robot)
     where = ("--seed=1", f"--twin={robot}", f"--origin={ORIGIN}")  # the two domains do not share their scenes
     run("taccorl", "collect", task, f"--episodes={config.real}", *where, f"--out={real}", store)
     run("taccorl", "collect", task, f"--episodes={config.sources}", f"--out={sources}", store)
-    run(
-        "taccorl", "augment", task, f"--source={sources}", f"--episodes={config.augmented}", f"--out={augmented}", store
-    )
-    run(
-        "taccorl",
-        "merge",
-        f"--real={real}",
-        f"--sim={sources}",
-        f"--sim={augmented}",
-        f"--out={(both := out / f'{name}_and_twin')}",
-        store,
-    )
+    run("taccorl", "augment", task, f"--source={sources}", f"--episodes={config.augmented}", f"--out={many}", store)
+    run("taccorl", "merge", f"--real={real}", f"--sim={sources}", f"--sim={many}", f"--out={both}", store)
     options = [f"--{name}={n}" for name in ("steps", "batch_size") if (n := getattr(config, name)) is not None]
     if command := (training := Training(recipe, both, options, out)).command():
         run(*command)

@@ -269,6 +269,13 @@ def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
     for part in ("transport", "contact"):
         noise = getattr(generation.noise, part)
         not_negative |= {f"noise/{part}/{f.name}": getattr(noise, f.name) for f in dataclasses.fields(noise)}
+    for f in dataclasses.fields(GatesSpec):
+        if not getattr(spec.gates, f.name) > 0:
+            yield f"gates/{f.name}", f"{getattr(spec.gates, f.name):g}: nothing would pass; give a number > 0"
+    for i, constraint in enumerate(spec.task_constraint_configs):
+        for name in ("coordination_scheme_pos_noise_scale", "coordination_scheme_rot_noise_scale"):
+            if getattr(constraint, name) < 0:
+                yield f"task_constraint_configs/{i}/{name}", f"{getattr(constraint, name):g}: give a half width ≥ 0"
     for name, value in (positive | not_negative).items():
         if value < 0 or (name in positive and value == 0):
             yield (

@@ -71,6 +71,16 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
         ("spec_version: 1", "spec_version: 2", r"this taccorl reads version 1"),
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {bridge: {speed_mps: 0.0}}", r"give a number > 0"),
         (
+            "task: assembly_2",
+            "task: assembly_2\ngates: {max_force_n: -5}",
+            r"-5: nothing would pass; give a number > 0",
+        ),
+        (
+            "coordination_scheme: replay",
+            "coordination_scheme: replay, coordination_scheme_pos_noise_scale: -0.05",
+            r"-0\.05: give a half width ≥ 0",
+        ),
+        (
             "[[left, 1], [right, 1]], constraint_type: coordination, coordination_scheme: replay}",
             "[[left, 1], [right, 0]], constraint_type: sequential}\n"
             "  - {eef_subtask_constraint_tuple: [[right, 1], [left, 0]], constraint_type: sequential}",
