@@ -224,7 +224,8 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
 def _pixels_counted() -> Iterator[None]:
     """While open, LeRobot counts how often each of a pixel's 256 values occurs, instead of sorting every picture into 5000 bins.
 
-    Of bytes the counts hold every statistic exactly. LeRobot 0.6.1 spends 40 % of an episode's CPU time on its way.
+    Of bytes the counts hold every statistic exactly. LeRobot 0.6.1's way took 45 % of the CPU time of an augmented episode with
+    three cameras (11.4 against 6.2 s, CHANGELOG).
     """
     from lerobot.datasets import compute_stats
 
@@ -242,7 +243,6 @@ def _pixels_counted() -> Iterator[None]:
             pixels = np.ascontiguousarray(batch.reshape(-1, 1, batch.shape[-1]))
             new = [cv2.calcHist([pixels], [c], None, [256], [0, 256])[:, 0] for c in range(batch.shape[-1])]
             self.counts = np.array(new, np.int64) + (0 if self.counts is None else self.counts)
-            self._count += len(pixels)
 
         def get_statistics(self) -> dict[str, np.ndarray]:
             return super().get_statistics() if self.counts is None else stats_of_counts(self.counts)
