@@ -29,6 +29,7 @@ from taccorl.demos.mimicgen.source import ArmTrack, Segment, SourcePool, contact
 from taccorl.demos.mimicgen.spec import ConstraintSpec, SubtaskSpec
 
 _SETTLED_M, _SETTLED_RAD = 0.0004, 0.004  # a hand that moves less in a control step is at rest
+_ARRIVED_M, _ARRIVED_RAD = 0.0005, 0.005  # a hand that is no further from its goal is there
 _REACH_M = 0.4  # of a joint to the hand: how far noise of the joints moves it
 _HANDED_OVER_STEPS = 2  # of a path: one in which another takes over, one when it has finished
 
@@ -232,17 +233,19 @@ class Director:
     # settling and noise -----------------------------------------------------------------------------------------------
 
     def _is_to_settle(self, arm: str, scene: SeenPoses) -> bool:
-        """Whether the arm's gripper would act next while the arm still moves."""
-        cue, hand = self.schedule.upcoming(arm), self._hands[arm]
-        if cue is None or hand.path is None or hand.seen is None:
+        """Whether the arm's gripper would act next while the arm still moves, or what it holds meet its mate while the arm is not
+        where it is to be."""
+        cue, hand, generation = self.schedule.upcoming(arm), self._hands[arm], self.spec.datagen_config
+        row = hand.path.row(cue.step) if cue is not None and hand.path is not None else None
+        if row is None or hand.path is None or hand.seen is None:
             return False
-        row = hand.path.row(cue.step)
-        if row is None or not hand.path.track.gripper_acts[row]:
-            return False
-        if hand.waited >= self.spec.datagen_config.num_settle_steps_before_gripper:
-            return False
-        moved = distance(hand.seen, scene.tcp(arm))
-        return moved.position_m > _SETTLED_M or moved.rotation_rad > _SETTLED_RAD
+        if hand.path.track.gripper_acts[row] and hand.waited < generation.num_settle_steps_before_gripper:
+            moved = distance(hand.seen, scene.tcp(arm))
+            return moved.position_m > _SETTLED_M or moved.rotation_rad > _SETTLED_RAD
+        if row == hand.path.contact and hand.path.held and hand.waited < generation.num_settle_steps_before_contact:
+            off = distance(hand.last.goal, scene.tcp(arm))
+            return off.position_m > _ARRIVED_M or off.rotation_rad > _ARRIVED_RAD
+        return False
 
     def _shaken(self, wish: Wish) -> Wish:
         noise = self.spec.datagen_config.noise

@@ -130,6 +130,9 @@ class GenerationSpec:
     num_settle_steps_before_gripper: int = 12
     """At most so many steps, without noise, an arm waits to come to rest before its gripper opens or closes; its partner in a
     coordination waits, too."""
+    num_settle_steps_before_contact: int = 30
+    """At most so many steps, likewise, it waits for the hand to come to its goal before contact begins (``contact_lead_steps``): an
+    arm that rests elsewhere in this twin than in the source's learns it then, and noise of the transport is gone."""
     contact_lead_steps: int = 15
     noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
 
@@ -263,9 +266,8 @@ def _subtask_mistakes(key: str, subtask: SubtaskSpec, *, last: bool) -> Iterator
 def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
     generation = spec.datagen_config
     positive = {f"bridge/{f.name}": getattr(generation.bridge, f.name) for f in dataclasses.fields(BridgeSpec)}
-    not_negative = {
-        name: getattr(generation, name) for name in ("num_settle_steps_before_gripper", "contact_lead_steps")
-    }
+    steps = ("num_settle_steps_before_gripper", "num_settle_steps_before_contact", "contact_lead_steps")
+    not_negative = {name: getattr(generation, name) for name in steps}
     for part in ("transport", "contact"):
         noise = getattr(generation.noise, part)
         not_negative |= {f"noise/{part}/{f.name}": getattr(noise, f.name) for f in dataclasses.fields(noise)}

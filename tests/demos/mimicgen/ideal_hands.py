@@ -17,6 +17,7 @@ NUM_ROWS, GRIP_ROW, LIFTED_ROW, LET_GO_ROW, TOUCH_ROW = 60, {"left": 18, "right"
 BOX = {"left": "cradle", "right": "plug"}
 OTHER = {"left": "plug", "right": "cradle"}
 HZ = 30.0
+SETTLES = ("num_settle_steps_before_gripper", "num_settle_steps_before_contact")
 REST = transform((0, 0, 0.003))
 """From a hand's goal to what is commanded for it: an arm hangs."""
 
@@ -138,7 +139,7 @@ def mimic_spec(scheme: str = "replay", *, synchronize_start: bool = False, **gen
         task="boxes",
         subtask_configs={arm: subtasks(arm) for arm in BOX},
         task_constraint_configs=(constraint,) if scheme != "none" else (),
-        datagen_config=GenerationSpec(**{"num_settle_steps_before_gripper": 0, **generation}),
+        datagen_config=GenerationSpec(**dict.fromkeys(SETTLES, 0) | generation),
     )
 
 

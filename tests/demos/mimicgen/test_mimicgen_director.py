@@ -2,6 +2,7 @@
 what a hand holds keeps its path however it lies in the hand."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from ideal_hands import (
     OPEN_M,
     REST,
     TOUCH_ROW,
+    IdealHands,
     demonstration,
     generate,
     mimic_spec,
@@ -27,6 +29,7 @@ from taccorl.demos.mimicgen.director import Director
 from taccorl.demos.mimicgen.source import ArmTrack, Source, SourcePool
 from taccorl.demos.mimicgen.spec import MimicSpec, NoiseSpec, SplitNoiseSpec
 
+LEAD = 4  # contact_lead_steps, where they are given
 G = pose(0.04, -0.03, 0.02, 0.1, -0.2, 0.7)
 SLIP = {"left": pose(0.001, 0.002, -0.001, 0.03, 0, 0.02), "right": pose(-0.002, 0.001, 0.0005, 0, 0.05, -0.03)}
 
@@ -150,13 +153,21 @@ def test_noise_is_split_into_transport_and_contact():
         assert np.abs(made.objects[body][-contact] - source.objects[body][-contact]).max() > 1e-4
 
 
+class Lagging(IdealHands):
+    """Goes a third of the way to its goal in each step."""
+
+    def execute(self, arm, goal, opening_m):
+        super().execute(arm, between(self.tcps[arm], goal, 1 / 3), opening_m)
+
+
+class RestingOff(IdealHands):
+    """The right hand stays 3 mm above its goal."""
+
+    def execute(self, arm, goal, opening_m):
+        super().execute(arm, pose(0, 0, 0.003 * (arm == "right")) @ goal, opening_m)
+
+
 def test_a_hand_waits_for_rest_before_its_gripper_acts():
-    class Lagging(type(scene())):
-        """Goes a third of the way to its goal in each step."""
-
-        def execute(self, arm, goal, opening_m):
-            super().execute(arm, between(self.tcps[arm], goal, 1 / 3), opening_m)
-
     source, start, moved_m = demonstration(scene()), scene(), []
     for settle in (0, 12):
         world = Lagging(dict(start.tcps), dict(start.bodies))
@@ -169,6 +180,71 @@ def test_a_hand_waits_for_rest_before_its_gripper_acts():
         moved_m.append(np.linalg.norm(world.tcp("right")[:3, 3] - seen[:3, 3]))
     # The hand of the source stands for two rows before it closes: (2/3)³ of its lag are left.
     assert moved_m[1] < 0.0004 < 0.002 < moved_m[0]
+
+
+@dataclasses.dataclass
+class BeforeContact:
+    """Steps up to the first of contact, which both hands begin in the same; then before that step:"""
+
+    num_steps: int
+    step_m: float
+    """How far the goal of the right hand went in the last step in which it moved."""
+    off_m: dict[str, float]
+    """Hand → how far it is from its last goal."""
+    apart: np.ndarray
+    """Cradle-from-plug (4, 4)."""
+
+
+def until_contact(kind: type[IdealHands], settle: int, **generation) -> BeforeContact:
+    start, goals, contact, now = scene(), [], False, None
+    world = kind(dict(start.tcps), dict(start.bodies))
+    pool = pool_of(mimic_spec(contact_lead_steps=LEAD, num_settle_steps_before_contact=settle, **generation))
+    director = Director(pool, world, world.openings, np.random.default_rng(0), hz=HZ)
+    while not contact:
+        apart = inverse(world.body("cradle")) @ world.body("plug")
+        tcps, wishes = dict(world.tcps), director.step(world)
+        contact = wishes["right"].contact
+        assert wishes["left"].contact == contact  # side by side
+        if contact:
+            steps_m = np.linalg.norm(np.diff([goal["right"][:3, 3] for goal in goals], axis=0), axis=1)
+            off_m = {arm: float(np.linalg.norm((tcps[arm] - goals[-1][arm])[:3, 3])) for arm in BOX}
+            now = BeforeContact(len(goals) + 1, steps_m[steps_m > 1e-9][-1], off_m, apart)
+        goals.append({arm: wish.goal for arm, wish in wishes.items()})
+        for arm, wish in wishes.items():
+            world.execute(arm, wish.goal, wish.opening_m)
+    assert now is not None
+    return now
+
+
+def test_hands_that_are_not_at_their_goal_wait_before_contact():
+    at_once, waited = (until_contact(Lagging, settle) for settle in (0, 30))
+    # In each step a hand goes on by v; what it lags behind comes to (v + lag) · 2/3 = lag, 2 v, of which (2/3)ⁿ is left after n.
+    assert at_once.off_m["right"] == pytest.approx(2 * at_once.step_m, rel=0.2)
+    steps = math.ceil(math.log(0.0005 / max(at_once.off_m.values())) / math.log(2 / 3))
+    assert waited.num_steps - at_once.num_steps == steps > 5
+    assert max(waited.off_m.values()) <= 0.0005
+
+
+def test_a_hand_that_never_comes_to_its_goal_waits_as_long_as_the_spec_says():
+    at_once, waited = (until_contact(RestingOff, settle) for settle in (0, 30))
+    assert at_once.off_m["right"] == pytest.approx(0.003)
+    assert waited.num_steps - at_once.num_steps == 30
+
+
+def test_hands_that_are_at_their_goal_do_not_wait_nor_those_of_plain_replay():
+    assert until_contact(IdealHands, 30).num_steps == until_contact(IdealHands, 0).num_steps
+    at_once, plain = (until_contact(RestingOff, settle, retarget="eef_command") for settle in (0, 30))
+    assert at_once.num_steps == plain.num_steps
+
+
+def test_noise_is_gone_when_contact_begins():
+    noise = SplitNoiseSpec(transport=NoiseSpec(position_m=0.0025, rotation_rad=0.024))
+    at_once, waited = (until_contact(IdealHands, settle, noise=noise) for settle in (0, 30))
+    source, row = demonstration(scene()), TOUCH_ROW - LEAD
+    then = inverse(source.objects["cradle"][row]) @ source.objects["plug"][row]
+    assert np.linalg.norm((at_once.apart - then)[:3, 3]) > 0.001
+    np.testing.assert_allclose(waited.apart, then, atol=1e-9)
+    assert waited.num_steps == at_once.num_steps + 1
 
 
 def test_the_source_nearest_in_position_and_angle_is_repeated():
