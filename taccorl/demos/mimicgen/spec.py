@@ -131,8 +131,8 @@ class GenerationSpec:
     """At most so many steps, without noise, an arm waits to come to rest before its gripper opens or closes; its partner in a
     coordination waits, too."""
     num_settle_steps_before_contact: int = 30
-    """At most so many steps, likewise, it waits for the hand to come to its goal before contact begins (``contact_lead_steps``): an
-    arm that rests elsewhere in this twin than in the source's learns it then, and noise of the transport is gone."""
+    """At most so many steps, likewise, it waits for the hand to come to its goal before contact begins (``contact_lead_steps``).
+    An arm that rests elsewhere in this twin than in the source's learns it then, and noise of the transport is gone."""
     contact_lead_steps: int = 15
     noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
 
