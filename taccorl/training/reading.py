@@ -26,6 +26,7 @@ import torch
 from av.container import InputContainer
 from lerobot import __version__ as lerobot_version
 from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
@@ -66,13 +67,25 @@ def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Calla
     """LeRobot's ``resolve_delta_timestamps``, to which a policy's ``window_delta_indices`` (feature → rows) are added."""
 
     def resolve_with_windows(cfg: Any, ds_meta: Any) -> dict[str, list] | None:
-        deltas = dict(resolve(cfg, ds_meta) or {})
+        deltas = Deltas(resolve(cfg, ds_meta) or {})
+        if getattr(cfg, "use_relative_actions", False):
+            action = ds_meta.features[ACTION]
+            names = [str(name).lower() for name in action["names"] or [""] * action["shape"][0]]
+            absolute = [str(word).lower() for word in cfg.relative_exclude_joints if word]
+            deltas.relative_actions = [not any(word in name for word in absolute) for name in names]
         for key, indices in (getattr(cfg, "window_delta_indices", None) or {}).items():
             if key in ds_meta.features:
                 deltas[key] = [index / ds_meta.fps for index in indices]
         return deltas or None
 
     return resolve_with_windows
+
+
+class Deltas(dict):
+    """LeRobot's ``delta_timestamps``, which come to the reader as they are."""
+
+    relative_actions: list[bool] | None = None
+    """Of each number of an action whether the policy learns it relative to the state; None: all as they are."""
 
 
 class Column:
@@ -115,6 +128,11 @@ class FastReader(DatasetReader):
 
     _columns: dict[str, Column] | None = None
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        given = [v for v in (*args, *kwargs.values()) if isinstance(v, Deltas)]
+        self._relative_actions = given[0].relative_actions if given else None
+
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in self.__dict__.items() if k != "_columns"}  # a worker makes its own, of the same files
 
@@ -127,6 +145,33 @@ class FastReader(DatasetReader):
             share = np.asarray(self.hf_dataset.data.column(IS_SIM).to_numpy(), dtype=np.float64).mean()
             assert self._meta.stats is not None, "LeRobot writes statistics with every dataset"
             self._meta.stats.setdefault(IS_SIM, {})["mean"] = np.array([share])
+        if self.hf_dataset is not None and self._relative_actions is not None:
+            # LeRobot normalises what is relative by the range of what is absolute unless lerobot-edit-dataset has overwritten it.
+            assert self._meta.stats is not None and self.delta_indices is not None
+            self._meta.stats[ACTION] = self._relative_statistics(np.array(self._relative_actions))
+
+    def _relative_statistics(self, relative_A: np.ndarray) -> dict[str, np.ndarray]:
+        """Exact statistics of actions as a policy with relative ones meets them: each step of each row's chunk, up to the end of
+        the episode, less the row's state where that is wanted."""
+        table: Any = self.hf_dataset
+        episode, state, action = (Column(table.data.column(k)) for k in ("episode_index", OBS_STATE, ACTION))
+        everything = list(range(len(table)))
+        episode_T = episode.rows(everything).reshape(-1).numpy()
+        state_TA, action_TA = (column.rows(everything).numpy().astype(np.float64) for column in (state, action))
+        state_TA = state_TA[:, : len(relative_A)] * relative_A
+        told: dict[str, list[Any]] = {}
+        for a in range(len(relative_A)):  # one by one: a chunk times a dataset is large
+            parts = []
+            for step in self.delta_indices[ACTION]:  # pyright: ignore[reportOptionalSubscript]
+                rows = np.arange(len(episode_T) - step)
+                rows = rows[episode_T[rows] == episode_T[rows + step]]
+                parts.append(action_TA[rows + step, a] - state_TA[rows, a])
+            values = np.concatenate(parts)
+            found = {"min": values.min(), "max": values.max(), "mean": values.mean(), "std": values.std()}
+            found |= {f"q{q:02d}": np.quantile(values, q / 100) for q in (1, 10, 50, 90, 99)}
+            for name, value in (found | {"count": len(values)}).items():
+                told.setdefault(name, []).append(value)
+        return {name: np.array(v if name != "count" else v[:1]) for name, v in told.items()}
 
     def columns(self) -> dict[str, Column]:
         """Feature → its column; empty: a dataset that is left to LeRobot."""

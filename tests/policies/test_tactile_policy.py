@@ -16,10 +16,11 @@ from safetensors.torch import save_file
 from tiny_policies import FORMAT, TACTILE, batch_of, chunk, plain_pi05, readings, tiny_config, tiny_policy
 
 from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.backbone import EarlyConvolutions
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import TactileReadingStep
-from taccorl.policies.tactile_pi05.tokenizer import ByteTokenizer, PromptTokenizerStep
+from taccorl.policies.tactile_pi05.tokenizer import ByteTokenizer, PromptTokenizerStep, WordTokenizer
 from taccorl.policies.tactile_pi05.weights import load_base_weights
 
 FEATURE = {
@@ -150,7 +151,7 @@ def test_counts_become_readings_and_the_normaliser_leaves_them(tmp_path):
         }
         for key, size in (("observation.state", 14), ("action", 14), (TACTILE, 1536))
     }
-    config = tiny_config(tokenizer_max_length=150)
+    config = tiny_config(tokenizer="bytes", tokenizer_max_length=150)
     config.validate_features()
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     counts = torch.randint(-20, 240, (2, 10, 1536))  # LeRobot gives int64
@@ -177,6 +178,33 @@ def test_counts_become_readings_and_the_normaliser_leaves_them(tmp_path):
     assert all(torch.equal(again[k], v) for k, v in seen.items() if isinstance(v, torch.Tensor))
 
 
+def test_relative_actions_of_a_chunk_are_relative_to_the_state_that_it_was_predicted_for(tmp_path):
+    names = [f"joint_{k}" for k in range(13)] + ["gripper"]
+    config = tiny_config(use_relative_actions=True, action_feature_names=names, n_action_steps=3, tactile=False)
+    config.validate_features()
+    ones = torch.ones(14)
+    action = {"q01": -0.2 * ones, "q99": 0.4 * ones, "mean": 0 * ones, "std": ones}
+    stats = {"observation.state": {"q01": -2 * ones, "q99": 2 * ones, "mean": 0 * ones, "std": ones}, "action": action}
+    for steps in make_pre_post_processors(config, dataset_stats=stats):
+        steps.save_pretrained(tmp_path)
+    before, after = make_pre_post_processors(config, pretrained_path=str(tmp_path))
+    policy = tiny_policy(use_relative_actions=True, action_feature_names=names, n_action_steps=3, tactile=False)
+    seen = {k: v for k, v in batch_of(False, False).items() if "language" not in k and k not in (TACTILE, "action")}
+    planned = []
+    plan = policy.predict_action_chunk
+    policy.predict_action_chunk = lambda batch, **kw: planned.append(plan(batch, **kw)) or planned[-1]
+    for k in range(5):
+        state = torch.linspace(-0.3, 0.3, 14).expand(2, 14) + 0.05 * k
+        told = policy.select_action(before({**seen, "observation.state": state, "task": ["move"] * 2}))
+        sent = after(told)
+        came_from, step = (0, k) if k < 3 else (3, k - 3)
+        change = (planned[-1][:, step] + 1) / 2 * 0.6 - 0.2  # quantiles −0.2 … 0.4
+        at_plan = torch.linspace(-0.3, 0.3, 14) + 0.05 * came_from
+        at_plan[13] = 0.0  # absolute
+        torch.testing.assert_close(sent, change + at_plan, atol=1e-5, rtol=0)
+    assert len(planned) == 2
+
+
 def test_a_prompt_is_never_cut_and_other_tokenizers_are_asked_for_by_name(tmp_path):
     step = PromptTokenizerStep(tokenizer_name="bytes", max_length=12)
     assert step._tokenize_text("ä")["input_ids"].tolist() == [[1, 0xC3 + 2, 0xA4 + 2] + 9 * [0]]
@@ -189,6 +217,42 @@ def test_a_prompt_is_never_cut_and_other_tokenizers_are_asked_for_by_name(tmp_pa
         TactileReadingStep(scheme="per_frame_max")
 
 
+def test_each_number_of_the_state_is_one_token_and_near_ones_start_out_alike():
+    numbers = [*range(-1, 256)]
+    tokens = WordTokenizer().tokens(f"Task: Move the TUBE, State: {' '.join(map(str, numbers))};\nAction: ")
+    begin, task, colon, move, the, tube, comma, state, also_colon = tokens[:9]
+    assert begin == 1 and colon == also_colon
+    assert (
+        len({task, move, the, tube, comma, state, colon}) == 7
+        and min(task, move, the, tube, comma, state, colon) >= 259
+    )
+    assert tokens[9 : 9 + 257] == [n + 3 for n in numbers]  # 0: filling, 1: the beginning, 2: −1
+    assert tokens[4:6] == WordTokenizer().tokens("the tube")[1:]  # capitals are no other word
+    assert WordTokenizer().tokens("256 1000")[1:] != WordTokenizer().tokens("255 100")[1:]
+    assert all(259 <= token < len(WordTokenizer()) == 515 for token in WordTokenizer().tokens("256 1000")[1:])
+    rows = PromptTokenizerStep(tokenizer_name="words", max_length=6)._tokenize_text(["move 7", "turn the tube 12"])
+    assert rows["attention_mask"].sum(1).tolist() == [3, 5] and rows["input_ids"][0, 3:].tolist() == [0, 0, 0]
+    policy = tiny_policy()
+    words = policy.model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight.detach()
+    numbers_ND = words[2:259] / words[2:259].norm(dim=1, keepdim=True)
+    alike = numbers_ND @ numbers_ND.T
+    assert alike.diagonal(1).min() > 0.7 > 0.5 > alike.diagonal(30).max()
+    assert words[2:259].std() == pytest.approx(words[259:].std().item(), rel=0.1)
+
+
+def test_early_convolutions_give_a_token_for_each_patch_which_looks_at_its_own_neighbourhood():
+    convolutions = EarlyConvolutions(28, 64)
+    images = torch.rand(2, 3, 112, 56)
+    assert convolutions(images).shape == (2, 64, 4, 2)
+    assert convolutions.weight.dtype is torch.float32
+    far, near = images.clone(), images.clone()
+    near[0, :, 33, 33] += 1
+    changed = (convolutions(near) - convolutions(far)).abs().amax(1)[0] > 1e-3
+    assert changed[1, 1]
+    odd = EarlyConvolutions(7, 64)
+    assert odd(torch.rand(1, 3, 56, 56)).shape == (1, 64, 8, 8)
+
+
 def test_plain_pi05s_weights_are_a_start_and_only_touch_may_be_missing(monkeypatch, tmp_path):
     torch.manual_seed(3)
     plain = plain_pi05(tiny_policy(), monkeypatch)
@@ -196,7 +260,7 @@ def test_plain_pi05s_weights_are_a_start_and_only_touch_may_be_missing(monkeypat
     weights = {k.removeprefix("model."): v.clone() for k, v in plain.state_dict().items()}
     embedding = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
     weights["paligemma_with_expert.paligemma.lm_head.weight"] = weights.pop(embedding)
-    weights["paligemma_with_expert.gemma_expert.lm_head.weight"] = torch.zeros(512, 64)
+    weights["paligemma_with_expert.gemma_expert.lm_head.weight"] = torch.zeros(520, 64)
     save_file(weights, tmp_path / "model.safetensors")
     torch.manual_seed(4)
     policy = TactilePI05Policy(tiny_config())

@@ -80,7 +80,7 @@ def test_the_papers_co_training_is_the_papers_table(task: str, steps: int, monke
 
 
 def test_words_after_the_file_count_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ("--steps=7", "--policy.sim_weight=0.95", "--policy.image_randomization=false")
+    words = ("--steps=7", "--policy.sim_weight=0.95", "--policy.image_randomization=true")
     config = lerobot_train(CONFIGS / "small" / "tiny.yaml", monkeypatch, *words)
-    assert (config.steps, config.policy.sim_weight, config.policy.image_randomization) == (7, 0.95, False)
-    assert config.policy.backbone == "tiny" and config.policy.optimizer_lr == 5e-4
+    assert (config.steps, config.policy.sim_weight, config.policy.image_randomization) == (7, 0.95, True)
+    assert config.policy.backbone == "tiny" and config.policy.optimizer_lr == 2e-3

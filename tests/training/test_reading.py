@@ -4,6 +4,7 @@ import logging
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from lerobot.datasets import dataset_reader, factory, lerobot_dataset
@@ -90,6 +91,35 @@ def test_the_share_of_simulated_rows_is_that_of_the_episodes_trained_on(root, mo
     for episodes, share in ((None, 14 / 37), ([0, 2], 14 / 26), ([1, 2], 0.0)):
         dataset = load(root, FastReader, monkeypatch, episodes=episodes)
         assert float(dataset.meta.stats[IS_SIM]["mean"][0]) == pytest.approx(share, abs=1e-12)
+
+
+def test_relative_actions_are_normalised_by_their_own_range_over_the_episodes_trained_on(root, monkeypatch):
+    settings = {"chunk_size": 3, "n_action_steps": 3, "use_relative_actions": True, "tactile": False}
+    config = TactilePI05Config(device="cpu", backbone="tiny", **settings)
+    resolve = with_windows(stock_resolve())
+    stock = load(root, dataset_reader.DatasetReader, monkeypatch)
+    deltas = resolve(config, stock.meta)
+    for episodes in (None, [0, 2]):
+        meta = load(root, FastReader, monkeypatch, episodes=episodes, delta_timestamps=deltas).meta
+        expected = []
+        for k in episodes or range(3):
+            rows = [row for row in stock.hf_dataset if row["episode_index"] == k]
+            for t, row in enumerate(rows):
+                for later in rows[t : t + 3]:
+                    change = (later["action"] - row["observation.state"]).double().numpy()
+                    change[[6, 13]] = later["action"][[6, 13]].double()  # openings stay absolute: LeRobot's default
+                    expected.append(change)
+        found, wanted = meta.stats["action"], np.array(expected)
+        assert found["count"].tolist() == [len(expected)]
+        for name, value in (
+            ("min", wanted.min(0)), ("max", wanted.max(0)), ("mean", wanted.mean(0)), ("std", wanted.std(0)),
+            ("q01", np.quantile(wanted, 0.01, axis=0)), ("q99", np.quantile(wanted, 0.99, axis=0)),
+        ):  # fmt: skip
+            np.testing.assert_allclose(found[name], value, atol=1e-6)
+        assert set(found) == set(stock.meta.stats["action"])
+    config.use_relative_actions = False
+    meta = load(root, FastReader, monkeypatch, delta_timestamps=resolve(config, stock.meta)).meta
+    np.testing.assert_array_equal(meta.stats["action"]["q01"], stock.meta.stats["action"]["q01"])
 
 
 def test_only_touch_gets_a_window(root, monkeypatch):

@@ -18,6 +18,8 @@ from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
 from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
 
 TACTILE = "observation.tactile"
+RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
+STATE_SINCE_PLAN = "state_since_plan"  # of an action tensor: how far that has moved since its chunk was predicted
 _PALIGEMMA = "google/paligemma-3b-pt-224"
 _BACKBONES = ("full", "small", "tiny")
 
@@ -106,7 +108,7 @@ class TactilePI05Config(PI05Config):
     base_checkpoint: str | None = None
     """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: at random."""
     tokenizer: str | None = None
-    """Hub id, folder, or ``bytes``. None: the backbone's own, PaliGemma's for full and bytes for small and tiny."""
+    """Hub id, folder, ``words`` or ``bytes``. None: the backbone's own, PaliGemma's for full and words for small and tiny."""
     tactile: bool = True
     """False: vision only. The same policy without touch: LeRobot's pi05."""
     tactile_history: int = 10
@@ -192,7 +194,7 @@ class TactilePI05Config(PI05Config):
     @property
     def tokenizer_name(self) -> str:
         """The tokenizer that is meant."""
-        return self.tokenizer or (_PALIGEMMA if self.backbone == "full" else "bytes")
+        return self.tokenizer or (_PALIGEMMA if self.backbone == "full" else "words")
 
     @property
     def window_delta_indices(self) -> dict[str, list[int]]:

@@ -25,7 +25,12 @@ from torch import Tensor, nn
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.backbone import SIZES, FullBackbone, SmallBackbone
 from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
-from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TACTILE, TactilePI05Config
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
+    RAW_STATE,
+    STATE_SINCE_PLAN,
+    TACTILE,
+    TactilePI05Config,
+)
 from taccorl.policies.tactile_pi05.encoder import TactileEncoder, TouchIntoContext
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
@@ -259,6 +264,7 @@ class TactilePI05Policy(PI05Policy):
         super().reset()
         self._graph: GraphedCall | None = getattr(self, "_graph", None)
         self._felt: deque[Tensor] = deque(maxlen=self.config.tactile_history)
+        self._plans_state: Tensor | None = None
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
         """The co-training loss (see ``mixture``) over pi05's flow-matching losses, and what there is to be logged.
@@ -353,7 +359,14 @@ class TactilePI05Policy(PI05Policy):
         """The next action of each environment; called at every control step, as it is here that touch is remembered."""
         if self.config.tactile and TACTILE in batch and batch[TACTILE].ndim == 2:
             batch = {**batch, TACTILE: self._remember(batch[TACTILE])}
-        return super().select_action(batch)
+        state = batch.get(RAW_STATE)
+        if not self._action_queue:
+            self._plans_state = state
+        action = super().select_action(batch)
+        if state is not None and self._plans_state is not None:  # see RawStateStep
+            action = action.clone()
+            setattr(action, STATE_SINCE_PLAN, state - self._plans_state)
+        return action
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

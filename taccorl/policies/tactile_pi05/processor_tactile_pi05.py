@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
 from lerobot.processor import (
     AbsoluteActionsProcessorStep,
@@ -15,10 +16,17 @@ from lerobot.processor import (
     make_default_policy_processor_steps,
     make_policy_processor_pipelines,
 )
+from lerobot.processor.relative_action_processor import to_relative_actions
+from lerobot.utils.constants import OBS_STATE
 
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.backbone import SIZES
-from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TACTILE, TactilePI05Config
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
+    RAW_STATE,
+    STATE_SINCE_PLAN,
+    TACTILE,
+    TactilePI05Config,
+)
 from taccorl.policies.tactile_pi05.tokenizer import PromptTokenizerStep
 
 SCHEME = "fixed_scale"
@@ -58,6 +66,61 @@ class TactileReadingStep(ObservationProcessorStep):
         return features
 
 
+@dataclass
+class RawStateStep(ProcessorStep):
+    """At inference, hands the policy the state as it is, too: what its relative actions are relative to.
+
+    LeRobot 0.6.1 adds the state of now to every action that comes out of a chunk, but all of them are relative to the state for
+    which the chunk was predicted: an arm that has moved since would be sent twice as far. So the policy says with each action how
+    far the state has moved since (``STATE_SINCE_PLAN``), and that is taken off again.
+    """
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        observation = transition.get(TransitionKey.OBSERVATION) or {}
+        if OBS_STATE in observation and transition.get(TransitionKey.ACTION) is None:
+            transition = transition.copy()
+            transition[TransitionKey.OBSERVATION] = {**observation, RAW_STATE: observation[OBS_STATE]}
+        return transition
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
+@dataclass
+class TakeStateSincePlanStep(ProcessorStep):
+    """Keeps what an action carries beside its numbers, before they change."""
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        moved = getattr(transition.get(TransitionKey.ACTION), STATE_SINCE_PLAN, None)
+        if moved is not None:
+            told = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
+            transition = transition.copy()
+            transition[TransitionKey.COMPLEMENTARY_DATA] = {**told, STATE_SINCE_PLAN: moved}
+        return transition
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
+@dataclass
+class FromPlansStateStep(RelativeActionsProcessorStep):
+    """After LeRobot's step has added the state of now: takes off how far it has moved since the chunk was predicted."""
+
+    _registry_name = None  # not LeRobot's step of that name
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        moved = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get(STATE_SINCE_PLAN)
+        action = transition.get(TransitionKey.ACTION)
+        if moved is not None and isinstance(action, torch.Tensor):
+            transition = transition.copy()
+            transition[TransitionKey.ACTION] = to_relative_actions(action, moved, self._build_mask(action.shape[-1]))
+        return transition
+
+
 def make_tactile_pi05_pre_post_processors(
     config: TactilePI05Config, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
@@ -78,14 +141,17 @@ def make_tactile_pi05_pre_post_processors(
         action_names=config.action_feature_names,
     )
     common = make_default_policy_processor_steps(config, dataset_stats)
-    before: list[ProcessorStep] = [common.rename_observations, common.add_batch_dim, relative, common.normalize]
+    before: list[ProcessorStep] = [common.rename_observations, common.add_batch_dim, relative]
+    if config.use_relative_actions:
+        before.append(RawStateStep())
+    before.append(common.normalize)
     if config.tactile:
         told = config.require_tactile_format()
         before.append(TactileReadingStep(scheme=told.scheme, gain_per_count=told.gain_per_count))
     before += [Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim), tokenizer, common.to_device]
-    after: list[ProcessorStep] = [
-        common.unnormalize,
-        AbsoluteActionsProcessorStep(enabled=config.use_relative_actions, relative_step=relative),
-        common.to_cpu,
-    ]
+    absolute = AbsoluteActionsProcessorStep(enabled=config.use_relative_actions, relative_step=relative)
+    after: list[ProcessorStep] = [common.unnormalize, absolute, common.to_cpu]
+    if config.use_relative_actions:
+        names = {"exclude_joints": config.relative_exclude_joints, "action_names": config.action_feature_names}
+        after = [TakeStateSincePlanStep(), common.unnormalize, absolute, FromPlansStateStep(**names), common.to_cpu]
     return make_policy_processor_pipelines(input_steps=before, output_steps=after)

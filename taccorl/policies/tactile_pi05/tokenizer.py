@@ -1,5 +1,12 @@
-"""The prompt as token numbers: π0.5's tokenizer from the hub or a folder, or bytes, which need neither network nor files."""
+"""The prompt as token numbers: π0.5's tokenizer from the hub or a folder; words or bytes, which need neither network nor files.
 
+π0.5's prompt ends with the robot's state, a number 0 … 255 for each joint (−1: below the range). As bytes, a policy that is
+trained from scratch has to learn first what digits mean, and reads three times as many tokens as there are words and numbers.
+"""
+
+import math
+import re
+import zlib
 from typing import Any
 
 import torch
@@ -7,27 +14,70 @@ from lerobot.processor import TokenizerProcessorStep
 
 from taccorl.errors import TaccorlError
 
-BYTES = "bytes"
-_PAD, _BEGIN, _FIRST_BYTE = 0, 1, 2
+BYTES, WORDS = "bytes", "words"
+_PAD, _BEGIN, _FIRST = 0, 1, 2
+_LOWEST, _HIGHEST = -1, 255  # numbers with a token of their own: π0.5's bins of the state
+_NUM_NUMBERS = _HIGHEST - _LOWEST + 1
+_NUM_WORDS = 256
+_PIECES = re.compile(r"-?\d+|[^\W\d]+|[^\w\s]")  # numbers, words, signs
 
 
 class ByteTokenizer:
     """UTF-8 bytes, behind a token that says where the prompt begins: 258 tokens in all."""
 
     def __len__(self) -> int:
-        return _FIRST_BYTE + 256
+        return _FIRST + 256
+
+    def tokens(self, text: str) -> list[int]:
+        """Of one prompt, without filling."""
+        return [_BEGIN, *(_FIRST + byte for byte in text.encode())]
 
     def __call__(self, texts: list[str], **_: Any) -> dict[str, torch.Tensor]:
         """``input_ids`` and ``attention_mask``, (B, longest), filled up at the right."""
-        rows = [[_BEGIN, *(_FIRST_BYTE + byte for byte in text.encode())] for text in texts]
+        rows = [self.tokens(text) for text in texts]
         longest = max(len(row) for row in rows)
         ids = torch.tensor([row + [_PAD] * (longest - len(row)) for row in rows])
         mask = torch.tensor([[1] * len(row) + [0] * (longest - len(row)) for row in rows])
         return {"input_ids": ids, "attention_mask": mask}
 
 
+class WordTokenizer(ByteTokenizer):
+    """A token for each number −1 … 255, and one of 256 for each word or sign, by its CRC-32: 515 tokens in all.
+
+    Two words may share a token (the hashing trick): 1 in 256. Instructions of a dataset that differ in nothing else would then
+    be one; ``bytes`` tells all of them apart.
+    """
+
+    def __len__(self) -> int:
+        return _FIRST + _NUM_NUMBERS + _NUM_WORDS
+
+    def tokens(self, text: str) -> list[int]:
+        """Of one prompt, without filling."""
+        return [_BEGIN, *(self._token(piece) for piece in _PIECES.findall(text))]
+
+    @staticmethod
+    def _token(piece: str) -> int:
+        if piece[-1].isdigit() and _LOWEST <= int(piece) <= _HIGHEST:
+            return _FIRST + int(piece) - _LOWEST
+        return _FIRST + _NUM_NUMBERS + zlib.crc32(piece.lower().encode()) % _NUM_WORDS
+
+
+def write_number_embeddings(embedding_VD: torch.Tensor) -> None:
+    """Let the embeddings (vocabulary, D) of ``WordTokenizer``'s numbers start near to those of near numbers: sines and cosines of
+    ½ … 128 half turns over the range, as large as the others. At random, each of them is learnt by itself."""
+    numbers = torch.arange(_NUM_NUMBERS, device=embedding_VD.device)[:, None] / _NUM_NUMBERS
+    half_turns = 2.0 ** torch.linspace(-1, 7, embedding_VD.shape[1] // 2, device=embedding_VD.device)
+    waves = torch.cat([trig(math.pi * numbers * half_turns) for trig in (torch.sin, torch.cos)], dim=1)
+    rest = embedding_VD[_FIRST + _NUM_NUMBERS :]
+    with torch.no_grad():
+        embedding_VD[_FIRST : _FIRST + _NUM_NUMBERS] = waves * math.sqrt(2) * rest.std()
+
+
+_SHIPPED = {BYTES: ByteTokenizer, WORDS: WordTokenizer}
+
+
 class PromptTokenizerStep(TokenizerProcessorStep):
-    """LeRobot's step with ``bytes`` as one more tokenizer. Never cuts a prompt: its end is the robot's state.
+    """LeRobot's step with ``words`` and ``bytes`` as further tokenizers. Never cuts a prompt: its end is the robot's state.
 
     Saved under its class's path, which LeRobot imports when it loads a checkpoint.
     """
@@ -39,8 +89,8 @@ class PromptTokenizerStep(TokenizerProcessorStep):
         Raises:
             TaccorlError: the tokenizer cannot be loaded.
         """
-        if self.tokenizer_name == BYTES:
-            self.input_tokenizer = ByteTokenizer()
+        if self.tokenizer_name in _SHIPPED:
+            self.input_tokenizer = _SHIPPED[self.tokenizer_name]()
             return
         try:
             super().__post_init__()
@@ -48,7 +98,7 @@ class PromptTokenizerStep(TokenizerProcessorStep):
             first = next(iter(str(error).splitlines()), "")
             raise TaccorlError(
                 f"--policy.tokenizer={self.tokenizer_name}: cannot be loaded: {first} Without network: a folder with "
-                f"tokenizer.json, or {BYTES} where the backbone is trained from scratch"
+                f"tokenizer.json, or {' or '.join(_SHIPPED)} where the backbone is trained from scratch"
             ) from error
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, torch.Tensor]:
