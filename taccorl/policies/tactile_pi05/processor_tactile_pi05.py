@@ -78,8 +78,7 @@ class RawStateStep(ProcessorStep):
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
         if OBS_STATE in observation and transition.get(TransitionKey.ACTION) is None:
-            transition = transition.copy()
-            transition[TransitionKey.OBSERVATION] = {**observation, RAW_STATE: observation[OBS_STATE]}
+            return _with(transition, TransitionKey.OBSERVATION, {**observation, RAW_STATE: observation[OBS_STATE]})
         return transition
 
     def transform_features(
@@ -96,8 +95,7 @@ class TakeStateSincePlanStep(ProcessorStep):
         moved = getattr(transition.get(TransitionKey.ACTION), STATE_SINCE_PLAN, None)
         if moved is not None:
             told = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
-            transition = transition.copy()
-            transition[TransitionKey.COMPLEMENTARY_DATA] = {**told, STATE_SINCE_PLAN: moved}
+            return _with(transition, TransitionKey.COMPLEMENTARY_DATA, {**told, STATE_SINCE_PLAN: moved})
         return transition
 
     def transform_features(
@@ -116,9 +114,15 @@ class FromPlansStateStep(RelativeActionsProcessorStep):
         moved = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get(STATE_SINCE_PLAN)
         action = transition.get(TransitionKey.ACTION)
         if moved is not None and isinstance(action, torch.Tensor):
-            transition = transition.copy()
-            transition[TransitionKey.ACTION] = to_relative_actions(action, moved, self._build_mask(action.shape[-1]))
+            at_plan = to_relative_actions(action, moved, self._build_mask(action.shape[-1]))
+            return _with(transition, TransitionKey.ACTION, at_plan)
         return transition
+
+
+def _with(transition: EnvTransition, key: TransitionKey, value: Any) -> EnvTransition:
+    changed: Any = transition.copy()
+    changed[key] = value
+    return changed
 
 
 def make_tactile_pi05_pre_post_processors(
