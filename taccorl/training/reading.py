@@ -44,14 +44,16 @@ def install() -> bool:
     if os.environ.get("TACCORL_NO_PATCH") == "1":
         _log.warning(
             "TACCORL_NO_PATCH=1: LeRobot reads datasets by itself: 5 to 20 times slower, touch without its history "
-            "(--policy.tactile_history=1), and α takes the share of simulated rows of the whole dataset even where "
+            "(--policy.tactile_history=1), relative actions only after lerobot-edit-dataset --operation.type=recompute_stats "
+            "--operation.relative_action=true, and α takes the share of simulated rows of the whole dataset even where "
             "--dataset.episodes takes a part of it"
         )
         return False
     if lerobot_version != COMPARED_VERSION:
         _log.warning(
             "LeRobot %s reads datasets by itself: taccorl's faster reader was compared with %s only. Touch comes without its "
-            "history (--policy.tactile_history=1); pip install lerobot==%s has all",
+            "history (--policy.tactile_history=1), relative actions with statistics of absolute ones; pip install lerobot==%s "
+            "has all",
             lerobot_version,
             COMPARED_VERSION,
             COMPARED_VERSION,

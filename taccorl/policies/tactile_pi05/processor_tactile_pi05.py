@@ -66,8 +66,17 @@ class TactileReadingStep(ObservationProcessorStep):
         return features
 
 
+class _KeepsFeatures(ProcessorStep):
+    """A step after which a dataset's or policy's features are what they were."""
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
 @dataclass
-class RawStateStep(ProcessorStep):
+class RawStateStep(_KeepsFeatures):
     """At inference, hands the policy the state as it is, too: what its relative actions are relative to.
 
     LeRobot 0.6.1 adds the state of now to every action that comes out of a chunk, but all of them are relative to the state for
@@ -81,14 +90,9 @@ class RawStateStep(ProcessorStep):
             return _with(transition, TransitionKey.OBSERVATION, {**observation, RAW_STATE: observation[OBS_STATE]})
         return transition
 
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
-
 
 @dataclass
-class TakeStateSincePlanStep(ProcessorStep):
+class TakeStateSincePlanStep(_KeepsFeatures):
     """Keeps what an action carries beside its numbers, before they change."""
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
@@ -97,11 +101,6 @@ class TakeStateSincePlanStep(ProcessorStep):
             told = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
             return _with(transition, TransitionKey.COMPLEMENTARY_DATA, {**told, STATE_SINCE_PLAN: moved})
         return transition
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
 
 
 @dataclass
