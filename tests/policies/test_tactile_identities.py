@@ -47,7 +47,7 @@ def test_tokens_without_contact_are_removed_not_zeroed(policy):
     assert torch.equal(chunk(policy, batch)[1], chunk(policy, other)[1])
     images, image_masks = policy._preprocess_images(batch)
     prompt = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
-    with policy.model.feeling(*policy._readings(batch)):
+    with policy.model.sensing(None, *policy._readings(batch)):
         _, valid, _ = policy.model.embed_prefix(images, image_masks, *prompt)
         _, suffix_valid, starts_block, _ = policy.model.embed_suffix(torch.zeros(2, 10, 32), torch.ones(2))
     assert valid[:, -8:].tolist() == [[True] * 8, [False] * 8]
@@ -56,7 +56,9 @@ def test_tokens_without_contact_are_removed_not_zeroed(policy):
     assert starts_block[0].tolist() == [1.0] + 7 * [0.0] + [1.0] + 9 * [0.0]
 
 
-def test_velocity_over_the_cached_prefix_is_that_of_the_joint_forward(policy):
+@pytest.mark.parametrize("is_discrete", [True, False])
+def test_velocity_over_the_cached_prefix_is_that_of_the_joint_forward(is_discrete):
+    policy = tiny_policy(discrete_state_input=is_discrete)
     batch, noise, time = batch_of(True, False, True), torch.randn(3, 10, 32), torch.tensor([1.0, 0.75, 0.25])
     model = policy.model
     images, image_masks = policy._preprocess_images(batch)
@@ -65,7 +67,7 @@ def test_velocity_over_the_cached_prefix_is_that_of_the_joint_forward(policy):
     x_t = time[:, None, None] * noise + (1 - time[:, None, None]) * actions
     seen = {}
     handle = model.action_out_proj.register_forward_hook(lambda *call: seen.update(joint=call[2]))
-    with torch.no_grad(), model.feeling(*policy._readings(batch)):
+    with torch.no_grad(), model.sensing(policy._state(batch), *policy._readings(batch)):
         model(images, image_masks, *prompt, actions, noise, time)
         prefix, valid, starts_block = model.embed_prefix(images, image_masks, *prompt)
         model.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = "eager"
@@ -88,7 +90,7 @@ def test_the_policy_starts_as_the_pretrained_one_does_with_tokens_beside_it(poli
     images, image_masks = fresh._preprocess_images(batch)
     prompt = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
     base, _, _ = fresh.model.embed_prefix(images, image_masks, *prompt)
-    with fresh.model.feeling(*fresh._readings(batch)):
+    with fresh.model.sensing(None, *fresh._readings(batch)):
         felt, valid, _ = fresh.model.embed_prefix(images, image_masks, *prompt)
     assert torch.equal(felt[:, :-8], base) and valid[:, -8:].all()
     # and it can leave zero: the gradient at the output's weights is not
@@ -97,7 +99,20 @@ def test_the_policy_starts_as_the_pretrained_one_does_with_tokens_beside_it(poli
     assert fresh.model.tactile.encoder.reading[0].weight.grad.abs().max() > 0
 
 
-def test_saved_and_loaded_it_acts_the_same(policy, tmp_path):
+def test_with_a_token_of_the_state_a_row_is_the_same_beside_any_other():
+    policy, batch = tiny_policy(discrete_state_input=False), batch_of(True, False, True, False)
+    blind = tiny_policy(discrete_state_input=False, tactile=False)
+    blind.load_state_dict({k: v for k, v in policy.state_dict().items() if not k.startswith("model.tactile.")})
+    assert torch.equal(chunk(policy, batch)[[1, 3]], chunk(blind, batch)[[1, 3]])
+    assert torch.equal(losses(policy, batch)[[1, 3]], losses(blind, batch)[[1, 3]])
+    other = {**batch, "observation.state": batch["observation.state"] + torch.tensor([[0], [0], [0.1], [0.1]])}
+    same = [torch.equal(a, b) for a, b in zip(chunk(policy, batch), chunk(policy, other), strict=True)]
+    assert same == [True, True, False, False]
+
+
+@pytest.mark.parametrize("is_discrete", [True, False])
+def test_saved_and_loaded_it_acts_the_same(is_discrete, tmp_path):
+    policy = tiny_policy(discrete_state_input=is_discrete)
     batch = batch_of(True, False)
     policy.save_pretrained(tmp_path)
     loaded = TactilePI05Policy.from_pretrained(tmp_path)
@@ -140,6 +155,6 @@ def test_masked_tokens_weigh_nothing(policy):
     prompt = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
     noise = torch.randn(2, 10, 32)
     plain = policy.model.sample_actions(images, image_masks, *prompt, noise=noise)
-    with policy.model.feeling(*policy._readings(batch), masked=True):
+    with policy.model.sensing(None, *policy._readings(batch), masked=True):
         masked = policy.model.sample_actions(images, image_masks, *prompt, noise=noise)
     assert (masked - plain).abs().max() <= 1e-5

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,6 +19,7 @@ from tiny_policies import FORMAT, TACTILE, batch_of, chunk, plain_pi05, readings
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.backbone import EarlyConvolutions
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
+from taccorl.policies.tactile_pi05.encoder import StateToken
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import TactileReadingStep
 from taccorl.policies.tactile_pi05.tokenizer import ByteTokenizer, PromptTokenizerStep, WordTokenizer
@@ -238,6 +240,47 @@ def test_each_number_of_the_state_is_one_token_and_near_ones_start_out_alike():
     alike = numbers_ND @ numbers_ND.T
     assert alike.diagonal(1).min() > 0.7 > 0.5 > alike.diagonal(30).max()
     assert words[2:259].std() == pytest.approx(words[259:].std().item(), rel=0.1)
+
+
+@pytest.mark.parametrize("is_discrete", [True, False])
+def test_a_state_beside_the_prompt_is_exact_where_one_in_the_prompt_has_256_steps(is_discrete):
+    """Over 2 rad a step is 8 mrad, at an arm's length 4 mm: more than parts leave each other to be joined."""
+    policy = tiny_policy(tactile=False, discrete_state_input=is_discrete, tokenizer_max_length=60)
+    stats = {
+        k: {"q01": torch.full((14,), -1.0), "q99": torch.full((14,), 1.0)} for k in ("observation.state", "action")
+    }
+    before, _ = make_pre_post_processors(policy.config, dataset_stats=stats)
+    rows = {k: v for k, v in batch_of(False).items() if "language" not in k and k != "action"} | {"task": ["join them"]}
+    middle = (torch.arange(14) - 7 + 0.5) / 128  # of steps
+    prompts, chunks = [], []
+    for state in (middle, middle + 0.003, middle + 0.01):
+        seen = before({**rows, "observation.state": state[None]})
+        prompts.append(seen["observation.language.tokens"])
+        chunks.append(chunk(policy, seen))
+    assert torch.equal(prompts[0], prompts[1]) and torch.equal(prompts[0], prompts[2]) is not is_discrete
+    assert torch.equal(chunks[0], chunks[1]) is is_discrete
+    assert not torch.equal(chunks[0], chunks[2])
+    number = WordTokenizer().tokens("130")[1]
+    assert (number in prompts[0]) is is_discrete
+
+
+def test_the_state_is_the_backbones_own_affair_unless_told():
+    assert TactilePI05Config(backbone="full").has_discrete_state  # as π0.5 was pretrained
+    assert not TactilePI05Config(backbone="small").has_discrete_state
+    assert not tiny_config(discrete_state_input=None).has_discrete_state
+    assert TactilePI05Config(backbone="small", discrete_state_input=True).has_discrete_state
+
+
+def test_a_token_of_the_state_is_the_waves_of_each_joint_and_no_joint_is_beyond_its_limit():
+    torch.manual_seed(0)
+    token, state = StateToken(2, 8), torch.tensor([[0.3, -0.7]])
+    waves = [math.pi * 2**k * x for x in (0.3, -0.7) for k in range(5)]  # ½ … 8 turns over the range of −1 … 1
+    told = torch.tensor([[0.3, -0.7, *map(math.sin, waves), *map(math.cos, waves)]])
+    expected = token.out(torch.nn.functional.gelu(token.hidden(told)))
+    torch.testing.assert_close(token(state), expected[:, None])
+    assert token(state).shape == (1, 1, 8)
+    # LeRobot's normaliser makes 2e8 of the noise of a joint that stood still in all of the data.
+    assert torch.equal(token(torch.tensor([[0.3, 2e8]])), token(torch.tensor([[0.3, 4.0]])))
 
 
 def test_early_convolutions_give_a_token_for_each_patch_that_changes_most_with_its_own_pixels():

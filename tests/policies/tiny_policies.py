@@ -37,7 +37,9 @@ def features() -> dict[str, dict[str, PolicyFeature]]:
 
 
 def tiny_config(**changes: Any) -> TactilePI05Config:
-    return TactilePI05Config(**{**COMMON, "backbone": "tiny", "tactile_format": FORMAT, **features(), **changes})
+    """With the state in the prompt, as LeRobot's pi05 has it."""
+    own = {"backbone": "tiny", "discrete_state_input": True, "tactile_format": FORMAT}
+    return TactilePI05Config(**{**COMMON, **own, **features(), **changes})
 
 
 def tiny_policy(**changes: Any) -> TactilePI05Policy:

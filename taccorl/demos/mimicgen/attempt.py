@@ -21,6 +21,7 @@ from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
 from taccorl.demos.mimicgen.schedule import DeadlockError
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import check_closed_loop
+from taccorl.demos.mimicgen.touching import Touching
 from taccorl.demos.recorder import EpisodeRecorder
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.robot import ARMS
@@ -82,11 +83,25 @@ class TwinScene:
 class Hands:
     """Wishes into joint targets: inverse kinematics, and what the joints rest off."""
 
-    def __init__(self, sim: Simulation, kinematics: Mapping[str, ArmKinematics], *, learn: bool = True) -> None:
-        """After a reset. ``learn``: wishes are where the joints are to be, not what to send."""
+    def __init__(
+        self,
+        sim: Simulation,
+        kinematics: Mapping[str, ArmKinematics],
+        *,
+        max_joint_speed_radps: float,
+        learn: bool = True,
+    ) -> None:
+        """After a reset.
+
+        Args:
+            max_joint_speed_radps: a wish that would take a joint there faster is followed as fast as that.
+            learn: wishes are where the joints are to be, not what to send.
+        """
+        self._max_step_rad = max_joint_speed_radps / CONTROL_HZ
         self.sim, self.kinematics, self.learn = sim, kinematics, learn
         self.joints_rad, self._rest = {}, {}
         self._joints = {arm: joint_addresses(sim.model, arm) for arm in ARMS}
+        self._touching = Touching(sim)
         self.unreached_m, self.unreached = 0.0, ""
         command = sim.arrays["ctrl"][0, sim.action_actuators]
         for a, arm in enumerate(ARMS):
@@ -99,9 +114,12 @@ class Hands:
     def action(self, wishes: Mapping[str, Wish]) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m]."""
         action, qpos = np.empty(14), self.sim.arrays["qpos"][0]
+        still = [arm for arm, rest in self._rest.items() if self.learn and rest.is_still and not wishes[arm].contact]
+        if still:
+            self._touching.look(self.sim.state_rows()[0])
         for a, arm in enumerate(ARMS):
             wish, rest = wishes[arm], self._rest[arm]
-            if not wish.contact:
+            if arm in still and not self._touching.holds_fast(arm):
                 rest.see(qpos[self._joints[arm]])
             if wish.joints_rad is None:
                 joints, error_m = self.kinematics[arm].solve(wish.goal, self.joints_rad[arm])
@@ -112,7 +130,8 @@ class Hands:
                     )
             else:
                 joints = wish.joints_rad
-            self.joints_rad[arm] = joints
+            last = self.joints_rad[arm]
+            self.joints_rad[arm] = joints = last + np.clip(joints - last, -self._max_step_rad, self._max_step_rad)
             action[7 * a : 7 * a + 6] = rest.command(joints) if self.learn else joints
             action[7 * a + 6] = wish.opening_m
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
@@ -134,7 +153,9 @@ class Attempts:
         sim, (scene_seed, rng) = self.sim, attempt_seeds(self.seed, self.spec.task, k)
         sim.reset([scene_seed])
         commanded = self.spec.datagen_config.retarget == "eef_command"
-        scene, hands = TwinScene(sim), Hands(sim, self.kinematics, learn=not commanded)
+        max_speed = self.spec.gates.max_joint_speed_radps
+        hands = Hands(sim, self.kinematics, max_joint_speed_radps=max_speed, learn=not commanded)
+        scene = TwinScene(sim)
         command = sim.arrays["ctrl"][0, sim.action_actuators]
         openings = {arm: float(command[7 * a + 6]) for a, arm in enumerate(ARMS)}
         director = Director(

@@ -44,7 +44,7 @@ from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
-VERSION = 1  # of an attempt
+VERSION = 2  # of an attempt
 _ROUND = (
     20  # attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end
 )

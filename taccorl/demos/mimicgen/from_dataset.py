@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from taccorl.data.dataset import Dataset
@@ -19,6 +18,7 @@ from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
 from taccorl.demos.mimicgen.source import ArmTrack, Source
 from taccorl.demos.mimicgen.spec import MimicSpec
+from taccorl.demos.mimicgen.touching import Touching
 from taccorl.errors import DatasetError
 from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation
@@ -88,10 +88,7 @@ class SourceReader:
     def __init__(self, sim: Simulation) -> None:
         self.sim = sim
         self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
-        self._data = mujoco.MjData(sim.model)
-        bodies = [sim.model.body(i).name for i in sim.model.geom_bodyid]
-        self._owner = ["arm" if name.startswith(ARMS) else name for name in bodies]
-        """Of each geom: a part, a clamped body, the table (its name is world), or any piece of an arm."""
+        self._touching = Touching(sim)
 
     def read(self, episode: Episode) -> Source:
         """
@@ -117,7 +114,8 @@ class SourceReader:
         for a, arm in enumerate(ARMS):
             commands = actions[:, 7 * a : 7 * a + 6]
             joints = np.stack([look.joints_rad[arm] for look in seen])
-            goals = self._goals(arm, joints, commands, rest_command[7 * a : 7 * a + 6], touched)
+            held_back = touched | np.array([look.holds_fast[arm] for look in seen])
+            goals = self._goals(arm, joints, commands, rest_command[7 * a : 7 * a + 6], held_back)
             goal, command = (np.stack([self.kinematics[arm].pose(row) for row in rows]) for rows in (goals, commands))
             tcp = np.stack([look.tcp[arm] for look in seen])
             arms[arm] = ArmTrack(tcp, goal, goals, actions[:, 7 * a + 6], command, commands)
@@ -130,18 +128,17 @@ class SourceReader:
 
     def _look(self, row: np.ndarray, names: tuple[str, ...]) -> "_Look":
         """What a stored state shows."""
-        model, data, task = self.sim.model, self._data, self.sim.task
-        mujoco.mj_setState(model, data, row[1 : 1 + self.sim.batch.nstate], mujoco.mjtState.mjSTATE_INTEGRATION)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        touching = [{self._owner[geom] for geom in contact.geom} for contact in data.contact]
-        mated = {name for pair in task.mating if set(pair) in touching for name in pair}
+        model, task, touching = self.sim.model, self.sim.task, self._touching
+        touching.look(row)
+        data = touching.data
+        mated = {name for pair in task.mating if set(pair) in touching.pairs for name in pair}
         return _Look(
             poses={name: _pose(data.body(name).xpos, data.body(name).xmat) for name in names},
             tcp={arm: _pose(data.site(f"{arm}_tcp").xpos, data.site(f"{arm}_tcp").xmat) for arm in ARMS},
             joints_rad={arm: data.qpos[joint_addresses(model, arm)] for arm in ARMS},
             mated={name: name in mated for name in task.parts},
-            free={name: not any(name in pair and "arm" not in pair for pair in touching) for name in task.parts},
+            free={name: touching.free(name) for name in task.parts},
+            holds_fast={arm: touching.holds_fast(arm) for arm in ARMS},
         )
 
     def _command(self, row: np.ndarray) -> np.ndarray:
@@ -149,15 +146,15 @@ class SourceReader:
         return self.sim.row_memory(row[None])["targets"][0]
 
     def _goals(
-        self, arm: str, joints: np.ndarray, commands: np.ndarray, at_rest: np.ndarray, touched: np.ndarray
+        self, arm: str, joints: np.ndarray, commands: np.ndarray, at_rest: np.ndarray, held_back: np.ndarray
     ) -> np.ndarray:
-        """(T, 6) where the commands (T, 6) were to bring the joints (T, 6). From when parts have ``touched`` (T,) each other
-        nothing is learnt of the arm's rest: contact holds it back."""
+        """(T, 6) where the commands (T, 6) were to bring the joints (T, 6). Where contact has ``held_back`` (T,) the arm, nothing
+        is learnt of its rest."""
         gains = self.sim.config.controller_of(arm)
         rest = RestOffset(joints[0], at_rest, np.divide(gains.kd_nms_per_rad, gains.kp_nm_per_rad))
         goals = []
-        for now, command, held_back in zip(joints, commands, touched, strict=True):
-            if not held_back:
+        for now, command, is_held_back in zip(joints, commands, held_back, strict=True):
+            if not is_held_back:
                 rest.see(now)
             goals.append(rest.goal(command))
         return np.array(goals)
@@ -172,6 +169,7 @@ class _Look:
     joints_rad: dict[str, np.ndarray]
     mated: dict[str, bool]
     free: dict[str, bool]
+    holds_fast: dict[str, bool]
 
 
 def _pose(pos: np.ndarray, mat: np.ndarray) -> np.ndarray:

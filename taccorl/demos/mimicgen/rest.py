@@ -34,10 +34,15 @@ class RestOffset:
         self._goal, self._predicted, self._lag_s = joints_rad, joints_rad, lag_s
         self._step_rad = 0.0
 
+    @property
+    def is_still(self) -> bool:
+        """Whether the last goal hardly moved: whether there is anything to ``see``."""
+        return self._step_rad < _STILL_RAD
+
     def see(self, joints_rad: np.ndarray) -> None:
         """Before a command, where nothing is touched: what is not where a lag would have it rests off. An arm that moves teaches
         nothing: its lag is not exactly of first order."""
-        if self._step_rad < _STILL_RAD:
+        if self.is_still:
             self.offset_rad = self.offset_rad + _LEARNED * (joints_rad - self._predicted)
 
     def command(self, goal_rad: np.ndarray) -> np.ndarray:

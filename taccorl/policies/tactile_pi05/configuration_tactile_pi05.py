@@ -109,6 +109,9 @@ class TactilePI05Config(PI05Config):
     """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: at random."""
     tokenizer: str | None = None
     """Hub id, folder, ``words`` or ``bytes``. None: the backbone's own, PaliGemma's for full and words for small and tiny."""
+    discrete_state_input: bool | None = None
+    """True: the state is part of the prompt, 256 steps over each joint's range, as in π0.5. False: a token beside the actions, as
+    in π0, exact. None: the backbone's own, True for full and False for small and tiny."""
     tactile: bool = True
     """False: vision only. The same policy without touch: LeRobot's pi05."""
     tactile_history: int = 10
@@ -195,6 +198,17 @@ class TactilePI05Config(PI05Config):
     def tokenizer_name(self) -> str:
         """The tokenizer that is meant."""
         return self.tokenizer or (_PALIGEMMA if self.backbone == "full" else "words")
+
+    @property
+    def has_discrete_state(self) -> bool:
+        """``discrete_state_input`` as it is meant."""
+        return self.backbone == "full" if self.discrete_state_input is None else self.discrete_state_input
+
+    @property
+    def state_dim(self) -> int:
+        """S: numbers of the robot's state."""
+        assert self.input_features is not None, "the policy's __init__ has made sure of features"
+        return self.input_features[OBS_STATE].shape[0]
 
     @property
     def window_delta_indices(self) -> dict[str, list[int]]:

@@ -1,8 +1,10 @@
 """Tokens from a window of touch, E_τ of the paper: "CNN2 temporal token"; and how the base context looks at them."""
 
+import math
+
 import torch
 import torch.nn.functional as F
-from torch import nn
+from torch import Tensor, nn
 
 # B batch, L history, P pads, R rows, C columns, M tokens, D width, T tokens of the context
 _CHANNELS = (32, 64)
@@ -85,3 +87,27 @@ class TouchIntoContext(nn.Module):
             for linear, x in ((self.query, context), (self.key, touch), (self.value, touch))
         )
         return self.out(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+
+
+class StateToken(nn.Module):
+    """The normalised state as one token: sines and cosines of ½ … 8 turns over each joint's range, and a hidden layer.
+
+    As numbers alone, fine differences weigh too little: with the waves errors of a chunk are a fifth smaller after 128 thousand
+    rows (one training each; CHANGELOG).
+    """
+
+    _OCTAVES = 5
+    _LIMIT = 4.0  # a joint that stands still in all of the data has no range: whatever it does is large
+
+    def __init__(self, state_dim: int, width: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(state_dim * (1 + 2 * self._OCTAVES), 4 * width)
+        self.out = nn.Linear(4 * width, width)
+
+    def forward(self, state_BS: Tensor) -> Tensor:
+        """(B, S), −1 … 1 where most rows are → (B, 1, width)."""
+        state_BS = state_BS.clamp(-self._LIMIT, self._LIMIT)
+        half_turns = math.pi * 2.0 ** torch.arange(self._OCTAVES, device=state_BS.device)
+        waves_BSO = state_BS[:, :, None] * half_turns
+        told = torch.cat([state_BS, waves_BSO.sin().flatten(1), waves_BSO.cos().flatten(1)], dim=1)
+        return self.out(F.gelu(self.hidden(told.to(self.hidden.weight.dtype))))[:, None]

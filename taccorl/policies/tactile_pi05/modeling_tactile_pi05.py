@@ -4,6 +4,8 @@
     prefix = [Z̄, Z_touch]                          images, language and state; then M_pre tokens of touch
     suffix = [Z_touch, actions]                     M_suf tokens of touch, then the noisy actions
 
+Without pretrained weights the state is not in the prompt, in 256 steps a joint, but a token before the actions, as in π0.
+
 Without contact neither exists for the row: attention masks the tokens, positions do not count them and the sum is left out.
 So a row without contact is what plain pi05 makes of it, bit by bit: when the whole batch is without, and on a CPU also beside
 rows with contact (``_by_contact``). Where a GPU computes by other kernels than LeRobot's (``compiled`` in training, ``graphed``
@@ -19,7 +21,7 @@ from typing import Any, NamedTuple
 import torch
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy, PI05Pytorch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor, nn
 
 from taccorl.errors import TaccorlError
@@ -31,13 +33,13 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     TACTILE,
     TactilePI05Config,
 )
-from taccorl.policies.tactile_pi05.encoder import TactileEncoder, TouchIntoContext
+from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder, TouchIntoContext
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
 from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkpoint
 
-# B batch, L history, K taxels, P pads, R rows, C columns, M tokens, T tokens of the context, D width, H horizon, A action
+# B batch, S state, L history, K taxels, P pads, R rows, C columns, M tokens, T of the context, D width, H horizon, A action
 ACTION_IS_PAD = "action_is_pad"
 _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
 
@@ -94,29 +96,35 @@ class TactilePI05Pytorch(PI05Pytorch):
         self.action_out_proj = nn.Linear(width, config.max_action_dim)
         self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
         self.gradient_checkpointing_enabled = False
+        if not config.has_discrete_state:
+            self.state_token = StateToken(config.state_dim, width)
         if config.tactile:
             text_config: Any = self.paligemma_with_expert.paligemma.config.text_config
             prefix_width = text_config.hidden_size
             self.tactile = TactileConditioning(config, prefix_width, self.action_in_proj.out_features)
         self._touch: Touch | None = None
+        self._state_B1D: Tensor | None = None
 
     @contextmanager
-    def feeling(
-        self, readings_BLPRC: Tensor | None, contact_B: Tensor | None, *, masked: bool = False
+    def sensing(
+        self, state_B1D: Tensor | None, readings_BLPRC: Tensor | None, contact_B: Tensor | None, *, masked: bool = False
     ) -> Iterator[None]:
-        """Whatever is computed inside feels these readings. None, or contact nowhere in the batch: plain pi05.
+        """Whatever is computed inside knows this state and feels these readings.
 
         Args:
+            state_B1D: its token. None: it is in the prompt.
+            readings_BLPRC: None, or contact nowhere in the batch: plain pi05.
             masked: tokens are there, masked, even if contact is nowhere; so that nothing is read back from a GPU.
         """
         if readings_BLPRC is not None and contact_B is not None and (masked or bool(contact_B.any())):
             # Float32 in training, too, as in a chunk: casting the encoder's many small weights takes longer than using them.
             with torch.autocast(contact_B.device.type, enabled=False):
                 self._touch = self.tactile(readings_BLPRC, contact_B)
+        self._state_B1D = state_B1D
         try:
             yield
         finally:
-            self._touch = None
+            self._touch = self._state_B1D = None
 
     def embed_prefix(
         self, images: list[Tensor], image_masks: list[Tensor], tokens: Tensor, token_mask: Tensor
@@ -139,18 +147,20 @@ class TactilePI05Pytorch(PI05Pytorch):
 
     def embed_suffix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         actions_BHD, valid_BH, starts_block_BH, condition_BD = super().embed_suffix(*args, **kwargs)
-        if self._touch is None:
-            return actions_BHD, valid_BH, starts_block_BH, condition_BD
-        tokens_BMD, contact_B = self._touch.suffix_BMD, self._touch.contact_B
-        # Touch is a block of its own: the context does not look at it, the actions do, and it does not look at them.
-        starts_block_BM = starts_block_BH.new_zeros(len(starts_block_BH), tokens_BMD.shape[1])
-        starts_block_BM[:, 0] = 1
-        return (
-            torch.cat([tokens_BMD.to(actions_BHD.dtype), actions_BHD], dim=1),
-            torch.cat([contact_B[:, None].expand(-1, tokens_BMD.shape[1]), valid_BH], dim=1),
-            torch.cat([starts_block_BM, starts_block_BH], dim=1),
-            condition_BD,
-        )
+        before: list[tuple[Tensor, Tensor]] = []  # tokens and whether the row has them
+        if self._touch is not None:
+            tokens_BMD, contact_B = self._touch.suffix_BMD, self._touch.contact_B
+            before.append((tokens_BMD, contact_B[:, None].expand(-1, tokens_BMD.shape[1])))
+        if self._state_B1D is not None:
+            before.append((self._state_B1D, valid_BH[:, :1]))
+        for tokens_BMD, valid_BM in before:
+            # A block of its own: the context does not look at it, the actions do, and it does not look at them.
+            starts_block_BM = starts_block_BH.new_zeros(valid_BM.shape)
+            starts_block_BM[:, 0] = 1
+            actions_BHD = torch.cat([tokens_BMD.to(actions_BHD.dtype), actions_BHD], dim=1)
+            valid_BH = torch.cat([valid_BM, valid_BH], dim=1)
+            starts_block_BH = torch.cat([starts_block_BM, starts_block_BH], dim=1)
+        return actions_BHD, valid_BH, starts_block_BH, condition_BD
 
 
 def _backbone(config: TactilePI05Config) -> CompiledBackbone:
@@ -334,18 +344,19 @@ class TactilePI05Policy(PI05Policy):
         Args:
             together: on a CPU, too.
         """
-        readings, contact_B = self._readings(batch)
+        state, (readings, contact_B) = self._state(batch), self._readings(batch)
         if readings is None or contact_B is None:
-            return compute(slice(None)), contact_B
+            with self.model.sensing(state, None, None):
+                return compute(slice(None)), contact_B
         # Compiled layers are compiled for a number of tokens, with those of touch.
         masked = self.model.paligemma_with_expert.fuses(contact_B.device)
         if masked or together or contact_B.device.type != "cpu" or contact_B.all():
-            with self.model.feeling(readings, contact_B, masked=masked):
+            with self.model.sensing(state, readings, contact_B, masked=masked):
                 return compute(slice(None)), contact_B
         kinds = [rows for rows in (contact_B.nonzero()[:, 0], (~contact_B).nonzero()[:, 0]) if len(rows)]
         parts = []
         for rows in kinds:
-            with self.model.feeling(readings[rows], contact_B[rows]):
+            with self.model.sensing(None if state is None else state[rows], readings[rows], contact_B[rows]):
                 parts.append(compute(rows))
         return torch.cat(parts)[torch.cat(kinds).argsort()], contact_B
 
@@ -384,7 +395,8 @@ class TactilePI05Policy(PI05Policy):
             noise = self.model.sample_noise(shape, prompt[0].device)
 
         if self._may_graph(prompt[0].device) and not kwargs:
-            actions = self._graphed_chunk(images, image_masks, *prompt, noise, *self._readings(batch))
+            sensed = self._state(batch), *self._readings(batch)
+            actions = self._graphed_chunk(images, image_masks, *prompt, noise, *sensed)
             return actions[:, :, : self._num_actions]
 
         def compute(rows: Any) -> Tensor:
@@ -410,21 +422,21 @@ class TactilePI05Policy(PI05Policy):
         tokens: Tensor,
         token_mask: Tensor,
         noise: Tensor,
-        readings: Tensor | None,
-        contact_B: Tensor | None,
+        *sensed: Tensor | None,
     ) -> Tensor:
-        """(B, H, 32) by a recorded graph; contact is a mask, also where there is none."""
-        num, felt = len(images), () if readings is None or contact_B is None else (readings, contact_B)
+        """(B, H, 32) by a recorded graph; contact is a mask, also where there is none. ``sensed``: as ``sensing`` takes it."""
+        num, given = len(images), [x for x in sensed if x is not None]
 
         def compute(*x: Tensor) -> Tensor:
-            with self.model.feeling(*(x[2 * num + 3 :] or (None, None)), masked=True):
+            rest = iter(x[2 * num + 3 :])
+            with self.model.sensing(*(None if y is None else next(rest) for y in sensed), masked=True):
                 return self.model.sample_actions(
                     list(x[:num]), list(x[num : 2 * num]), *x[2 * num : 2 * num + 2], noise=x[2 * num + 2]
                 )
 
         if self._graph is None:
             self._graph = GraphedCall(compute)
-        return self._graph(*images, *image_masks, tokens, token_mask, noise, *felt)
+        return self._graph(*images, *image_masks, tokens, token_mask, noise, *given)
 
     def train(self, mode: bool = True) -> "TactilePI05Policy":
         if mode:
@@ -443,6 +455,10 @@ class TactilePI05Policy(PI05Policy):
         self._felt.append(reading_BK)
         missing = self.config.tactile_history - len(self._felt)
         return torch.stack([self._felt[0]] * missing + list(self._felt), dim=1)
+
+    def _state(self, batch: dict[str, Tensor]) -> Tensor | None:
+        """(B, 1, D) the state's token, of all rows at once: few rows are rounded elsewhere. None where the prompt has it."""
+        return None if self.config.has_discrete_state else self.model.state_token(batch[OBS_STATE].to(torch.float32))
 
     def _readings(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
         """(B, L, P, R, C) readings and (B,) contact; None and None for vision only.

@@ -151,7 +151,9 @@ def make_tactile_pi05_pre_post_processors(
     if config.tactile:
         told = config.require_tactile_format()
         before.append(TactileReadingStep(scheme=told.scheme, gain_per_count=told.gain_per_count))
-    before += [Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim), tokenizer, common.to_device]
+    if config.has_discrete_state:
+        before.append(Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim))
+    before += [tokenizer, common.to_device]
     absolute = AbsoluteActionsProcessorStep(enabled=config.use_relative_actions, relative_step=relative)
     after: list[ProcessorStep] = [common.unnormalize, absolute, common.to_cpu]
     if config.use_relative_actions:

@@ -14,12 +14,14 @@ from taccorl.demos.collect import Plan
 from taccorl.demos.experts import experts
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.scripted import EXACT
-from taccorl.demos.mimicgen.attempt import Attempts, attempt_seeds
+from taccorl.demos.mimicgen.attempt import Attempts, Hands, attempt_seeds
+from taccorl.demos.mimicgen.director import Wish
 from taccorl.demos.mimicgen.from_dataset import SourceReader, read_sources, simulation_of
 from taccorl.demos.mimicgen.gates import Measured, foreign_contact
 from taccorl.demos.mimicgen.rest import RestOffset
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, load_mimic_spec, with_options
+from taccorl.demos.mimicgen.touching import Touching
 from taccorl.demos.recorder import EpisodeRecorder, with_simulator
 from taccorl.errors import DatasetError
 from taccorl.sim.robot import ARMS
@@ -100,6 +102,72 @@ def test_what_an_arm_rests_off_is_learnt_when_it_stands_still():
     rest.command(home + 0.1)
     rest.see(home + 1.0)  # an arm that moves teaches nothing
     np.testing.assert_array_equal(rest.offset_rad, before)
+
+
+@pytest.fixture(scope="module")
+def hands_at(collected):
+    """row → a simulation in that row of a demonstration, and hands in it."""
+    episode, sim = Dataset(collected).episode(1), Simulation(Assembly2())
+    kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+
+    def make(row):
+        sim.restore_rows(episode.arrays["sim.state"][[row]], episode.arrays["sim.seed"][row])
+        return sim, Hands(sim, kinematics, max_joint_speed_radps=3.0)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def gripped_and_lifted(pool):
+    """Rows of the right hand with the plug: gripped on the table, and in the air."""
+    source = pool.sources[1]
+    closed = source.arms["right"].opening_m < 0.01
+    free, height_m = source.free["plug"], source.objects["plug"][:, 2, 3]
+    lifted = int(np.flatnonzero(closed & free & (height_m > height_m[0] + 0.02))[0])
+    return int(np.flatnonzero(closed & ~free)[-1 - np.count_nonzero(closed[lifted:] & ~free[lifted:])]), lifted
+
+
+def test_a_hand_that_grips_what_stands_on_the_table_holds_it_fast_and_one_that_carries_it_does_not(
+    hands_at, gripped_and_lifted, pool
+):
+    touching, found = Touching(hands_at(0)[0]), []
+    last = len(pool.sources[1].mated["plug"]) - 1
+    for row in (30, *gripped_and_lifted, last):
+        touching.look(hands_at(row)[0].state_rows()[0])
+        found.append((touching.free("plug"), touching.holds_fast("right"), touching.holds_fast("left")))
+    assert found[0] == (False, False, False)  # on the table, no hand near
+    assert found[1][:2] == (False, True)
+    assert found[2][:2] == (True, False)
+    assert found[3] == (False, False, True)  # let go in the cradle, which the left hand holds
+
+
+@pytest.mark.parametrize("is_gripped", [True, False])
+def test_nothing_is_learnt_of_an_arms_rest_while_it_holds_something_fast(hands_at, gripped_and_lifted, is_gripped):
+    """Else a hand that is to be lower than the table lets it would push ever harder."""
+    sim, hands = hands_at(gripped_and_lifted[0 if is_gripped else 1])
+    lower = {arm: sim.tcp(arm)[0].copy() for arm in ARMS}
+    lower["right"][2, 3] -= 0.004
+    opening_m = {arm: float(sim.arrays["ctrl"][0, sim.action_actuators][7 * a + 6]) for a, arm in enumerate(ARMS)}
+    before = np.zeros(6)
+    for k in range(35):
+        if k == 5:  # the first of them take what is held a little off the table
+            before = hands._rest["right"].offset_rad
+        action = hands.action({arm: Wish(goal=lower[arm], opening_m=opening_m[arm]) for arm in ARMS})
+        sim.step(action[None].astype(np.float64))
+    learnt_rad = np.abs(hands._rest["right"].offset_rad - before).max()
+    assert learnt_rad == 0 if is_gripped else learnt_rad > 1e-4
+
+
+def test_no_joint_is_sent_faster_than_it_may_turn_and_it_still_arrives(hands_at):
+    sim, hands = hands_at(0)
+    start, last = hands.joints_rad["left"], None
+    goal = {arm: hands.joints_rad[arm] + (0.35 * np.r_[1, 1, -1, 1, -1, 1] if arm == "left" else 0.0) for arm in ARMS}
+    wishes = {arm: Wish(goal=sim.tcp(arm)[0], opening_m=0.05, joints_rad=goal[arm], contact=True) for arm in ARMS}
+    for k in range(4):  # 3 rad/s at 30 Hz: 0.1 rad a step
+        last = hands.action(wishes)
+        np.testing.assert_allclose(np.abs(hands.joints_rad["left"] - start), min(0.1 * (k + 1), 0.35), atol=1e-12)
+        np.testing.assert_array_equal(hands.joints_rad["right"], goal["right"])
+    np.testing.assert_allclose(last[:6], goal["left"] - hands._rest["left"].offset_rad, atol=1e-6)
 
 
 def test_a_recording_without_simulator_state_is_refused_with_the_way_out(collected, tmp_path):
