@@ -46,7 +46,6 @@ def test_the_paper_s_gains_are_found_from_its_sweep(signal: str) -> None:
         found = fit.estimates[name]
         assert abs(found.value - true) < wide * (found.high - found.low) / 2, name
     assert kp.low > 0.8 * truth.kp and kp.high < 1.2 * truth.kp
-    assert fit.cpu_s < 3.0
     # What is left is the noise, on the recording that was not fitted as well.
     for error in fit.errors:
         assert error.rmse_after == pytest.approx(2e-4, rel=0.1)
