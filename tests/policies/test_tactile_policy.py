@@ -244,7 +244,7 @@ def test_each_number_of_the_state_is_one_token_and_near_ones_start_out_alike():
 
 @pytest.mark.parametrize("is_discrete", [True, False])
 def test_a_state_beside_the_prompt_is_exact_where_one_in_the_prompt_has_256_steps(is_discrete):
-    """Over 2 rad a step is 8 mrad, at an arm's length 4 mm: more than parts leave each other to be joined."""
+    """Over 2 rad a step is 8 mrad, at half a metre 4 mm: more than parts leave each other to be joined."""
     policy = tiny_policy(tactile=False, discrete_state_input=is_discrete, tokenizer_max_length=60)
     stats = {
         k: {"q01": torch.full((14,), -1.0), "q99": torch.full((14,), 1.0)} for k in ("observation.state", "action")
