@@ -74,7 +74,8 @@ def _load(policy: PI05Policy, weights: dict[str, Tensor], said: str, *, may_miss
         told = "; ".join(f"{len(names)} {what}, first {_first(names)}" for what, names in faults if names)
         raise TaccorlError(
             f"{said}: its weights are not those of this policy (--policy.backbone={config.backbone}, "
-            f"--policy.tactile={str(config.tactile).lower()}): {told}. Nothing was loaded"
+            f"--policy.tactile={str(config.tactile).lower()}, "
+            f"--policy.discrete_state_input={str(config.has_discrete_state).lower()}): {told}. Nothing was loaded"
         )
     policy.load_state_dict(weights, strict=False)
 
