@@ -62,6 +62,7 @@ def install() -> bool:
     if lerobot_dataset.DatasetReader is not FastReader:
         lerobot_dataset.DatasetReader = FastReader
         factory.resolve_delta_timestamps = with_windows(factory.resolve_delta_timestamps)
+        factory.StreamingLeRobotDataset = streamed(factory.StreamingLeRobotDataset)
     return True
 
 
@@ -81,6 +82,23 @@ def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Calla
         return deltas or None
 
     return resolve_with_windows
+
+
+def streamed(make: Callable[..., Any]) -> Callable[..., Any]:
+    """LeRobot's ``StreamingLeRobotDataset``, which no reader of ours is in: says what its statistics of relative actions are."""
+
+    def make_streamed(*args: Any, **kwargs: Any) -> Any:
+        if any(isinstance(v, Deltas) and v.relative_actions for v in (*args, *kwargs.values())):
+            _log.warning(
+                "--dataset.streaming=true: relative actions are normalised by the action statistics that the dataset %s was "
+                "written with, as LeRobot does it. Those of taccorl's commands are of absolute actions, several times wider: "
+                "leave streaming out, or run lerobot-edit-dataset --operation.type=recompute_stats "
+                "--operation.relative_action=true first",
+                kwargs.get("root") or kwargs.get("repo_id") or args[0],
+            )
+        return make(*args, **kwargs)
+
+    return make_streamed
 
 
 class Deltas(dict):

@@ -1,7 +1,6 @@
 """The compiled one-joint model against MuJoCo, joint by joint and effect by effect, and against the whole twin."""
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
@@ -273,22 +272,6 @@ def test_a_sliding_axis_follows_its_closed_form() -> None:
     assert 0.02 - with_friction.reported[-1] == pytest.approx(20 / 1e4, rel=0.02)  # F / K_p before its target
     with pytest.raises(TaccorlError, match="test_late cannot be had"):
         model.simulate(joint_motion(m, None, "slide"), model.gains, [_Late(late=1.0)])
-
-
-def test_ten_seconds_take_a_millisecond() -> None:
-    signal = "left_joint2"
-    model = JointModel(TWIN, signal)
-    motion = joint_motion(chirp(signal, 10.0), TWIN, signal)
-    took = []
-    for effect in ([], [make_effect("coulomb_friction", torque_nm=1.0)], [make_effect("backlash", play_rad=0.01)]):
-        model.simulate(motion, model.gains, effect)
-        times = []
-        for _ in range(5):
-            begin = time.process_time()
-            model.simulate(motion, model.gains, effect)
-            times.append(time.process_time() - begin)
-        took.append(min(times))
-    assert max(took) < 5e-3, "three times what it takes on a slow core"
 
 
 def test_a_joint_starts_in_balance() -> None:

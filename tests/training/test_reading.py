@@ -9,6 +9,7 @@ import pytest
 import torch
 from lerobot.datasets import dataset_reader, factory, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 from tiny_dataset import IS_SIM, TOUCH, write_tiny
 
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
@@ -29,6 +30,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TACCORL_NO_PATCH", raising=False)
     monkeypatch.setattr(lerobot_dataset, "DatasetReader", dataset_reader.DatasetReader)
     monkeypatch.setattr(factory, "resolve_delta_timestamps", stock_resolve())
+    monkeypatch.setattr(factory, "StreamingLeRobotDataset", StreamingLeRobotDataset)
 
 
 def stock_resolve():
@@ -157,3 +159,17 @@ def test_it_can_be_left_out(installed, monkeypatch, caplog):
         assert not reading.install()
     assert "TACCORL_NO_PATCH=1" in caplog.text and "--policy.tactile_history=1" in caplog.text
     assert lerobot_dataset.DatasetReader is dataset_reader.DatasetReader
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_streaming_says_that_relative_actions_have_the_range_of_absolute_ones(root, installed, caplog, relative):
+    reading.install()
+    settings = {"chunk_size": 3, "n_action_steps": 3, "use_relative_actions": relative, "tactile": False}
+    config = TactilePI05Config(device="cpu", backbone="tiny", **settings)
+    stock = LeRobotDataset("local/tiny", root=root).meta
+    with caplog.at_level(logging.WARNING):
+        deltas = factory.resolve_delta_timestamps(config, stock)
+        made = factory.StreamingLeRobotDataset("local/tiny", root=root, delta_timestamps=deltas)
+    assert isinstance(made, StreamingLeRobotDataset)
+    np.testing.assert_array_equal(made.meta.stats["action"]["q99"], stock.stats["action"]["q99"])  # of absolute actions
+    assert ("lerobot-edit-dataset" in caplog.text and str(root) in caplog.text) == relative

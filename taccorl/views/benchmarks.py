@@ -1,0 +1,38 @@
+"""Figures of checking and showing an episode; ``make bench ONLY=one_episode``."""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from taccorl.benchmark import Row, benchmark, cpu_s, spread
+
+EPISODE_S = 24.0
+REPEATS = 5
+
+
+@benchmark("one_episode")
+def one_episode() -> Iterator[Row]:
+    """CPU-seconds to check a stand-in episode of 720 rows and to write it for Rerun."""
+    from taccorl.data.checks import check_episode
+    from taccorl.data.cutting import open_episodes
+    from taccorl.demos.stand_in import StandInConfig, write_mcap
+    from taccorl.views.episode import save_episode
+
+    with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
+        recording, rrd = Path(name) / "recording.mcap", Path(name) / "episode.rrd"
+        write_mcap(recording, StandInConfig(duration_s=EPISODE_S, seed=0))
+        with open_episodes(recording, "piper_flexitac_mcap") as (episode,):
+            what = f"{episode.num_rows} rows with 1536 taxels"
+            yield _row(f"checks of {what}, without pictures", lambda: check_episode(episode, pictures=False), "≤ 0.5")
+            yield _row(f"{what} and three cameras at 224×224 written for Rerun", lambda: save_episode(episode, rrd))
+
+
+def _row(name: str, work: Callable[[], Any], goal: str = "") -> Row:
+    work()  # what is imported and compiled at the first call
+    costs = []
+    for _ in range(REPEATS):
+        before = cpu_s(children=True)
+        work()
+        costs.append(cpu_s(children=True) - before)
+    return Row(name=name, value=sum(costs) / REPEATS, unit="CPU-s", goal=goal, n=REPEATS, spread=spread(costs))
