@@ -55,7 +55,9 @@ def main(argv: list[str]) -> int:
     """0: collected."""
     config = parse(CollectConfig, argv, positional=None)
     if not config.task and not isinstance(config.source, ActionsSource):
-        raise TaccorlError("missing --task=; --help says more")
+        from taccorl.sim.tasks import tasks
+
+        raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
     plan = Plan(
         task=config.task or "",
         episodes=config.episodes,

@@ -104,14 +104,20 @@ def _check_option(option: str, hints: dict[str, Any]) -> None:
         raise TaccorlError(f"unknown option {option!r}; {nearest(name, known)}")
     if not equals or not value:
         raise TaccorlError(f"option {option!r} needs a value: --{name}=…")
+    if hasattr(hints.get(name), "get_known_choices"):
+        raise TaccorlError(f"{option}: one of several kinds, say --{name}.type={value}")
 
 
 def _inner_names(hint: Any) -> list[str]:
-    """Names below a field that is a dataclass, or one of several by ``type``."""
+    """Names below a field that is a dataclass, or one of several by ``type``, at any depth: ``hands.speed``."""
     choices = getattr(hint, "get_known_choices", dict)()
-    kinds = [*choices.values(), hint] if choices else [hint]
-    inner = [f.name for kind in kinds if dataclasses.is_dataclass(kind) for f in dataclasses.fields(kind)]
-    return [*(["type"] if choices else []), *dict.fromkeys(inner)]
+    names = ["type"] if choices else []
+    for kind in [*choices.values(), hint]:
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+            hints = typing.get_type_hints(kind)
+            for field in dataclasses.fields(kind):
+                names += [field.name, *(f"{field.name}.{inner}" for inner in _inner_names(hints[field.name]))]
+    return list(dict.fromkeys(names))
 
 
 def _text_kind(hint: Any) -> str | None:
@@ -175,6 +181,11 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
     try:
         return draccus.parse(config_class, args=given, exit_on_error=False)
     except (DraccusException, argparse.ArgumentError, yaml.YAMLError) as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, TaccorlError):  # a config's own check says it better than draccus, which wraps it
+                raise cause from None
+            cause = cause.__cause__ or cause.__context__
         raise TaccorlError(" ".join(str(error).split())) from error
 
 

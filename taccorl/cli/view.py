@@ -132,16 +132,16 @@ def _write(config: ViewConfig, episode: "Episode") -> bool:
         save_episode(episode, config.save, native=True)
         command = shlex.join([str(Path(sys.executable).with_name("rerun")), str(config.save)])
         print(f"wrote {config.save}: look at it with {command}")
-    if config.screenshot is not None:
-        from taccorl.views.screenshot import screenshot
-
-        who = screenshot(episode, config.screenshot)
-        print(f"wrote {config.screenshot}, drawn by {who}")
     if config.sheet is not None:
         from taccorl.views.contact_sheet import contact_sheet
 
         contact_sheet(episode, config.sheet)
         print(f"wrote {config.sheet}")
+    if config.screenshot is not None:  # last: it alone needs what a machine may lack
+        from taccorl.views.screenshot import screenshot
+
+        who = screenshot(episode, config.screenshot)
+        print(f"wrote {config.screenshot}, drawn by {who}")
     return any(path is not None for path in (config.save, config.screenshot, config.sheet))
 
 

@@ -16,6 +16,7 @@ from taccorl.lineage.store import Store
 
 SHOWN = 12  # hex digits of a digest; changed files by name
 SHOWN_ITEMS = 4  # of a list in a config
+SHOWN_LETTERS = 400  # of a config: a spec or a twin goes with it whole
 
 
 @dataclass
@@ -156,6 +157,15 @@ def _title(manifest: dict[str, Any]) -> str:
 
 
 def _config(manifest: dict[str, Any]) -> str:
+    text = " ".join(_settings(manifest).split())  # a file's text has lines of its own
+    return (
+        text
+        if len(text) <= SHOWN_LETTERS
+        else f"{text[:SHOWN_LETTERS]}… ({len(text)} characters, all in its manifest.json)"
+    )
+
+
+def _settings(manifest: dict[str, Any]) -> str:
     changed = manifest["config_not_default"]
     if changed is not None:
         text = ", ".join(f"{name}={_readable(value)}" for name, value in changed.items())

@@ -73,6 +73,26 @@ class Store:
         )
         return Artefact(path, digest)
 
+    def dataset(self, root: Path) -> Artefact:
+        """As ``source``, of a LeRobot dataset whose numbers and pictures are those that it was written with, as far as it says.
+
+        Its ``meta`` may be another: LeRobot's commands compute statistics anew in place.
+
+        Raises:
+            LineageError: a file of ``data`` or ``videos`` is another now, or gone.
+        """
+        then = read_manifest(Path(root).absolute()).get("files", {})
+        now = digests_now(Path(root).absolute(), self.digests) if then else {}
+        kept = [name for name in then if name.startswith(("data/", "videos/"))]
+        if changed := [name for name in kept if now.get(name) != then[name]]:
+            more = f" and {len(changed) - 1} more files" if len(changed) > 1 else ""
+            raise LineageError(
+                f"{root}: {changed[0]}{more} {'are' if more else 'is'} not as written: damaged, or changed since "
+                f"(taccorl lineage explain {root}). Copy or make the dataset again; if the change was meant, take a copy of the "
+                f"folder without {manifest_place(Path(root))}, which is a source of its own then"
+            )
+        return self.source(root)
+
     def key(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> str:
         """The address of what ``stage`` makes of ``config`` and ``inputs``."""
         parts = [stage.name, str(stage.version), canonical_text(config), *(artefact.digest for artefact in inputs)]

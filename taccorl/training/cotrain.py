@@ -45,6 +45,7 @@ def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) 
 
     Raises:
         DatasetError: as ``merge_domains``.
+        LineageError: a dataset's numbers or pictures are not those that it was written with.
         InTheWayError: ``out`` holds something else.
     """
     check_domains(real, sim)
@@ -55,7 +56,7 @@ def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) 
 
     stage = Stage("cotraining", build, VERSION, manifest=f"{PROVENANCE}/manifest.json")
     config = {"real": len(real), "sim": len(sim)}  # which they are, their content says
-    store.run(stage, config, [store.source(root) for root in (*real, *sim)], destination=out)
+    store.run(stage, config, [store.dataset(root) for root in (*real, *sim)], destination=out)
     told = json.loads((out / RECORD).read_text(encoding="utf-8"))
     return [Part(**{**part, "origins": tuple(part["origins"])}) for part in told]
 

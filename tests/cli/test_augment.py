@@ -123,14 +123,40 @@ def test_a_recording_without_simulator_state_is_refused_with_the_command_that_co
     assert "taccorl collect --task=assembly_2 --out=outputs/assembly_2" in text
 
 
+def test_what_the_twin_made_has_nothing_to_warn_of(collected: Path, place: Path, said: Any) -> None:
+    for dataset in (collected, place / "new"):
+        code, text = said("check", dataset)
+        assert (code, "warning" in text, "error" in text) == (0, False, False), text
+
+
+@pytest.mark.parametrize("verb", ["augment", "merge"])
+def test_sources_with_one_flipped_byte_are_refused_by_name(
+    collected: Path, said: Any, tmp_path: Path, verb: str
+) -> None:
+    shutil.copytree(collected, tmp_path / "flipped")
+    (path,) = (tmp_path / "flipped" / "data").rglob("*.parquet")
+    content = bytearray(path.read_bytes())
+    content[1000] ^= 1
+    path.write_bytes(content)
+    of = {
+        "augment": (f"--source={tmp_path / 'flipped'}", "--task=assembly_2"),
+        "merge": (f"--sim={tmp_path / 'flipped'}",),
+    }
+    code, text = said(verb, *of[verb], f"--out={tmp_path / 'x'}", f"--store={tmp_path / 'store'}")
+    assert code == 2
+    assert "data/chunk-000/file-000.parquet is not as written" in text
+    assert not (tmp_path / "x").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
         (("--task=asembly_2",), "no task 'asembly_2'; did you mean 'assembly_2'?"),
-        (("--task=assembly_1", "--out=x"), "is of task assembly_2, the spec is of assembly_1"),
+        (("--task=assembly_1", "--out=x"), "is of task assembly_2, not of assembly_1: --task=assembly_2"),
         (("--task=assembly_2", "--spec=puzzle"), "--spec=puzzle is of task puzzle, --task=assembly_2"),
         (("--task=assembly_2", "--difficulty=hrad"), "did you mean 'hard'?"),
         (("--task=assembly_2", "--twin=no.yaml"), "no.yaml"),
+        (("--task=assembly_2", "--engine.workers=0"), "augment: --engine.workers=0: at least one"),
         (("--task=assembly_2", "--episodes=0"), "--episodes=0: at least one"),
         (("--task=assembly_2", "--out=store/x", "--store=store"), "lie in one another"),
         (("--task=assembly_2", "--source=nowhere"), "nowhere: no such folder"),

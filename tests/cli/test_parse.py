@@ -12,6 +12,13 @@ from taccorl.errors import TaccorlError
 
 
 @dataclass(frozen=True, kw_only=True)
+class Coil:
+    """In a motor."""
+
+    turns: int = 100
+
+
+@dataclass(frozen=True, kw_only=True)
 class Motor(draccus.ChoiceRegistry):
     """Something that turns."""
 
@@ -22,6 +29,11 @@ class SmallMotor(Motor):
     """The default."""
 
     poles: int = 2
+    coil: Coil = field(default_factory=Coil)
+
+    def __post_init__(self) -> None:
+        if self.poles < 1:
+            raise TaccorlError(f"--motor.poles={self.poles}: at least one")
 
 
 @Motor.register_subclass("big")
@@ -107,6 +119,7 @@ def test_a_config_file_may_have_any_name(tmp_path: Path) -> None:
 
 def test_a_nested_option_means_the_default_kind() -> None:
     assert robot("x", "--name=x", "--motor.poles=8").motor == SmallMotor(poles=8)
+    assert robot("x", "--name=x", "--motor.coil.turns=7").motor == SmallMotor(coil=Coil(turns=7))
     assert robot("x", "--name=x", "--motor.type=big", "--motor.voltage_v=12").motor == BigMotor(voltage_v=12.0)
 
 
@@ -116,6 +129,8 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("x", "--nme=a"), ("unknown option '--nme=a'", "did you mean 'name'")),
         (("x", "--name=a", "-joints=3"), ("unknown option '-joints=3'", "did you mean 'joints'")),
         (("x", "--name=a", "--motor.pole=3"), ("unknown option", "did you mean 'motor.poles'")),
+        (("x", "--name=a", "--motor.coil.turn=3"), ("unknown option", "did you mean 'motor.coil.turns'")),
+        (("x", "--name=a", "--motor=big"), ("--motor=big", "say --motor.type=big")),
         (("x", "--name=a", "--motor.type=bigg"), ("'bigg'", "small", "big")),
         (("x", "--name=a", "--motor.type=big"), ("voltage_v",)),
         (("x", "--name=a", "--motor.type=big", "--motor.poles=3"), ("poles",)),
@@ -164,6 +179,11 @@ def test_help_names_the_verb_then_says_what_the_module_says(capsys: pytest.Captu
     assert "None" not in options
 
 
+def test_what_a_config_itself_says_is_said_without_what_draccus_wraps_around_it() -> None:
+    with pytest.raises(TaccorlError, match=r"^--motor.poles=0: at least one$"):
+        robot("x", "--name=a", "--motor.poles=0")
+
+
 def test_one_word_fills_a_single_field_and_no_more() -> None:
     @dataclass(kw_only=True)
     class One:
@@ -195,5 +215,10 @@ def test_every_field_of_every_verb_survives_the_way_through(tmp_path: Path) -> N
         engine=LocalEngine(workers=3),
     )
     assert parse(IngestConfig, words, positional="paths") == expected
+    from taccorl.cli.collect import CollectConfig
+    from taccorl.demos.collect import ExpertSource
+
+    source = parse(CollectConfig, ["--source.hands.speed=1.2"]).source
+    assert isinstance(source, ExpertSource) and source.hands.speed == 1.2
     words[-1:] = ["--engine.type=slurm", "--engine.partition=gpu", "--engine.time=01:00:00"]
     assert parse(IngestConfig, words, positional="paths").engine == SlurmEngine(partition="gpu", time="01:00:00")

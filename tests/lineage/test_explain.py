@@ -199,3 +199,14 @@ def test_config_is_shown_to_be_read_not_parsed(tmp_path):
 
 def _write(config, inputs, out_dir):
     (out_dir / "one").write_text("x")
+
+
+def test_a_config_that_holds_a_whole_file_takes_one_line_and_not_a_page(tmp_path):
+    def write(config, inputs, out_dir):
+        (out_dir / "x").write_text("x")
+
+    store = Store(tmp_path / "store")
+    made = store.run(Stage("toy", write), {"twin": "arms:\n  left: 1\n\n" + "x" * 5000, "seed": 3}, [])
+    (line,) = [line for line in explain(made.path, store).splitlines() if "config:" in line]
+    assert "seed=3, twin=arms: left: 1 xxx" in line and line.endswith("characters, all in its manifest.json)")
+    assert len(line) < 500

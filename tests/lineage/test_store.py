@@ -107,6 +107,31 @@ def test_dataset_used_as_a_source_is_the_artefact_it_is(store, raw, tmp_path):
     assert store.run(ONE, "x", [edited]).manifest["inputs"][0]["key"] is None
 
 
+@pytest.mark.parametrize("hurt", [lambda p: p.write_bytes(b"0123456x89"), lambda p: p.write_bytes(b""), Path.unlink])
+def test_a_dataset_whose_numbers_are_not_as_written_is_refused_and_its_meta_may_change(store, tmp_path, hurt):
+    def write(config, inputs, out_dir):
+        for name in ("data/file-000.parquet", "videos/front.mp4", "meta/stats.json"):
+            (out_dir / name).parent.mkdir()
+            (out_dir / name).write_bytes(b"0123456789")
+
+    made = store.run(Stage("toy", write, manifest="meta/taccorl/manifest.json"), None, [], destination=tmp_path / "d")
+    assert store.dataset(tmp_path / "d") == store.source(tmp_path / "d")
+    (tmp_path / "d/meta/stats.json").write_text("{}")  # as lerobot-edit-dataset does
+    assert store.dataset(tmp_path / "d").digest != made.digest
+    for name in ("data/file-000.parquet", "videos/front.mp4"):
+        shutil.copytree(tmp_path / "d", tmp_path / "hurt")
+        hurt(tmp_path / "hurt" / name)
+        with pytest.raises(
+            LineageError, match=rf"hurt: {name} is not as written: damaged.*explain {tmp_path / 'hurt'}"
+        ):
+            store.dataset(tmp_path / "hurt")
+        (tmp_path / "hurt/meta/taccorl/manifest.json").unlink()  # the way out that it names
+        assert store.dataset(tmp_path / "hurt") == store.source(tmp_path / "hurt")
+        shutil.rmtree(tmp_path / "hurt")
+    with pytest.raises(LineageError):
+        store.dataset(tmp_path / "nowhere")
+
+
 def test_hidden_file_that_a_stage_wrote_is_part_of_the_artefact(store):
     def write_hidden(config, inputs, out_dir):
         (out_dir / ".info").mkdir()

@@ -133,9 +133,9 @@ def augment(
     """A LeRobot dataset at ``out`` of ``plan.episodes`` successes made of those at ``source``; returns the report.
 
     Raises:
-        TaccorlError: sources that do not fit, something else at ``out``, or hardly any attempt succeeds.
+        TaccorlError: sources that do not fit or are not as written, something else at ``out``, or hardly any attempt succeeds.
     """
-    sources = store.source(source)
+    sources = store.dataset(source)
     engine, entries, made = engine or LocalEngine(), [], []
     # Before anything is sent away: what does not fit is refused here.
     sim = _attempts(plan, sources.path, sources.digest).sim

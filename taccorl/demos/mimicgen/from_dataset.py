@@ -69,7 +69,9 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
     if not isinstance(told, dict) or "twin" not in told:
         raise DatasetError(f"{episode.name}: does not say in which twin it was made; collect it with this taccorl")
     if told["task"] != task:
-        raise DatasetError(f"{episode.name}: is of task {told['task']}, the spec is of {task}")
+        raise DatasetError(
+            f"{episode.name}: is of task {told['task']}, not of {task}: --task={told['task']}, or give a dataset of {task}"
+        )
     return simulation_told(told)
 
 
