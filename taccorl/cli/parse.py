@@ -104,7 +104,7 @@ def _check_option(option: str, hints: dict[str, Any]) -> None:
         raise TaccorlError(f"unknown option {option!r}; {nearest(name, known)}")
     if not equals or not value:
         raise TaccorlError(f"option {option!r} needs a value: --{name}=…")
-    if hasattr(hints.get(name), "get_known_choices"):
+    if value in getattr(hints.get(name), "get_known_choices", dict)():
         raise TaccorlError(f"{option}: one of several kinds, say --{name}.type={value}")
 
 

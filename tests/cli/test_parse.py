@@ -119,6 +119,7 @@ def test_a_config_file_may_have_any_name(tmp_path: Path) -> None:
 
 def test_a_nested_option_means_the_default_kind() -> None:
     assert robot("x", "--name=x", "--motor.poles=8").motor == SmallMotor(poles=8)
+    assert robot("x", "--name=x", "--motor={type: small, poles: 4}").motor == SmallMotor(poles=4)
     assert robot("x", "--name=x", "--motor.coil.turns=7").motor == SmallMotor(coil=Coil(turns=7))
     assert robot("x", "--name=x", "--motor.type=big", "--motor.voltage_v=12").motor == BigMotor(voltage_v=12.0)
 
