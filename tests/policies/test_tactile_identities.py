@@ -1,9 +1,11 @@
 """What must be exactly so: no contact is plain pi05, the cached prefix is the joint forward, a checkpoint is the policy."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
-from tiny_policies import PROMPT_TOKENS, TACTILE, batch_of, chunk, losses, plain_pi05, readings, tiny_policy
+from tiny_policies import PROMPT_TOKENS, TACTILE, batch_of, chunk, losses, plain_pi05, readings, sees_with, tiny_policy
 
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import KeptConstants
@@ -18,8 +20,14 @@ def one_thread():
     torch.set_num_threads(before)
 
 
+@pytest.fixture(scope="module", params=["keypoints", "patches"], autouse=True)
+def vision(request) -> Iterator[str]:
+    with sees_with(request.param):
+        yield request.param
+
+
 @pytest.fixture(scope="module")
-def policy() -> TactilePI05Policy:
+def policy(vision) -> TactilePI05Policy:
     return tiny_policy()
 
 

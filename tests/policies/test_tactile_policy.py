@@ -14,13 +14,14 @@ from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, load_optimize
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from safetensors.torch import save_file
-from tiny_policies import FORMAT, TACTILE, batch_of, chunk, plain_pi05, readings, tiny_config, tiny_policy
+from tiny_policies import FORMAT, TACTILE, batch_of, chunk, losses, plain_pi05, readings, tiny_config, tiny_policy
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.backbone import EarlyConvolutions
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
 from taccorl.policies.tactile_pi05.encoder import StateToken
+from taccorl.policies.tactile_pi05.keypoints import KeypointCamera
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+from taccorl.policies.tactile_pi05.muon import MuonAdamW, orthogonal
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import TactileReadingStep
 from taccorl.policies.tactile_pi05.tokenizer import ByteTokenizer, PromptTokenizerStep, WordTokenizer
 from taccorl.policies.tactile_pi05.weights import load_base_weights
@@ -283,18 +284,59 @@ def test_a_token_of_the_state_is_the_waves_of_each_joint_and_no_joint_is_beyond_
     assert torch.equal(token(torch.tensor([[0.3, 2e8]])), token(torch.tensor([[0.3, 4.0]])))
 
 
-def test_early_convolutions_give_a_token_for_each_patch_that_changes_most_with_its_own_pixels():
-    convolutions = EarlyConvolutions(28, 64)
-    images = torch.rand(2, 3, 112, 56)
-    assert convolutions(images).shape == (2, 64, 4, 2)
-    assert convolutions.weight.dtype is torch.float32
-    far, near = images.clone(), images.clone()
-    near[0, :, 33, 33] += 1
-    changed = (convolutions(near) - convolutions(far)).abs().amax(1)
-    assert changed[0].argmax() == 1 * 2 + 1  # pixel 33 of 28 a patch: the second row and column of four by two
-    assert changed[1].max() == 0  # the other image
-    odd = EarlyConvolutions(7, 64)
-    assert odd(torch.rand(1, 3, 56, 56)).shape == (1, 64, 8, 8)
+def test_a_key_point_is_where_its_map_is_high():
+    camera = KeypointCamera(2, 3, 8)
+    camera.maps = torch.nn.Conv2d(3, 2, 1)  # the first map: red; the second: blue
+    torch.nn.init.zeros_(camera.maps.bias)
+    with torch.no_grad():
+        camera.maps.weight.copy_(40 * torch.tensor([[1.0, 0, 0], [0, 0, 1]])[:, :, None, None])
+    image = torch.zeros(2, 3, 5, 9)
+    image[0, 0, 1, 6] = 1  # of 9 columns −1 … 1 the seventh: 0.5; of 5 rows the second: −0.5
+    image[0, 2, 4, 0] = 1
+    image[1, 0, 0, [2, 8]] = 1  # two alike: between them, at column 5, 0.25
+    points = camera.points(image)  # x of red and blue, y of red and blue; blue of the second is nowhere, so the middle
+    torch.testing.assert_close(points, torch.tensor([[0.5, -1.0, -0.5, 1.0], [0.25, 0.0, -1.0, 0.0]]))
+
+    waves = [math.pi * 2**k * p for p in (0.5, -1.0, -0.5, 1.0) for k in range(3)]
+    told = torch.tensor([[0.5, -1.0, -0.5, 1.0, *map(math.sin, waves), *map(math.cos, waves)]])
+    expected = camera.out(torch.nn.functional.gelu(camera.hidden(told)))
+    torch.testing.assert_close(camera(image[:1]), expected.view(1, 3, 8))
+
+
+def test_each_camera_has_key_points_of_its_own_and_none_may_be_missing():
+    policy, batch = tiny_policy(), batch_of(True, True)
+    front, left = "observation.images.front", "observation.images.left_wrist"
+    tower: Any = policy.model.paligemma_with_expert.paligemma.model.vision_tower
+    images = [batch[k] for k in policy.config.image_features]
+    for camera, image, tokens in zip(tower.cameras, images, tower(images), strict=True):
+        assert tokens.shape == (2, 4, 96) and torch.equal(tokens, camera(image))
+    assert not torch.equal(chunk(policy, {**batch, front: batch[left], left: batch[front]}), chunk(policy, batch))
+    del batch[left]
+    for use in (chunk, losses):
+        with pytest.raises(
+            TaccorlError, match=r"backbone=tiny has weights for each camera.* no observation.images.left_wrist; "
+        ):
+            use(policy, batch)
+    # LeRobot's own cameras that are never there
+    more, batch = tiny_policy(empty_cameras=1), batch_of(True, True)
+    seen = chunk(more, batch)
+    torch.nn.init.ones_(more.model.paligemma_with_expert.paligemma.model.vision_tower.cameras[3].out.bias)
+    assert torch.equal(chunk(more, batch), seen)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"backbone": "tiny", "image_resolution": (56, 84)}, "tiny takes squares, such as"),
+        (
+            {"backbone": "small", "image_resolution": (56, 56)},
+            "small takes squares of a multiple of 16 pixels, such as",
+        ),
+    ],
+)
+def test_pictures_of_a_size_that_it_does_not_take_are_refused(changes, said):
+    with pytest.raises(TaccorlError, match=said):
+        TactilePI05Policy(tiny_config(**changes))
 
 
 def test_plain_pi05s_weights_are_a_start_and_only_touch_may_be_missing(monkeypatch, tmp_path):
@@ -357,7 +399,8 @@ def test_settings_out_of_range_are_refused(setting, said):
         tiny_config(**setting)
 
 
-def test_two_steps_stop_resume_are_the_numbers_of_four_steps(tmp_path):
+@pytest.mark.parametrize("optimizer_muon", [False, True])
+def test_two_steps_stop_resume_are_the_numbers_of_four_steps(optimizer_muon, tmp_path):
     def train(policy: TactilePI05Policy, optimizer: torch.optim.Optimizer, steps: range) -> list[float]:
         losses = []
         policy.train()
@@ -370,14 +413,14 @@ def test_two_steps_stop_resume_are_the_numbers_of_four_steps(tmp_path):
         return losses
 
     torch.manual_seed(0)
-    policy = TactilePI05Policy(tiny_config())
-    optimizer = policy.config.get_optimizer_preset().build(policy.parameters())
+    policy = TactilePI05Policy(tiny_config(optimizer_muon=optimizer_muon))
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     train(policy, optimizer, range(2))
     policy.save_pretrained(tmp_path)
     kept, generator = copy.deepcopy(optimizer.state_dict()), torch.get_rng_state()
     straight = train(policy, optimizer, range(2, 4))
     resumed = TactilePI05Policy.from_pretrained(tmp_path)
-    optimizer = resumed.config.get_optimizer_preset().build(resumed.parameters())
+    optimizer = resumed.config.get_optimizer_preset().build(resumed.get_optim_params())
     optimizer.load_state_dict(kept)
     torch.set_rng_state(generator)
     assert train(resumed, optimizer, range(2, 4)) == straight
@@ -404,6 +447,71 @@ def test_the_optimizer_is_lerobots_adamw_and_its_files_are_read_again(tmp_path):
     assert again.state_dict()["param_groups"] == optimizer.state_dict()["param_groups"]
     state, stored = again.state_dict()["state"][0], optimizer.state_dict()["state"][0]
     assert state.keys() == stored.keys() and all(torch.equal(state[k], v) for k, v in stored.items())
+
+
+def test_muon_moves_matrices_as_torchs_does_and_adamw_moves_the_rest(tmp_path):
+    """Theirs computes in bfloat16, with 8 bits: directions differ by less than 1 in 64 of a step."""
+    torch.manual_seed(0)
+    shapes = ((24, 8), (8, 24), (8, 24), (16, 16))
+    ours, theirs = ([torch.nn.Parameter(x.clone()) for x in start] for start in 2 * [[torch.randn(s) for s in shapes]])
+    bias, their_bias = (torch.nn.Parameter(torch.linspace(-1, 1, 8)) for _ in range(2))
+    idle = torch.nn.Parameter(torch.ones(3, 3))  # never has a gradient
+    kind = {"lr": 1e-2, "weight_decay": 0.1}
+    groups = [{"params": [bias]}, {"params": [*ours, idle], "by_muon": True}]
+    optimizer = dataclasses.replace(tiny_config().get_optimizer_preset(), **kind).build(groups)
+    assert isinstance(optimizer, MuonAdamW)
+    muon = torch.optim.Muon(theirs, adjust_lr_fn="match_rms_adamw", **kind)
+    adamw = dataclasses.replace(tiny_config().get_optimizer_preset(), **kind).build([their_bias])
+    for _ in range(3):
+        for p, q in zip([*ours, bias], [*theirs, their_bias], strict=True):
+            p.grad = torch.randn(p.shape)
+            q.grad = p.grad.clone()
+        before = [p.detach().clone() for p in ours]
+        for each in (optimizer, muon, adamw):
+            each.step()
+        assert all(p.grad is not None for p in ours)
+    for p, q, old in zip(ours, theirs, before, strict=True):
+        assert (p - q).norm() < (p - old).norm() / 20
+        step = (p - old * (1 - 1e-2 * 0.1)) / (1e-2 * 0.2 * math.sqrt(max(p.shape)))
+        values = torch.linalg.svdvals(step.detach())
+        assert values.min() > 0.6 and values.max() < 1.25  # nearly orthogonal, whatever the gradient's size
+    assert torch.equal(bias, their_bias) and torch.equal(idle, torch.ones(3, 3))
+
+    save_optimizer_state(optimizer, tmp_path)
+    empty = [torch.nn.Parameter(torch.zeros_like(p)) for p in (bias, *ours, idle)]
+    fresh = [{"params": empty[:1]}, {"params": empty[1:], "by_muon": True}]
+    again = load_optimizer_state(tiny_config().get_optimizer_preset().build(fresh), tmp_path)
+    stored, kept = again.state_dict(), optimizer.state_dict()
+    assert stored["param_groups"] == kept["param_groups"] and stored["state"].keys() == kept["state"].keys()
+    for i, state in kept["state"].items():
+        assert all(torch.equal(stored["state"][i][k], v) for k, v in state.items())
+
+
+def test_directions_of_muon_are_the_nearest_orthogonal_matrices():
+    torch.manual_seed(0)
+    for shape in ((3, 6, 20), (3, 20, 6)):
+        matrices = torch.randn(shape)
+        left, _, right = torch.linalg.svd(matrices, full_matrices=False)
+        nearest, found = left @ right, orthogonal(1e-3 * matrices)  # of any size
+        assert found.shape == shape
+        # same singular vectors: what differs from the nearest one is along them only
+        along = left.mT @ found @ right.mT
+        off = along - torch.diag_embed(along.diagonal(dim1=1, dim2=2))
+        assert off.abs().max() < 1e-3 and (found - nearest).abs().max() < 0.35
+
+
+def test_with_muon_hidden_matrices_are_a_group_and_everything_is_in_one():
+    policy = tiny_policy(optimizer_muon=True)
+    rest, hidden = policy.get_optim_params()
+    names = {p: name for name, p in policy.named_parameters()}
+    assert hidden["by_muon"] and "by_muon" not in rest
+    assert sorted(names[p] for p in rest["params"] + hidden["params"]) == sorted(names.values())
+    told = {names[p].split("layers.")[1] for p in hidden["params"]}
+    parts = ("self_attn.q_proj", "self_attn.k_proj", "self_attn.v_proj", "self_attn.o_proj")
+    parts += ("mlp.gate_proj", "mlp.up_proj", "mlp.down_proj")
+    assert told == {f"{layer}.{part}.weight" for layer in range(3) for part in parts}
+    assert len(hidden["params"]) == 2 * 3 * 7  # of the language model and of the expert
+    assert len(list(tiny_policy().get_optim_params())) == len(names)
 
 
 def test_every_backbone_that_can_be_named_has_a_size():

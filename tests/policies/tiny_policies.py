@@ -1,5 +1,8 @@
 """Tiny policies with fixed weights, batches for them, and LeRobot's own pi05 in the same size."""
 
+import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +12,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
-from taccorl.policies.tactile_pi05.backbone import SIZES, SmallBackbone, without_language_heads
+from taccorl.policies.tactile_pi05.backbone import SIZES, Patches, SmallBackbone, without_language_heads
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactileFormat, TactilePI05Config
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 
@@ -24,6 +27,16 @@ COMMON: dict[str, Any] = {
     "num_inference_steps": 4,
     "image_resolution": (56, 56),
 }
+
+
+@contextmanager
+def sees_with(vision: str) -> Iterator[None]:
+    """tiny with "keypoints", as it is, or with "patches", as the larger ones are."""
+    with pytest.MonkeyPatch.context() as patch:
+        if vision == "patches":
+            patches = Patches(px=28, width=64, depth=2, heads=4, mlp=128)
+            patch.setitem(SIZES, "tiny", dataclasses.replace(SIZES["tiny"], vision=patches))
+        yield
 
 
 def features() -> dict[str, dict[str, PolicyFeature]]:
@@ -57,7 +70,7 @@ def plain_pi05(weights_of: TactilePI05Policy, monkeypatch: pytest.MonkeyPatch) -
     widths = {"gemma_2b": size.text_width, "gemma_300m": size.expert_width}
 
     def backbone(*_: Any, precision: Any, image_size: int, use_adarms: Any, **frozen: bool) -> SmallBackbone:
-        return SmallBackbone(size, precision=precision, image_px=image_size, **frozen)
+        return SmallBackbone(size, precision=precision, image_px=image_size, num_cameras=len(CAMERAS), **frozen)
 
     monkeypatch.setattr(pi05, "get_gemma_config", lambda variant: SimpleNamespace(width=widths[variant]))
     monkeypatch.setattr(pi05, "PaliGemmaWithExpertModel", backbone)
@@ -67,6 +80,11 @@ def plain_pi05(weights_of: TactilePI05Policy, monkeypatch: pytest.MonkeyPatch) -
     shared = {k: v for k, v in weights_of.state_dict().items() if not k.startswith("model.tactile.")}
     without_language_heads(policy.model.paligemma_with_expert)
     policy.load_state_dict(shared, strict=True)
+    embed_prefix, seeing = policy.model.embed_prefix, policy.model.paligemma_with_expert
+    if seeing.tells_cameras_apart:  # LeRobot's does not say of which camera a picture is
+        monkeypatch.setattr(
+            policy.model, "embed_prefix", lambda images, *rest: embed_prefix(seeing.embed_images(images), *rest)
+        )
     return policy
 
 

@@ -8,6 +8,7 @@ layers in the expert as in the language model, and its sizes (modeling_pi05.py, 
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from lerobot.policies.pi05.modeling_pi05 import (
     CONFIG_MAPPING,
     PaliGemmaForConditionalGenerationWithPiGemma,
@@ -18,10 +19,29 @@ from lerobot.policies.pi05.modeling_pi05 import (
 from torch import Tensor, nn
 
 from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
+from taccorl.policies.tactile_pi05.keypoints import KeypointTower
 from taccorl.policies.tactile_pi05.tokenizer import write_number_embeddings
 
 _HEADS, _KV_HEADS = 8, 1
-_FEWEST_CHANNELS, _GROUPS = 16, 4  # of early convolutions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Patches:
+    """SigLIP, a token for each patch of a picture."""
+
+    px: int
+    width: int
+    depth: int
+    heads: int
+    mlp: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keypoints:
+    """A ``KeypointTower``. Numbers are of each camera."""
+
+    points: int
+    tokens: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,61 +54,22 @@ class Size:
     text_mlp: int
     expert_width: int
     expert_mlp: int
-    vision_width: int
-    vision_depth: int
-    vision_heads: int
-    vision_mlp: int
-    patch_px: int
+    vision: Patches | Keypoints
     vocabulary: int
-    early_convolutions: bool = False
-    """A few small convolutions cut an image into patches, not one large one (see ``EarlyConvolutions``)."""
 
 
 SIZES = {
     # 30 M, for one GPU from scratch: 196 tokens a camera
     "small": Size(
         depth=7, head_width=48, text_width=384, text_mlp=1536, expert_width=256, expert_mlp=1024,
-        vision_width=256, vision_depth=6, vision_heads=4, vision_mlp=1024, patch_px=16, vocabulary=520,
+        vision=Patches(px=16, width=256, depth=6, heads=4, mlp=1024), vocabulary=520,
     ),
-    # 1 M, for a CPU: 64 tokens a camera
+    # 1 M, for a CPU: 4 tokens a camera
     "tiny": Size(
         depth=3, head_width=16, text_width=96, text_mlp=192, expert_width=64, expert_mlp=128,
-        vision_width=64, vision_depth=2, vision_heads=4, vision_mlp=128, patch_px=28, vocabulary=520,
-        early_convolutions=True,
+        vision=Keypoints(points=32, tokens=4), vocabulary=520,
     ),
 }  # fmt: skip
-
-
-class EarlyConvolutions(nn.Module):
-    """Patches of an image as SigLIP's one convolution gives them, by several: 3 × 3 with stride 2 as long as that divides.
-
-    A vision transformer learns faster that way, and with fewer rows (Xiao et al. 2021, Early Convolutions Help Transformers See
-    Better). Only where nothing is pretrained.
-    """
-
-    def __init__(self, patch_px: int, width: int) -> None:
-        """
-        Args:
-            patch_px: side of a patch, the product of the strides.
-            width: channels that come out.
-        """
-        super().__init__()
-        layers: list[nn.Module] = []
-        channels, rest_px = 3, patch_px
-        while rest_px % 2 == 0 and rest_px > 2:
-            more = min(max(_FEWEST_CHANNELS, 2 * channels if layers else 0), width)
-            layers += [nn.Conv2d(channels, more, 3, 2, padding=1), nn.GroupNorm(_GROUPS, more), nn.GELU()]
-            channels, rest_px = more, rest_px // 2
-        self.layers = nn.Sequential(*layers, nn.Conv2d(channels, width, rest_px, rest_px))
-
-    @property
-    def weight(self) -> Tensor:
-        """SigLIP asks for its type."""
-        return next(self.layers[-1].parameters())
-
-    def forward(self, images_BCRC: Tensor) -> Tensor:
-        """(B, 3, rows, columns) → (B, width, rows of patches, columns of patches)."""
-        return self.layers(images_BCRC)
 
 
 class FullBackbone(CompiledBackbone):
@@ -115,7 +96,14 @@ class SmallBackbone(CompiledBackbone):
     """LeRobot's PaliGemma with its action expert, in another size and without language heads."""
 
     def __init__(
-        self, size: Size, *, precision: Any, image_px: int, freeze_vision_encoder: bool, train_expert_only: bool
+        self,
+        size: Size,
+        *,
+        precision: Any,
+        image_px: int,
+        num_cameras: int,
+        freeze_vision_encoder: bool,
+        train_expert_only: bool,
     ) -> None:
         nn.Module.__init__(self)
         self.freeze_vision_encoder = freeze_vision_encoder
@@ -131,14 +119,16 @@ class SmallBackbone(CompiledBackbone):
             "dtype": "float32",
         }
         text = {"model_type": "gemma", "hidden_size": size.text_width, "intermediate_size": size.text_mlp, **shared}
+        no_patches = Patches(px=image_px, width=8, depth=0, heads=1, mlp=8)  # its tower is replaced below
+        patches = size.vision if isinstance(size.vision, Patches) else no_patches
         vision = {
             "model_type": "siglip_vision_model",
-            "hidden_size": size.vision_width,
-            "intermediate_size": size.vision_mlp,
-            "num_hidden_layers": size.vision_depth,
-            "num_attention_heads": size.vision_heads,
+            "hidden_size": patches.width,
+            "intermediate_size": patches.mlp,
+            "num_hidden_layers": patches.depth,
+            "num_attention_heads": patches.heads,
             "image_size": image_px,
-            "patch_size": size.patch_px,
+            "patch_size": patches.px,
             "projection_dim": size.text_width,
             "vision_use_head": False,
             "dtype": "float32",
@@ -168,13 +158,19 @@ class SmallBackbone(CompiledBackbone):
         expert.embed_tokens = None
         model: Any = self.paligemma.model
         write_number_embeddings(model.language_model.embed_tokens.weight)
-        if size.early_convolutions:
-            model.vision_tower.vision_model.embeddings.patch_embedding = EarlyConvolutions(
-                size.patch_px, size.vision_width
-            )
+        if isinstance(size.vision, Keypoints):
+            self.tells_cameras_apart = True
+            model.vision_tower = KeypointTower(num_cameras, size.vision.points, size.vision.tokens, size.text_width)
+            model.multi_modal_projector = None
         without_language_heads(self)
         self.to_bfloat16_for_selected_params(precision)
         self._set_requires_grad()
+
+    def embed_images(self, images: list[Tensor]) -> list[Tensor]:
+        if not self.tells_cameras_apart:
+            return super().embed_images(images)
+        tower: Any = self.paligemma.model.vision_tower
+        return [tokens.to(images[0].dtype) for tokens in tower([image.to(torch.float32) for image in images])]
 
 
 def without_language_heads(backbone: PaliGemmaWithExpertModel) -> None:

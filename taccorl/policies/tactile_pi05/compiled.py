@@ -67,6 +67,8 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
     """LeRobot's PaliGemma with its action expert; in training on a GPU its layers are compiled."""
 
     compiles_layers: bool = True
+    tells_cameras_apart: bool = False
+    """Pictures go through ``embed_images`` only, as each camera has weights of its own."""
 
     def fuses(self, device: torch.device) -> bool:
         """Whether a joint forward there is this module's, not LeRobot's. Recomputed activations are LeRobot's business."""

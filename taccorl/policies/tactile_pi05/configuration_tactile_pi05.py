@@ -16,6 +16,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from taccorl.errors import TaccorlError, nearest
 from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
 from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
+from taccorl.policies.tactile_pi05.muon import BY_MUON, MuonAdamW
 
 TACTILE = "observation.tactile"
 RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
@@ -49,7 +50,8 @@ class FusedAdamW(AdamWConfig):
     def build(self, params: OptimizerParams) -> AdamW:
         groups: Any = super().build(params).param_groups
         fused = all(p.is_cuda for group in groups for p in group["params"])
-        return AdamW([{**group, "fused": fused} for group in groups], fused=fused)
+        optimizer = MuonAdamW if any(group.get(BY_MUON) for group in groups) else AdamW
+        return optimizer([{**group, "fused": fused} for group in groups], fused=fused)
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,8 @@ class TactilePI05Config(PI05Config):
     """K_denoise."""
     optimizer_lr: float = 2.5e-5
     """η_max."""
+    optimizer_muon: bool = False
+    """Move the matrices of the language model's and the expert's layers by Muon (see ``muon``). For training from scratch."""
     scheduler_warmup_steps: int = 100
     """T_warm."""
     scheduler_decay_lr: float = 5e-6

@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 import torch
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy, PI05Pytorch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor, nn
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.backbone import SIZES, FullBackbone, SmallBackbone
+from taccorl.policies.tactile_pi05.backbone import SIZES, FullBackbone, Patches, SmallBackbone
 from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     RAW_STATE,
@@ -37,10 +37,12 @@ from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder, To
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
+from taccorl.policies.tactile_pi05.muon import BY_MUON
 from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkpoint
 
 # B batch, S state, L history, K taxels, P pads, R rows, C columns, M tokens, T of the context, D width, H horizon, A action
 ACTION_IS_PAD = "action_is_pad"
+_EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"  # of LeRobot's --policy.empty_cameras
 _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
 
 _log = logging.getLogger(__name__)
@@ -129,8 +131,10 @@ class TactilePI05Pytorch(PI05Pytorch):
     def embed_prefix(
         self, images: list[Tensor], image_masks: list[Tensor], tokens: Tensor, token_mask: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        if self.paligemma_with_expert.fuses(tokens.device):
-            images = self.paligemma_with_expert.embed_images(images)
+        backbone = self.paligemma_with_expert
+        are_tokens = images[0].ndim == 3
+        if not are_tokens and (backbone.tells_cameras_apart or backbone.fuses(tokens.device)):
+            images = backbone.embed_images(images)
         context_BTD, valid_BT, starts_block_BT = super().embed_prefix(images, image_masks, tokens, token_mask)
         if self._touch is None:
             return context_BTD, valid_BT, starts_block_BT
@@ -170,8 +174,9 @@ def _backbone(config: TactilePI05Config) -> CompiledBackbone:
     """
     size = SIZES.get(config.backbone)
     image_px = config.image_resolution[0]
-    if config.image_resolution != (image_px, image_px) or (size is not None and image_px % size.patch_px):
-        patches = f" of a multiple of {size.patch_px} pixels" if size is not None else ""
+    patch_px = size.vision.px if size is not None and isinstance(size.vision, Patches) else None
+    if config.image_resolution != (image_px, image_px) or (patch_px and image_px % patch_px):
+        patches = f" of a multiple of {patch_px} pixels" if patch_px else ""
         raise TaccorlError(
             f"--policy.image_resolution={config.image_resolution}: --policy.backbone={config.backbone} takes squares{patches}, "
             "such as [224, 224]"
@@ -182,6 +187,7 @@ def _backbone(config: TactilePI05Config) -> CompiledBackbone:
         size,
         precision=config.dtype,
         image_px=image_px,
+        num_cameras=len(config.image_features),
         freeze_vision_encoder=config.freeze_vision_encoder,
         train_expert_only=config.train_expert_only,
     )
@@ -314,6 +320,7 @@ class TactilePI05Policy(PI05Policy):
         if self.training and self._change_images is not None:
             batch = {**batch, **{k: self._change_images(batch[k]) for k in self.config.image_features if k in batch}}
         images, image_masks = self._preprocess_images(batch)
+        images = self._tokens(images)
         actions = self.prepare_action(batch)
         noise = self.model.sample_noise(actions.shape, actions.device)
         time = self.model.sample_time(len(actions), actions.device)
@@ -398,6 +405,7 @@ class TactilePI05Policy(PI05Policy):
             sensed = self._state(batch), *self._readings(batch)
             actions = self._graphed_chunk(images, image_masks, *prompt, noise, *sensed)
             return actions[:, :, : self._num_actions]
+        images = self._tokens(images)
 
         def compute(rows: Any) -> Tensor:
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
@@ -456,6 +464,11 @@ class TactilePI05Policy(PI05Policy):
         missing = self.config.tactile_history - len(self._felt)
         return torch.stack([self._felt[0]] * missing + list(self._felt), dim=1)
 
+    def _tokens(self, images: list[Tensor]) -> list[Tensor]:
+        """Key points' tokens of all rows at once: few rows are rounded elsewhere. Pictures for patches remain pictures."""
+        backbone = self.model.paligemma_with_expert
+        return backbone.embed_images(images) if backbone.tells_cameras_apart else images
+
     def _state(self, batch: dict[str, Tensor]) -> Tensor | None:
         """(B, 1, D) the state's token, of all rows at once: few rows are rounded elsewhere. None where the prompt has it."""
         return None if self.config.has_discrete_state else self.model.state_token(batch[OBS_STATE].to(torch.float32))
@@ -484,6 +497,29 @@ class TactilePI05Policy(PI05Policy):
         readings = readings.to(torch.float32)
         gate = contact(readings, self.config.contact_threshold, self.config.contact_min_active)
         return readings.unflatten(-1, told.layout), gate
+
+    def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """
+        Raises:
+            TaccorlError: a camera is missing, and each has weights of its own: LeRobot puts black pictures behind the others.
+        """
+        missing = [k for k in self.config.image_features if k not in batch and not k.startswith(_EMPTY_CAMERA)]
+        if missing and self.model.paligemma_with_expert.tells_cameras_apart:
+            raise TaccorlError(
+                f"--policy.backbone={self.config.backbone} has weights for each camera, but the batch has no "
+                f"{', '.join(missing)}; it has: {', '.join(batch)}"
+            )
+        return super()._preprocess_images(batch)
+
+    def get_optim_params(self) -> Any:
+        """All parameters, or those that Muon moves in a group of their own."""
+        if not self.config.optimizer_muon:
+            return super().get_optim_params()
+        hidden, rest = [], []
+        for name, p in self.named_parameters():
+            is_hidden = p.ndim == 2 and ".layers." in name and "norm" not in name  # norms: of the expert, from the time
+            (hidden if is_hidden else rest).append(p)
+        return [{"params": rest}, {"params": hidden, BY_MUON: True}]
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         targets = super()._get_default_peft_targets()
