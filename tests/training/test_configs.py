@@ -83,4 +83,4 @@ def test_words_after_the_file_count_more(monkeypatch: pytest.MonkeyPatch) -> Non
     words = ("--steps=7", "--policy.sim_weight=0.95", "--policy.image_randomization=true")
     config = lerobot_train(CONFIGS / "small" / "tiny.yaml", monkeypatch, *words)
     assert (config.steps, config.policy.sim_weight, config.policy.image_randomization) == (7, 0.95, True)
-    assert config.policy.backbone == "tiny" and config.policy.optimizer_lr == 2e-3
+    assert config.policy.backbone == "tiny" and config.policy.optimizer_lr == 2e-3 and config.policy.optimizer_muon

@@ -64,7 +64,7 @@ SIZES = {
         depth=7, head_width=48, text_width=384, text_mlp=1536, expert_width=256, expert_mlp=1024,
         vision=Patches(px=16, width=256, depth=6, heads=4, mlp=1024), vocabulary=520,
     ),
-    # 1 M, for a CPU: 4 tokens a camera
+    # 1.6 M with three cameras, for a CPU: 4 tokens a camera
     "tiny": Size(
         depth=3, head_width=16, text_width=96, text_mlp=192, expert_width=64, expert_mlp=128,
         vision=Keypoints(points=32, tokens=4), vocabulary=520,

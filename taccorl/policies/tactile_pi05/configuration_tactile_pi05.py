@@ -106,7 +106,7 @@ class TactilePI05Config(PI05Config):
     """π0.5 with touch. Fields that are not here are those of LeRobot's pi05."""
 
     backbone: str = "full"
-    """full: π0.5's own size (3.4 billion parameters); small (30 million) and tiny (1 million): from scratch, same code."""
+    """full: π0.5's own size (3.4 billion parameters); small (30 million) and tiny (1.6 million): from scratch, same code."""
     base_checkpoint: str | None = None
     """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: at random."""
     tokenizer: str | None = None
