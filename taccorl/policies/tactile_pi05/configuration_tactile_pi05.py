@@ -45,7 +45,10 @@ class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
 @OptimizerConfig.register_subclass("fused_adamw")
 @dataclass
 class FusedAdamW(AdamWConfig):
-    """LeRobot's AdamW; on a GPU PyTorch's fused kernel, half the time, and bfloat16 weights are rounded once a step."""
+    """LeRobot's AdamW; on a GPU PyTorch's fused kernel, half the time, and bfloat16 weights are rounded once a step.
+
+    Parameter groups that are marked so are moved by Muon (see ``muon``).
+    """
 
     def build(self, params: OptimizerParams) -> AdamW:
         groups: Any = super().build(params).param_groups

@@ -17,7 +17,7 @@ from torch.optim import AdamW
 
 BY_MUON = "by_muon"  # of a parameter group: its matrices are moved by Muon
 _MOMENTUM = 0.95
-_COEFFICIENTS = 3.4445, -4.775, 2.0315  # of Jordan's quintic: steep at 0, all of 0.7 … 1.2 stays there
+_COEFFICIENTS = 3.4445, -4.775, 2.0315  # of Jordan's quintic: steep at 0, what is in 0.7 … 1.2 stays about there
 _STEPS = 5
 _RMS = 0.2  # of AdamW's steps, per learning rate
 
@@ -27,10 +27,11 @@ class MuonAdamW(AdamW):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """One step of all groups."""
+        """One step of all groups; what ``closure`` gives, which computes gradients anew."""
+        loss = None
         if closure is not None:
             with torch.enable_grad():
-                closure()
+                loss = closure()
         # AdamW leaves alone what has no gradient.
         held = [(p, p.grad, group) for group in self.param_groups if group.get(BY_MUON) for p in group["params"]]
         for p, _, _ in held:
@@ -46,6 +47,7 @@ class MuonAdamW(AdamW):
             for (p, _, group), direction in zip(same, directions, strict=True):
                 p.mul_(1 - group["lr"] * group["weight_decay"])
                 p.add_(direction.to(p.dtype), alpha=-group["lr"] * _RMS * math.sqrt(max(p.shape)))
+        return loss
 
     def _update(self, p: Tensor, gradient: Tensor) -> Tensor:
         """Nesterov's momentum."""
