@@ -168,7 +168,7 @@ def _training_step(policy: Any, batch: dict[str, Any]) -> Callable[[], Any]:
     """What ``update_policy`` of lerobot-train does: under autocast for the policy's dtype, numbers read for the log."""
     import torch
 
-    optimizer = policy.config.get_optimizer_preset().build(policy.parameters())
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     scheduler = policy.config.get_scheduler_preset().build(optimizer, 3000)
     bfloat16 = policy.config.dtype == "bfloat16"
 

@@ -14,7 +14,18 @@ from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, load_optimize
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from safetensors.torch import save_file
-from tiny_policies import FORMAT, TACTILE, batch_of, chunk, losses, plain_pi05, readings, tiny_config, tiny_policy
+from tiny_policies import (
+    FORMAT,
+    TACTILE,
+    batch_of,
+    chunk,
+    losses,
+    plain_pi05,
+    readings,
+    sees_with,
+    tiny_config,
+    tiny_policy,
+)
 
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
@@ -286,6 +297,7 @@ def test_a_token_of_the_state_is_the_waves_of_each_joint_and_no_joint_is_beyond_
 
 def test_a_key_point_is_where_its_map_is_high():
     camera = KeypointCamera(2, 3, 8)
+    assert camera.maps(torch.rand(1, 3, 112, 112)).shape == (1, 2, 28, 28)
     camera.maps = torch.nn.Conv2d(3, 2, 1)  # the first map: red; the second: blue
     torch.nn.init.zeros_(camera.maps.bias)
     with torch.no_grad():
@@ -296,6 +308,19 @@ def test_a_key_point_is_where_its_map_is_high():
     image[1, 0, 0, [2, 8]] = 1  # two alike: between them, at column 5, 0.25
     points = camera.points(image)  # x of red and blue, y of red and blue; blue of the second is nowhere, so the middle
     torch.testing.assert_close(points, torch.tensor([[0.5, -1.0, -0.5, 1.0], [0.25, 0.0, -1.0, 0.0]]))
+
+    # A softmax that is not all in one place: of 9 columns one weighs e^(3 · 0.5 · 2) = e³, the rest 1 each.
+    torch.nn.init.constant_(camera.sharpness, 0.5)
+    with torch.no_grad():
+        camera.maps.weight *= 2 / 40
+    soft = torch.zeros(1, 3, 1, 9)
+    soft[0, 0, 0, 8] = 1
+    weight = math.exp(3) / (math.exp(3) + 8)
+    places = [-1 + column / 4 for column in range(9)]
+    assert camera.points(soft)[0, 0].item() == pytest.approx(weight + (1 - weight) * sum(places[:8]) / 8, rel=1e-5)
+    torch.nn.init.ones_(camera.sharpness)
+    with torch.no_grad():
+        camera.maps.weight *= 40 / 2
 
     waves = [math.pi * 2**k * p for p in (0.5, -1.0, -0.5, 1.0) for k in range(3)]
     told = torch.tensor([[0.5, -1.0, -0.5, 1.0, *map(math.sin, waves), *map(math.cos, waves)]])
@@ -322,6 +347,15 @@ def test_each_camera_has_key_points_of_its_own_and_none_may_be_missing():
     seen = chunk(more, batch)
     torch.nn.init.ones_(more.model.paligemma_with_expert.paligemma.model.vision_tower.cameras[3].out.bias)
     assert torch.equal(chunk(more, batch), seen)
+
+
+def test_a_tiny_that_saw_with_patches_is_told_apart(tmp_path):
+    with sees_with("patches"):
+        tiny_policy().save_pretrained(tmp_path)
+    with pytest.raises(
+        TaccorlError, match=r"it saw with patches, before tiny had key points: train anew\. Nothing was loaded"
+    ):
+        TactilePI05Policy.from_pretrained(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -469,7 +503,7 @@ def test_muon_moves_matrices_as_torchs_does_and_adamw_moves_the_rest(tmp_path):
         before = [p.detach().clone() for p in ours]
         for each in (optimizer, muon, adamw):
             each.step()
-        assert all(p.grad is not None for p in ours)
+        assert all(torch.equal(p.grad, q.grad) for p, q in zip(ours, theirs, strict=True))
     for p, q, old in zip(ours, theirs, before, strict=True):
         assert (p - q).norm() < (p - old).norm() / 20
         step = (p - old * (1 - 1e-2 * 0.1)) / (1e-2 * 0.2 * math.sqrt(max(p.shape)))
@@ -487,6 +521,33 @@ def test_muon_moves_matrices_as_torchs_does_and_adamw_moves_the_rest(tmp_path):
         assert all(torch.equal(stored["state"][i][k], v) for k, v in state.items())
 
 
+def test_muon_takes_a_closure_and_leaves_bfloat16_weights_where_decay_takes_them():
+    weight = torch.nn.Parameter(torch.ones(4, 4, dtype=torch.bfloat16))
+    optimizer = MuonAdamW([{"params": [weight], "by_muon": True}], lr=0.5, weight_decay=0.01)
+
+    def closure() -> float:
+        weight.grad = torch.zeros_like(weight)
+        return 3.5
+
+    for _ in range(2):
+        assert optimizer.step(closure) == 3.5
+    # 1 − 0.5 · 0.01 = 0.995, in bfloat16 0.996; of that 0.991, in bfloat16 0.992
+    assert weight.tolist() == 4 * [4 * [0.9921875]]
+
+
+def test_muon_leaves_out_a_step_whose_gradients_overflowed():
+    weight, bias = torch.nn.Parameter(torch.ones(3, 3)), torch.nn.Parameter(torch.ones(3))
+    optimizer = MuonAdamW([{"params": [bias]}, {"params": [weight], "by_muon": True}], lr=0.1, fused=True)
+    scaler = torch.amp.GradScaler("cpu")
+    for factor, moves in ((math.inf, False), (1.0, True)):
+        scaler.scale(factor * ((weight * torch.arange(9.0).view(3, 3)).sum() + bias.sum())).backward()
+        scaler.step(optimizer)
+        scaler.update()
+        optimizer.zero_grad()
+        for p in (weight, bias):
+            assert p.isfinite().all() and torch.equal(p, torch.ones_like(p)) is not moves
+
+
 def test_directions_of_muon_are_the_nearest_orthogonal_matrices():
     torch.manual_seed(0)
     for shape in ((3, 6, 20), (3, 20, 6)):
@@ -500,8 +561,10 @@ def test_directions_of_muon_are_the_nearest_orthogonal_matrices():
         assert off.abs().max() < 1e-3 and (found - nearest).abs().max() < 0.35
 
 
-def test_with_muon_hidden_matrices_are_a_group_and_everything_is_in_one():
-    policy = tiny_policy(optimizer_muon=True)
+@pytest.mark.parametrize("vision", ["keypoints", "patches"])
+def test_with_muon_hidden_matrices_are_a_group_and_everything_is_in_one(vision):
+    with sees_with(vision):
+        policy = tiny_policy(optimizer_muon=True)
     rest, hidden = policy.get_optim_params()
     names = {p: name for name, p in policy.named_parameters()}
     assert hidden["by_muon"] and "by_muon" not in rest
@@ -511,7 +574,8 @@ def test_with_muon_hidden_matrices_are_a_group_and_everything_is_in_one():
     parts += ("mlp.gate_proj", "mlp.up_proj", "mlp.down_proj")
     assert told == {f"{layer}.{part}.weight" for layer in range(3) for part in parts}
     assert len(hidden["params"]) == 2 * 3 * 7  # of the language model and of the expert
-    assert len(list(tiny_policy().get_optim_params())) == len(names)
+    policy.config.optimizer_muon = False
+    assert len(list(policy.get_optim_params())) == len(names)
 
 
 def test_every_backbone_that_can_be_named_has_a_size():

@@ -1,8 +1,8 @@
 """LeRobot's joint forward of pi05 for training on a GPU: the same weights and arithmetic in fewer, larger kernels.
 
 LeRobot starts fifteen thousand kernels a step, one by one, and a GPU waits for Python. Here torch.compile fuses each layer
-(one compilation serves all layers, in half a minute), and four things are done otherwise: all cameras go through the vision
-tower together; positions become angles once, not in each layer; the query heads share one key head, so their scores are one
+(one compilation serves all layers, in half a minute), and four things are done otherwise: all cameras go through SigLIP
+together; positions become angles once, not in each layer; the query heads share one key head, so their scores are one
 matrix product; of the last layer only what the actions need is computed. Results differ from LeRobot's by rounding.
 """
 

@@ -5,7 +5,7 @@
     tokens = MLP(x, y, and sines and cosines of π · {1, 2, 4} of each)
 
 The mean of positions, weighed by a softmax, is the spatial softmax of Levine et al. 2016, End-to-End Training of Deep Visuomotor
-Policies, §4.1. Places are all that passes: not colours, not how many there are of a thing.
+Policies, §4.1. What passes is mostly places: hardly colours, or how many there are of a thing.
 """
 
 import math

@@ -517,7 +517,8 @@ class TactilePI05Policy(PI05Policy):
             return super().get_optim_params()
         hidden, rest = [], []
         for name, p in self.named_parameters():
-            is_hidden = p.ndim == 2 and ".layers." in name and "norm" not in name  # norms: of the expert, from the time
+            of_layers = "language_model.layers." in name or "gemma_expert.model.layers." in name
+            is_hidden = p.ndim == 2 and of_layers and "norm" not in name  # norms: of the expert, from the time
             (hidden if is_hidden else rest).append(p)
         return [{"params": rest}, {"params": hidden, BY_MUON: True}]
 

@@ -3,7 +3,7 @@
 Muon (Jordan et al. 2024) replaces a matrix's momentum by the nearest one whose singular values are all about 1, so that rare
 directions learn as fast as frequent ones. Steps are as long as AdamW's, 0.2 · √(longer side), and take its learning rate (Liu et
 al. 2025, Muon is Scalable for LLM Training, §2.2). ``torch.optim.Muon`` computes that in bfloat16, one matrix after another: on
-a CPU it takes half as long again as the training step of tiny.
+a CPU tiny's 42 took 0.22 CPU-s a step, here 0.02 (n = 5, one thread).
 """
 
 import math
@@ -25,6 +25,11 @@ _RMS = 0.2  # of AdamW's steps, per learning rate
 class MuonAdamW(AdamW):
     """AdamW; parameter groups with ``by_muon`` hold matrices and are moved by Muon."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # A scaler of gradients leaves it to AdamW's fused kernel to skip a step with an overflow; Muon has no such kernel.
+        self._step_supports_amp_scaling = False
+
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:
         """One step of all groups; what ``closure`` gives, which computes gradients anew."""
@@ -45,8 +50,9 @@ class MuonAdamW(AdamW):
         for same in alike.values():
             directions = orthogonal(torch.stack([update for _, update, _ in same]))
             for (p, _, group), direction in zip(same, directions, strict=True):
-                p.mul_(1 - group["lr"] * group["weight_decay"])
-                p.add_(direction.to(p.dtype), alpha=-group["lr"] * _RMS * math.sqrt(max(p.shape)))
+                length = group["lr"] * _RMS * math.sqrt(max(p.shape))
+                # In float32, rounded once: 1 − lr · decay is 1 in bfloat16.
+                p.copy_(p.to(torch.float32) * (1 - group["lr"] * group["weight_decay"]) - length * direction)
         return loss
 
     def _update(self, p: Tensor, gradient: Tensor) -> Tensor:
@@ -61,7 +67,8 @@ class MuonAdamW(AdamW):
 
 
 def orthogonal(matrices_NRC: Tensor) -> Tensor:
-    """(N, R, C) → each with its singular vectors, all singular values 0.7 … 1.2. Newton-Schulz iterations in float32."""
+    """(N, R, C) → each with its singular vectors, singular values 0.7 … 1.2 but for those a hundred times below the largest,
+    which are raised less. Newton-Schulz iterations in float32."""
     x = matrices_NRC.to(torch.float32)
     is_tall = x.shape[1] > x.shape[2]
     if is_tall:
