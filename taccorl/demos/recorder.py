@@ -22,8 +22,12 @@ _ANY = (-1e12, 1e12)
 PICTURE = "observation.images."
 
 
-def with_simulator(spec: DatasetSpec, sim: Simulation, *, pictures: bool) -> DatasetSpec:
-    """The dataset contract with the simulator's own features: state, seed, subtask of each arm, success.
+EXECUTED = "sim.executed"
+
+
+def with_simulator(spec: DatasetSpec, sim: Simulation, *, pictures: bool, executed: bool = False) -> DatasetSpec:
+    """The dataset contract with the simulator's own features: state, seed, subtask of each arm, success; and what was executed,
+    where ``action`` is what was intended.
 
     ``sim.state`` has the size of the task's scene, so datasets of different tasks merge only without it.
     """
@@ -41,6 +45,8 @@ def with_simulator(spec: DatasetSpec, sim: Simulation, *, pictures: bool) -> Dat
         "sim.subtask": FeatureSpec(dtype="int16", shape=(len(ARMS),), range=(0, 99), names=ARMS, **own),
         "sim.success": FeatureSpec(dtype="int16", shape=(1,), range=(0, 1), **own),
     }
+    if executed:
+        features[EXECUTED] = spec.features["action"]
     return dataclasses.replace(spec, features=features)
 
 
@@ -60,10 +66,12 @@ class EpisodeRecorder:
     def __post_init__(self) -> None:
         self._dense = DenseRecorder(self.sim) if self.dense else None
 
-    def step(self, action: np.ndarray, watch: Watch | None = None) -> None:
+    def step(self, action: np.ndarray, watch: Watch | None = None, intended: np.ndarray | None = None) -> None:
         """One row and one control step. The action is rounded to float32 before it acts: what is stored is what was done.
 
-        ``watch`` sees the state in between, if nothing dense is kept.
+        Args:
+            watch: sees the state in between, if nothing dense is kept.
+            intended: the row's ``action``, where what is done differs: that is ``sim.executed`` then.
         """
         action = np.asarray(action, dtype=np.float32)
         sim = self.sim
@@ -76,6 +84,8 @@ class EpisodeRecorder:
         }
         sim.step(action[None].astype(np.float64), watch=self._dense.watch() if self._dense else watch)
         row["action"] = sim.executed[0].astype(np.float32)
+        if intended is not None:
+            row[EXECUTED], row["action"] = row["action"], np.asarray(intended, np.float32)
         row["sim.success"] = sim.judge.success[:1].astype(np.int16)
         self.rows.append(row)
 

@@ -8,13 +8,14 @@ import functools
 import time
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.mimicgen.director import Director, Wish
+from taccorl.demos.mimicgen.disturbance import disturbed
 from taccorl.demos.mimicgen.expert_contact import ExpertContact
 from taccorl.demos.mimicgen.gates import GateKeeper, Measured, foreign_contact
 from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
@@ -31,6 +32,7 @@ from taccorl.sim.twin import CONTROL_HZ
 
 _UNREACHABLE_M = 0.005  # that inverse kinematics leaves: the hand would be elsewhere
 _AFTER_STEPS = round((HOLD_S + 0.5) * CONTROL_HZ)  # a goal reached last of all must still hold
+_DISTURBANCE = 3  # apart from the pads' noise, which draws from (scene seed, 2)
 _WORD = "mimicgen"  # apart from the scenes of ``taccorl collect`` with the same seed
 
 
@@ -53,6 +55,8 @@ class Attempted:
     reason: str = ""
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 14), np.float32))
     """(T, 14) float32 as they were executed."""
+    intended: np.ndarray | None = None
+    """(T, 14) float32 what an attempt that is disturbed was to do; None: what it did."""
     last_state: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(row_size,) after the last action."""
     provenance: dict[str, object] = field(default_factory=dict)
@@ -144,6 +148,7 @@ class Attempts:
         self.pool, self.spec, self.sim, self.seed = pool, pool.spec, sim, seed
         self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
         self._feels = self.spec.datagen_config.contact_mode == "closed_loop_expert"
+        self._disturbs = self.spec.datagen_config.disturbance.joint_rad > 0
         if self._feels:
             check_closed_loop(self.spec)
 
@@ -168,7 +173,7 @@ class Attempts:
             contact_hands=functools.partial(ExpertContact, sim) if self._feels else None,
         )
         done = Attempted(k, scene_seed, "unfinished")
-        actions, after = [], 0
+        actions, mates_touch, after = [], [], 0
         while after < _AFTER_STEPS and not sim.judge.outcome.over[0]:
             try:
                 wishes = director.step(scene, hands.joints_rad)
@@ -180,25 +185,50 @@ class Attempts:
                 done.outcome = "unreachable"
                 done.reason = f"{hands.unreached} is out of reach by {hands.unreached_m * 1e3:.1f} mm"
                 break
+            if self._disturbs:
+                mates_touch.append(any(sim.contact(*pair).touching[0] for pair in sim.task.mating))
             sim.step(action[None].astype(np.float64))
             actions.append(action)
             after += director.done
-        outcome = sim.judge.outcome
-        if outcome.over[0]:
-            done.outcome = "success" if outcome.success[0] else str(outcome.failure[0])
         done.actions = np.array(actions, np.float32).reshape(-1, 14)
-        done.last_state = sim.state_rows()[0]
+        self._end(done)
         done.provenance = self._provenance(director, k, scene_seed)
+        if self._disturbs and done.success:
+            self._disturb(done, np.array(mates_touch))
         done.cpu_s = time.process_time() - began_s
         return done
+
+    def _end(self, done: Attempted) -> None:
+        """What the judge says now."""
+        outcome = self.sim.judge.outcome
+        if outcome.over[0]:
+            done.outcome = "success" if outcome.success[0] else str(outcome.failure[0])
+        done.last_state = self.sim.state_rows()[0]
+
+    def _disturb(self, done: Attempted, mates_touch: np.ndarray) -> None:
+        """Do a success again with its arms pushed off their way. One whose success takes longer now stands still until then."""
+        sim, spec = self.sim, self.spec.datagen_config.disturbance
+        waits = [done.actions[-1:]] * _AFTER_STEPS
+        intended = np.concatenate([done.actions, *waits])
+        mates_touch = np.pad(mates_touch, (0, _AFTER_STEPS), mode="edge")
+        rng = np.random.default_rng([done.scene_seed, _DISTURBANCE])
+        executed, num = disturbed(intended, mates_touch, spec, rng), 0
+        sim.reset([done.scene_seed])
+        while num < len(executed) and not sim.judge.outcome.over[0]:
+            sim.step(executed[[num]].astype(np.float64))
+            num += 1
+        done.actions, done.intended, done.outcome = executed[:num], intended[:num], "unfinished"
+        self._end(done)
+        if not done.success:
+            done.reason = "disturbed; undisturbed it succeeds"
 
     def redo(self, done: Attempted, spec: DatasetSpec, noise: np.random.Generator | None = None) -> EpisodeRecorder:
         """Execute a success again from its stored actions, with touch, under the gates; its outcome may become a gate's name."""
         sim = self.sim
         sim.reset([done.scene_seed])
         recorder, gates = EpisodeRecorder(sim, spec, noise), GateKeeper(sim)
-        for action in done.actions:
-            recorder.step(action, gates.watch())
+        for t, action in enumerate(done.actions):
+            recorder.step(action, gates.watch(), None if done.intended is None else done.intended[t])
         gates.see_actions(done.actions)
         states = np.stack([row["sim.state"] for row in recorder.rows])
         measured = gates.measured
@@ -228,6 +258,7 @@ class Attempts:
             )
         generation, feels = self.spec.datagen_config, director.contact_hands
         felt = {"corrections": [list(event) for event in feels.corrections]} if feels else {}
+        pushed = {"disturbance": asdict(generation.disturbance)} if self._disturbs else {}
         return {
             "attempt": k,
             "seed": self.seed,
@@ -236,6 +267,7 @@ class Attempts:
             "retarget": generation.retarget,
             "contact_mode": generation.contact_mode,
             **felt,
+            **pushed,
             "draw": {name: np.asarray(value).tolist() for name, value in self.sim.draws[0].items()},
             "subtasks": choices,
         }

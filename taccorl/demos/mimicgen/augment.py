@@ -23,7 +23,7 @@ import numpy as np
 import taccorl
 from taccorl.data.dataset import PROVENANCE, episode_record
 from taccorl.data.episode import Episode
-from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
 from taccorl.demos.collect import REPORT, assemble, in_the_way
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
 from taccorl.demos.mimicgen.from_dataset import read_sources, simulation_told
@@ -108,6 +108,12 @@ class AugmentPlan:
         check_task(self.spec, task)
         return Simulation(task, self.twin_config(), scale=self.randomization)
 
+    def rows(self, sim: Simulation) -> DatasetSpec:
+        """What a new episode's rows hold."""
+        disturbs = self.spec.datagen_config.disturbance.joint_rad > 0
+        contract = load_dataset_spec(find_spec("taccorl_bimanual"))
+        return with_simulator(contract, sim, pictures=self.images, executed=disturbs)
+
     def config(self, k: int) -> dict[str, Any]:
         """What attempt ``k`` depends on besides the sources; not on how many there are."""
         return canonical(
@@ -139,7 +145,7 @@ def augment(
     engine, entries, made = engine or LocalEngine(), [], []
     # Before anything is sent away: what does not fit is refused here.
     sim = _attempts(plan, sources.path, sources.digest).sim
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=plan.images)
+    spec = plan.rows(sim)
     fn = functools.partial(run_attempt, plan, sources, store)
     lost = functools.partial(_lost_attempt, plan, sources, store)
 
@@ -300,7 +306,7 @@ def _build(plan: AugmentPlan, sources: Artefact, k: int, config: dict[str, Any],
     from taccorl.data.lerobot_format import write_episodes
 
     attempts = _attempts(plan, sources.path, sources.digest)
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), attempts.sim, pictures=plan.images)
+    spec = plan.rows(attempts.sim)
     try:
         done = attempts.run(k)
         recorder = attempts.redo(done, spec, np.random.default_rng([done.scene_seed, 2])) if done.success else None

@@ -19,6 +19,7 @@ from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
 from taccorl.demos.mimicgen.source import ArmTrack, Source
 from taccorl.demos.mimicgen.spec import MimicSpec
 from taccorl.demos.mimicgen.touching import Touching
+from taccorl.demos.recorder import EXECUTED
 from taccorl.errors import DatasetError
 from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation
@@ -47,7 +48,7 @@ def open_sources(root: Path, task: str) -> Dataset:
     """The dataset, if it has what sources need. Reads ``meta/`` only.
 
     Raises:
-        DatasetError: no dataset, or no simulator state; with the way out.
+        DatasetError: no dataset, no simulator state, or disturbed; with the way out.
     """
     dataset = Dataset(root)
     missing = [key for key in COLUMNS if key not in dataset.info["features"]]
@@ -55,6 +56,11 @@ def open_sources(root: Path, task: str) -> Dataset:
         raise DatasetError(
             f"{root}: has no {', '.join(missing)}: object poses are not known, as in every recording of a robot, so it cannot "
             f"be a source. Sources come from the twin: taccorl collect --task={task} --out=outputs/{task}"
+        )
+    if EXECUTED in dataset.info["features"]:
+        raise DatasetError(
+            f"{root}: its arms were pushed off their way (datagen_config/disturbance), {EXECUTED} is not what a hand wanted: "
+            "give the dataset that it was made of, or one without disturbance"
         )
     return dataset
 

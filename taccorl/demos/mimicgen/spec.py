@@ -111,6 +111,17 @@ class SplitNoiseSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DisturbanceSpec:
+    """What pushes the arms off their way in new episodes, so that these show the way back (``disturbance.py``): ``action`` is
+    what was intended, ``sim.executed`` what was sent."""
+
+    joint_rad: float = 0.0
+    """Standard deviation of each joint's drift; 0: none. 0.02 moves a hand by about 10 mm."""
+    time_s: float = 0.7
+    """After which a drift is down to 1/e."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class GenerationSpec:
     """What holds for all subtasks."""
 
@@ -135,6 +146,7 @@ class GenerationSpec:
     An arm that rests elsewhere in this twin than in the source's learns it then, and noise of the transport is gone."""
     contact_lead_steps: int = 15
     noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
+    disturbance: DisturbanceSpec = field(default_factory=DisturbanceSpec)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,8 +278,10 @@ def _subtask_mistakes(key: str, subtask: SubtaskSpec, *, last: bool) -> Iterator
 def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
     generation = spec.datagen_config
     positive = {f"bridge/{f.name}": getattr(generation.bridge, f.name) for f in dataclasses.fields(BridgeSpec)}
+    positive["disturbance/time_s"] = generation.disturbance.time_s
     steps = ("num_settle_steps_before_gripper", "num_settle_steps_before_contact", "contact_lead_steps")
     not_negative = {name: getattr(generation, name) for name in steps}
+    not_negative["disturbance/joint_rad"] = generation.disturbance.joint_rad
     for part in ("transport", "contact"):
         noise = getattr(generation.noise, part)
         not_negative |= {f"noise/{part}/{f.name}": getattr(noise, f.name) for f in dataclasses.fields(noise)}
