@@ -37,7 +37,7 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
     Row k of a dataset made from a recording holds the command in force at time k. Row k of one collected in the twin holds
     the action that was reached, in a straight line, at time k + 1: in force at time k was the action before.
     """
-    state, action = (episode.arrays[key].astype(float) for key in (STATE, ACTION))
+    state, action = episode.arrays[STATE].astype(float), episode.executed().astype(float)
     late = 1 if episode.provenance.get("simulation") else 0
     target, measured = action[: len(action) - late], state[late:]
     if len(measured) < 2:

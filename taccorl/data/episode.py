@@ -10,6 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from taccorl.data.spec import DatasetSpec
+from taccorl.errors import DatasetError
+
+EXECUTED = "sim.executed"
+"""What was sent to the twin, where ``action`` is what was intended."""
 
 Pictures = dict[str, np.ndarray]
 """Feature key → (rows, columns, 3) uint8 RGB."""
@@ -85,6 +89,23 @@ class Episode:
     def time_s(self) -> np.ndarray:
         """(T,) seconds since row 0."""
         return np.arange(self.num_rows) / self.spec.fps
+
+    def executed(self) -> np.ndarray:
+        """(T, A) what was sent: the actions, or of a disturbed episode what they became.
+
+        Raises:
+            DatasetError: it was disturbed, and what was sent is not there any more.
+        """
+        told = self.provenance.get("simulation")
+        made = told.get("mimicgen") if isinstance(told, dict) else None
+        if EXECUTED in self.arrays:
+            return self.arrays[EXECUTED]
+        if isinstance(made, dict) and "disturbance" in made:
+            raise DatasetError(
+                f"{self.name}: its arms were pushed off their way, and {EXECUTED}, what was sent to them, is not there: taccorl "
+                "merge leaves it out. Give the dataset from before it was merged"
+            )
+        return self.arrays["action"]
 
     def joints(self, key: str, unit: str) -> np.ndarray:
         """(size,) bool: which elements of ``key`` have that unit."""

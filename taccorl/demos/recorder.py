@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.data.episode import Episode, Pictures
+from taccorl.data.episode import EXECUTED, Episode, Pictures
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation, Watch
@@ -20,9 +20,6 @@ from taccorl.sim.trajectory import DenseRecorder, Trajectory
 ORIGIN = "MuJoCo twin, not a robot"
 _ANY = (-1e12, 1e12)
 PICTURE = "observation.images."
-
-
-EXECUTED = "sim.executed"
 
 
 def with_simulator(spec: DatasetSpec, sim: Simulation, *, pictures: bool, executed: bool = False) -> DatasetSpec:
@@ -67,7 +64,7 @@ class EpisodeRecorder:
         self._dense = DenseRecorder(self.sim) if self.dense else None
 
     def step(self, action: np.ndarray, watch: Watch | None = None, intended: np.ndarray | None = None) -> None:
-        """One row and one control step. The action is rounded to float32 before it acts: what is stored is what was done.
+        """One row and one control step. The action is rounded to float32 before it acts: what acts is what is stored.
 
         Args:
             watch: sees the state in between, if nothing dense is kept.

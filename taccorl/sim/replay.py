@@ -72,7 +72,7 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
 
 def replay_episode(sim: Simulation, episode: Episode) -> Episode:
     """The twin's version of a measured episode: the same commands, the twin's own joints and touch, no pictures."""
-    state, action = episode.arrays["observation.state"], episode.arrays["action"]
+    state, action = episode.arrays["observation.state"], episode.executed()
     done = replay(sim, action, episode.spec.fps, state[0])
     arrays = {"observation.state": done.reported.astype(np.float32), "action": action}
     if "observation.tactile" in episode.spec.features:

@@ -15,7 +15,7 @@ import numpy as np
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.mimicgen.director import Director, Wish
-from taccorl.demos.mimicgen.disturbance import disturbed
+from taccorl.demos.mimicgen.disturbance import Exact, disturbed
 from taccorl.demos.mimicgen.expert_contact import ExpertContact
 from taccorl.demos.mimicgen.gates import GateKeeper, Measured, foreign_contact
 from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
@@ -173,7 +173,8 @@ class Attempts:
             contact_hands=functools.partial(ExpertContact, sim) if self._feels else None,
         )
         done = Attempted(k, scene_seed, "unfinished")
-        actions, mates_touch, after = [], [], 0
+        actions, is_exact, after = [], [], 0
+        exact = Exact(sim) if self._disturbs else None
         while after < _AFTER_STEPS and not sim.judge.outcome.over[0]:
             try:
                 wishes = director.step(scene, hands.joints_rad)
@@ -185,8 +186,8 @@ class Attempts:
                 done.outcome = "unreachable"
                 done.reason = f"{hands.unreached} is out of reach by {hands.unreached_m * 1e3:.1f} mm"
                 break
-            if self._disturbs:
-                mates_touch.append(any(sim.contact(*pair).touching[0] for pair in sim.task.mating))
+            if exact is not None:
+                is_exact.append(exact.look())
             sim.step(action[None].astype(np.float64))
             actions.append(action)
             after += director.done
@@ -194,7 +195,7 @@ class Attempts:
         self._end(done)
         done.provenance = self._provenance(director, k, scene_seed)
         if self._disturbs and done.success:
-            self._disturb(done, np.array(mates_touch))
+            self._disturb(done, np.array(is_exact))
         done.cpu_s = time.process_time() - began_s
         return done
 
@@ -205,14 +206,14 @@ class Attempts:
             done.outcome = "success" if outcome.success[0] else str(outcome.failure[0])
         done.last_state = self.sim.state_rows()[0]
 
-    def _disturb(self, done: Attempted, mates_touch: np.ndarray) -> None:
+    def _disturb(self, done: Attempted, is_exact: np.ndarray) -> None:
         """Do a success again with its arms pushed off their way. One whose success takes longer now stands still until then."""
         sim, spec = self.sim, self.spec.datagen_config.disturbance
         waits = [done.actions[-1:]] * _AFTER_STEPS
         intended = np.concatenate([done.actions, *waits])
-        mates_touch = np.pad(mates_touch, (0, _AFTER_STEPS), mode="edge")
+        is_exact = np.pad(is_exact, ((0, _AFTER_STEPS), (0, 0)), mode="edge")
         rng = np.random.default_rng([done.scene_seed, _DISTURBANCE])
-        executed, num = disturbed(intended, mates_touch, spec, rng), 0
+        executed, num = disturbed(intended, is_exact, spec, rng), 0
         sim.reset([done.scene_seed])
         while num < len(executed) and not sim.judge.outcome.over[0]:
             sim.step(executed[[num]].astype(np.float64))

@@ -272,11 +272,14 @@ def attempt_episode(folder: Path) -> Episode:
             f"{folder}: attempt {entry['attempt']} has no actions to show: {entry['outcome']}: {entry['reason']}"
         )
     sim, scene_seed = simulation_told(config), entry["scene_seed"]
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=config["images"])
+    disturbed = (folder / "intended.npy").is_file()
+    contract = load_dataset_spec(find_spec("taccorl_bimanual"))
+    spec = with_simulator(contract, sim, pictures=config["images"], executed=disturbed)
     sim.reset([scene_seed])
     recorder = EpisodeRecorder(sim, spec, np.random.default_rng([scene_seed, 2]))
-    for action in actions:
-        recorder.step(action)
+    intended = np.load(folder / "intended.npy") if disturbed else [None] * len(actions)
+    for action, wanted in zip(actions, intended, strict=True):
+        recorder.step(action, intended=wanted)
     told = {key: value for key, value in config.items() if key != "spec"} | {"mimicgen": entry["provenance"]}
     ended = f"{entry['outcome']}: {entry['reason']}" if entry["reason"] else entry["outcome"]
     episode = recorder.episode(f"{config['task']} attempt {entry['attempt']}, {ended}", told)
@@ -329,6 +332,8 @@ def _write(done: Attempted, folder: Path) -> None:
     entry = {"attempt": done.k, "outcome": done.outcome, "rows": rows, "seconds": rows / CONTROL_HZ}
     entry |= {"reason": done.reason, "scene_seed": done.scene_seed, "provenance": done.provenance}
     np.save(folder / "actions.npy", done.actions)
+    if done.intended is not None:
+        np.save(folder / "intended.npy", done.intended)
     (folder / "entry.json").write_text(json.dumps(entry, indent=1, ensure_ascii=False), encoding="utf-8")
 
 

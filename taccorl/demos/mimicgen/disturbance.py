@@ -12,8 +12,10 @@ import math
 import numpy as np
 
 from taccorl.demos.mimicgen.spec import DisturbanceSpec
+from taccorl.demos.mimicgen.touching import Touching
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.robot import ARMS
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
 # T rows
@@ -24,18 +26,18 @@ _JOINTS, _PER_ARM = 6, 7
 
 
 def disturbed(
-    intended: np.ndarray, mates_touch: np.ndarray, spec: DisturbanceSpec, rng: np.random.Generator
+    intended: np.ndarray, is_exact: np.ndarray, spec: DisturbanceSpec, rng: np.random.Generator
 ) -> np.ndarray:
     """What is executed: joints drift, openings are as intended.
 
     Args:
         intended: (T, 14) float32 joint targets [rad] and openings [m].
-        mates_touch: (T,) whether parts that belong together touch when the action is sent.
+        is_exact: (T, 2) whether an arm may not be pushed when the action is sent (``Exact``).
 
     Returns:
         (T, 14) float32, within the limits of actions.
     """
-    off_rad, strength = drift(len(intended), spec, rng), strengths(intended, mates_touch)
+    off_rad, strength = drift(len(intended), spec, rng), strengths(intended, is_exact)
     executed = intended.astype(float)
     for a in range(len(ARMS)):
         joints = slice(_PER_ARM * a, _PER_ARM * a + _JOINTS)
@@ -43,13 +45,32 @@ def disturbed(
     return np.clip(executed, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 
 
-def strengths(intended: np.ndarray, mates_touch: np.ndarray) -> np.ndarray:
-    """(T, 2) of each arm, 0 … 1: none while its gripper moves or parts that belong together touch, nor 0.4 s before and after;
-    full another 0.4 s away."""
+class Exact:
+    """When an arm may not be pushed: it grips what something else holds fast, the table for one; or what belongs together has met
+    and a hand still holds one of it. Inside its play a plug does not touch all the time, so that they have met is remembered."""
+
+    def __init__(self, sim: Simulation) -> None:
+        """After a reset."""
+        self._sim, self._touching = sim, Touching(sim)
+        self._have_met = np.zeros(len(sim.task.mating), bool)
+
+    def look(self) -> np.ndarray:
+        """(2,) of each arm in the simulation's present state; to be called at each row."""
+        sim = self._sim
+        self._touching.look(sim.state_rows()[0])
+        for i, pair in enumerate(sim.task.mating):
+            is_held = any({arm, part} in self._touching.pairs for arm in ARMS for part in pair)
+            self._have_met[i] = is_held and (self._have_met[i] or sim.contact(*pair).touching[0])
+        return np.array([self._have_met.any() or self._touching.holds_fast(arm) for arm in ARMS])
+
+
+def strengths(intended: np.ndarray, is_exact: np.ndarray) -> np.ndarray:
+    """(T, 2) of each arm, 0 … 1: none in rows (T, 2) that are exact or while its gripper moves, nor 0.4 s before and after; full
+    another 0.4 s away."""
     strength = np.ones((len(intended), len(ARMS)))
     for a in range(len(ARMS)):
         opening_m = intended[:, _PER_ARM * a + _JOINTS].astype(float)
-        exact = mates_touch | (np.abs(np.diff(opening_m, prepend=opening_m[:1])) > _MOVES_M)
+        exact = is_exact[:, a] | (np.abs(np.diff(opening_m, prepend=opening_m[:1])) > _MOVES_M)
         rows = np.flatnonzero(exact)
         if len(rows):
             away = np.abs(np.arange(len(intended))[:, None] - rows).min(1)

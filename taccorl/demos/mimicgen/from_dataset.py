@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.dataset import Dataset
-from taccorl.data.episode import Episode
+from taccorl.data.episode import EXECUTED, Episode
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
 from taccorl.demos.mimicgen.source import ArmTrack, Source
 from taccorl.demos.mimicgen.spec import MimicSpec
 from taccorl.demos.mimicgen.touching import Touching
-from taccorl.demos.recorder import EXECUTED
 from taccorl.errors import DatasetError
 from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation
@@ -59,8 +58,8 @@ def open_sources(root: Path, task: str) -> Dataset:
         )
     if EXECUTED in dataset.info["features"]:
         raise DatasetError(
-            f"{root}: its arms were pushed off their way (datagen_config/disturbance), {EXECUTED} is not what a hand wanted: "
-            "give the dataset that it was made of, or one without disturbance"
+            f"{root}: its arms were pushed off their way (datagen_config/disturbance): hands are not where they were to be. "
+            "Give the dataset that it was made of, or one without disturbance"
         )
     return dataset
 

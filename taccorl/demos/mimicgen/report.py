@@ -85,6 +85,7 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None)
         "spec": plan.spec.digest,
         "retarget": plan.spec.datagen_config.retarget,
         "contact_mode": plan.spec.datagen_config.contact_mode,
+        "disturbance": _disturbance(plan),
         "yield": share_of(plain).told(),
         "yield_of": f"attempts 0 … {len(plain) - 1}, the paper's randomisation",
         "all_attempts": share.told(),
@@ -103,6 +104,11 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None)
         ],
         "cost": _cost(attempts, spent),
     }
+
+
+def _disturbance(plan: AugmentPlan) -> str:
+    pushed = plan.spec.datagen_config.disturbance
+    return f"{pushed.joint_rad:g} rad of each joint, {pushed.time_s:g} s" if pushed.joint_rad else "none"
 
 
 def _by_source(attempts: Sequence[Attempt], successes: int) -> list[dict[str, Any]]:
@@ -153,7 +159,17 @@ def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
             ("", ""),
             [
                 [html.escape(name), html.escape(str(told[name]))]
-                for name in ("dataset", "source", "twin", "difficulty", "seed", "retarget", "contact_mode", "spec")
+                for name in (
+                    "dataset",
+                    "source",
+                    "twin",
+                    "difficulty",
+                    "seed",
+                    "retarget",
+                    "contact_mode",
+                    "disturbance",
+                    "spec",
+                )
             ],
         ),
         *_filled(told),

@@ -62,12 +62,11 @@ def score_generation(
     for k in range(num_attempts):
         done = attempts.run(k)
         if done.success:
-            recorder = attempts.redo(done, rows)
+            attempts.redo(done, rows)
             if done.success:
                 score.duration_s.append(len(done.actions) / CONTROL_HZ)
                 if check:
-                    stored = np.stack([row["action"] for row in recorder.rows])
-                    score.broken += not _holds(other, done.scene_seed, stored, done.last_state)
+                    score.broken += not _holds(other, done.scene_seed, done.actions, done.last_state)
         score.outcomes.append(done.outcome)
         score.cpu_s.append(done.cpu_s)
     return score

@@ -293,11 +293,17 @@ def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
             if getattr(constraint, name) < 0:
                 yield f"task_constraint_configs/{i}/{name}", f"{getattr(constraint, name):g}: give a half width ≥ 0"
     for name, value in (positive | not_negative).items():
-        if value < 0 or (name in positive and value == 0):
+        if not value >= 0 or (name in positive and value == 0):
             yield (
                 f"datagen_config/{name}",
                 f"{value:g} is not wanted; give a number {'> 0' if name in positive else '≥ 0'}",
             )
+    disturbance = generation.disturbance
+    if disturbance.joint_rad == 0 and disturbance != DisturbanceSpec():
+        yield (
+            "datagen_config/disturbance/time_s",
+            "has no effect without joint_rad; give joint_rad: 0.02, or leave it out",
+        )
     yield from _closed_loop_mistakes(generation)
 
 
@@ -309,6 +315,12 @@ def _closed_loop_mistakes(generation: GenerationSpec) -> Iterator[tuple[str, str
             "datagen_config/retarget",
             "eef_command sends poses as they were commanded, but closed_loop_expert says where the hands are to be; take "
             "held_object or eef, or contact_mode: replay",
+        )
+    if generation.disturbance.joint_rad > 0:
+        yield (
+            "datagen_config/disturbance",
+            "disturbed episodes do again what was done undisturbed, and closed_loop_expert would no longer follow from touch; "
+            "leave one of them out",
         )
     if generation.noise.contact != NoiseSpec():
         yield (
