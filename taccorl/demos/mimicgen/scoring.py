@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from taccorl.data.episode import EXECUTED
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.mimicgen.attempt import Attempts
 from taccorl.demos.mimicgen.coverage import Share
@@ -62,11 +63,12 @@ def score_generation(
     for k in range(num_attempts):
         done = attempts.run(k)
         if done.success:
-            attempts.redo(done, rows)
+            recorder = attempts.redo(done, rows)
             if done.success:
                 score.duration_s.append(len(done.actions) / CONTROL_HZ)
                 if check:
-                    score.broken += not _holds(other, done.scene_seed, done.actions, done.last_state)
+                    stored = np.stack([row.get(EXECUTED, row["action"]) for row in recorder.rows])
+                    score.broken += not _holds(other, done.scene_seed, stored, done.last_state)
         score.outcomes.append(done.outcome)
         score.cpu_s.append(done.cpu_s)
     return score
