@@ -419,10 +419,43 @@ def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
         load_base_weights(policy, str(tmp_path))
 
 
+def test_regression_predicts_one_chunk_and_its_loss_is_that_chunks_error():
+    policy, batch = tiny_policy(objective="regression"), batch_of(True, False, True)
+    predicted = chunk(policy, batch, seed=1)
+    assert torch.equal(predicted, chunk(policy, batch, seed=2))  # no draw
+    assert torch.equal(predicted, policy.predict_action_chunk(batch, num_steps=7))  # and one step
+    errors, scale = batch["action"] - predicted, 0.02
+    wanted = ((errors**2 + scale**2).sqrt() - scale).mean(dim=(1, 2))
+    torch.testing.assert_close(losses(policy, batch, seed=3), wanted, rtol=1e-5, atol=1e-6)
+    # Far off it is the absolute error less the scale, near by the square over twice the scale; at 0 it has a gradient.
+    near, far = predicted + 1e-4, predicted + 3.0
+    assert losses(policy, {**batch, "action": far}).tolist() == pytest.approx([2.98] * 3, rel=1e-3)
+    assert losses(policy, {**batch, "action": near}).tolist() == pytest.approx([1e-8 / 0.04] * 3, rel=0.05)
+    policy.forward({**batch, "action": predicted})[0].backward()
+    assert all(torch.isfinite(p.grad).all() for p in policy.parameters() if p.grad is not None)
+
+
+def test_regression_is_learnt_in_a_few_steps_and_kept_in_a_checkpoint(tmp_path):
+    policy, batch = tiny_policy(objective="regression"), batch_of(True, False)
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
+    first = losses(policy, batch).mean()
+    for _ in range(30):
+        policy.train().forward(batch)[0].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    policy.eval()
+    assert losses(policy, batch).mean() < 0.2 * first
+    assert (chunk(policy, batch) - batch["action"]).abs().mean() < 0.2 * batch["action"].abs().mean()
+    policy.save_pretrained(tmp_path)
+    again = TactilePI05Policy.from_pretrained(tmp_path)
+    assert again.config.regresses and torch.equal(chunk(again, batch), chunk(policy, batch))
+
+
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
         ({"backbone": "tny"}, "--policy.backbone=tny: did you mean 'tiny'"),
+        ({"objective": "regresion"}, "--policy.objective=regresion: did you mean 'regression'"),
         ({"base_checkpoint": "lerobot/pi05_base"}, "fit --policy.backbone=full only, not tiny"),
         ({"tactile_history": 0}, "--policy.tactile_history=0: at least 1"),
         ({"contact_threshold": float("nan")}, "--policy.contact_threshold=nan"),

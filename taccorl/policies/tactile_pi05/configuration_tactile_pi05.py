@@ -23,6 +23,7 @@ RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative 
 STATE_SINCE_PLAN = "state_since_plan"  # of an action tensor: how far that has moved since its chunk was predicted
 _PALIGEMMA = "google/paligemma-3b-pt-224"
 _BACKBONES = ("full", "small", "tiny")
+_OBJECTIVES = ("flow_matching", "regression")
 
 
 @LRSchedulerConfig.register_subclass("warmup_then_cosine")
@@ -149,12 +150,17 @@ class TactilePI05Config(PI05Config):
     compile_model: bool = True
     """On a GPU, train with compiled layers (see ``compiled``; ``compile_mode`` is not used). False: LeRobot's own forward."""
 
+    objective: str = "flow_matching"
+    """What a chunk is. flow_matching: π0.5's, a draw, in ``num_inference_steps`` steps out of noise. regression: the one chunk
+    whose absolute errors are least (nearly: see ``REGRESSION_SCALE``), in one step out of zeros, as L1 regression in OpenVLA-OFT
+    (arXiv:2502.19645). Good after fewer rows; it has no second way where demonstrations go two."""
+
     chunk_size: int = 10
     """H: actions that are predicted."""
     n_action_steps: int = 10
     """Actions of a chunk that are executed before the policy looks again."""
     num_inference_steps: int = 4
-    """K_denoise."""
+    """K_denoise. Not used by regression, which takes one."""
     optimizer_lr: float = 2.5e-5
     """η_max."""
     optimizer_muon: bool = False
@@ -172,6 +178,8 @@ class TactilePI05Config(PI05Config):
         super().__post_init__()
         if self.backbone not in _BACKBONES:
             raise TaccorlError(f"--policy.backbone={self.backbone}: {nearest(self.backbone, _BACKBONES)}")
+        if self.objective not in _OBJECTIVES:
+            raise TaccorlError(f"--policy.objective={self.objective}: {nearest(self.objective, _OBJECTIVES)}")
         if self.base_checkpoint and self.backbone != "full":
             raise TaccorlError(
                 f"--policy.base_checkpoint={self.base_checkpoint}: π0.5's weights fit --policy.backbone=full only, not "
@@ -200,6 +208,11 @@ class TactilePI05Config(PI05Config):
         if self.image_randomization:
             return ImageRandomizationConfig(noise_std=self.image_noise_std)
         return ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
+
+    @property
+    def regresses(self) -> bool:
+        """Whether the chunk is predicted at once."""
+        return self.objective == "regression"
 
     @property
     def tokenizer_name(self) -> str:

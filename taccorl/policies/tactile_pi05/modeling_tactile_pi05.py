@@ -44,6 +44,8 @@ from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkp
 ACTION_IS_PAD = "action_is_pad"
 _EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"  # of LeRobot's --policy.empty_cameras
 _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
+REGRESSION_SCALE = 0.02
+"""s, in normalised actions, whose range is 2. Smaller errors count by their square, larger ones as they are."""
 
 _log = logging.getLogger(__name__)
 
@@ -84,6 +86,7 @@ class TactileConditioning(nn.Module):
 class TactilePI05Pytorch(PI05Pytorch):
     """LeRobot's model; only ``embed_prefix`` and ``embed_suffix`` know of touch."""
 
+    config: TactilePI05Config
     paligemma_with_expert: CompiledBackbone
 
     def __init__(self, config: TactilePI05Config, rtc_processor: Any = None) -> None:
@@ -148,6 +151,15 @@ class TactilePI05Pytorch(PI05Pytorch):
             torch.cat([valid_BT, contact_B[:, None].expand(-1, num_tokens)], dim=1),
             torch.cat([starts_block_BT, starts_block_BT.new_zeros(len(starts_block_BT), num_tokens)], dim=1),
         )
+
+    def sample_noise(self, shape: Any, device: Any) -> Tensor:
+        return torch.zeros(shape, device=device) if self.config.regresses else super().sample_noise(shape, device)
+
+    def sample_time(self, bsize: int, device: Any) -> Tensor:
+        return torch.ones(bsize, device=device) if self.config.regresses else super().sample_time(bsize, device)
+
+    def sample_actions(self, *args: Any, num_steps: int | None = None, **kwargs: Any) -> Tensor:
+        return super().sample_actions(*args, num_steps=1 if self.config.regresses else num_steps, **kwargs)
 
     def embed_suffix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         actions_BHD, valid_BH, starts_block_BH, condition_BD = super().embed_suffix(*args, **kwargs)
@@ -283,7 +295,7 @@ class TactilePI05Policy(PI05Policy):
         self._plans_state: Tensor | None = None
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
-        """The co-training loss (see ``mixture``) over pi05's flow-matching losses, and what there is to be logged.
+        """The co-training loss (see ``mixture``) over ``action_losses``, and what there is to be logged.
 
         A row's loss is the mean over its action steps without those behind the episode's end (LeRobot's pi05 counts them,
         too). Where there are none, and one domain, it is LeRobot's to the bit.
@@ -291,7 +303,7 @@ class TactilePI05Policy(PI05Policy):
         Args:
             reduction: "mean", or "none" for the rows, (B,), of which it is the mean.
         """
-        losses_BHA, contact_B = self.flow_losses(batch)
+        losses_BHA, contact_B = self.action_losses(batch)
         rows, horizon = losses_BHA.shape[:2]
         counts_BH = losses_BHA.new_ones(rows, horizon)
         if ACTION_IS_PAD in batch:
@@ -312,10 +324,12 @@ class TactilePI05Policy(PI05Policy):
         said: dict[str, Any] = dict(zip(told, torch.stack(list(told.values())).tolist(), strict=True))
         return loss, said
 
-    def flow_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
-        """(B, H, 32) squared errors of the velocity at a random time, and (B,) contact (None: vision only).
+    def action_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
+        """(B, H, 32) losses by ``config.objective``, and (B,) contact (None: vision only).
 
-        Draws noise and time from torch's generator as LeRobot's pi05 does; in training, first what changes the images.
+        Flow matching: squared errors of the velocity at a random time. Draws noise and time from torch's generator as LeRobot's
+        pi05 does; in training, first what changes the images. Regression: √(e² + s²) − s of the chunk's errors e, in normalised
+        actions, with s = ``REGRESSION_SCALE``: absolute errors, that are smooth at 0 (pseudo-Huber).
         """
         if self.training and self._change_images is not None:
             batch = {**batch, **{k: self._change_images(batch[k]) for k in self.config.image_features if k in batch}}
@@ -330,7 +344,10 @@ class TactilePI05Policy(PI05Policy):
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
             return self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
 
-        return self._by_contact(batch, compute)
+        losses_BHA, contact_B = self._by_contact(batch, compute)
+        if self.config.regresses:  # from zeros at time 1 the velocity is minus the chunk, and its error the chunk's
+            losses_BHA = (losses_BHA + REGRESSION_SCALE**2).sqrt() - REGRESSION_SCALE
+        return losses_BHA, contact_B
 
     @property
     def _num_actions(self) -> int:
@@ -391,7 +408,7 @@ class TactilePI05Policy(PI05Policy):
         """(B, H, A). ``observation.tactile`` is the window, (B, L, K): a caller that re-plans rarely has to bring it along.
 
         Args:
-            kwargs: LeRobot's, for real-time chunking; and ``noise`` (B, H, 32), ``num_steps``.
+            kwargs: LeRobot's, for real-time chunking; and, of flow matching, ``noise`` (B, H, 32) and ``num_steps``.
         """
         self.eval()
         images, image_masks = self._preprocess_images(batch)
