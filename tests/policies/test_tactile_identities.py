@@ -12,14 +12,6 @@ from taccorl.policies.tactile_pi05.graphed import KeptConstants
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module", params=["keypoints", "patches"], autouse=True)
 def vision(request) -> Iterator[str]:
     with sees_with(request.param):

@@ -13,6 +13,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, load_optimizer_state, save_optimizer_state
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from safetensors.torch import save_file
 from tiny_policies import (
     FORMAT,
@@ -423,23 +424,38 @@ def test_regression_predicts_one_chunk_and_its_loss_is_that_chunks_error():
     policy, batch = tiny_policy(objective="regression"), batch_of(True, False, True)
     predicted = chunk(policy, batch, seed=1)
     assert torch.equal(predicted, chunk(policy, batch, seed=2))  # no draw
-    assert torch.equal(predicted, policy.predict_action_chunk(batch, num_steps=7))  # and one step
+    # … and one step, out of zeros, whatever the caller says
+    assert torch.equal(predicted, policy.predict_action_chunk(batch, num_steps=7, noise=torch.ones(3, 10, 32)))
     errors, scale = batch["action"] - predicted, 0.02
     wanted = ((errors**2 + scale**2).sqrt() - scale).mean(dim=(1, 2))
     torch.testing.assert_close(losses(policy, batch, seed=3), wanted, rtol=1e-5, atol=1e-6)
-    # Far off it is the absolute error less the scale, near by the square over twice the scale; at 0 it has a gradient.
+    # Far off it is the absolute error less the scale, near by the square over twice the scale; at 0 its gradient is finite.
     near, far = predicted + 1e-4, predicted + 3.0
     assert losses(policy, {**batch, "action": far}).tolist() == pytest.approx([2.98] * 3, rel=1e-3)
     assert losses(policy, {**batch, "action": near}).tolist() == pytest.approx([1e-8 / 0.04] * 3, rel=0.05)
     policy.forward({**batch, "action": predicted})[0].backward()
-    assert all(torch.isfinite(p.grad).all() for p in policy.parameters() if p.grad is not None)
+    gradients = [p.grad for p in policy.model.action_out_proj.parameters()]
+    assert all(gradient is not None and torch.isfinite(gradient).all() for gradient in gradients)
+
+
+def test_a_regressed_chunk_in_real_time_begins_where_the_last_one_goes_on():
+    policy, batch = tiny_policy(objective="regression"), batch_of(True, False)
+    free = chunk(policy, batch)
+    policy.config.rtc_config = RTCConfig(execution_horizon=8)  # as LeRobot's rollout does it, with its weight of 10
+    policy.init_rtc_processor()
+    assert policy.config.rtc_config.max_guidance_weight == 10
+    led = policy.predict_action_chunk(batch, prev_chunk_left_over=free + 0.1, inference_delay=2)
+    share = ((led - free) / 0.1).mean(dim=(0, 2))
+    # LINEAR: what is on its way is kept; then the last chunk weighs 6/7, 5/7, …; behind the horizon not at all.
+    wanted = [1, 1, *(k / 7 for k in range(6, 0, -1)), 0, 0]
+    assert share.tolist() == pytest.approx(wanted, abs=1e-3)
 
 
 def test_regression_is_learnt_in_a_few_steps_and_kept_in_a_checkpoint(tmp_path):
-    policy, batch = tiny_policy(objective="regression"), batch_of(True, False)
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
+    policy = tiny_policy(objective="regression", image_randomization=False, image_noise_std=0.0)
+    batch, optimizer = batch_of(True, False), torch.optim.AdamW(policy.parameters(), lr=3e-3)
     first = losses(policy, batch).mean()
-    for _ in range(30):
+    for _ in range(80):
         policy.train().forward(batch)[0].backward()
         optimizer.step()
         optimizer.zero_grad()
@@ -448,7 +464,7 @@ def test_regression_is_learnt_in_a_few_steps_and_kept_in_a_checkpoint(tmp_path):
     assert (chunk(policy, batch) - batch["action"]).abs().mean() < 0.2 * batch["action"].abs().mean()
     policy.save_pretrained(tmp_path)
     again = TactilePI05Policy.from_pretrained(tmp_path)
-    assert again.config.regresses and torch.equal(chunk(again, batch), chunk(policy, batch))
+    assert again.config.is_regression and torch.equal(chunk(again, batch), chunk(policy, batch))
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ class TactilePI05Config(PI05Config):
     """True: the state is part of the prompt, 256 steps over each joint's range, as in π0.5. False: a token beside the actions, as
     in π0, exact. None: the backbone's own, True for full and False for small and tiny."""
     tactile: bool = True
-    """False: vision only. The same policy without touch: LeRobot's pi05."""
+    """False: vision only. The same policy without touch: with flow matching, LeRobot's pi05."""
     tactile_history: int = 10
     """L: readings in the window, one a row of the dataset."""
     prefix_tokens: int = 8
@@ -151,9 +151,10 @@ class TactilePI05Config(PI05Config):
     """On a GPU, train with compiled layers (see ``compiled``; ``compile_mode`` is not used). False: LeRobot's own forward."""
 
     objective: str = "flow_matching"
-    """What a chunk is. flow_matching: π0.5's, a draw, in ``num_inference_steps`` steps out of noise. regression: the one chunk
-    whose absolute errors are least (nearly: see ``REGRESSION_SCALE``), in one step out of zeros, as L1 regression in OpenVLA-OFT
-    (arXiv:2502.19645). Good after fewer rows; it has no second way where demonstrations go two."""
+    """How chunks are learnt and made; a checkpoint is of the one that it was trained with. flow_matching, π0.5's: drawn out of
+    noise in ``num_inference_steps`` steps. regression: predicted in one step, trained by a smooth absolute error (as L1
+    regression in OpenVLA-OFT, arXiv:2502.19645). The same observation always gives the same chunk; where demonstrations do
+    different things in the same situation, that may lie between them. What a tiny policy gains: configs/small/tiny.yaml."""
 
     chunk_size: int = 10
     """H: actions that are predicted."""
@@ -210,7 +211,7 @@ class TactilePI05Config(PI05Config):
         return ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
 
     @property
-    def regresses(self) -> bool:
+    def is_regression(self) -> bool:
         """Whether the chunk is predicted at once."""
         return self.objective == "regression"
 

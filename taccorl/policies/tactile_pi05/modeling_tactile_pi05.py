@@ -2,16 +2,17 @@
 
     Z̄ = Z_base + CrossAttn(Z_base, Z_touch)        the cross-attention's output is zero when training starts
     prefix = [Z̄, Z_touch]                          images, language and state; then M_pre tokens of touch
-    suffix = [Z_touch, actions]                     M_suf tokens of touch, then the noisy actions
+    suffix = [Z_touch, actions]                     M_suf tokens of touch, then the noisy actions (regression: zeros)
 
 Without pretrained weights the state is not in the prompt, in 256 steps a joint, but a token before the actions, as in π0.
 
 Without contact neither exists for the row: attention masks the tokens, positions do not count them and the sum is left out.
-So a row without contact is what plain pi05 makes of it, bit by bit: when the whole batch is without, and on a CPU also beside
-rows with contact (``_by_contact``). Where a GPU computes by other kernels than LeRobot's (``compiled`` in training, ``graphed``
-for a chunk), it is so up to rounding.
+So a row without contact is, with flow matching, what plain pi05 makes of it, bit by bit: when the whole batch is without, and
+on a CPU also beside rows with contact (``_by_contact``). Where a GPU computes by other kernels than LeRobot's (``compiled`` in
+training, ``graphed`` for a chunk), it is so up to rounding.
 """
 
+import dataclasses
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -45,7 +46,7 @@ ACTION_IS_PAD = "action_is_pad"
 _EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"  # of LeRobot's --policy.empty_cameras
 _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
 REGRESSION_SCALE = 0.02
-"""s, in normalised actions, whose range is 2. Smaller errors count by their square, larger ones as they are."""
+"""s, in normalised actions, 2 of which are an action's range. Smaller errors count by their square, larger ones as they are."""
 
 _log = logging.getLogger(__name__)
 
@@ -153,13 +154,28 @@ class TactilePI05Pytorch(PI05Pytorch):
         )
 
     def sample_noise(self, shape: Any, device: Any) -> Tensor:
-        return torch.zeros(shape, device=device) if self.config.regresses else super().sample_noise(shape, device)
+        if self.config.is_regression:
+            return torch.zeros(shape, dtype=torch.float32, device=device)
+        return super().sample_noise(shape, device)
 
     def sample_time(self, bsize: int, device: Any) -> Tensor:
-        return torch.ones(bsize, device=device) if self.config.regresses else super().sample_time(bsize, device)
+        if self.config.is_regression:
+            return torch.ones(bsize, dtype=torch.float32, device=device)
+        return super().sample_time(bsize, device)
 
-    def sample_actions(self, *args: Any, num_steps: int | None = None, **kwargs: Any) -> Tensor:
-        return super().sample_actions(*args, num_steps=1 if self.config.regresses else num_steps, **kwargs)
+    def sample_actions(
+        self,
+        images: list[Tensor],
+        img_masks: list[Tensor],
+        tokens: Tensor,
+        masks: Tensor,
+        noise: Tensor | None = None,
+        num_steps: int | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        if self.config.is_regression:
+            noise, num_steps = None, 1
+        return super().sample_actions(images, img_masks, tokens, masks, noise=noise, num_steps=num_steps, **kwargs)
 
     def embed_suffix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         actions_BHD, valid_BH, starts_block_BH, condition_BD = super().embed_suffix(*args, **kwargs)
@@ -298,7 +314,7 @@ class TactilePI05Policy(PI05Policy):
         """The co-training loss (see ``mixture``) over ``action_losses``, and what there is to be logged.
 
         A row's loss is the mean over its action steps without those behind the episode's end (LeRobot's pi05 counts them,
-        too). Where there are none, and one domain, it is LeRobot's to the bit.
+        too). Where there are none, and one domain, that of flow matching is LeRobot's to the bit.
 
         Args:
             reduction: "mean", or "none" for the rows, (B,), of which it is the mean.
@@ -329,7 +345,7 @@ class TactilePI05Policy(PI05Policy):
 
         Flow matching: squared errors of the velocity at a random time. Draws noise and time from torch's generator as LeRobot's
         pi05 does; in training, first what changes the images. Regression: √(e² + s²) − s of the chunk's errors e, in normalised
-        actions, with s = ``REGRESSION_SCALE``: absolute errors, that are smooth at 0 (pseudo-Huber).
+        actions, with s = ``REGRESSION_SCALE``: absolute errors, that are smooth at 0 (pseudo-Huber, over s).
         """
         if self.training and self._change_images is not None:
             batch = {**batch, **{k: self._change_images(batch[k]) for k in self.config.image_features if k in batch}}
@@ -345,9 +361,20 @@ class TactilePI05Policy(PI05Policy):
             return self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
 
         losses_BHA, contact_B = self._by_contact(batch, compute)
-        if self.config.regresses:  # from zeros at time 1 the velocity is minus the chunk, and its error the chunk's
+        if self.config.is_regression:  # from zeros at time 1 the velocity is minus the chunk, and its error the chunk's
             losses_BHA = (losses_BHA + REGRESSION_SCALE**2).sqrt() - REGRESSION_SCALE
         return losses_BHA, contact_B
+
+    def init_rtc_processor(self) -> None:
+        """LeRobot's, called again once a rollout has set ``config.rtc_config``.
+
+        Guidance pulls harder (up to 10 times) the earlier a denoising step is, as later ones make up for it. Regression has one.
+        """
+        super().init_rtc_processor()
+        if self.rtc_processor is not None and self.config.is_regression:
+            given = self.rtc_processor.rtc_config
+            weight = min(1.0, given.max_guidance_weight)
+            self.rtc_processor.rtc_config = dataclasses.replace(given, max_guidance_weight=weight)
 
     @property
     def _num_actions(self) -> int:
