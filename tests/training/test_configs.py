@@ -84,3 +84,4 @@ def test_words_after_the_file_count_more(monkeypatch: pytest.MonkeyPatch) -> Non
     config = lerobot_train(CONFIGS / "small" / "tiny.yaml", monkeypatch, *words)
     assert (config.steps, config.policy.sim_weight, config.policy.image_randomization) == (7, 0.95, True)
     assert config.policy.backbone == "tiny" and config.policy.optimizer_lr == 2e-3 and config.policy.optimizer_muon
+    assert config.policy.objective == "regression"
