@@ -1,224 +1,43 @@
-"""π0.5 with touch: LeRobot's pi05 with two more kinds of tokens, gated by contact (paper §3.2).
+"""π0.5 with touch as a LeRobot policy: training's loss and the chunk of actions, around the ``network``.
 
-    Z̄ = Z_base + CrossAttn(Z_base, Z_touch)        the cross-attention's output is zero when training starts
-    prefix = [Z̄, Z_touch]                          images, language and state; then M_pre tokens of touch
-    suffix = [Z_touch, actions]                     M_suf tokens of touch, then the noisy actions (regression: zeros)
-
-Without pretrained weights the state is not in the prompt, in 256 steps a joint, but a token before the actions, as in π0.
-
-Without contact neither exists for the row: attention masks the tokens, positions do not count them and the sum is left out.
-So a row without contact is, with flow matching, what plain pi05 makes of it, bit by bit: when the whole batch is without, and
-on a CPU also beside rows with contact (``_by_contact``). Where a GPU computes by other kernels than LeRobot's (``compiled`` in
+A row without contact is, with flow matching, what plain pi05 makes of it, bit by bit: when the whole batch is without, and on a
+CPU also beside rows with contact (``_by_contact``). Where a GPU computes by other kernels than LeRobot's (``compiled`` in
 training, ``graphed`` for a chunk), it is so up to rounding.
 """
 
 import dataclasses
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import torch
-from lerobot.policies.pi05.modeling_pi05 import PI05Policy, PI05Pytorch
+from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
-from torch import Tensor, nn
+from torch import Tensor
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.backbone import SIZES, FullBackbone, Patches, SmallBackbone
-from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     RAW_STATE,
     STATE_SINCE_PLAN,
     TACTILE,
     TactilePI05Config,
 )
-from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder, TouchIntoContext
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
 from taccorl.policies.tactile_pi05.muon import BY_MUON
+from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
 from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkpoint
 
-# B batch, S state, L history, K taxels, P pads, R rows, C columns, M tokens, T of the context, D width, H horizon, A action
+# B batch, S state, L history, K taxels, P pads, R rows, C columns, H horizon, A action
 ACTION_IS_PAD = "action_is_pad"
 _EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"  # of LeRobot's --policy.empty_cameras
-_TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
 REGRESSION_SCALE = 0.02
 """s, in normalised actions, 2 of which are an action's range. Smaller errors count by their square, larger ones as they are."""
 
 _log = logging.getLogger(__name__)
-
-
-class Touch(NamedTuple):
-    """Touch of a batch as tokens."""
-
-    prefix_BMD: Tensor
-    suffix_BMD: Tensor
-    contact_B: Tensor
-    """c_t: rows without contact do not have the tokens."""
-
-
-class TactileConditioning(nn.Module):
-    """All that touch adds to pi05's weights: ``model.tactile.*`` of a checkpoint."""
-
-    def __init__(self, config: TactilePI05Config, prefix_width: int, suffix_width: int) -> None:
-        super().__init__()
-        width = min(_TOUCH_WIDTH, prefix_width)
-        self.num_prefix = config.prefix_tokens
-        self.encoder = TactileEncoder(
-            config.require_tactile_format().layout,
-            config.tactile_history,
-            config.prefix_tokens + config.suffix_tokens,
-            width,
-        )
-        self.to_prefix = nn.Linear(width, prefix_width)  # W_τ
-        self.to_suffix = nn.Linear(width, suffix_width)
-        self.into_context = TouchIntoContext(prefix_width)
-
-    def forward(self, readings_BLPRC: Tensor, contact_B: Tensor) -> Touch:
-        """Tokens of normalised readings."""
-        tokens_BMD = self.encoder(readings_BLPRC)
-        prefix_BMD, suffix_BMD = tokens_BMD[:, : self.num_prefix], tokens_BMD[:, self.num_prefix :]
-        return Touch(self.to_prefix(prefix_BMD), self.to_suffix(suffix_BMD), contact_B)
-
-
-class TactilePI05Pytorch(PI05Pytorch):
-    """LeRobot's model; only ``embed_prefix`` and ``embed_suffix`` know of touch."""
-
-    config: TactilePI05Config
-    paligemma_with_expert: CompiledBackbone
-
-    def __init__(self, config: TactilePI05Config, rtc_processor: Any = None) -> None:
-        """As ``PI05Pytorch.__init__``, around a backbone of ours."""
-        nn.Module.__init__(self)
-        self.config, self.rtc_processor = config, rtc_processor
-        self.paligemma_with_expert = _backbone(config)
-        self.paligemma_with_expert.compiles_layers = config.compile_model
-        expert_config: Any = self.paligemma_with_expert.gemma_expert.config
-        width = expert_config.hidden_size
-        self.action_in_proj = nn.Linear(config.max_action_dim, width)
-        self.action_out_proj = nn.Linear(width, config.max_action_dim)
-        self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
-        self.gradient_checkpointing_enabled = False
-        if not config.has_discrete_state:
-            self.state_token = StateToken(config.state_dim, width)
-        if config.tactile:
-            text_config: Any = self.paligemma_with_expert.paligemma.config.text_config
-            prefix_width = text_config.hidden_size
-            self.tactile = TactileConditioning(config, prefix_width, self.action_in_proj.out_features)
-        self._touch: Touch | None = None
-        self._state_B1D: Tensor | None = None
-
-    @contextmanager
-    def sensing(
-        self, state_B1D: Tensor | None, readings_BLPRC: Tensor | None, contact_B: Tensor | None, *, masked: bool = False
-    ) -> Iterator[None]:
-        """Whatever is computed inside knows this state and feels these readings.
-
-        Args:
-            state_B1D: its token. None: it is in the prompt.
-            readings_BLPRC: None, or contact nowhere in the batch: plain pi05.
-            masked: tokens are there, masked, even if contact is nowhere; so that nothing is read back from a GPU.
-        """
-        if readings_BLPRC is not None and contact_B is not None and (masked or bool(contact_B.any())):
-            # Float32 in training, too, as in a chunk: casting the encoder's many small weights takes longer than using them.
-            with torch.autocast(contact_B.device.type, enabled=False):
-                self._touch = self.tactile(readings_BLPRC, contact_B)
-        self._state_B1D = state_B1D
-        try:
-            yield
-        finally:
-            self._touch = self._state_B1D = None
-
-    def embed_prefix(
-        self, images: list[Tensor], image_masks: list[Tensor], tokens: Tensor, token_mask: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        backbone = self.paligemma_with_expert
-        are_tokens = images[0].ndim == 3
-        if not are_tokens and (backbone.tells_cameras_apart or backbone.fuses(tokens.device)):
-            images = backbone.embed_images(images)
-        context_BTD, valid_BT, starts_block_BT = super().embed_prefix(images, image_masks, tokens, token_mask)
-        if self._touch is None:
-            return context_BTD, valid_BT, starts_block_BT
-        tokens_BMD, contact_B = self._touch.prefix_BMD, self._touch.contact_B
-        felt_BTD = self.tactile.into_context(context_BTD.to(tokens_BMD.dtype), tokens_BMD).to(context_BTD.dtype)
-        # where, not a product with the gate: 0 · x is not 0 for every x, and −0 + 0 is not −0
-        context_BTD = torch.where(contact_B[:, None, None], context_BTD + felt_BTD, context_BTD)
-        num_tokens = tokens_BMD.shape[1]
-        return (
-            torch.cat([context_BTD, tokens_BMD.to(context_BTD.dtype)], dim=1),
-            torch.cat([valid_BT, contact_B[:, None].expand(-1, num_tokens)], dim=1),
-            torch.cat([starts_block_BT, starts_block_BT.new_zeros(len(starts_block_BT), num_tokens)], dim=1),
-        )
-
-    def sample_noise(self, shape: Any, device: Any) -> Tensor:
-        if self.config.is_regression:
-            return torch.zeros(shape, dtype=torch.float32, device=device)
-        return super().sample_noise(shape, device)
-
-    def sample_time(self, bsize: int, device: Any) -> Tensor:
-        if self.config.is_regression:
-            return torch.ones(bsize, dtype=torch.float32, device=device)
-        return super().sample_time(bsize, device)
-
-    def sample_actions(
-        self,
-        images: list[Tensor],
-        img_masks: list[Tensor],
-        tokens: Tensor,
-        masks: Tensor,
-        noise: Tensor | None = None,
-        num_steps: int | None = None,
-        **kwargs: Any,
-    ) -> Tensor:
-        if self.config.is_regression:
-            noise, num_steps = None, 1
-        return super().sample_actions(images, img_masks, tokens, masks, noise=noise, num_steps=num_steps, **kwargs)
-
-    def embed_suffix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        actions_BHD, valid_BH, starts_block_BH, condition_BD = super().embed_suffix(*args, **kwargs)
-        before: list[tuple[Tensor, Tensor]] = []  # tokens and whether the row has them
-        if self._touch is not None:
-            tokens_BMD, contact_B = self._touch.suffix_BMD, self._touch.contact_B
-            before.append((tokens_BMD, contact_B[:, None].expand(-1, tokens_BMD.shape[1])))
-        if self._state_B1D is not None:
-            before.append((self._state_B1D, valid_BH[:, :1]))
-        for tokens_BMD, valid_BM in before:
-            # A block of its own: the context does not look at it, the actions do, and it does not look at them.
-            starts_block_BM = starts_block_BH.new_zeros(valid_BM.shape)
-            starts_block_BM[:, 0] = 1
-            actions_BHD = torch.cat([tokens_BMD.to(actions_BHD.dtype), actions_BHD], dim=1)
-            valid_BH = torch.cat([valid_BM, valid_BH], dim=1)
-            starts_block_BH = torch.cat([starts_block_BM, starts_block_BH], dim=1)
-        return actions_BHD, valid_BH, starts_block_BH, condition_BD
-
-
-def _backbone(config: TactilePI05Config) -> CompiledBackbone:
-    """
-    Raises:
-        TaccorlError: pictures of a size that the vision tower does not take.
-    """
-    size = SIZES.get(config.backbone)
-    image_px = config.image_resolution[0]
-    patch_px = size.vision.px if size is not None and isinstance(size.vision, Patches) else None
-    if config.image_resolution != (image_px, image_px) or (patch_px and image_px % patch_px):
-        patches = f" of a multiple of {patch_px} pixels" if patch_px else ""
-        raise TaccorlError(
-            f"--policy.image_resolution={config.image_resolution}: --policy.backbone={config.backbone} takes squares{patches}, "
-            "such as [224, 224]"
-        )
-    if size is None:
-        return FullBackbone(config)
-    return SmallBackbone(
-        size,
-        precision=config.dtype,
-        image_px=image_px,
-        num_cameras=len(config.image_features),
-        freeze_vision_encoder=config.freeze_vision_encoder,
-        train_expert_only=config.train_expert_only,
-    )
 
 
 class TactilePI05Policy(PI05Policy):
