@@ -22,11 +22,11 @@ known effects hidden in one joint. The search sees positions only, and nobody te
 were chosen on seeds below 300 and after a look at 1000 to 1012; these are others. Pairs of 5 floors each were added after a look
 at the first 27 pairs of drawn strength, without a change to the search.
 
-*Material*: the held-out error, gains refitted, is at least {MATERIAL:g} noise floors; below that there is nothing to find.
+*Material*: the validation error, gains refitted, is at least {MATERIAL:g} noise floors; below that there is nothing to find.
 *Exact*: the hidden effect is the one that was added first. *Named*: it is that, or named with it as a tie, a rival or a near-twin
-by nature. Intervals are 95 % (Wilson). *Signal*: what the effect leaves above the floor on the held-out recordings once the gains
-are refitted, √(error² − 1) floors. *50 % detection*: the signal at which the effect is named in half of the robots, with its 95 %
-interval, from curves of one steepness (log odds 5 times log signal).
+by nature. Intervals are 95 % (Wilson). *Signal*: what the effect leaves above the floor on the validation recordings once the
+gains are refitted, √(error² − 1) floors. *50 % detection*: the signal at which the effect is named in half of the robots, with
+its 95 % interval, from curves of one steepness (log odds 5 times log signal).
 
 All rows come from `python -m pipelines.diagnosis_study none chirp pack touch pairs_alike pairs removed outside amplitude` (20
 seeds each by default) on two shared cores of an AMD EPYC, one process each; the tables say how many there are so far.
@@ -55,14 +55,14 @@ def write_page(rows: list[dict]) -> None:
         lines.append(_share("… pairs that no angle tells apart counted as one", own, exact_but_for_algebra, first))
         lines.append(_share("… named", own, named, second))
         mended = [r["errors"]["after"] for r in own if named(r)]
-        lines.append(_spread("… held-out error / floor afterwards", [e["held_out"] for e in mended], (1.1, 1.3)))
+        lines.append(_spread("… validation error / floor afterwards", [e["validation"] for e in mended], (1.1, 1.3)))
         lines.append(_spread("… test error / floor afterwards (no choice has seen it)", [e["test"] for e in mended]))
         asked_s = (15.0, 15.0) if design == "chirp" else None  # of 10 s; a pack is seven recordings
         lines.append(_spread("… CPU-seconds of a diagnosis", [r["cpu_s"] for r in everything], asked_s))
     pads = [r for r in rows if r["study"] == "touch" and material(r)]
     lines.append(_share("one hidden effect of the pads, press–hold–release: exact", pads, exact_but_for_algebra, 0.9))
-    held = [r["errors"]["after"]["held_out"] for r in pads if exact_but_for_algebra(r)]
-    lines.append(_spread("… held-out error / floor afterwards", held, (1.1, 1.3)))
+    held = [r["errors"]["after"]["validation"] for r in pads if exact_but_for_algebra(r)]
+    lines.append(_spread("… validation error / floor afterwards", held, (1.1, 1.3)))
     none = [r for r in rows if r["study"] == "none"]
     lines.append(_share("no hidden effect: nothing added", none, lambda r: not r["found"], 0.98))
     for words, alike in (
@@ -145,7 +145,7 @@ def _said(row: dict[str, Any]) -> str:
 
 def _signal(row: dict[str, Any]) -> float:
     """What the effect leaves above the floor, in floors, once the gains are refitted."""
-    return float(np.sqrt(max(row["errors"]["fitted"]["held_out"] ** 2 - 1.0, 0.01)))
+    return float(np.sqrt(max(row["errors"]["fitted"]["validation"] ** 2 - 1.0, 0.01)))
 
 
 def _detections(rows: list[dict]) -> tuple[np.ndarray, np.ndarray]:

@@ -52,7 +52,7 @@ class MotionError:
     """How far the model is off on one recording, before (gains of the twin's config) and after."""
 
     name: str
-    use: Literal["fit", "held_out"]
+    use: Literal["fit", "validation"]
     loss_before: float
     """Eq. 9 of the paper, rad."""
     loss_after: float
@@ -105,7 +105,7 @@ def identify_controller(
     *,
     method: Method = "least_squares",
     free: Sequence[str] | None = None,
-    held_out: Sequence[JointMotion] = (),
+    validation: Sequence[JointMotion] = (),
     start: Gains = REFERENCE,
     bounds: Mapping[str, tuple[float, float]] = PAPER_BOUNDS,
     seed: int = 0,
@@ -118,7 +118,7 @@ def identify_controller(
     Args:
         free: of ``kp``, ``kd``, ``torque_ff``; by default all but gains that every recording states as commanded. What is not
             free is as commanded, or the twin's.
-        held_out: recordings to which nothing is fitted; their errors are told.
+        validation: recordings to which nothing is fitted; their errors are told.
         start: where the search starts; least squares starts from the twin's gains as well.
         seed: of SPSA's random signs.
 
@@ -128,7 +128,7 @@ def identify_controller(
     began = time.process_time()
     if not motions_fit:
         raise TaccorlError(f"{model.signal}: no recording to fit; give at least one sweep of this joint")
-    for motion in (*motions_fit, *held_out):
+    for motion in (*motions_fit, *validation):
         _check_usable(motion, model)
     if free is None:
         known = {"kp": all(m.kp_known for m in motions_fit), "kd": all(m.kd_known for m in motions_fit)}
@@ -154,7 +154,7 @@ def identify_controller(
         gains=search.gains(x),
         estimates=estimates,
         ridge=ridge,
-        errors=(*_errors(search, motions_fit, "fit", x), *_errors(search, held_out, "held_out", x)),
+        errors=(*_errors(search, motions_fit, "fit", x), *_errors(search, validation, "validation", x)),
         used_effort=search.sigma_effort is not None,
         effective_samples=len(residual) / correlated,
         converged=not unfinished,
@@ -264,7 +264,7 @@ def _remarks(search: GainSearch, estimates: dict[str, Estimate], ridge: float) -
 
 
 def _errors(
-    search: GainSearch, motions: Sequence[JointMotion], use: Literal["fit", "held_out"], x: np.ndarray
+    search: GainSearch, motions: Sequence[JointMotion], use: Literal["fit", "validation"], x: np.ndarray
 ) -> list[MotionError]:
     errors = []
     for motion in motions:

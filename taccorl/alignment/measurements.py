@@ -4,13 +4,13 @@ A folder of recordings may hold a ``measurements.yaml`` that says what the files
 
     spec: piper_flexitac_mcap         # how its recordings are read; not needed where only one shipped spec reads the format
     columns: columns.yaml             # names and units of its tables
-    held_out_every: 3                 # every third motion judges; or say it recording by recording
+    validation_every: 3                 # every third motion judges; or say it recording by recording
     recordings:
-      sweep_05.mcap: {use: held_out}
+      sweep_05.mcap: {use: validation}
       sweep_02.mcap: {repeat_of: sweep_01.mcap}
       sweep_03.mcap: {kp: {left_joint5: 40}, kd: {left_joint5: 4}, payload_kg: {left: 0.5}, effort_scale: {left_joint1: 0.25}}
       press_01.mcap: {pressed: &ball {shape: sphere, radius_m: 0.012, arm: left, position_m: [0.001, 0, 0.003]}}
-      press_02.mcap: {pressed: *ball, use: held_out}
+      press_02.mcap: {pressed: *ball, use: validation}
       press_03.mcap: {pressed: {shape: rod, radius_m: 0.008, length_m: 0.04, arm: left, rpy_rad: [0, 1.5708, 0]}}
 
 ``pressed`` is a known object between the fingers of one arm; with it ``taccorl compare`` and ``diagnose`` look at the arm's pads.
@@ -38,7 +38,7 @@ from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.sim.actions import OPEN_M
 
 INDEX = "measurements.yaml"
-Use = Literal["fit", "held_out", "test"]
+Use = Literal["fit", "validation", "test"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ class RecordingNote:
     """What is known of one recording besides its file."""
 
     use: Use | None = None
-    """fit: parameters are fitted to it; held_out: choices are made on it; test: nothing is chosen on it."""
+    """fit: parameters are fitted to it; validation: choices are made on it; test: nothing is chosen on it."""
     repeat_of: str | None = None
     kp: dict[str, float] = field(default_factory=dict)
     """Signal → commanded gain [N·m/rad, N/m]."""
@@ -91,7 +91,7 @@ class MeasurementIndex:
 
     spec: str | None = None
     columns: str | None = None
-    held_out_every: int = 0
+    validation_every: int = 0
     """0: only what is named."""
     recordings: dict[str, RecordingNote] = field(default_factory=dict)
 
@@ -101,7 +101,7 @@ class Measurements:
     """Several measurements and what each is for; the split is part of every result made from them."""
 
     fit: tuple[Measurement, ...]
-    held_out: tuple[Measurement, ...] = ()
+    validation: tuple[Measurement, ...] = ()
     test: tuple[Measurement, ...] = ()
     rule: str = ""
     """How they were divided, in words."""
@@ -110,11 +110,11 @@ class Measurements:
 
     @property
     def all(self) -> tuple[Measurement, ...]:
-        return (*self.fit, *self.held_out, *self.test)
+        return (*self.fit, *self.validation, *self.test)
 
     def record(self) -> dict[str, object]:
         """The split for a report: rule and names."""
-        names = {use: [m.name for m in getattr(self, use)] for use in ("fit", "held_out", "test")}
+        names = {use: [m.name for m in getattr(self, use)] for use in ("fit", "validation", "test")}
         return {"rule": self.rule, **names, "skipped": list(self.skipped)}
 
 
@@ -123,17 +123,17 @@ def read_measurements(
     *,
     spec: str | Path | RecordingSpec | None = None,
     columns: Path | TableSpec | None = None,
-    held_out: Sequence[str] = (),
+    validation: Sequence[str] = (),
     test: Sequence[str] = (),
-    held_out_every: int | None = None,
+    validation_every: int | None = None,
 ) -> Measurements:
     """A recording, a table, a dataset, or a folder of those, divided.
 
     Args:
         spec: recording spec; else the index's, else the only shipped one that reads the format.
         columns: columns file of the tables; else the index's, else our own names.
-        held_out, test: names of measurements; with those the index's ``use`` is not looked at.
-        held_out_every: every k-th motion that is not named is held out; else the index's.
+        validation, test: names of measurements; with those the index's ``use`` is not looked at.
+        validation_every: every k-th motion that is not named is for validation; else the index's.
 
     Raises:
         TaccorlError: nothing to read, unknown names, or a motion and its repeat on both sides.
@@ -148,25 +148,25 @@ def read_measurements(
     found = sorted(_read(path, spec, table_spec, skipped), key=lambda m: natural_key(m.name))
     found = _noted(found, index, folder, whole=path.is_dir())
     whole = path.is_dir()
-    if held_out or test or not whole:  # who asks for one file wants to fit it
-        named = {"held_out": list(held_out), "test": list(test)}
+    if validation or test or not whole:  # who asks for one file wants to fit it
+        named = {"validation": list(validation), "test": list(test)}
     else:
-        named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "held_out", "test")}
-    every = index.held_out_every * whole if held_out_every is None else held_out_every
-    return dataclasses.replace(split(found, **named, held_out_every=every), skipped=tuple(skipped))
+        named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "validation", "test")}
+    every = index.validation_every * whole if validation_every is None else validation_every
+    return dataclasses.replace(split(found, **named, validation_every=every), skipped=tuple(skipped))
 
 
 def split(
     measurements: Iterable[Measurement],
     *,
     fit: Sequence[str] = (),
-    held_out: Sequence[str] = (),
+    validation: Sequence[str] = (),
     test: Sequence[str] = (),
-    held_out_every: int = 0,
+    validation_every: int = 0,
 ) -> Measurements:
-    """Divide by name, and every k-th of the other motions to ``held_out``. The same list gives the same split.
+    """Divide by name, and every k-th of the other motions to ``validation``. The same list gives the same split.
 
-    A motion and its repeats count as one and stay together: held out, a repeat would measure the noise and not the model.
+    A motion and its repeats count as one and stay together: in validation, a repeat would measure the noise and not the model.
 
     Raises:
         TaccorlError: a name that no measurement has, one named twice, a motion on both sides, or nothing left to fit.
@@ -178,16 +178,14 @@ def split(
             f"two measurements are called {next(n for n in names if names.count(n) > 1)!r}; rename one file"
         )
     uses: dict[str, str] = {}
-    for use, listed in (("fit", fit), ("held_out", held_out), ("test", test)):
+    for use, listed in (("fit", fit), ("validation", validation), ("test", test)):
         for name in listed:
             if name not in names:
                 raise TaccorlError(f"{use}: no measurement {name!r}; {nearest(name, names)}")
             if uses.setdefault(name, use) != use:
                 raise TaccorlError(f"{name} is both {uses[name]} and {use}; name it once")
-    if held_out_every < 0 or held_out_every == 1:
-        raise TaccorlError(
-            f"held_out_every: {held_out_every} leaves nothing to fit; 0 holds nothing out, 2 every second"
-        )
+    if validation_every < 0 or validation_every == 1:
+        raise TaccorlError(f"validation_every: {validation_every} leaves nothing to fit; 0 is none, 2 every second")
     motion = motions(measurements)
     for name, use in list(uses.items()):
         for other in (n for n in names if motion[n] == motion[name]):
@@ -196,17 +194,17 @@ def split(
                     f"{name} ({use}) and {other} ({uses[other]}) repeat one motion: put both on one side"
                 )
     free = list(dict.fromkeys(motion[n] for n in names if n not in uses))
-    taken = {m for k, m in enumerate(free) if held_out_every and k % held_out_every == held_out_every - 1}
+    taken = {m for k, m in enumerate(free) if validation_every and k % validation_every == validation_every - 1}
     for name in names:
-        uses.setdefault(name, "held_out" if motion[name] in taken else "fit")
-    sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "held_out", "test")}
+        uses.setdefault(name, "validation" if motion[name] in taken else "fit")
+    sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "validation", "test")}
     if not sides["fit"]:
         raise TaccorlError(
-            f"nothing is left to fit: {len(sides['held_out'])} held out, {len(sides['test'])} for the test"
+            f"nothing is left to fit: {len(sides['validation'])} for validation, {len(sides['test'])} for the test"
         )
-    words = [f"{len(held_out) + len(test)} by name"] * bool(held_out or test)
-    words += [f"every {held_out_every}. of {len(free)} motions held out"] * bool(held_out_every)
-    return Measurements(sides["fit"], sides["held_out"], sides["test"], rule=", ".join(words) or "all for fitting")
+    words = [f"{len(validation) + len(test)} by name"] * bool(validation or test)
+    words += [f"every {validation_every}. of {len(free)} motions for validation"] * bool(validation_every)
+    return Measurements(sides["fit"], sides["validation"], sides["test"], rule=", ".join(words) or "all for fitting")
 
 
 def motions(measurements: Iterable[Measurement]) -> dict[str, str]:

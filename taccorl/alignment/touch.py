@@ -102,10 +102,10 @@ class TouchCalibration:
     correlation: float
     """Of the two estimates: near ±1 the recordings say only a combination; press at two speeds."""
     before: TouchMatch
-    """On the held-out recordings, with the twin's own k_n and k_d."""
+    """On the validation recordings, with the twin's own k_n and k_d."""
     after: TouchMatch
     fitted_to: tuple[str, ...]
-    held_out: tuple[str, ...]
+    validation: tuple[str, ...]
     trouble: str
     """Why it is not to be relied upon; empty if nothing speaks against it."""
 
@@ -183,16 +183,16 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
 
 
 def calibrate_touch(
-    fit: Sequence[TouchMotion], held_out: Sequence[TouchMotion], config: TwinConfig
+    fit: Sequence[TouchMotion], validation: Sequence[TouchMotion], config: TwinConfig
 ) -> TouchCalibration:
     """λ_noise and (k_n, k_d) from matched contact replays; ``config``'s own effects act throughout.
 
     Raises:
-        TaccorlError: nothing held out, too little contact or too little without any, or a sensor other than FlexiTac.
+        TaccorlError: nothing for validation, too little contact or too little without any, or a sensor other than FlexiTac.
     """
-    if not fit or not held_out:
+    if not fit or not validation:
         raise TaccorlError(
-            f"touch calibration: {len(fit)} recordings to fit and {len(held_out)} held out; give at least one of each"
+            f"touch calibration: {len(fit)} recordings to fit and {len(validation)} for validation; give at least one of each"
         )
     model = TouchModel(config)
     noise = noise_level(fit)
@@ -228,7 +228,7 @@ def calibrate_touch(
     low, high = value - 1.96 * std, value + 1.96 * std
     threshold = noise.threshold_count
     matches = [
-        touch_match(held_out, [model.counts(m, model.simulate(m, *numbers)) for m in held_out], threshold)
+        touch_match(validation, [model.counts(m, model.simulate(m, *numbers)) for m in validation], threshold)
         for numbers in (start, value)
     ]
     return TouchCalibration(
@@ -239,7 +239,7 @@ def calibrate_touch(
         before=matches[0],
         after=matches[1],
         fitted_to=tuple(m.name for m in fit),
-        held_out=tuple(m.name for m in held_out),
+        validation=tuple(m.name for m in validation),
         trouble=_trouble(solved.status, value, std),
     )
 

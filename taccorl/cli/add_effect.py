@@ -197,7 +197,7 @@ def _offer(name: str, part: str, diagnosis: dict[str, Any]) -> list[Entry]:
     if not rows or chosen is None:
         return []
     values = {k.split(".", 1)[1]: v for k, v in rows[0]["values"].items()}
-    words = f"{rows[0]['verdict']}: held-out error {rows[0]['held_out_error']:.2f} noise floors with it alone"
+    words = f"{rows[0]['verdict']}: validation error {rows[0]['validation_error']:.2f} noise floors with it alone"
     effect = make_effect(name, **chosen, **values, evidence=words)
     return [Entry(part, [effect], rows[0]["base"], diagnosis["intervals"])]
 

@@ -1,8 +1,8 @@
 """``taccorl compare --twin=twin.yaml --measurements=sweeps/``: how far the twin is from measurements, and where.
 
 MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may say which
-are held out, which repeat one another, and what the pads pressed: then touch is compared, pad by pad. Every recording's commands
-run through the twin. What is wrong with the data is said first; with errors nothing is compared.
+are for validation, which repeat one another, and what the pads pressed: then touch is compared, pad by pad. Every recording's
+commands run through the twin. What is wrong with the data is said first; with errors nothing is compared.
 
     --against=other.yaml   another twin beside it: before and after
     --out=DIR              report.html (one page, works anywhere) and report.json
@@ -59,8 +59,8 @@ class CompareConfig:
     """Recording spec; needed where several shipped ones read the format."""
     columns: Path | None = None
     """Columns file of tables with other names or units than ours."""
-    held_out_every: int | None = None
-    """Every k-th motion is held out; else as measurements.yaml says."""
+    validation_every: int | None = None
+    """Every k-th motion is for validation; else as measurements.yaml says."""
     pressed: PressedConfig = field(default_factory=PressedConfig)
     """What the fingers pressed in recordings with pads of which measurements.yaml does not say it."""
     out: Path | None = None
@@ -80,7 +80,7 @@ def main(argv: list[str]) -> int:
         (name_of(path), twin_of(path)) for path in (config.twin, config.against)[: 1 + (config.against is not None)]
     ]
     measurements = read_measurements(
-        config.measurements, spec=config.spec, columns=config.columns, held_out_every=config.held_out_every
+        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
     )
     findings = checked(measurements, "not compared")
     if findings is None:

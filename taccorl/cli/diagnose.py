@@ -61,8 +61,8 @@ class DiagnoseConfig:
     """Recording spec; needed where several shipped ones read the format."""
     columns: Path | None = None
     """Columns file of tables with other names or units than ours."""
-    held_out_every: int | None = None
-    """Every k-th motion is held out; else as measurements.yaml says."""
+    validation_every: int | None = None
+    """Every k-th motion is for validation; else as measurements.yaml says."""
 
 
 def main(argv: list[str]) -> int:
@@ -82,7 +82,7 @@ def main(argv: list[str]) -> int:
     for name in config.without:
         effects.get(name)
     measurements = read_measurements(
-        config.measurements, spec=config.spec, columns=config.columns, held_out_every=config.held_out_every
+        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
     )
     findings = checked(measurements, "not diagnosed")
     if findings is None:
@@ -217,7 +217,7 @@ def print_finding(finding: "JointFinding | PadFinding") -> None:
     out, d = console(), finding.diagnosis
     out.print(Text(f"\n{finding.part}", "bold"))
     out.print(f"  noise floor {finding.noise}", highlight=False)
-    judged = "the last rows of each" if finding.rows_split else ", ".join(finding.recordings["held_out"])
+    judged = "the last rows of each" if finding.rows_split else ", ".join(finding.recordings["validation"])
     out.print(f"  {finding.numbers}; judged on {judged}", highlight=False, soft_wrap=True)
     hardly = [_why_invisible(finding, name) for name in finding.can_tell.invisible if name not in d.names]
     if hardly:
@@ -228,7 +228,7 @@ def print_finding(finding: "JointFinding | PadFinding") -> None:
         out.print(Text(f"  nor tell at once: {_some(pairs)}", "dim"), soft_wrap=True)
     for number, found in enumerate(d.rounds, 1):
         table = Table(box=None, pad_edge=False)
-        for head in ("", f"round {number}: effect", "with", "held-out error", "gain", "÷ s.e.", "evidence", ""):
+        for head in ("", f"round {number}: effect", "with", "validation error", "gain", "÷ s.e.", "evidence", ""):
             left = head in ("", "with", "evidence") or "effect" in head
             table.add_column(head, justify="left" if left else "right", overflow="fold")
         for e in found.evidence[:6]:
@@ -242,7 +242,7 @@ def print_finding(finding: "JointFinding | PadFinding") -> None:
                 mark,
                 e.name,
                 numbers,
-                f"{e.held_out_error:.2f} ×",
+                f"{e.validation_error:.2f} ×",
                 f"{round(e.gain, 2) + 0.0:.0%}",
                 score,
                 evidence_words(e),
@@ -271,11 +271,11 @@ def verdict(finding: "JointFinding | PadFinding") -> list[str]:
     from taccorl.diagnosis.evidence_words import to_record, unit_words, unjudged
 
     d = finding.diagnosis
-    errors = d.errors["fitted"]["held_out"], d.errors["after"]["held_out"]
+    errors = d.errors["fitted"]["validation"], d.errors["after"]["validation"]
     added = [e.name for e in d.effects if e.name not in d.present]
-    told = [f"{d.errors['before']['held_out']:.2f} as it was", f"{errors[0]:.2f} with its numbers refitted"]
+    told = [f"{d.errors['before']['validation']:.2f} as it was", f"{errors[0]:.2f} with its numbers refitted"]
     told += [f"{errors[1]:.2f} with {', '.join(added)}"] * bool(added)
-    lines = [f"  {d.words}", f"  held-out error in noise floors ({finding.measured}): {', '.join(told)}"]
+    lines = [f"  {d.words}", f"  validation error in noise floors ({finding.measured}): {', '.join(told)}"]
     lines += [f"    {words}" for words in (unjudged(d),) if words]
     for name in ("kp", "kd"):
         ratio = d.base.get(name, 1.0) / d.start.get(name, 1.0) if name in d.base else 1.0

@@ -108,7 +108,7 @@ class AxisProblem:
         stiffness = length / force
         self.gains = Gains(axis.kp * stiffness, axis.kd * stiffness, axis.torque_ff / force)
         sides = [
-            [self._scaled(m) for m in side] for side in (measurements.fit, measurements.held_out, measurements.test)
+            [self._scaled(m) for m in side] for side in (measurements.fit, measurements.validation, measurements.test)
         ]
         everything = [m for side in sides for m in side]
         self.effort = all(m.has_effort()[m.column(axis.name)] for m in everything)
@@ -126,7 +126,7 @@ class AxisProblem:
                 Free(name=name, unit=unit, start=at, low=at / GAINS_WITHIN, high=at * GAINS_WITHIN, log=True)
                 for name, unit, at in (("kp", "N·m/rad", self.gains.kp), ("kd", "N·m·s/rad", self.gains.kd))
             )
-        self.fit, self.held_out, self.test = ([self._recording(m) for m in side] for side in sides)
+        self.fit, self.validation, self.test = ([self._recording(m) for m in side] for side in sides)
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.gains._asdict() | {"inertia": inertia})
         self.start: Values = {f.name: f.start for f in self.base}

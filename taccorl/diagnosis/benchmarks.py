@@ -21,7 +21,7 @@ def diagnosis() -> Iterator[Row]:
     jobs = [Job(study="cost", hidden=(name,), seed=400 + k, design="chirp") for k, name in enumerate(HIDDEN)]
     costs = [float(run(job)["cpu_s"]) for job in jobs]
     yield Row(
-        name="one joint, 10 s chirp twice and four held-out motions at 200 Hz, 26 candidates, gains unknown, surrogate",
+        name="one joint, 10 s chirp twice and four validation motions at 200 Hz, 26 candidates, gains unknown, surrogate",
         value=median(costs),
         unit="CPU-s",
         goal="≤ 15",
@@ -56,5 +56,5 @@ def _one_of_an_arm(job: tuple[str, int]) -> float:
     made = recordings(case, "chirp")
     took = time.perf_counter() - before
     problem = JointProblem(case.twin, signal, made, gains="fitted", effort=False)
-    diagnose(problem, problem.fit, problem.held_out, problem.test, start=problem.start)
+    diagnose(problem, problem.fit, problem.validation, problem.test, start=problem.start)
     return took

@@ -23,7 +23,7 @@ from taccorl.sim.robot import PADS
 
 Kind = Literal["position", "effort"]
 Way = Literal["joint", "twin"]
-USES: tuple[Use, ...] = ("fit", "held_out", "test")
+USES: tuple[Use, ...] = ("fit", "validation", "test")
 BLOCK_S = 0.5
 """Residuals of neighbouring rows are alike: intervals come from whole blocks, as in research/discrepancy.md §4.1."""
 FELT_FLOORS = 4.0
@@ -143,7 +143,7 @@ class Comparison:
     traces: tuple[Trace, ...]
     touches: tuple[TouchTrace, ...] = ()
     split: dict[str, object]
-    """Which recordings are fit, held-out, test, and by what rule."""
+    """Which recordings are fit, validation, test, and by what rule."""
     clock: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
     """Recording → what its replay says about its clock."""
     left_out: tuple[str, ...] = ()

@@ -10,9 +10,9 @@ from taccorl.sim.effects.effect import Effect
 OVERWHELMING_BIC, OVERWHELMING_SCORE = 100.0, 5.0
 """ΔBIC, twice the logarithm of a Bayes factor (above 10 is very strong: Kass and Raftery 1995), and standard errors."""
 UNJUDGED = 1.3
-"""Times the held-out error that the error on the fit recordings is remarkable: more than another motion's noise makes it."""
+"""Times the validation error that the error on the fit recordings is remarkable: more than another motion's noise makes it."""
 NO_GAIN = 0.01
-"""Of the held-out squared error above the floor: less is none."""
+"""Of the validation squared error above the floor: less is none."""
 
 
 def evidence_words(e: Evidence) -> str:
@@ -30,12 +30,12 @@ def evidence_words(e: Evidence) -> str:
 def unjudged(d: Diagnosis) -> str:
     """What shows in the recordings that were fitted and hardly in those that judge, where nothing can be believed or refuted;
     empty if there is no such thing."""
-    fit, held_out = d.errors["after"]["fit"], d.errors["after"]["held_out"]
-    if fit <= UNJUDGED * max(held_out, 1.0):
+    fit, validation = d.errors["after"]["fit"], d.errors["after"]["validation"]
+    if fit <= UNJUDGED * max(validation, 1.0):
         return ""
     return (
-        f"the recordings that were fitted keep {fit:.2f} floors, those that judge {held_out:.2f}: something acts there that no "
-        "held-out recording shows; hold one of each kind of motion out"
+        f"the recordings that were fitted keep {fit:.2f} floors, those that judge {validation:.2f}: something acts there that no "
+        "validation recording shows; hold one of each kind of motion out"
     )
 
 

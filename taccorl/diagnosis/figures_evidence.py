@@ -18,13 +18,13 @@ class Step:
 
     label: str
     error: float
-    """Held-out RMSE in noise floors."""
+    """Validation RMSE in noise floors."""
     interval: tuple[float, float] | None = None
     """95 %."""
 
 
 def waterfall(steps: Sequence[Step], origins: Sequence[str], title: str, goal: float = 1.25) -> Figure:
-    """Held-out error after each added effect, down to the noise floor.
+    """Validation error after each added effect, down to the noise floor.
 
     Args:
         steps: the twin as it was first, then one for each effect.
@@ -54,7 +54,7 @@ def waterfall(steps: Sequence[Step], origins: Sequence[str], title: str, goal: f
         )
     labels = [s.label if k == 0 else f"+ {s.label}" for k, s in enumerate(steps)]
     axes.set_xticks(range(len(steps)), labels, rotation=20, ha="right", fontsize=8)
-    axes.set_ylabel("held-out RMSE / noise floor", fontsize=8)
+    axes.set_ylabel("validation RMSE / noise floor", fontsize=8)
     axes.set_ylim(0, 1.22 * max(max(s.error, *(s.interval or (0.0,))) for s in steps))
     tidy(axes)
     axes.grid(axis="x", visible=False)

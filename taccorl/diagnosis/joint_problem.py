@@ -59,7 +59,7 @@ class JointProblem:
         gains: GainsAre = "auto",
         effort: bool = True,
     ) -> None:
-        on_robot = {use: tuple(map(_on_robot, getattr(measurements, use))) for use in ("fit", "held_out", "test")}
+        on_robot = {use: tuple(map(_on_robot, getattr(measurements, use))) for use in ("fit", "validation", "test")}
         measurements = dataclasses.replace(measurements, **on_robot)
         everything = measurements.all
         stated = all(signal in m.kp and signal in m.kd for m in everything)
@@ -83,9 +83,9 @@ class JointProblem:
         self._own_floors = {r: floors_of(group, signal, effort=self.effort) for r, group in groups.items()}
         self._motion = root
         self.base = self._base()
-        self.fit, self.held_out, self.test = (
+        self.fit, self.validation, self.test = (
             [self._recording(m, config) for m in side]
-            for side in (measurements.fit, measurements.held_out, measurements.test)
+            for side in (measurements.fit, measurements.validation, measurements.test)
         )
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.model.gains._asdict())

@@ -40,9 +40,9 @@ class JointFinding:
     commanded: bool
     """Gains are the commanded ones; else they were fitted."""
     recordings: dict[str, tuple[str, ...]]
-    """fit, held_out, test → names."""
+    """fit, validation, test → names."""
     rows_split: bool
-    """No recording was held out: rows at the end of each were."""
+    """No recording was marked for validation: rows at the end of each were."""
 
     @property
     def part(self) -> str:
@@ -93,18 +93,18 @@ def diagnose_joint(
     """
     sides = [
         tuple(m for m in side if moves(m, signal))
-        for side in (measurements.fit, measurements.held_out, measurements.test)
+        for side in (measurements.fit, measurements.validation, measurements.test)
     ]
     if not sides[0]:
         raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
-    own = dataclasses.replace(measurements, fit=sides[0], held_out=sides[1], test=sides[2])
+    own = dataclasses.replace(measurements, fit=sides[0], validation=sides[1], test=sides[2])
     problem = JointProblem(config, signal, own, gains=gains)
-    fit_to, held_out = (problem.fit, problem.held_out) if problem.held_out else split_rows(problem.fit)
+    fit_to, validation = (problem.fit, problem.validation) if problem.validation else split_rows(problem.fit)
     can_tell = identifiability(problem, fit_to, problem.start, problem.present)
     found = diagnose(
         problem,
         fit_to,
-        held_out,
+        validation,
         problem.test,
         start=problem.start,
         present=problem.present,
@@ -118,9 +118,9 @@ def diagnose_joint(
         floors=tuple(problem.floors),
         commanded=problem.commanded,
         recordings={
-            use: tuple(m.name for m in side) for use, side in zip(("fit", "held_out", "test"), sides, strict=True)
+            use: tuple(m.name for m in side) for use, side in zip(("fit", "validation", "test"), sides, strict=True)
         },
-        rows_split=not problem.held_out,
+        rows_split=not problem.validation,
     )
 
 

@@ -6,7 +6,7 @@
     small chirp      0.02 rad up to 4 Hz: play, dead bands, stiction
     chirp at 2× K_p and K_d; chirp with 0.3 kg in the hand: what gains and inertia hide
 
-Held out (choices are made on it) and test (final figures) are other motions about other middles.
+Validation (choices are made on it) and test (final figures) are other motions about other middles.
 
 Letters in shapes: T rows.
 """
@@ -161,7 +161,7 @@ PACK = (
 )
 HELD_STEPS = Motion(name="held_steps", target=_steps((0.0, -0.6, 0.85, 0.9, -1.0, 0.6, 0.5, -0.3, 0.0), -0.2))
 """Recorded twice, too: with dry friction a robot repeats its steps worse than its chirp."""
-HELD_OUT = (
+VALIDATION = (
     Motion(
         name="held_chirp",
         target=lambda r: _rested(chirp(10.0, 0.15, 2.1, 0.77 * r.sweep_rad), r.middle_rad - 0.3 * r.sweep_rad),

@@ -46,9 +46,9 @@ class PadFinding:
     lower_bound: bool
     """No press was recorded twice: what the pads and the opening do not repeat is not in the floor."""
     recordings: dict[str, tuple[str, ...]]
-    """fit, held_out, test → names."""
+    """fit, validation, test → names."""
     rows_split: bool
-    """No recording was held out: rows at the end of each were."""
+    """No recording was marked for validation: rows at the end of each were."""
 
     @property
     def part(self) -> str:
@@ -101,7 +101,7 @@ def diagnose_arm(
         TaccorlError: no fit recording says so, or one that cannot be a matched contact replay of the same pads.
     """
     uses: dict[str, tuple[Measurement, ...]] = {
-        use: tuple(m for m in getattr(measurements, use) if presses(m, arm)) for use in ("fit", "held_out", "test")
+        use: tuple(m for m in getattr(measurements, use) if presses(m, arm)) for use in ("fit", "validation", "test")
     }
     if not uses["fit"]:
         raise TaccorlError(
@@ -111,16 +111,16 @@ def diagnose_arm(
     every = [motion for some in motions.values() for motion in some]
     _check_pads(every)
     problem = TouchProblem(every, config)
-    fit_to, held_out, test = ([problem.recording(m) for m in some] for some in motions.values())
+    fit_to, validation, test = ([problem.recording(m) for m in some] for some in motions.values())
     floor_count = float(np.median(np.concatenate([r.floor for r in fit_to])))
-    rows_split = not held_out
+    rows_split = not validation
     if rows_split:
-        fit_to, held_out = split_rows(fit_to)
+        fit_to, validation = split_rows(fit_to)
     can_tell = identifiability(problem, fit_to, problem.start, problem.present)
     found = diagnose(
         problem,
         fit_to,
-        held_out,
+        validation,
         test,
         start=problem.start,
         present=problem.present,

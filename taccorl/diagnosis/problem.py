@@ -138,7 +138,7 @@ class Problem(Protocol):
 
 
 def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[list[Recording], list[Recording]]:
-    """Where no recording is held out: the first ``share`` of the rows of each for fitting, the others for judging.
+    """Where no recording is marked for validation: the first ``share`` of the rows of each for fitting, the others for judging.
 
     Both are simulated from the beginning, where the robot was at rest.
     """

@@ -28,8 +28,8 @@ def diagnosis_section(part: str, d: Diagnosis, can_tell: Identifiability | None,
         parts.append(note(f"{unjudged(d)[0].upper()}{unjudged(d)[1:]}."))
     if d.at_bound:
         parts.append(note(f"At the end of its range: {', '.join(d.at_bound)}. Its value says little."))
-    drawn = waterfall(_steps(d), origins, f"{part}: held-out error, effect by effect")
-    parts.append(figure(data_uri(png(drawn)), "held-out error over the noise floor; down is better"))
+    drawn = waterfall(_steps(d), origins, f"{part}: validation error, effect by effect")
+    parts.append(figure(data_uri(png(drawn)), "validation error over the noise floor; down is better"))
     parts += [_effect(part, d, e) for e in found]
     parts.append(_numbers(d))
     for k, r in enumerate(d.rounds, start=1):
@@ -37,8 +37,8 @@ def diagnosis_section(part: str, d: Diagnosis, can_tell: Identifiability | None,
     if d.rounds:
         parts.append(
             note(
-                "gain: share of the held-out squared error above the floor that goes away after everything was refitted. z: that "
-                "gain over its standard error between half-second blocks. Evidence: from both and "
+                "gain: share of the validation squared error above the floor that goes away after everything was refitted. z: "
+                "that gain over its standard error between half-second blocks. Evidence: from both and "
                 "ΔBIC, which must be above 10 to pay for the parameters; it is shown when pointed at, and in report.json."
             )
         )
@@ -68,7 +68,7 @@ def _can_tell(found: Identifiability) -> str:
 
 def _errors(d: Diagnosis) -> str:
     lines = []
-    for use, words in (("held_out", "held-out"), ("test", "test, which no choice has seen")):
+    for use, words in (("validation", "validation"), ("test", "test, which no choice has seen")):
         if use in d.errors["before"]:
             before, fitted, after = (d.errors[stage][use] for stage in ("before", "fitted", "after"))
             by_effects = f", by the effects {after / fitted - 1:+.0%}"
@@ -77,10 +77,10 @@ def _errors(d: Diagnosis) -> str:
 
 
 def _steps(d: Diagnosis) -> list[Step]:
-    first = [Step("twin as it was", d.errors["before"]["held_out"])]
+    first = [Step("twin as it was", d.errors["before"]["validation"])]
     steps = first + [Step(name or ALWAYS_FITTED, error) for name, error in d.steps]
     if d.removed or d.swapped:
-        steps.append(Step("superfluous ones removed, ties tried again", d.errors["after"]["held_out"]))
+        steps.append(Step("superfluous ones removed, ties tried again", d.errors["after"]["validation"]))
     return steps
 
 
@@ -120,7 +120,7 @@ def _effect(part: str, d: Diagnosis, e: Effect) -> str:
 
 
 def _evidence(r: Round) -> str:
-    heads = ("effect", "equation", "held-out × floor", "gain", "z", "evidence", "fitted", "at bound", "verdict")
+    heads = ("effect", "equation", "validation × floor", "gain", "z", "evidence", "fitted", "at bound", "verdict")
     rows, classes = [], []
     for e in r.evidence:
         cls = effect_class(e.name)
@@ -130,7 +130,7 @@ def _evidence(r: Round) -> str:
             [
                 html.escape(e.name) + (_in_words(cls) if cls else ""),
                 f"<code>{html.escape(cls.equation)}</code>" if cls else "",
-                f"{e.held_out_error:.3g}",
+                f"{e.validation_error:.3g}",
                 f"{round(e.gain, 2) + 0.0:.0%}",
                 f"{e.score:.1f}",
                 f'<span title="ΔBIC {e.bic:.0f}">{evidence_words(e)}</span>',

@@ -37,7 +37,7 @@ details.small summary{font-weight:400;color:#6b7280;font-size:12px}td code{white
 .good{color:#047857;font-weight:600}.bad{color:#b45309;font-weight:600}
 code{background:#f1f5f9;padding:1px 4px;border-radius:3px}
 """
-USE_WORDS = {"fit": "fit", "held_out": "held-out", "test": "test"}
+USE_WORDS = {"fit": "fit", "validation": "validation", "test": "test"}
 
 
 def page(report: Report) -> str:
@@ -105,7 +105,7 @@ def _score_table(c: Comparison, after: Comparison | None) -> str:
         rows.append(row)
     text = note(
         "RMSE of measurement − replay. × floor: RMSE over the noise floor; 1 is as good as any twin can be. NRMSE: share of the "
-        "standard deviation of what was measured. 95 %: from half-second blocks drawn again. Held-out recordings judge; test "
+        "standard deviation of what was measured. 95 %: from half-second blocks drawn again. Validation recordings judge; test "
         "recordings were not looked at for any choice."
     )
     if any(s.lower_bound for s in c.scores()):
@@ -154,7 +154,7 @@ def _pictures(report: Report) -> list[str]:
 
 
 def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind) -> str:
-    """The held-out recording as curves, and all recordings along variables."""
+    """The validation recording as curves, and all recordings along variables."""
     shown_one = representative(c.of(signal, kind))
     pairs = [t for t in after.of(signal, kind, shown_one.use) if t.recording == shown_one.recording] if after else []
     later = pairs[0] if pairs else None
@@ -172,8 +172,8 @@ def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind) ->
 
 
 def representative(traces: Sequence[Trace]) -> Trace:
-    """Of the held-out recordings (else test, else fit) the one with the median error."""
-    for use in ("held_out", "test", "fit"):
+    """Of the validation recordings (else test, else fit) the one with the median error."""
+    for use in ("validation", "test", "fit"):
         own = sorted(
             (t for t in traces if t.use == use), key=lambda t: float((t.residual**2)[t.residual == t.residual].mean())
         )
@@ -190,7 +190,7 @@ def _touch(c: Comparison, after: Comparison | None) -> Iterable[str]:
     parts = ["<h2>Touch</h2>", figure(data_uri(png(touch_histogram(c.touches, later, names))), "all recordings")]
     for pads in dict.fromkeys(t.pads for t in c.touches):
         own = [t for t in c.touches if t.pads == pads]
-        shown_one = next(t for use in ("held_out", "test", "fit") for t in own if t.use == use)
+        shown_one = next(t for use in ("validation", "test", "fit") for t in own if t.use == use)
         other = next((t for t in later if t.recording == shown_one.recording), None)
         maps, over_time = touch_maps(shown_one, other, names), touch_over_time(shown_one, other, names)
         parts.append(

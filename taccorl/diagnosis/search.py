@@ -1,9 +1,9 @@
-"""Which physical effect is missing: fit, screen, refit, judge on held-out recordings, accept or say that it is something else.
+"""Which physical effect is missing: fit, screen, refit, judge on validation recordings, accept or say that it is something else.
 
     1. The numbers that are always fitted are fitted to the fit recordings.
-    2. While the held-out error is above ``stop_at`` noise floors:
+    2. While the validation error is above ``stop_at`` noise floors:
        a. every effect is probed once (``screen``); the likeliest are refitted together with all numbers;
-       b. they are ranked by their error on the held-out recordings;
+       b. they are ranked by their error on the validation recordings;
        c. the best is accepted if it takes away enough of what lies above the floor, more than chance and more than its
           parameters explain (BIC). Those that do as well are its ties, and the simplest of them is taken;
        d. else the search ends with "something else".
@@ -44,16 +44,16 @@ class SearchConfig:
     """When an effect is believed. The values of research/discrepancy.md §4.1, checked in docs/diagnosis.md."""
 
     stop_at: float = 1.25
-    """Held-out error in noise floors at which nothing more is looked for."""
+    """Validation error in noise floors at which nothing more is looked for."""
     min_gain: float = 0.10
-    """Of the held-out error squared that lies above the floor, an effect must take away so much,"""
+    """Of the validation error squared that lies above the floor, an effect must take away so much,"""
     min_score: float = 2.0
     """by so many standard errors between blocks,"""
     sure_gain: float = 0.5
     """or so much of it: rare events (a limit that is reached twice) never get a great score,"""
     min_bic: float = 10.0
-    """and lower the Bayesian information criterion by so much on the fit recordings; those that are sure on the held-out ones by
-    both measures above need only lower it at all."""
+    """and lower the Bayesian information criterion by so much on the fit recordings; those that are sure on the validation ones
+    by both measures above need only lower it at all."""
     tie_share: float = 0.05
     """Effects that take away as much but for this share are ties,"""
     tie_rise: float = 0.25
@@ -106,10 +106,10 @@ class Evidence:
     explained: float
     """Share of the residual that its probe explained, before any refit."""
     fit_error: float
-    held_out_error: float
+    validation_error: float
     """RMS in floors, after refitting everything."""
     gain: float
-    """Share of the held-out squared error above the floor that goes away."""
+    """Share of the validation squared error above the floor that goes away."""
     score: float
     """That gain over its standard error between half-second blocks."""
     bic: float
@@ -129,7 +129,7 @@ class Round:
     added: str | None
     ties: tuple[str, ...]
     """Effects that explain as much as the added one, without it."""
-    held_out_error: float
+    validation_error: float
     """Afterwards."""
     fit_error: float
 
@@ -157,10 +157,10 @@ class Diagnosis:
     """Accepted and later found superfluous."""
     swapped: tuple[tuple[str, str], ...]
     errors: dict[str, dict[str, float]]
-    """``before`` (with the start numbers as given), ``fitted`` (numbers fitted, no effect) and ``after`` → fit, held_out, test
+    """``before`` (with the start numbers as given), ``fitted`` (numbers fitted, no effect) and ``after`` → fit, validation, test
     in floors. Test recordings were not looked at for any choice."""
     steps: tuple[tuple[str, float], ...]
-    """(what was added, held-out error in floors) for the waterfall."""
+    """(what was added, validation error in floors) for the waterfall."""
     at_bound: tuple[str, ...]
     trouble: str
     evaluations: int
@@ -180,7 +180,7 @@ class Diagnosis:
 def diagnose(
     problem: Problem,
     fit_to: Sequence[Recording],
-    held_out: Sequence[Recording],
+    validation: Sequence[Recording],
     test: Sequence[Recording] = (),
     *,
     start: Mapping[str, float] | None = None,
@@ -196,7 +196,7 @@ def diagnose(
         present: effects that the twin has already: they are refitted and stay.
         without: effects that are not considered.
     """
-    search = _Search(problem, fit_to, held_out, config or SearchConfig(), progress)
+    search = _Search(problem, fit_to, validation, config or SearchConfig(), progress)
     return search.run(test, dict(start or {}), tuple(present), without)
 
 
@@ -205,11 +205,11 @@ class _Search:
         self,
         problem: Problem,
         fit_to: Sequence[Recording],
-        held_out: Sequence[Recording],
+        validation: Sequence[Recording],
         config: SearchConfig,
         progress: Progress,
     ) -> None:
-        self.problem, self.fit_to, self.held_out = problem, list(fit_to), list(held_out)
+        self.problem, self.fit_to, self.validation = problem, list(fit_to), list(validation)
         self.config, self.progress = config, progress
         self.evaluations = 0
         self.removed: list[str] = []
@@ -235,7 +235,7 @@ class _Search:
             if better is None:
                 break
             model = better
-        steps = [("", self.error(first)), *((r.added, r.held_out_error) for r in rounds if r.added)]
+        steps = [("", self.error(first)), *((r.added, r.validation_error) for r in rounds if r.added)]
         model = self._without_superfluous(model)
         model, rivals = self._against_ties(model, rounds)
         model = self._finished(model)
@@ -277,7 +277,7 @@ class _Search:
         for p in sorted(probes, key=lambda p: -p.explained):
             best.setdefault(p.name, []).append(p)
         order = sorted(best, key=lambda name: -best[name][0].explained)
-        before = block_squares(self.problem, parent, self.held_out)
+        before = block_squares(self.problem, parent, self.validation)
         self.progress("refitting with the likeliest")
         starts = {
             name: [parent.values | _scaled(p, self.problem.candidates[name]) for p in self._likely(best[name])]
@@ -358,7 +358,7 @@ class _Search:
         return fine
 
     def _tie(self, row: "_Row", best: "_Row", before: np.ndarray) -> bool:
-        """Whether held-out recordings do not tell the two apart."""
+        """Whether validation recordings do not tell the two apart."""
         lost = float(row.squares.mean() - best.squares.mean())
         won = float(before.mean() - best.squares.mean())
         c = self.config
@@ -386,7 +386,7 @@ class _Search:
             not_refitted=tuple(order[len(rows) :]),
             added=pick.name if pick else None,
             ties=tuple(row.name for row in ties),
-            held_out_error=self.error(after),
+            validation_error=self.error(after),
             fit_error=after.error,
         )
 
@@ -397,8 +397,8 @@ class _Search:
         for name in [n for n in model.names if n not in self.present][:-1]:
             rest = tuple(other for other in model.names if other != name)
             smaller = self._fitted(rest, [model.values], self.config.steps)
-            before = block_squares(self.problem, smaller, self.held_out)
-            better = before - block_squares(self.problem, model, self.held_out)
+            before = block_squares(self.problem, smaller, self.validation)
+            better = before - block_squares(self.problem, model, self.validation)
             if self.config.too_little(gain_of(better, before), standard_score(better)):
                 self.removed.append(name)
                 model = smaller
@@ -409,14 +409,14 @@ class _Search:
         ties = {r.added: r.ties for r in rounds if r.added}
         rivals: dict[str, tuple[str, ...]] = {}
         for name in model.names:
-            here = block_squares(self.problem, model, self.held_out)
+            here = block_squares(self.problem, model, self.validation)
             found = []
             for other in (t for t in ties.get(name, ()) if t not in model.names):
                 self.progress(f"trying {other} in place of {name}")
                 others = tuple(other if n == name else n for n in model.names)
                 starts = [model.values | start for start in self.problem.candidates[other].starts]
                 swapped = self._fitted(others, starts, self.config.steps)
-                found.append((other, swapped, block_squares(self.problem, swapped, self.held_out)))
+                found.append((other, swapped, block_squares(self.problem, swapped, self.validation)))
             found.sort(key=lambda item: item[2].mean())
             kept = name
             if found:
@@ -444,11 +444,11 @@ class _Search:
         return model
 
     def error(self, model: Fit) -> float:
-        """RMS on the held-out recordings, in floors."""
-        return rms(stacked(self.problem, model.values, model.effects, self.held_out))
+        """RMS on the validation recordings, in floors."""
+        return rms(stacked(self.problem, model.values, model.effects, self.validation))
 
     def _errors(self, values: Values, effects: Sequence[Effect], test: Sequence[Recording]) -> dict[str, float]:
-        uses = {"fit": self.fit_to, "held_out": self.held_out, "test": list(test)}
+        uses = {"fit": self.fit_to, "validation": self.validation, "test": list(test)}
         return {use: rms(stacked(self.problem, values, effects, recs)) for use, recs in uses.items() if recs}
 
     def _status(self, model: Fit) -> Status:
@@ -467,24 +467,24 @@ class _Search:
             prefix = f"{effect.name}."
             effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}
             effect.evidence = (
-                f"held-out error {before:.2f} to {after:.2f} noise floors with {', '.join(model.names)}; recordings "
-                f"{', '.join(r.name for r in self.held_out)}"
+                f"validation error {before:.2f} to {after:.2f} noise floors with {', '.join(model.names)}; recordings "
+                f"{', '.join(r.name for r in self.validation)}"
             )
         return list(model.effects)
 
 
 def gain_of(better: np.ndarray, before: np.ndarray) -> float:
-    """Share of the held-out squared error above the floor that goes away: (B,) how much better, (B,) before."""
+    """Share of the validation squared error above the floor that goes away: (B,) how much better, (B,) before."""
     return float(better.mean()) / max(float(before.mean()) - 1.0, 1e-12)
 
 
 class _Row:
-    """One refitted effect beside its parent, on the held-out recordings."""
+    """One refitted effect beside its parent, on the validation recordings."""
 
     def __init__(self, search: _Search, parent: Fit, before: np.ndarray, model: Fit, seen: Probe) -> None:
         self.name, self.model, self.seen, self._config = model.names[-1], model, seen, search.config
-        self.squares = block_squares(search.problem, model, search.held_out)
-        self.held_out_error = search.error(model)
+        self.squares = block_squares(search.problem, model, search.validation)
+        self.validation_error = search.error(model)
         better = before - self.squares
         self.gain = gain_of(better, before)
         self.score = standard_score(better)
@@ -503,7 +503,7 @@ class _Row:
             base={k: v for k, v in self.model.values.items() if not k.startswith(own)},
             explained=self.seen.explained,
             fit_error=self.model.error,
-            held_out_error=self.held_out_error,
+            validation_error=self.validation_error,
             gain=self.gain,
             score=self.score,
             bic=self.bic,

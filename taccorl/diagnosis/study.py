@@ -18,7 +18,7 @@ from taccorl.diagnosis.touch_problem import TouchProblem
 from taccorl.sim.effects import effects as registry
 
 MATERIAL = 1.5
-"""Held-out error in floors, once the gains are refitted, from which a hidden effect must be found."""
+"""Validation error in floors, once the gains are refitted, from which a hidden effect must be found."""
 
 
 IDENTICAL = (
@@ -62,7 +62,7 @@ def run(job: Job) -> dict[str, Any]:
     found = diagnose(
         problem,
         problem.fit,
-        problem.held_out,
+        problem.validation,
         problem.test,
         start=problem.start,
         without=job.without,
@@ -88,9 +88,9 @@ def run_touch(job: Job) -> dict[str, Any]:
     motions = touch_recordings(case).motions(case.twin)
     recorded = time.process_time()
     problem = TouchProblem([m for side in motions.values() for m in side], case.twin)
-    fit_to, held_out, test = ([problem.recording(m) for m in motions[use]] for use in ("fit", "held_out", "test"))
+    fit_to, validation, test = ([problem.recording(m) for m in motions[use]] for use in ("fit", "validation", "test"))
     config = SearchConfig(max_effects=len(job.hidden) + 1)
-    found = diagnose(problem, fit_to, held_out, test, start=problem.start, without=job.without, config=config)
+    found = diagnose(problem, fit_to, validation, test, start=problem.start, without=job.without, config=config)
     done = time.process_time()
     return {
         "key": job.key,
@@ -123,7 +123,7 @@ def told(found: Diagnosis) -> dict[str, Any]:
 
 def material(row: dict[str, Any]) -> bool:
     """Whether there was something to find."""
-    return row["errors"]["fitted"]["held_out"] >= MATERIAL
+    return row["errors"]["fitted"]["validation"] >= MATERIAL
 
 
 def exact(row: dict[str, Any]) -> bool:

@@ -189,7 +189,7 @@ class TouchProblem:
         load, product = np.zeros(self.floor_count.size), np.zeros(self.floor_count.size)
         for recording in recordings:
             motion, rows = recording.data.motion, recording.data.rows
-            rows = rows[np.isfinite(recording.measured).any(axis=1)]  # the others are held out
+            rows = rows[np.isfinite(recording.measured).any(axis=1)]  # the others are for validation
             alone = self._counts(base | zeros, material, motion, everywhere)
             rest = self._counts(base, effects, motion, everywhere) - alone
             measured = motion.measured.reshape(len(alone), -1)

@@ -13,7 +13,7 @@
       arm: left
       joints: [joint5]
       interval: {torque_nm: [0.38, 0.44]}        # 95 %
-      evidence: held-out error of sweep_07 falls from 2.01 to 0.20 mrad
+      evidence: validation error of sweep_07 falls from 2.01 to 0.20 mrad
 """
 
 import dataclasses

@@ -5,7 +5,7 @@
     /<recording>/touch/{measured,twin,mended}     pads side by side, counts above baseline, one colour scale
     /provenance
 
-One tab a signal, in it one row a recording, held-out ones first, ``MOST_ROWS`` in a tab.
+One tab a signal, in it one row a recording, validation ones first, ``MOST_ROWS`` in a tab.
 Time line: ``time`` (seconds since a recording's first row).
 """
 
@@ -26,7 +26,7 @@ COMMAND_COLOR, MEASURED_COLOR = (120, 130, 145), (235, 235, 235)
 TWIN_COLORS = ((230, 120, 40), (86, 180, 233))
 """Before, after: the orange and blue of the report's figures, on dark ground."""
 TWIN_NAMES = ("twin", "mended")
-FIRST_USES = ("held_out", "test", "fit")
+FIRST_USES = ("validation", "test", "fit")
 PAD_GAP_TAXELS = 3
 MOST_ROWS = 5
 """Recordings in one tab."""

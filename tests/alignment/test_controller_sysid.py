@@ -34,8 +34,8 @@ def test_the_paper_s_loss_by_hand() -> None:
 
 @pytest.mark.parametrize("signal", TRUTH)
 def test_the_paper_s_gains_are_found_from_its_sweep(signal: str) -> None:
-    held_out = motion_of(signal, 1, high_hz=1.0)
-    fit = identify_controller([motion_of(signal)], JointModel(REFERENCE_TWIN, signal), held_out=[held_out])
+    validation = motion_of(signal, 1, high_hz=1.0)
+    fit = identify_controller([motion_of(signal)], JointModel(REFERENCE_TWIN, signal), validation=[validation])
     truth = TRUTH[signal]
     assert fit.converged, fit.remarks
     assert fit.gains.kd / fit.gains.kp == pytest.approx(truth.kd / truth.kp, rel=1e-3)  # the goal is 1 %
@@ -50,7 +50,7 @@ def test_the_paper_s_gains_are_found_from_its_sweep(signal: str) -> None:
     for error in fit.errors:
         assert error.rmse_after == pytest.approx(2e-4, rel=0.1)
         assert error.rmse_after < 0.1 * error.rmse_before and error.loss_after < 0.1 * error.loss_before
-    assert [error.use for error in fit.errors] == ["fit", "held_out"]
+    assert [error.use for error in fit.errors] == ["fit", "validation"]
     assert json.loads(json.dumps(fit.record()))["gains"]["kp"] == fit.gains.kp
 
 
@@ -229,7 +229,7 @@ def test_recordings_that_tell_nothing_are_refused_by_name() -> None:
     with pytest.raises(
         TaccorlError, match=r"dead\.mcap: left_joint5 moved by 0 rad where its targets move by 0\.\d+ rad"
     ):
-        identify_controller([good], model, held_out=[dead])
+        identify_controller([good], model, validation=[dead])
     with pytest.raises(TaccorlError, match=r"free parameters \['mass'\]; choose of kp, kd, torque_ff"):
         identify_controller([good], model, free=["mass"])
 

@@ -40,15 +40,15 @@ def folder(tmp_path):
 def test_a_folder_is_read_in_natural_order_and_says_what_it_left(folder):
     found = read_measurements(folder)
     assert names(found.fit) == ["sweep_1.csv", "sweep_2.csv", "sweep_3.csv", "sweep_10.csv"]
-    assert found.held_out == found.test == ()
+    assert found.validation == found.test == ()
     assert found.rule == "all for fitting"
 
 
-def test_every_third_motion_is_held_out_and_the_record_says_so(folder):
-    found = read_measurements(folder, held_out_every=3)
-    assert names(found.held_out) == ["sweep_3.csv"]
+def test_every_third_motion_is_validation_and_the_record_says_so(folder):
+    found = read_measurements(folder, validation_every=3)
+    assert names(found.validation) == ["sweep_3.csv"]
     record = found.record()
-    assert record["rule"] == "every 3. of 4 motions held out"
+    assert record["rule"] == "every 3. of 4 motions for validation"
     assert record["fit"] == ["sweep_1.csv", "sweep_2.csv", "sweep_10.csv"]
 
 
@@ -56,22 +56,22 @@ def test_an_index_says_what_files_cannot(folder):
     (folder / "measurements.yaml").write_text(
         "recordings:\n"
         "  sweep_2.csv: {repeat_of: sweep_1.csv}\n"
-        "  sweep_3.csv: {use: held_out, kp: {left_joint5: 40}, payload_kg: {left: 0.5}, effort_scale: {left_joint5: 0.25}}\n"
+        "  sweep_3.csv: {use: validation, kp: {left_joint5: 40}, payload_kg: {left: 0.5}, effort_scale: {left_joint5: 0.25}}\n"
         "  sweep_10.csv: {use: test}\n"
     )
     found = read_measurements(folder)
-    assert (names(found.fit), names(found.held_out), names(found.test)) == (
+    assert (names(found.fit), names(found.validation), names(found.test)) == (
         ["sweep_1.csv", "sweep_2.csv"],
         ["sweep_3.csv"],
         ["sweep_10.csv"],
     )
     assert found.fit[1].repeat_of == "sweep_1.csv"
-    (held,) = found.held_out
+    (held,) = found.validation
     assert (held.kp, held.payload_kg) == ({"left_joint5": 40.0}, {"left": 0.5})
     np.testing.assert_array_equal(held.effort[:, 0], 1.0)
     (alone,) = read_measurements(folder / "sweep_3.csv").fit  # asked for by itself
     assert alone.kp == {"left_joint5": 40.0}
-    assert names(read_measurements(folder, held_out=["sweep_10.csv"]).held_out) == ["sweep_10.csv"]
+    assert names(read_measurements(folder, validation=["sweep_10.csv"]).validation) == ["sweep_10.csv"]
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_an_index_says_what_files_cannot(folder):
             TaccorlError,
             "repeat_of: no recording 'sweep_99.csv' here",
         ),
-        ("recordings: {sweep_1.csv: {use: hold_out}}", SpecError, "did you mean 'held_out'"),
+        ("recordings: {sweep_1.csv: {use: validate}}", SpecError, "did you mean 'validation'"),
         ("recordings: {sweep_1.csv: {kp: {left_joint9: 3}}}", TaccorlError, "kp: no signal 'left_joint9'"),
         ("recordings: {sweep_1.csv: {kp: {left_joint5: -3}}}", SpecError, "measurements.yaml:1: .*-3 is below 0"),
         ("recordings: {sweep_1.csv: {payload_kg: {middle: 1}}}", SpecError, "no arm 'middle'"),
@@ -147,31 +147,31 @@ def test_nothing_to_read_is_an_error_with_a_way_out(tmp_path):
 
 
 def test_split_is_deterministic_and_complete():
-    found = [split(made(*"abcdefg"), held_out_every=2) for _ in range(2)]
+    found = [split(made(*"abcdefg"), validation_every=2) for _ in range(2)]
     assert found[0].record() == found[1].record()
-    assert names(found[0].held_out) == ["b", "d", "f"]
+    assert names(found[0].validation) == ["b", "d", "f"]
     assert sorted(names(found[0].all)) == list("abcdefg")
 
 
 def test_a_motion_and_its_repeats_stay_together():
     measurements = made(*"abcd", b="a", d="c")
     assert motions(measurements) == {"a": "a", "b": "a", "c": "c", "d": "c"}
-    found = split(measurements, held_out_every=2)
-    assert (names(found.fit), names(found.held_out)) == (["a", "b"], ["c", "d"])
-    assert names(split(measurements, held_out=["d"]).held_out) == ["c", "d"]
+    found = split(measurements, validation_every=2)
+    assert (names(found.fit), names(found.validation)) == (["a", "b"], ["c", "d"])
+    assert names(split(measurements, validation=["d"]).validation) == ["c", "d"]
     with pytest.raises(
-        TaccorlError, match=r"d \(test\) and c \(held_out\) repeat one motion|c \(held_out\) and d \(test\)"
+        TaccorlError, match=r"d \(test\) and c \(validation\) repeat one motion|c \(validation\) and d \(test\)"
     ):
-        split(measurements, held_out=["c"], test=["d"])
+        split(measurements, validation=["c"], test=["d"])
 
 
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"held_out": ["z"]}, "held_out: no measurement 'z'"),
-        ({"held_out": ["a"], "test": ["a"]}, "a is both held_out and test"),
-        ({"held_out": ["a", "b"]}, "nothing is left to fit: 2 held out"),
-        ({"held_out_every": 1}, "leaves nothing to fit"),
+        ({"validation": ["z"]}, "validation: no measurement 'z'"),
+        ({"validation": ["a"], "test": ["a"]}, "a is both validation and test"),
+        ({"validation": ["a", "b"]}, "nothing is left to fit: 2 for validation"),
+        ({"validation_every": 1}, "leaves nothing to fit"),
     ],
 )
 def test_splits_that_cannot_be(kwargs, message):

@@ -332,11 +332,11 @@ def test_a_folder_of_everything_is_read_by_its_index(recorded, dataset, moved, t
     shutil.copytree(dataset, tmp_path / "episodes")
     write_tables(recorded, tmp_path)[1].unlink()
     (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff")
-    index = "spec: piper_flexitac_mcap\nrecordings: {sweep_1.mcap: {use: held_out, kp: {left_joint5: 20}}}\n"
+    index = "spec: piper_flexitac_mcap\nrecordings: {sweep_1.mcap: {use: validation, kp: {left_joint5: 20}}}\n"
     (tmp_path / "measurements.yaml").write_text(index)
     found = read_measurements(tmp_path)
     assert [m.name for m in found.fit] == ["bench.csv", "episodes/episode_0"]
-    (held,) = found.held_out
+    (held,) = found.validation
     assert held.kp == {"left_joint5": 20.0}  # what the index says goes before what the recording says
     assert found.skipped == ("photo.jpg (a JPEG picture, no recording)",)
     (tmp_path / "measurements.yaml").unlink()

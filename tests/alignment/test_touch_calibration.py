@@ -54,10 +54,10 @@ def test_stiffness_and_damping_are_recovered_within_their_intervals(found: Touch
     assert abs(found.correlation) < 0.5
 
 
-def test_the_held_out_recording_is_matched_in_every_respect_that_the_paper_aligns(found: TouchCalibration) -> None:
+def test_the_validation_recording_is_matched_in_every_respect_that_the_paper_aligns(found: TouchCalibration) -> None:
     before, after = found.before, found.after
     assert found.fitted_to == ("press_0", "press_1")
-    assert found.held_out == ("press_2",)
+    assert found.validation == ("press_2",)
     assert after.rms_count < 0.6 * before.rms_count
     assert after.rms_count == pytest.approx(1.33, rel=0.05), "what is left is noise"
     assert after.histogram_count < 0.2 * before.histogram_count
@@ -101,7 +101,7 @@ def test_a_perfect_twin_matches_perfectly_and_one_off_by_a_taxel_does_not(presse
 
 
 def test_what_cannot_be_calibrated_is_said(presses: list[TouchMotion]) -> None:
-    with pytest.raises(TaccorlError, match="1 recordings to fit and 0 held out"):
+    with pytest.raises(TaccorlError, match="1 recordings to fit and 0 for validation"):
         calibrate_touch(presses[:1], [], CONFIG)
     late = motions(0, law=lambda depth, rate, time_s: np.roll(plain(depth, rate, time_s), 3, axis=0))
     found = calibrate_touch(late, late, CONFIG)

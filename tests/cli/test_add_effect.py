@@ -10,7 +10,7 @@ import yaml
 
 from taccorl.alignment.measurements import Measurements
 from taccorl.cli.main import main
-from taccorl.diagnosis.motions import AGAIN, CHIRP, HELD_OUT
+from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.twin import TwinConfig
@@ -32,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     truth = TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=TRUTH_NM, arm="left", joints=["joint4"])])
     made = [
         recorded(truth, m, k, signal=SIGNAL, stated=False, effort=True)
-        for k, m in enumerate((CHIRP, AGAIN, HELD_OUT[0]))
+        for k, m in enumerate((CHIRP, AGAIN, VALIDATION[0]))
     ]
     write_folder(path / "sweeps", Measurements(tuple(made[:2]), (made[2],)), ACTION_NAMES[:7])
     save_twin(TwinConfig(), path / "twin.yaml")
@@ -69,7 +69,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said:
     assert effect.acts_on() == [SIGNAL]
     assert vars(effect)["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
     low, high = effect.interval["torque_nm"]
-    assert low < vars(effect)["torque_nm"] < high and "held-out error" in effect.evidence
+    assert low < vars(effect)["torque_nm"] < high and "validation error" in effect.evidence
     # gains that were refitted with it come along, for this joint of this arm
     found = json.loads((folder / "diagnosis" / "report.json").read_text())["diagnoses"][SIGNAL]
     assert twin.controller_of("left").kp_nm_per_rad[3] == pytest.approx(found["base"]["kp"])
@@ -82,7 +82,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said:
     assert code == 0
     report = json.loads((out / "report.json").read_text())
     held = [
-        next(s["ratio"] for s in report[k] if s["use"] == "held_out" and s["kind"] == "position")
+        next(s["ratio"] for s in report[k] if s["use"] == "validation" and s["kind"] == "position")
         for k in ("scores", "scores_after")
     ]
     assert held[0] > 4.0 and held[1] < 1.25

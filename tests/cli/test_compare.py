@@ -45,7 +45,7 @@ def row(text: str, signal: str, use: str) -> list[str]:
 def test_table_says_how_far_off_and_where(folder: Path, said: Any):
     code, text = said(f"--twin={folder / 'twin.yaml'}", f"--measurements={folder / 'sweeps'}")
     assert code == 0
-    words = row(text, f"{SIGNAL} position", "held-out")
+    words = row(text, f"{SIGNAL} position", "validation")
     error, unit, ratio = float(words[3]), words[4], float(words[5])
     assert unit == "mrad" and 3.0 < error < 7.0  # F / K_p = 1 / 151 rad = 6.6 mrad at most
     assert ratio == pytest.approx(error / 0.2, rel=0.1)  # made with 0.2 mrad of noise; the floor is from the repeat
@@ -61,12 +61,12 @@ def test_before_and_after_side_by_side_with_report_and_rerun_file(folder: Path, 
     words = [folder / "sweeps", f"--twin={folder / 'twin.yaml'}", f"--against={folder / 'mended.yaml'}"]
     code, text = said(*words, f"--out={out}", f"--rerun={rrd}")
     assert code == 0
-    assert "RMSE mended" in text and "-9" in " ".join(row(text, f"{SIGNAL} position", "held-out"))
+    assert "RMSE mended" in text and "-9" in " ".join(row(text, f"{SIGNAL} position", "validation"))
     found = json.loads((out / "report.json").read_text())
-    before, after = (next(s for s in found[k] if s["use"] == "held_out") for k in ("scores", "scores_after"))
+    before, after = (next(s for s in found[k] if s["use"] == "validation") for k in ("scores", "scores_after"))
     assert before["ratio"] > 10 and after["ratio"] < 1.2
     assert found["provenance"]["command"].startswith("taccorl compare ")
-    assert found["recordings"]["held_out"] == ["sweep_2.csv"]
+    assert found["recordings"]["validation"] == ["sweep_2.csv"]
     assert rrd.read_bytes()[:4] == b"RRF2"
     code, text = said(*words, f"--out={out}")
     assert code == 0 and "replaced the report of" in text
@@ -78,7 +78,7 @@ def test_errors_of_the_data_stop_it_with_what_to_do(folder: Path, said: Any, tmp
     early = {n: getattr(m, n)[:-3] for n in ("time_s", "target")} | {
         n: getattr(m, n)[3:] for n in ("measured", "velocity", "effort")
     }
-    write_folder(tmp_path / "early", dataclasses.replace(good, fit=(dataclasses.replace(m, **early),), held_out=()))
+    write_folder(tmp_path / "early", dataclasses.replace(good, fit=(dataclasses.replace(m, **early),), validation=()))
     code, text = said(tmp_path / "early", f"--out={tmp_path / 'report'}")
     assert code == 1
     assert "before its command" in text and "latency_s" in text, "what is wrong, and the way out"

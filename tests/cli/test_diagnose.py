@@ -12,7 +12,7 @@ import yaml
 
 from taccorl.alignment.measurements import Measurements
 from taccorl.cli.main import main
-from taccorl.diagnosis.motions import AGAIN, CHIRP, HELD_OUT
+from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.diagnosis.surrogate.cases import draw_case
 from taccorl.diagnosis.surrogate.recordings import record
 from taccorl.sim.actions import ACTION_NAMES
@@ -38,7 +38,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three recordings of the same robot as tables, which are read faster: a chirp, the same again, one to judge on."""
     case = draw_case(["coulomb_friction"], 3, signal=SIGNAL, strength=12.0, gains_known=True, design="chirp")
-    chirp, again, held = (record(case, motion) for motion in (CHIRP, AGAIN, HELD_OUT[0]))
+    chirp, again, held = (record(case, motion) for motion in (CHIRP, AGAIN, VALIDATION[0]))
     folder = tmp_path_factory.mktemp("sweeps")
     save_twin(case.twin, folder / "twin.yaml")
     write_folder(folder / "sweeps", Measurements((chirp, again), (held,)), ACTION_NAMES[:7])
@@ -84,7 +84,7 @@ def test_the_hidden_friction_is_found_among_all_effects(robot: Path, mended: Pat
     assert found["effects"][0]["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
     assert found["rounds"][0]["ties"] == ["asymmetric_friction"]
     assert len(found["rounds"][0]["evidence"]) >= 4
-    for use in ("fit", "held_out", "test"):
+    for use in ("fit", "validation", "test"):
         assert found["errors"]["after"][use] < 1.5 < 6.0 < found["errors"]["fitted"][use]
     assert report["data"] == [f"surrogate robot, simulated; not a robot; {SIGNAL} under test"]
     before, after = (next(s for s in report[k] if s["use"] == "test") for k in ("scores", "scores_after"))
@@ -113,7 +113,7 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert "of a typical strength these recordings would not show: encoder_bias (taken up by torque_ff)" in text
     assert "tied with coulomb_friction" in text and "cannot be told from asymmetric_friction" in text
     assert "→ coulomb_friction: torque_nm 0.028" in text and "N·m (0.028" in text
-    assert "at the noise floor\n  held-out error in noise floors" in text
+    assert "at the noise floor\n  validation error in noise floors" in text
     assert f"next: taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}" in text
     assert not (out / "twin.yaml").exists(), "one effect: add-effect writes the twin"
     (out / "notes.txt").write_text("mine")

@@ -22,7 +22,7 @@ DEPTHS = touch._presses((3e-4, 6e-4, 1e-3), (0.12, 0.5), 0.4, 2.5, 2.0)
 FIT = touch.Press(name="press", knots=DEPTHS, x_m=0.001, z_m=0.003)
 SHORT = {
     "fit": (FIT, dataclasses.replace(FIT, name="again", repeat_of="press")),
-    "held_out": (touch.Press(name="held", knots=touch._presses((8e-4, 4e-4), (0.1, 0.4), 0.5, 2.5, 2.0), z_m=0.002),),
+    "validation": (touch.Press(name="held", knots=touch._presses((8e-4, 4e-4), (0.1, 0.4), 0.5, 2.5, 2.0), z_m=0.002),),
     "test": (),
 }
 CONSIDERED = ("taxel_saturation", "taxel_creep", "baseline_drift", "touch_lag")
@@ -77,7 +77,7 @@ def test_the_report_holds_the_effect_with_its_numbers(robot: Path):
     assert "<h2>Touch</h2>" in page and "ΔBIC" in page
     for signal in ("touch", "left_a", "left_b"):
         before, after = (
-            next(s["ratio"] for s in report[k] if s["signal"] == signal and s["use"] == "held_out")
+            next(s["ratio"] for s in report[k] if s["signal"] == signal and s["use"] == "validation")
             for k in ("scores", "scores_after")
         )
         assert after < 0.35 * before and after < 1.35
@@ -103,7 +103,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(robot: Path, said: 
     code, text = said("compare", robot / "sweeps", twin, f"--against={out}")
     assert code == 0
     for pad in ("left_a", "left_b"):
-        line = next(x.split() for x in text.splitlines() if x.startswith(f"{pad} touch") and "held-out" in x)
+        line = next(x.split() for x in text.splitlines() if x.startswith(f"{pad} touch") and "validation" in x)
         before, after = float(line[5]), float(line[8])
         assert line[4] == line[7] == "counts" and before > 4.0 and after < 1.35
     assert "data: surrogate robot, simulated; not a robot" in text
@@ -121,7 +121,7 @@ def test_the_terminal_tells_noise_evidence_and_numbers(robot: Path):
     )
     assert "lower bound" not in text, "one press is recorded twice"
     assert "→  taxel_saturation" in text and "strong" in text and "ΔBIC" not in text
-    assert "held-out error in noise floors (means of 5 frames): " in text
+    assert "validation error in noise floors (means of 5 frames): " in text
     assert "    k_n " in text and ", the twin had 695.8" in text
     assert max(len(line) for line in text.splitlines() if "would not show" in line) < 400
 
@@ -213,5 +213,5 @@ def test_a_drifting_zero_is_found_among_all_effects(tmp_path: Path, said: Any):
     truth = json.loads(_sealed(said, folder))["hidden"][0]["values"]["rate_per_min"]
     assert drift["rate_per_min"] == pytest.approx(truth, rel=0.03)
     assert "overwhelming" in text and "next: taccorl add-effect baseline_drift --pads=left" in text
-    assert found["errors"]["after"]["held_out"] < 0.25 * found["errors"]["fitted"]["held_out"]
+    assert found["errors"]["after"]["validation"] < 0.25 * found["errors"]["fitted"]["validation"]
     assert code == int(found["status"] != "at_floor"), "taxels do not drift alike: that may be something else"

@@ -28,7 +28,7 @@ def trace(residual: np.ndarray, position: np.ndarray, **fields: Any) -> Trace:
     return Trace(
         **{
             "recording": "made",
-            "use": "held_out",
+            "use": "validation",
             "signal": "left_joint5",
             "kind": "position",
             "unit": "rad",
@@ -48,7 +48,7 @@ def trace(residual: np.ndarray, position: np.ndarray, **fields: Any) -> Trace:
 
 
 def comparison(*traces: Trace, **fields: Any) -> Comparison:
-    split = {"rule": "by hand", "fit": [], "held_out": [t.recording for t in traces], "test": [], "skipped": []}
+    split = {"rule": "by hand", "fit": [], "validation": [t.recording for t in traces], "test": [], "skipped": []}
     return Comparison(**{"twin": "made twin", "effects": (), "traces": traces, "split": split} | fields)
 
 

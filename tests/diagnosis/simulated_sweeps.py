@@ -65,19 +65,19 @@ def recorded(config: TwinConfig, target: np.ndarray, seed: int, **fields: Any) -
 
 
 def sweeps(config: TwinConfig, signals: tuple[str, ...] = (SIGNAL,), seconds: float = 6.0) -> Measurements:
-    """Two sweeps to fit, the first recorded twice, and one held out."""
+    """Two sweeps to fit, the first recorded twice, and one for validation."""
     first = recorded(config, chirp(0, seconds, signals), 0)
     again = dataclasses.replace(recorded(config, first.target, 7), name="sweep_0_again", repeat_of=first.name)
     second = recorded(config, chirp(1, seconds, signals), 1)
-    held_out = recorded(config, chirp(2, seconds, signals), 2)
-    return Measurements((first, again, second), (held_out,), rule="by hand")
+    validation = recorded(config, chirp(2, seconds, signals), 2)
+    return Measurements((first, again, second), (validation,), rule="by hand")
 
 
 def write_folder(folder: Path, measurements: Measurements, signals: tuple[str, ...] = (SIGNAL,)) -> Path:
-    """As tables with a ``measurements.yaml`` that says which is held out and which repeats another."""
+    """As tables with a ``measurements.yaml`` that says which is for validation and which repeats another."""
     folder.mkdir(parents=True, exist_ok=True)
     index: dict[str, Any] = {"recordings": {}}
-    for use in ("fit", "held_out", "test"):
+    for use in ("fit", "validation", "test"):
         for m in getattr(measurements, use):
             note = {"use": use} | ({"repeat_of": f"{m.repeat_of}.csv"} if m.repeat_of else {})
             index["recordings"][f"{m.name}.csv"] = note

@@ -70,11 +70,11 @@ def own_units(axis: AxisConfig, found: Diagnosis, name: str, unit: str) -> float
 
 
 def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
-    found = diagnose(problem, problem.fit, problem.held_out, start=problem.start, config=SearchConfig(max_effects=1))
+    found = diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
     first = found.rounds[0]
     assert "coulomb_friction" in (first.added, *first.ties)
-    assert found.errors["fitted"]["held_out"] > 5.0
-    assert found.errors["after"]["held_out"] < 0.4 * found.errors["fitted"]["held_out"]
+    assert found.errors["fitted"]["validation"] > 5.0
+    assert found.errors["after"]["validation"] < 0.4 * found.errors["fitted"]["validation"]
     best = next(e for e in first.evidence if e.name == "coulomb_friction")
     friction_n = best.values["coulomb_friction.torque_nm"] * AXIS.factor("N·m")
     assert friction_n == pytest.approx(FRICTION_N, rel=0.2)  # the model's steps of 1 ms cost some
@@ -180,7 +180,7 @@ def test_a_real_drive_s_dry_friction_is_found_and_that_something_remains():
     first = found.rounds[0]
     assert first.added in ("coulomb_friction", "asymmetric_friction", "stribeck_friction")
     assert "coulomb_friction" in (first.added, *first.ties)
-    assert found.errors["after"]["held_out"] <= 0.4 * found.errors["fitted"]["held_out"]
+    assert found.errors["after"]["validation"] <= 0.4 * found.errors["fitted"]["validation"]
     row = next(e for e in first.evidence if e.name == "coulomb_friction")
     assert 15.0 < row.values["coulomb_friction.torque_nm"] * axis.factor("N·m") < 30.0
     assert 85.0 < row.base["inertia"] * axis.factor("kg·m²") < 115.0

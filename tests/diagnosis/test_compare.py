@@ -35,7 +35,7 @@ def measured() -> Measurements:
 
 def test_twin_with_the_hidden_effect_is_at_the_floor_and_without_it_off_by_friction_over_stiffness(measured):
     nominal, true = compare(TwinConfig(), measured), compare(friction(FRICTION_NM), measured)
-    for use in ("fit", "held_out"):
+    for use in ("fit", "validation"):
         score = true.score(SIGNAL, "position", use)
         assert score is not None and 0.9 < score.ratio < 1.1
         assert score.floor == pytest.approx(NOISE_RAD, rel=0.1), "from the repeated recording"
@@ -43,7 +43,7 @@ def test_twin_with_the_hidden_effect_is_at_the_floor_and_without_it_off_by_frict
     residual = np.concatenate([t.residual for t in nominal.of(SIGNAL)])
     behind = FRICTION_NM / KP_NM_PER_RAD[4]
     assert np.quantile(np.abs(residual), 0.99) == pytest.approx(behind, rel=0.08)
-    effort = nominal.score(SIGNAL, "effort", "held_out")
+    effort = nominal.score(SIGNAL, "effort", "validation")
     assert effort is not None and effort.unit == "N·m" and effort.ratio > 5
 
 
@@ -138,7 +138,7 @@ def test_score_is_the_arithmetic_written_out():
     residual[:200] = np.nan  # not measured for a second
     measured = np.where(np.isnan(residual), np.nan, position)
     one = trace(np.nan_to_num(residual), position, measured=measured)
-    score = comparison(one).score("left_joint5", "position", "held_out")
+    score = comparison(one).score("left_joint5", "position", "validation")
     assert score is not None
     assert score.rmse == pytest.approx(3e-3)
     assert score.ratio == pytest.approx(3e-3 / FLOOR_RAD)  # 15
@@ -154,7 +154,7 @@ def test_uses_are_kept_apart():
     found = comparison(trace(good, position, use="fit"), trace(bad, position, use="test"))
     assert found.uses == ("fit", "test")
     assert [s.rmse for s in found.scores()] == pytest.approx([1e-3, 5e-3])
-    assert found.score("left_joint5", "position", "held_out") is None
+    assert found.score("left_joint5", "position", "validation") is None
 
 
 def test_interval_holds_the_truth_although_neighbours_are_alike():
@@ -193,7 +193,7 @@ def test_pads_of_the_right_law_are_at_their_noise_and_of_another_stiffness_are_n
     for name, sensor in (("right", right), ("nominal", FlexiTacConfig())):
         found = compare(TwinConfig(sensor=sensor), presses, pressed=ball)
         scores[name] = [s for s in found.scores() if s.kind == "touch"]
-        assert [s.use for s in scores[name]] == ["fit", "held_out"]
+        assert [s.use for s in scores[name]] == ["fit", "validation"]
         # Something was between the fingers: where the gripper stands is not held against the twin, and that is said.
         assert found.signals == () and "left_gripper of press_0" in found.left_out[0]
     assert all(0.9 < s.ratio < 1.1 for s in scores["right"])

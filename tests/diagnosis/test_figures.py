@@ -161,7 +161,7 @@ def touch() -> TouchTrace:
     replayed[50:150, 0, 10:20, 3:9] = 100
     return TouchTrace(
         recording="press",
-        use="held_out",
+        use="validation",
         pads=("left_a", "left_b"),
         time_s=np.tile((np.arange(200) / 100)[:, None], (1, 2)),
         measured=measured,

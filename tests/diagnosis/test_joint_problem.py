@@ -9,7 +9,7 @@ from imagined_motions import NOISE_NM, NOISE_RAD, SIGNAL, recorded
 from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.fit import fit, rms, stacked
 from taccorl.diagnosis.joint_problem import JointProblem
-from taccorl.diagnosis.motions import AGAIN, CHIRP, HELD_OUT, HELD_STEPS, STIFFER_CHIRP, WIDE_TRIANGLE
+from taccorl.diagnosis.motions import AGAIN, CHIRP, HELD_STEPS, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
 from taccorl.diagnosis.search import SearchConfig, diagnose
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
@@ -51,7 +51,7 @@ def test_gains_are_fitted_if_one_recording_is_silent_or_they_are_not_believed(ch
     for problem in (
         JointProblem(NOMINAL, SIGNAL, Measurements((chirps[0], silent)), effort=False),
         JointProblem(NOMINAL, SIGNAL, Measurements(chirps), gains="fitted", effort=False),
-        JointProblem(NOMINAL, SIGNAL, Measurements(chirps[:1], held_out=(silent,)), effort=False),
+        JointProblem(NOMINAL, SIGNAL, Measurements(chirps[:1], validation=(silent,)), effort=False),
     ):
         assert not problem.commanded
         assert names(problem) == ["kp", "kd", "torque_ff"]
@@ -123,7 +123,7 @@ def test_a_friction_s_starts_hang_on_what_the_motor_gives(chirps):
 def test_an_effect_that_the_twin_has_is_refitted_and_is_no_candidate_twice():
     truth = TwinConfig(effects=[friction(0.8)])
     fit_to = tuple(recorded(truth, m, k) for k, m in enumerate((CHIRP, AGAIN)))
-    made = Measurements(fit_to, (recorded(truth, HELD_OUT[0], 5),))
+    made = Measurements(fit_to, (recorded(truth, VALIDATION[0], 5),))
     # the twin has it in all joints of both arms, and too little of it
     twin = TwinConfig(effects=[friction(0.3, ("joint4", "joint5"), "both")])
     problem = JointProblem(twin, SIGNAL, made)
@@ -133,14 +133,14 @@ def test_an_effect_that_the_twin_has_is_refitted_and_is_no_candidate_twice():
     found = diagnose(
         problem,
         problem.fit,
-        problem.held_out,
+        problem.validation,
         start=problem.start,
         present=problem.present,
         without=[name for name in problem.candidates if name not in keep],
         config=SearchConfig(max_effects=1),
     )
     assert found.names == ("coulomb_friction",) and found.status == "nothing_missing"
-    assert found.errors["before"]["held_out"] > 5.0 and found.errors["after"]["held_out"] < 1.25
+    assert found.errors["before"]["validation"] > 5.0 and found.errors["after"]["validation"] < 1.25
     assert found.after.values["coulomb_friction.torque_nm"] == pytest.approx(0.8, abs=0.02)
     assert not [e for r in found.rounds for e in r.evidence if e.name == "coulomb_friction"]
 
@@ -175,12 +175,12 @@ def test_a_repeated_motion_is_judged_by_its_own_noise_floor():
     fit_to = [recorded(NOMINAL, m, k) for k, m in enumerate((CHIRP, AGAIN, WIDE_TRIANGLE))]
     held = [recorded(NOMINAL, m, 10 + k, noise_rad=loud) for k, m in enumerate((HELD_STEPS, again))]
     problem = JointProblem(NOMINAL, SIGNAL, Measurements(tuple(fit_to), tuple(held)))
-    floor = {r.name: float(r.floor[0]) for r in (*problem.fit, *problem.held_out)}
+    floor = {r.name: float(r.floor[0]) for r in (*problem.fit, *problem.validation)}
     assert floor["chirp"] == floor["chirp_again"] == pytest.approx(NOISE_RAD, rel=0.1)
     assert floor["held_steps"] == floor["held_steps_again"] == pytest.approx(loud, rel=0.1)
     assert floor["wide_triangle"] == problem.floors[0].value
     assert NOISE_RAD < floor["wide_triangle"] < loud
-    assert rms(stacked(problem, problem.start, [], problem.held_out)) == pytest.approx(1.0, abs=0.1)
+    assert rms(stacked(problem, problem.start, [], problem.validation)) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_joint_that_was_never_measured_is_refused(chirps):

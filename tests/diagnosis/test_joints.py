@@ -20,7 +20,7 @@ from taccorl.diagnosis.joints import (
     set_numbers,
     swept_joints,
 )
-from taccorl.diagnosis.motions import AGAIN, CHIRP, HELD_OUT
+from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.diagnosis.search import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_NAMES
@@ -46,7 +46,7 @@ def still(name: str = "still", **spans: float) -> Measurement:
 def sweeps(signal: str = SIGNAL, torque_nm: float = TRUTH_NM, stated: bool = True) -> Measurements:
     arm, joint = signal.split("_")
     truth = TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=torque_nm, arm=arm, joints=[joint])])
-    made = [recorded(truth, m, k, signal=signal, stated=stated) for k, m in enumerate((CHIRP, AGAIN, HELD_OUT[0]))]
+    made = [recorded(truth, m, k, signal=signal, stated=stated) for k, m in enumerate((CHIRP, AGAIN, VALIDATION[0]))]
     return Measurements(tuple(made[:2]), (made[2],))
 
 
@@ -61,8 +61,8 @@ def finding() -> JointFinding:
 def test_a_joint_is_swept_if_a_fit_recording_commands_it_to_move():
     few = 0.9 * MOVES_RAD
     fit = still("a", left_joint5=0.1, left_joint2=few), still("b", right_joint1=-0.2, left_gripper=0.03)
-    held_out = (still("c", left_joint6=0.1),)
-    assert swept_joints(Measurements(fit, held_out)) == (SIGNAL, "right_joint1")
+    validation = (still("c", left_joint6=0.1),)
+    assert swept_joints(Measurements(fit, validation)) == (SIGNAL, "right_joint1")
     assert swept_joints(Measurements((still(),))) == ()
     assert moves(fit[0], SIGNAL) and not moves(fit[0], "left_joint2") and not moves(fit[1], SIGNAL)
 
@@ -93,7 +93,7 @@ def test_the_friction_is_found_at_its_joint_with_fitted_gains(finding):
     assert d.names == ("coulomb_friction",) and d.status == "at_floor"
     assert d.after.values["coulomb_friction.torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
     assert "asymmetric_friction" in d.rivals["coulomb_friction"]
-    assert finding.recordings == {"fit": ("chirp", "chirp_again"), "held_out": ("held_chirp",), "test": ()}
+    assert finding.recordings == {"fit": ("chirp", "chirp_again"), "validation": ("held_chirp",), "test": ()}
     assert len(finding.floors) == 1, "no effort was recorded"
 
 
@@ -105,10 +105,10 @@ def test_recordings_that_leave_the_joint_alone_are_left_out(finding):
     assert again.diagnosis.errors == finding.diagnosis.errors
 
 
-def test_without_held_out_recordings_the_last_rows_judge():
-    made = dataclasses.replace(sweeps(), held_out=())
+def test_without_validation_recordings_the_last_rows_judge():
+    made = dataclasses.replace(sweeps(), validation=())
     found = diagnose_joint(TwinConfig(), SIGNAL, made, search=ONE, without=WITHOUT)
-    assert found.rows_split and found.recordings["held_out"] == ()
+    assert found.rows_split and found.recordings["validation"] == ()
     assert found.diagnosis.names == ("coulomb_friction",)
     n = made.fit[0].num_rows
     # 60 % of the rows of both chirps were fitted to
@@ -151,11 +151,13 @@ def test_the_mended_twin_is_at_the_floor_and_comes_back_from_its_file(finding, t
     read = load_twin(tmp_path / "twin.yaml")
     assert twin_digest(read) == twin_digest(twin) and read == twin
     (effect,) = read.effects
-    assert effect.acts_on() == [SIGNAL] and "held-out error" in effect.evidence
+    assert effect.acts_on() == [SIGNAL] and "validation error" in effect.evidence
     low, high = effect.interval["torque_nm"]
     assert low < vars(effect)["torque_nm"] < high
     ratio = [
-        next(s.ratio for s in compare(c, sweeps(stated=False)).scores() if s.use == "held_out" and s.kind == "position")
+        next(
+            s.ratio for s in compare(c, sweeps(stated=False)).scores() if s.use == "validation" and s.kind == "position"
+        )
         for c in (nominal, read)
     ]
     assert ratio[0] > 10.0 and ratio[1] < 1.25

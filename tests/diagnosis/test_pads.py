@@ -72,8 +72,8 @@ def test_the_bent_law_is_found_with_its_numbers(finding: PadFinding):
     assert d.names == ("taxel_saturation",) and d.effects[0].acts_on() == ["left_a", "left_b"]
     assert vars(d.effects[0])["limit"] == pytest.approx(LIMIT, rel=0.03)
     assert d.base["k_n"] == pytest.approx(K_N, rel=0.02) and d.base["k_d"] == pytest.approx(K_D, rel=0.1)
-    assert d.errors["fitted"]["held_out"] > 2.0 and d.errors["after"]["held_out"] < 1.25
-    assert finding.recordings == {"fit": ("press_0", "press_2"), "held_out": ("press_1",), "test": ()}
+    assert d.errors["fitted"]["validation"] > 2.0 and d.errors["after"]["validation"] < 1.25
+    assert finding.recordings == {"fit": ("press_0", "press_2"), "validation": ("press_1",), "test": ()}
     # 1.3 counts of noise, rounded: √(1.3² + 1/12) / √5 = 0.60 for the mean over five frames
     assert finding.lower_bound and finding.noise.endswith("lower bound: record a press twice)")
     assert finding.floor_count == pytest.approx(0.60, rel=0.05)
@@ -218,7 +218,7 @@ def evidence(**fields) -> Evidence:
             "base": {},
             "explained": 0.5,
             "fit_error": 1.0,
-            "held_out_error": 1.1,
+            "validation_error": 1.1,
             "gain": 0.8,
             "score": 6.0,
             "bic": 5000.0,

@@ -134,7 +134,7 @@ def test_evidence_says_what_effects_are_and_what_cannot_be_told_apart(diagnosed:
         assert rival in text and "do not tell which it is" in text
         assert f"taccorl excite {SIGNAL} --effects=coulomb_friction,{','.join(d.rivals['coulomb_friction'])}" in text
     assert "taccorl add-effect coulomb_friction" in text
-    before, fitted, after = (d.errors[stage]["held_out"] for stage in ("before", "fitted", "after"))
+    before, fitted, after = (d.errors[stage]["validation"] for stage in ("before", "fitted", "after"))
     assert f"{before:.3g}, numbers refitted {fitted:.3g}, now {after:.3g} × floor" in text
     assert f"by the effects {after / fitted - 1:+.0%}" in text, "what the gains alone did is not the effect's merit"
 

@@ -23,7 +23,7 @@ from taccorl.sim.effects import effects
 
 
 def row(hidden: tuple[str, ...], found: tuple[str, ...], **fields: Any) -> dict[str, Any]:
-    plain = {"status": "at_floor", "ties": {}, "swapped": [], "rivals": {}, "errors": {"fitted": {"held_out": 5.0}}}
+    plain = {"status": "at_floor", "ties": {}, "swapped": [], "rivals": {}, "errors": {"fitted": {"validation": 5.0}}}
     return {"hidden": list(hidden), "found": list(found)} | plain | fields
 
 
@@ -90,8 +90,8 @@ def test_silently_wrong_is_at_the_floor_with_another_effect_and_no_word_of_the_t
 
 
 def test_material_is_what_refitted_gains_leave():
-    at = {"errors": {"fitted": {"held_out": MATERIAL}, "before": {"held_out": 99.0}}}
-    below = {"errors": {"fitted": {"held_out": MATERIAL - 0.01}, "before": {"held_out": 99.0}}}
+    at = {"errors": {"fitted": {"validation": MATERIAL}, "before": {"validation": 99.0}}}
+    below = {"errors": {"fitted": {"validation": MATERIAL - 0.01}, "before": {"validation": 99.0}}}
     assert material(row((), (), **at)) and not material(row((), (), **below))
 
 

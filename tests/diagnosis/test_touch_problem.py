@@ -109,7 +109,7 @@ def test_nothing_is_missing_where_nothing_is_and_the_base_is_recovered() -> None
     assert found.base["k_n"] == pytest.approx(K_N, rel=0.003)
     assert found.base["k_d"] == pytest.approx(K_D, rel=0.03)
     assert abs(found.base["zero_left_a"]) < 0.1
-    assert found.errors["fitted"]["held_out"] == pytest.approx(1.0, abs=0.1)
+    assert found.errors["fitted"]["validation"] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_the_planted_effect_is_added_and_the_error_falls_to_the_floor(name: str)
     found = diagnose(made, recordings[:2], recordings[2:])
     assert name in found.names or name in found.rivals.get(found.names[0], ())
     assert found.names[0] == name
-    assert found.errors["after"]["held_out"] < 1.25
+    assert found.errors["after"]["validation"] < 1.25
 
 
 def test_a_gain_map_is_estimated_from_the_rows_that_are_fitted_to_and_dead_taxels_are_in_it() -> None:

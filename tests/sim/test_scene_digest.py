@@ -11,7 +11,7 @@ def digest(**effect) -> float:
 
 
 def test_evidence_and_interval_of_an_effect_make_no_other_scene_but_its_value_does():
-    told = digest(torque_nm=0.4, interval={"torque_nm": (0.3, 0.5)}, evidence="held-out error halves")
+    told = digest(torque_nm=0.4, interval={"torque_nm": (0.3, 0.5)}, evidence="validation error halves")
     assert told == digest(torque_nm=0.4)
     assert told != digest(torque_nm=0.41)
 

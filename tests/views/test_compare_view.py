@@ -36,7 +36,7 @@ def touch() -> TouchTrace:
     measured[10:40, 1, 5:9, 2:6] = 60
     return TouchTrace(
         recording="press 1.mcap",
-        use="held_out",
+        use="validation",
         pads=("left_a", "left_b"),
         time_s=np.tile((np.arange(50) / 100)[:, None], (1, 2)),
         measured=measured,

@@ -10,7 +10,7 @@ import numpy as np
 
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements, split
-from taccorl.diagnosis.motions import DESIGNS, HELD_OUT, OPENING_M, RATE_HZ, REST_POSE, TEST, Motion
+from taccorl.diagnosis.motions import DESIGNS, OPENING_M, RATE_HZ, REST_POSE, TEST, VALIDATION, Motion
 from taccorl.diagnosis.surrogate.cases import Case
 from taccorl.diagnosis.surrogate.plant import COMMAND_MS
 from taccorl.diagnosis.surrogate.robot import NOISE_RAD, QUANTUM_RAD
@@ -27,7 +27,7 @@ _GRIPPERS = [6, 13]
 
 
 def recordings(case: Case, design: str | None = None) -> Measurements:
-    """All recordings of one robot: those of the design for fitting, and others held out and for the test.
+    """All recordings of one robot: those of the design for fitting, and others for validation and for the test.
 
     Args:
         design: ``chirp`` (the paper's 10 s sweep, twice) or ``pack`` (with triangle, steps, small chirp, 2× gain, payload);
@@ -39,9 +39,9 @@ def recordings(case: Case, design: str | None = None) -> Measurements:
     design = case.design if design is None else design
     if design not in DESIGNS:
         raise TaccorlError(f"surrogate: no design {design!r}; {nearest(design, DESIGNS)}")
-    uses: dict[str, Sequence[Motion]] = {"fit": DESIGNS[design], "held_out": HELD_OUT, "test": TEST}
+    uses: dict[str, Sequence[Motion]] = {"fit": DESIGNS[design], "validation": VALIDATION, "test": TEST}
     made = [record(case, motion) for motions in uses.values() for motion in motions]
-    return split(made, held_out=[m.name for m in HELD_OUT], test=[m.name for m in TEST])
+    return split(made, validation=[m.name for m in VALIDATION], test=[m.name for m in TEST])
 
 
 def record(case: Case, motion: Motion) -> Measurement:

@@ -95,7 +95,7 @@ FIT = (
     Press(name="rod", knots=_presses((3e-4, 7e-4), (0.15, 0.6), 0.6, 2.5, 2.5), shape="rod", z_m=0.012),
 )
 # Near to places that were fitted to: what is known of a taxel counts, and not how many of them were never pressed.
-HELD_OUT = (
+VALIDATION = (
     Press(name="held_press", knots=_presses((9e-4, 4e-4, 7e-4), (0.1, 0.5), 0.6, 2.5, 2.5), x_m=0.0, z_m=0.002),
     Press(name="held_ramp", knots=_ramp((7e-4, 9e-4, 6e-4), 3.0), x_m=-0.0035, z_m=-0.0095),
 )
@@ -147,16 +147,16 @@ class TouchRecordings:
     """Recordings with what was pressed in each."""
 
     fit: tuple[Measurement, ...]
-    held_out: tuple[Measurement, ...]
+    validation: tuple[Measurement, ...]
     test: tuple[Measurement, ...]
     pressed: dict[str, PressedObject]
     """Name of a recording → object."""
 
     def motions(self, config: TwinConfig) -> dict[str, list[TouchMotion]]:
-        """fit, held_out, test → matched contact replays, as ``TouchProblem`` takes them."""
+        """fit, validation, test → matched contact replays, as ``TouchProblem`` takes them."""
         return {
             use: [touch_motion(m, config, self.pressed[m.name]) for m in getattr(self, use)]
-            for use in ("fit", "held_out", "test")
+            for use in ("fit", "validation", "test")
         }
 
 
@@ -209,7 +209,7 @@ def touch_recordings(case: TouchCase) -> TouchRecordings:
     return TouchRecordings(**made, pressed=pressed)
 
 
-_USES = {"fit": FIT, "held_out": HELD_OUT, "test": TEST}
+_USES = {"fit": FIT, "validation": VALIDATION, "test": TEST}
 
 
 def pressed_object(case: TouchCase, press: Press) -> PressedObject:

@@ -137,7 +137,7 @@ def write_recordings(case: Case, folder: Path) -> Measurements:
         TaccorlError: the folder holds something that is no surrogate's.
     """
     made = recordings(case)
-    uses = [(use, m) for use in ("fit", "held_out", "test") for m in getattr(made, use)]
+    uses = [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
     _write(Path(folder), case.truth(), case.twin, uses, {})
     return made
 
@@ -149,7 +149,7 @@ def write_touch_recordings(case: TouchCase, folder: Path) -> TouchRecordings:
         TaccorlError: the folder holds something that is no surrogate's.
     """
     made = touch_recordings(case)
-    uses = [(use, _commanded(m, case.arm)) for use in ("fit", "held_out", "test") for m in getattr(made, use)]
+    uses = [(use, _commanded(m, case.arm)) for use in ("fit", "validation", "test") for m in getattr(made, use)]
     pressed = {name: _pressed(of) for name, of in made.pressed.items()}
     _write(Path(folder), case.truth(), case.twin, uses, pressed)
     return made

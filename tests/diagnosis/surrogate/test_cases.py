@@ -48,7 +48,7 @@ def test_without_hidden_effects_the_twin_with_the_true_gains_is_at_the_noise_flo
     made = recordings(case)
     floor = noise_floor(made.fit)[case.signal].value
     # The kernel's start is the mean of noisy rows, the disturbance differs from repeat to repeat: 0.85 to 1.25 on 20 seeds.
-    assert 0.7 < rms(errors_floors(case, made.held_out, Gains(*case.gains), floor)) < 1.35
+    assert 0.7 < rms(errors_floors(case, made.validation, Gains(*case.gains), floor)) < 1.35
 
 
 def test_a_refit_finds_the_true_gains():
@@ -71,8 +71,8 @@ def test_the_registrys_effect_with_the_true_numbers_explains_what_is_hidden(name
         made = recordings(case)
         floor = noise_floor(made.fit)[case.signal].value
         own = [h.effect() for h in case.hidden]
-        before.append(rms(errors_floors(case, made.held_out, refitted(case, made.fit, floor), floor)))
-        after.append(rms(errors_floors(case, made.held_out, refitted(case, made.fit, floor, own), floor, own)))
+        before.append(rms(errors_floors(case, made.validation, refitted(case, made.fit, floor), floor)))
+        after.append(rms(errors_floors(case, made.validation, refitted(case, made.fit, floor, own), floor, own)))
     assert max(after) < 1.7
     if name not in ("encoder_bias", "encoder_scale", "encoder_eccentricity"):  # which a joint's own data hardly show
         assert max(before) > 1.5

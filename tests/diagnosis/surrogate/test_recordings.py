@@ -8,7 +8,6 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.telemetry_checks import check_measurements
 from taccorl.diagnosis.motions import (
     DESIGNS,
-    HELD_OUT,
     KNOWN_KG,
     OPENING_M,
     POSES,
@@ -17,6 +16,7 @@ from taccorl.diagnosis.motions import (
     SPEED_RAD_PER_S,
     TEST,
     TORQUE_NM,
+    VALIDATION,
     Room,
 )
 from taccorl.diagnosis.surrogate.cases import draw_case
@@ -27,7 +27,7 @@ from taccorl.sim.controller import KP_NM_PER_RAD, TORQUE_FF_NM
 from taccorl.sim.robot import LINKS
 from taccorl.sim.twin import TwinConfig, empty_bench
 
-MOTIONS = (*DESIGNS["pack"], *HELD_OUT, *TEST)
+MOTIONS = (*DESIGNS["pack"], *VALIDATION, *TEST)
 JOINTS = range(1, 7)
 
 
@@ -96,7 +96,12 @@ def test_over_the_wide_range_the_arm_touches_nothing(joint):
 def test_recordings_are_divided_and_hold_what_readers_want(measurements):
     names = [m.name for m in measurements.fit]
     assert names == ["chirp", "chirp_again", "wide_triangle", "steps", "small_chirp", "chirp_2x_gain", "chirp_payload"]
-    assert [m.name for m in measurements.held_out] == ["held_chirp", "held_triangle", "held_steps", "held_steps_again"]
+    assert [m.name for m in measurements.validation] == [
+        "held_chirp",
+        "held_triangle",
+        "held_steps",
+        "held_steps_again",
+    ]
     assert len(measurements.test) == 2
     by_name: dict[str, Measurement] = {m.name: m for m in measurements.all}
     assert by_name["chirp_again"].repeat_of == "chirp"

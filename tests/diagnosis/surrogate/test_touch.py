@@ -152,7 +152,7 @@ def test_recordings_are_what_the_touch_problem_takes():
     case = draw_touch_case([], 5)
     made = touch_recordings(case)
     motions = made.motions(case.twin)
-    assert [len(motions[use]) for use in ("fit", "held_out", "test")] == [4, 2, 1]
+    assert [len(motions[use]) for use in ("fit", "validation", "test")] == [4, 2, 1]
     assert made.fit[1].repeat_of == made.fit[0].name
     for motion in (m for use in motions.values() for m in use):
         assert motion.pads == tuple(case.pads)

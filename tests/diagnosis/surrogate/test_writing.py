@@ -46,8 +46,8 @@ def read(folder):
 def test_what_is_read_back_is_what_was_recorded(case, read):
     made = recordings(case)
     assert [m.name.removesuffix(".mcap")[3:] for m in read.all] == [m.name for m in made.all]
-    assert [len(getattr(read, use)) for use in ("fit", "held_out", "test")] == [
-        len(part) for part in (made.fit, made.held_out, made.test)
+    assert [len(getattr(read, use)) for use in ("fit", "validation", "test")] == [
+        len(part) for part in (made.fit, made.validation, made.test)
     ]
     assert not read.skipped
     for one, back in zip(made.all, read.all, strict=True):

@@ -37,7 +37,7 @@ def written(case: TouchCase, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     """Three short presses instead of seven long ones."""
     folder = tmp_path_factory.mktemp("pads") / "made"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(touch, "_USES", {"fit": (BALL, AGAIN), "held_out": (ROD,), "test": ()})
+        patch.setattr(touch, "_USES", {"fit": (BALL, AGAIN), "validation": (ROD,), "test": ()})
         return folder, write_touch_recordings(case, folder)
 
 
@@ -48,8 +48,8 @@ def read(written: tuple[Path, TouchRecordings]) -> Measurements:
 
 def test_frames_and_stamps_are_read_back_as_they_were_made(written: tuple[Path, TouchRecordings], read: Measurements):
     made = written[1]
-    assert [m.name for m in read.fit] == ["01_ball.mcap", "02_again.mcap"] and read.held_out[0].name == "03_rod.mcap"
-    for one, back in zip((*made.fit, *made.held_out), read.all, strict=True):
+    assert [m.name for m in read.fit] == ["01_ball.mcap", "02_again.mcap"] and read.validation[0].name == "03_rod.mcap"
+    for one, back in zip((*made.fit, *made.validation), read.all, strict=True):
         assert one.touch is not None and back.touch is not None
         sent, told = (t.counts + t.baseline for t in (one.touch, back.touch))
         np.testing.assert_array_equal(told, sent)  # every byte of every board
@@ -135,7 +135,7 @@ def test_a_disk_that_is_full_leaves_nothing_half_written_and_what_was_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     case = draw_touch_case((), 3, arm="left")
-    monkeypatch.setattr(touch, "_USES", {"fit": (BALL,), "held_out": (), "test": ()})
+    monkeypatch.setattr(touch, "_USES", {"fit": (BALL,), "validation": (), "test": ()})
     folder = tmp_path / "robot"
     write_touch_recordings(case, folder)
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
