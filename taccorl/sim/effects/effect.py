@@ -100,6 +100,8 @@ class Effect:
     """Name of another effect, or of a number that is always fitted (kp, kd, torque_ff, k_n, k_d) → why measurements can hardly
     tell them apart, and which recording can."""
 
+    reduces_to: ClassVar[dict[str, str]] = {}
+    """Name of a simpler effect → own parameter at whose lower bound this effect equals it. The search prefers the simpler one."""
     rewrites: ClassVar[tuple[str, ...]] = ()
     """Fields of ``mujoco.MjModel``, or ``qfrc_applied`` of ``mujoco.MjData``, that ``rewrite`` changes."""
 
