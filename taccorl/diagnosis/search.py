@@ -1,11 +1,11 @@
 """Which physical effect is missing: fit, screen, refit, judge on validation recordings, accept or say that it is something else.
 
     1. The numbers that are always fitted are fitted to the fit recordings.
-    2. While the validation error is above ``stop_at`` noise floors:
+    2. While the error of the validation or of the fit recordings is above ``stop_at`` noise floors:
        a. every effect is probed once (``screen``); the likeliest are refitted together with all numbers;
        b. they are ranked by their error on the validation recordings;
        c. an effect is accepted if it takes away enough of what lies above the floor, more than chance and more than its
-          parameters explain (BIC), and if its numbers are inside of their ranges. The best of those is added. Those that do as
+          parameters explain (BIC), and if it was not fitted to nothing. The best of those is added. Those that do as
           well are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else;
        d. if none is accepted, the search ends with "something else".
     3. Effects that others have made superfluous go; each is tried against its ties once more, now that the others are in. An
@@ -50,7 +50,7 @@ class SearchConfig:
     """When an effect is believed. The values of research/discrepancy.md §4.1, checked in docs/diagnosis.md."""
 
     stop_at: float = 1.25
-    """Validation error in noise floors at which nothing more is looked for."""
+    """Error in noise floors, of fit and of validation recordings, at which nothing more is looked for."""
     min_gain: float = 0.10
     """Of the validation error squared that lies above the floor, an effect must take away so much,"""
     min_score: float = 2.0
@@ -273,7 +273,7 @@ class _Search:
     def _search(self, model: Fit, names: Sequence[str], most: int) -> tuple[Fit, list[Round]]:
         """``model`` with up to ``most`` effects more, one a round, until its error is at the floor or none is accepted."""
         rounds: list[Round] = []
-        while self.error(model) > self.config.stop_at and len(rounds) < most:
+        while not self._at_floor(model) and len(rounds) < most:
             found, better = self._round(model, names)
             rounds.append(found)
             if better is None:
@@ -317,8 +317,8 @@ class _Search:
         if not accepted:
             return self._told(parent, rows, order, None, []), None
         best_row = accepted[0]
-        tied = [row for row in rows if row is best_row or self._tie(row, best_row, before)]
-        as_good = [row for row in tied if row in accepted and self._as_good(row, best_row)]
+        tied = [row for row in accepted if row is best_row or self._tie(row, best_row, before)]
+        as_good = [row for row in tied if self._as_good(row, best_row)]
         pick = min(as_good, key=lambda row: (row.num_parameters, row.squares.mean))
         pick.model = self._polished(pick.model)
         return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
@@ -428,7 +428,7 @@ class _Search:
         Returns:
             model, its rounds, and added effect → the effect with more numbers that does as well.
         """
-        if self.error(model) > self.config.stop_at:
+        if not self._at_floor(model):
             return model, rounds, {}
         for k, name in enumerate(r.added for r in rounds):
             if name is None or not self.problem.candidates[name].cls.reduces_to:
@@ -440,7 +440,7 @@ class _Search:
             other, found = self._search(parent, [n for n in names if n != name], allowed)
             here, there = (block_squares(self.problem, m, self.validation) for m in (model, other))
             if (
-                self.error(other) <= self.config.stop_at
+                self._at_floor(other)
                 and self._num_parameters(other) <= self._num_parameters(model)
                 and above_floor(there) <= self.config.simpler * above_floor(here)
             ):
@@ -491,6 +491,10 @@ class _Search:
         self.evaluations += model.evaluations
         return model
 
+    def _at_floor(self, model: Fit) -> bool:
+        """Whether neither the validation nor the fit recordings have an error that another effect could explain."""
+        return max(self.error(model), model.error) <= self.config.stop_at
+
     def error(self, model: Fit) -> float:
         """RMS on the validation recordings, in floors."""
         return rms(stacked(self.problem, model.values, model.effects, self.validation))
@@ -502,7 +506,7 @@ class _Search:
     def _status(self, model: Fit) -> Status:
         if model.trouble:
             return "not_converged"
-        if self.error(model) <= self.config.stop_at:
+        if self._at_floor(model):
             if len(model.names) > len(self.present):
                 return "at_floor"
             return "gains_moved" if self._moved(self.first) else "nothing_missing"
@@ -567,26 +571,26 @@ class _Row:
         return self._at_its_end() or self._config.refusal(self.gain, self.score, self.bic)
 
     def _at_its_end(self) -> str:
-        """Why the fitted numbers do not describe the effect: the strength is at a bound, or a shape makes it another effect."""
+        """Why the fitted numbers are those of no effect, or of another one; empty if they are not."""
         cls = self.candidate.cls
-        simpler = {parameter: name for name, parameter in cls.reduces_to.items()}
+        for name, shape in cls.reduces_to.items():
+            if self._at_bound(shape) == "low":
+                return f"with {shape} at {self.model.values[f'{cls.name}.{shape}']:.3g} it is {name}"
         for p in cls.parameters():
-            name = f"{cls.name}.{p.name}"
-            if name not in self.model.at_bound or (p.absent is None and p.name not in simpler):
-                continue
-            value = self.model.values[name]
-            free = next(f for f in self.model.frees if f.name == name)
-            lowest = value - free.low < free.high - value
-            if p.name in simpler:
-                if lowest:
-                    return f"with {p.name} at {value:.3g} {p.unit} it is {simpler[p.name]}"
-            elif lowest == (p.absent == p.low) and p.absent in (p.low, p.high, np.inf):
+            side = self._at_bound(p.name)
+            if (side and p.absent == (p.low if side == "low" else p.high)) or (side == "high" and p.absent == np.inf):
+                value = self.model.values[f"{cls.name}.{p.name}"]
                 return f"fitted to nothing: {p.name} is at {value:.3g} {p.unit}, where the effect is absent"
-            else:
-                return (
-                    f"{p.name} is at the end of its range, {value:.3g} {p.unit}: outside of it the search does not look"
-                )
         return ""
+
+    def _at_bound(self, parameter: str) -> Literal["", "low", "high"]:
+        """At which end of its range a parameter of the effect was fitted."""
+        name = f"{self.candidate.name}.{parameter}"
+        if name not in self.model.at_bound:
+            return ""
+        free = next(f for f in self.model.frees if f.name == name)
+        place, low, high = (free.coordinate(x) for x in (self.model.values[name], free.low, free.high))
+        return "low" if place - low < high - place else "high"
 
     def evidence(self, verdict: str) -> Evidence:
         own = f"{self.name}."
