@@ -70,7 +70,7 @@ class JointProblem:
                 "or fit them (gains=fitted)"
             )
         self.signal, self.commanded = signal, gains != "fitted" and stated
-        own = [e for e in config.effects if isinstance(e, ArmEffect) and _acts_on(e, signal)]
+        own = [e for e in config.effects if isinstance(e, ArmEffect) and e.fitted and _acts_on(e, signal)]
         self.present = tuple(effect.name for effect in own)
         others = [e for e in config.effects if not any(e is mine for mine in own)]
         self.model = JointModel(dataclasses.replace(config, effects=others), signal)
@@ -104,9 +104,10 @@ class JointProblem:
         """Starts of searches hang on the torques that the motor would give with these gains."""
         seen = self._seen(values)
         for name in registry:
-            where = selectors(registry.get(name), self.signal)
+            cls = registry.get(name)
+            where = selectors(cls, self.signal) if cls.fitted else None
             if where is not None and (self.commanded or name not in _GAIN_LIKE):
-                self.candidates[name] = candidate(registry.get(name), seen, **where)
+                self.candidates[name] = candidate(cls, seen, **where)
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
@@ -153,6 +154,8 @@ class JointProblem:
             "peak_motor_nm": max(float(np.abs(a.effort + w).max()) for a, w in zip(answers, weights, strict=True)),
             "peak_speed_rad_per_s": float(speeds.max()),
             "span_rad": float(np.ptp(angles)),
+            "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
+            "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
             "duration_s": max(float(m.time_s[-1]) for m in motions),
         }
 
