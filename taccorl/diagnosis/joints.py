@@ -14,6 +14,7 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.noise_floor import SignalFloor
 from taccorl.diagnosis.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.identifiable import Known, absolute_numbers, identifiable_numbers
 from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.problem import split_rows
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
@@ -43,6 +44,8 @@ class JointFinding:
     """fit, validation, test → names."""
     rows_split: bool
     """No recording was marked for validation: rows at the end of each were."""
+    known: Known
+    """The numbers that the recordings identify, and what they leave open of the others."""
 
     @property
     def part(self) -> str:
@@ -111,9 +114,11 @@ def diagnose_joint(
         without=without,
         config=search,
     )
+    known = known_numbers(problem, found)
     return JointFinding(
         signal=signal,
-        diagnosis=found,
+        known=known,
+        diagnosis=with_intervals(found, known),
         can_tell=can_tell,
         floors=tuple(problem.floors),
         commanded=problem.commanded,
@@ -122,6 +127,29 @@ def diagnose_joint(
         },
         rows_split=not problem.validation,
     )
+
+
+def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
+    """What the recordings of a joint identify of the numbers that were fitted to them."""
+    pinned_by = problem.pinned_by(found.names)
+    kd = problem.model.gains.kd if problem.commanded else None
+    return Known(
+        identifiable=identifiable_numbers(found.after, problem.commanded, bool(pinned_by), kd),
+        absolute=absolute_numbers(found.after, inertia_kgm2=problem.inertia_kgm2, pinned=bool(pinned_by), kd=kd),
+        pinned_by=pinned_by,
+    )
+
+
+def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
+    """``found`` with the absolute numbers' intervals, in its effects too, and the identified numbers in their evidence."""
+    effects = []
+    for effect in found.effects:
+        prefix = f"{effect.name}."
+        own = [n.words() for n in known.identifiable if n.name.startswith(prefix)]
+        evidence = "; ".join(part for part in (effect.evidence, f"identified: {', '.join(own)}" * bool(own)) if part)
+        ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in known.absolute if n.name.startswith(prefix)}
+        effects.append(dataclasses.replace(effect, interval=effect.interval | ends, evidence=evidence))
+    return dataclasses.replace(found, effects=tuple(effects), intervals=found.intervals | known.intervals)
 
 
 def diagnose_joints(
