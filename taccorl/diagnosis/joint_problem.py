@@ -34,8 +34,8 @@ WIDER = 100.0
 this factor, downwards."""
 _GAIN_LIKE = ("torque_scale",)
 """No candidates where gains are fitted: those take it up, and what it does to the carried weight is ``gravity_mismatch``."""
-WEIGHS = 10.0
-"""Floors of the angle that a weight must move the joint by, at least, to tell the scale of the torques. A choice."""
+WEIGHS = 3.0
+"""Floors of the angle by which a weight must move the joint (standard deviation) to tell the scale of the torques. A choice."""
 EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
 """Reported effort over torque: PiPER firmware differs in it."""
 

@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
@@ -147,7 +147,8 @@ def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
         prefix = f"{effect.name}."
         own = [n.words() for n in known.identifiable if n.name.startswith(prefix)]
         evidence = "; ".join(part for part in (effect.evidence, f"identified: {', '.join(own)}" * bool(own)) if part)
-        ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in known.absolute if n.name.startswith(prefix)}
+        mine = [n for n in known.absolute if n.name.startswith(prefix) and np.isfinite([n.low, n.high]).all()]
+        ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in mine}
         effects.append(dataclasses.replace(effect, interval=effect.interval | ends, evidence=evidence))
     return dataclasses.replace(found, effects=tuple(effects), intervals=found.intervals | known.intervals)
 
@@ -200,7 +201,18 @@ def mended(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig:
     return new
 
 
-def set_numbers(config: TwinConfig, signal: str, base: dict[str, float]) -> None:
+def refitted(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig:
+    """``config`` with its always fitted numbers refitted and no further effect: what effects are credited against."""
+    new = copy.deepcopy(config)
+    for finding in findings:
+        first = finding.diagnosis.before
+        set_numbers(new, finding.signal, first.values)
+        for effect in first.effects:
+            add_effect(new, effect)
+    return new
+
+
+def set_numbers(config: TwinConfig, signal: str, base: Mapping[str, float]) -> None:
     """Write fitted gains into one arm of ``config``."""
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
