@@ -34,6 +34,8 @@ WIDER = 100.0
 this factor, downwards."""
 _GAIN_LIKE = ("torque_scale",)
 """No candidates where gains are fitted: those take it up, and what it does to the carried weight is ``gravity_mismatch``."""
+WEIGHS = 3.0
+"""Floors of the angle by which a weight must move the joint (standard deviation) to tell the scale of the torques. A choice."""
 EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
 """Reported effort over torque: PiPER firmware differs in it."""
 
@@ -92,6 +94,30 @@ class JointProblem:
         self.start: Values = self.model.gains._asdict() | {
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
         }
+
+    @property
+    def inertia_kgm2(self) -> float:
+        """Of the joint: the least of the fit recordings, whose loop timing is the most uncertain."""
+        return min(self.model.inertia_kgm2(r.data) for r in self.fit)
+
+    def pinned_by(self, names: Sequence[str]) -> tuple[str, ...]:
+        """What fixes the scale of the torques (``taccorl.diagnosis.identifiable``) while the effects ``names`` are fitted."""
+        found = ["commanded gains"] * self.commanded + ["recorded effort"] * (self.effort and not self.commanded)
+        unknown = {"gravity_mismatch", "payload"} & {*names}
+        if not unknown and self._weighs():
+            found.append("known weight")
+        return tuple(found)
+
+    def _weighs(self) -> bool:
+        """Whether known weight that the controller holds varies more than the torque J q̈ of the motion, which else decides."""
+        motions: list[JointMotion] = [r.data for r in self.fit]
+        weights = np.concatenate([self.model.weight_nm(m, m.target) for m in motions])
+        torques = []
+        for m in motions:
+            angle = self.model.simulate(m, self.model.gains).reported
+            torques.append(self.model.inertia_kgm2(m) * np.gradient(np.gradient(angle, m.time_s), m.time_s))
+        seen = WEIGHS * self.floors[0].value * self.model.gains.kp
+        return float(np.std(weights)) > max(float(np.std(np.concatenate(torques))), seen)
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """(T, C) angle [rad], and effort [N·m] as the driver would report it."""

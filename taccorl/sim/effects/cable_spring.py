@@ -43,6 +43,7 @@ class CableSpring(JointEffect):
         low=0.0,
         high=50.0,
         typical=1.0,
+        over="kp",
         source="a choice",
     )
     rest_rad: float = parameter(

@@ -50,6 +50,7 @@ class CoulombFriction(JointEffect):
         low=0.0,
         high=20.0,
         typical=0.4,
+        over="kp",
         source="0.2–0.8 N·m on a Unitree Go2, research/discrepancy.md §4.6; 0.3 in Menagerie’s PiPER",
     )
 

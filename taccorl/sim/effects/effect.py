@@ -65,6 +65,9 @@ class Parameter:
     typical: float
     """Of a robot like this one: where a search starts."""
     source: str
+    over: Literal["", "kp"] = ""
+    """``kp``: a torque, stiffness, damping, inertia or mass. Positions alone identify only (value − absent) / K_p of it
+    (``taccorl.diagnosis.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""
 
 
 def parameter(
@@ -76,10 +79,13 @@ def parameter(
     typical: float,
     absent: float | None,
     source: str,
+    over: Literal["", "kp"] = "",
 ) -> float:
     """A dataclass field that holds a ``Parameter``; its default is the absent value, or else the typical one."""
     meta = {"unit": unit, "symbol": symbol, "absent": absent, "low": low, "high": high, "typical": typical}
-    return field(default=typical if absent is None else absent, metadata={"parameter": meta | {"source": source}})
+    return field(
+        default=typical if absent is None else absent, metadata={"parameter": meta | {"source": source, "over": over}}
+    )
 
 
 @dataclass(kw_only=True)

@@ -45,6 +45,7 @@ class StribeckFriction(JointEffect):
         low=0.0,
         high=20.0,
         typical=0.3,
+        over="kp",
         source="as coulomb_friction",
     )
     stiction_share: float = parameter(

@@ -45,6 +45,7 @@ class TorqueSaturation(JointEffect):
         low=0.05,
         high=200.0,
         typical=8.0,
+        over="kp",
         source="torque range of the MIT mode, ±8 N·m by default (research/mujoco.md §2)",
     )
 
