@@ -1,20 +1,34 @@
-"""``python -m pipelines.diagnosis_study chirp pack none …``: is the search for missing effects right? On surrogate robots.
+"""``python -m pipelines.diagnosis_study pack chirp … [--seeds=10] [--workers=2] [--rows=PATH] [--first_seed=20000]``
 
-Rows go to docs/diagnosis_study.jsonl as they are finished; what is there is not run again. Then docs/diagnosis.md is written.
-Seeds from 5000 on are for these figures only: thresholds were chosen on seeds below 300, and after a look at 1000 to 1012.
+Is the search for missing effects right? On surrogate robots. Rows go to docs/diagnosis_study.jsonl as they are finished; what is
+there is not run again (a case that failed is, with ``--again``). ``--page`` writes docs/diagnosis.md from the rows and runs
+nothing. Thresholds were chosen on seeds 300 to 999 and 15000 to 15999; seeds from 20000 on are for the page only.
 """
 
 import json
+import os
+import platform
 import sys
-from multiprocessing import get_context
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
-from taccorl.cli.tables import Bars
-from taccorl.diagnosis import study
-from taccorl.diagnosis.surrogate.hidden import OUTSIDE, REGISTERED
-from taccorl.diagnosis.surrogate.touch_hidden import REGISTERED_TOUCH
+# Before NumPy is imported, here and in every worker: CPU-seconds are those of one thread.
+for _name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB_MAXIMUM", "NUMEXPR"):
+    os.environ[f"{_name}_NUM_THREADS"] = "1"
+
+from pipelines.worker_processes import finished  # noqa: E402
+from taccorl.cli.tables import Bars  # noqa: E402
+from taccorl.diagnosis import study  # noqa: E402
+from taccorl.diagnosis.surrogate.hidden import OUTSIDE, REGISTERED  # noqa: E402
+from taccorl.diagnosis.surrogate.touch_hidden import OUTSIDE_TOUCH, REGISTERED_TOUCH  # noqa: E402
+from taccorl.errors import TaccorlError, nearest  # noqa: E402
 
 ROWS = Path("docs/diagnosis_study.jsonl")
+FIRST_SEED = 20000
 PAIRS = (
     ("coulomb_friction", "command_delay"),
     ("coulomb_friction", "gravity_mismatch"),
@@ -31,43 +45,173 @@ PAIR_FLOORS = 5.0
 """Noise floors that each of two effects leaves alone."""
 AMPLITUDES = (0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.3)
 """Noise floors that an effect leaves: around those at which it begins to be found."""
-STUDIES = {
-    "chirp": lambda n: study.single("chirp", REGISTERED, range(5000, 5000 + n)),
-    "pack": lambda n: study.single("pack", REGISTERED, range(5000, 5000 + n)),
-    "amplitude": lambda n: study.amplitude("chirp", REGISTERED, AMPLITUDES, range(8000, 8000 + n // 4)),
-    "none": lambda n: study.nothing("chirp", range(5000, 5000 + 5 * n)),
-    "removed": lambda n: study.removed("chirp", REGISTERED, range(6000, 6000 + n)),
-    "outside": lambda n: study.removed("chirp", OUTSIDE, range(6000, 6000 + n)),
-    "touch": lambda n: study.touch(REGISTERED_TOUCH, range(5000, 5000 + n)),
-    "pairs": lambda n: study.pairs("pack", PAIRS, range(7000, 7000 + n)),
-    "pairs_alike": lambda n: study.pairs("pack", PAIRS, range(7000, 7000 + n), strength=PAIR_FLOORS),
+Jobs = list[study.Job]
+
+
+def _seeds(first: int, n: float) -> range:
+    return range(first, first + max(1, round(n)))
+
+
+STUDIES: dict[str, Callable[[int, float], Jobs]] = {
+    "pack": lambda first, n: study.single("pack", REGISTERED, _seeds(first, n)),
+    "chirp": lambda first, n: study.single("chirp", REGISTERED, _seeds(first, n)),
+    "pairs": lambda first, n: study.pairs("pack", PAIRS, _seeds(first + 1000, n)),
+    "pairs_alike": lambda first, n: study.pairs("pack", PAIRS, _seeds(first + 1000, n), strength=PAIR_FLOORS),
+    "none": lambda first, n: [
+        *study.nothing("chirp", _seeds(first, 11 * n)),
+        *study.nothing("pack", _seeds(first, 5.5 * n)),
+    ],
+    "outside": lambda first, n: [
+        *study.removed("chirp", OUTSIDE, _seeds(first + 2000, n / 2)),
+        *study.removed("pack", OUTSIDE, _seeds(first + 2500, n / 2)),
+    ],
+    "removed": lambda first, n: study.removed("chirp", REGISTERED, _seeds(first + 2000, n / 5)),
+    "dropped": lambda first, n: [
+        *study.dropped("chirp", _seeds(first + 3000, 3 * n)),
+        *study.dropped("pack", _seeds(first + 3000, 3 * n)),
+    ],
+    "touch": lambda first, n: study.touch(REGISTERED_TOUCH, _seeds(first, n / 2)),
+    "touch_none": lambda first, n: study.nothing("press", _seeds(first, n)),
+    "touch_outside": lambda first, n: study.removed("press", OUTSIDE_TOUCH, _seeds(first + 2000, n / 2)),
+    "amplitude": lambda first, n: study.amplitude("chirp", REGISTERED, AMPLITUDES, _seeds(first + 4000, n / 5)),
 }
+"""Name → cases, from the first seed and the number of seeds."""
+EVERY_JOBS = 40
+"""After so many cases the reference loop is run among them, so that it is as slow as they are."""
+_COST = {"press": 3, "pack": 1, "chirp": 0}
 
 
-def read_rows() -> list[dict]:
-    """All rows that have been made."""
-    return [json.loads(line) for line in ROWS.read_text(encoding="utf-8").splitlines()] if ROWS.exists() else []
+@dataclass(kw_only=True)
+class StudyConfig:
+    """Words of the command line."""
+
+    seeds: float = 10.0
+    workers: int = 2
+    rows: Path = ROWS
+    first_seed: int = FIRST_SEED
+    limit_s: float = 900.0
+    """Wall time of one case; what takes longer is stopped, stored and counted as wrong."""
+    page: bool = False
+    again: bool = False
+    """Run cases once more that failed."""
 
 
-def _run(job: study.Job) -> dict:
-    return study.run_touch(job) if job.study == "touch" else study.run(job)
+def parse(words: list[str]) -> tuple[StudyConfig, list[str]]:
+    """Studies, and how they are run.
+
+    Raises:
+        TaccorlError: a word that is neither.
+    """
+    config, names = StudyConfig(), []
+    types = {f.name: type(getattr(config, f.name)) for f in fields(config)}
+    for word in words:
+        name, _, value = word.removeprefix("--").partition("=")
+        if not word.startswith("--"):
+            if name not in STUDIES:
+                raise TaccorlError(f"no study {name!r}; {nearest(name, STUDIES)}")
+            names.append(name)
+        elif name not in types:
+            raise TaccorlError(f"no option --{name}; {nearest(name, types)}")
+        else:
+            kind = types[name]
+            try:
+                setattr(config, name, value in ("", "true") if kind is bool else _made(kind, value))
+            except ValueError as error:
+                raise TaccorlError(f"--{name}={value}: a {kind.__name__} is wanted") from error
+    return config, names
+
+
+def _made(kind: type, value: str) -> Any:
+    return Path(value) if issubclass(kind, Path) else kind(value)
+
+
+def read_rows(path: Path = ROWS) -> list[dict]:
+    """All rows that have been made; of a case that was run again, the last."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return list({row["key"]: row for row in map(json.loads, lines)}.values())
+
+
+def reference_loop(_: object = None) -> dict[str, float]:
+    """CPU-seconds of 200 000 MuJoCo steps of a chain of twelve links: machines differ by a factor of four."""
+    import mujoco
+
+    joint = '<joint type="hinge" axis="{x} {y} 0" damping="0.01"/>'
+    body = f'<body pos="0 0 {{z}}">{joint}<geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.2"/>'
+    links = "".join(body.format(z=0 if i == 0 else -0.2, x=i % 2, y=1 - i % 2) for i in range(12))
+    option = '<option timestep="0.001" integrator="implicitfast"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{links}{'</body>' * 12}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.1
+    began = time.process_time()
+    mujoco.mj_step(model, data, nstep=200_000)
+    return {"cpu_s": round(time.process_time() - began, 3)}
+
+
+def work(job: study.Job | str) -> dict[str, Any]:
+    """A row; a word stands for the reference loop."""
+    if isinstance(job, str):
+        return {"key": job, "study": "reference", **reference_loop()}
+    return study.run_job(job)
+
+
+def _machine() -> str:
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    model = next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine()
+    )
+    return f"{model}, {os.cpu_count()} cores"
+
+
+def ordered(jobs: Jobs, stamp: str) -> list[study.Job | str]:
+    """Longest first, so that no core waits at the end, with reference loops among them."""
+    out: list[study.Job | str] = []
+    for k, job in enumerate(sorted(jobs, key=lambda j: (-_COST[j.design], -len(j.hidden)))):
+        if k % EVERY_JOBS == 0:
+            out.append(f"reference {stamp} {k // EVERY_JOBS}")
+        out.append(job)
+    return out
 
 
 def main(words: list[str]) -> None:
-    """Words: names of studies, and ``--seeds=20``."""
-    seeds = next((int(w.partition("=")[2]) for w in words if w.startswith("--seeds=")), 20)
-    names = [w for w in words if not w.startswith("--")]
-    done = {row["key"] for row in read_rows()}
-    jobs = [job for name in names for job in STUDIES[name](seeds) if job.key not in done]
-    with Bars(len(jobs)) as bars, get_context("spawn").Pool(2) as pool, ROWS.open("a", encoding="utf-8") as file:
-        for count, row in enumerate(pool.imap_unordered(_run, jobs), 1):
-            file.write(json.dumps(row, ensure_ascii=False) + "\n")
-            file.flush()
-            bars.update(row["key"], count, len(jobs))
-    from pipelines.diagnosis_page import write_page
+    """Words: names of studies, and options."""
+    config, names = parse(words)
+    if config.page:
+        from pipelines.diagnosis_page import write_page
 
-    write_page(read_rows())
+        write_page(read_rows(config.rows))
+        return
+    there = {row["key"] for row in read_rows(config.rows) if not (config.again and "failed" in row)}
+    jobs = [job for name in names for job in STUDIES[name](config.first_seed, config.seeds) if job.key not in there]
+    if not jobs:
+        print("nothing to run: all rows are there, or no study was named; --page writes the page")
+        return
+    # What Numba compiles is written to its cache once, before many processes need it.
+    warm_up = [study.Job(study="warm-up", hidden=(), seed=300, design=d) for d in sorted({j.design for j in jobs})]
+    for done in finished(work, warm_up, 1, config.limit_s):
+        print(f"{done.job.key}: {done.why or 'compiled'}", flush=True)
+    stamp = time.strftime("%Y-%m-%d %H:%M")
+    head = {"key": f"machine {stamp}", "study": "machine", "machine": _machine(), "workers": config.workers}
+    count = wrong = 0
+    with Bars(len(jobs)) as bars, config.rows.open("a", encoding="utf-8") as file:
+        for row in chain([head], _rows(ordered(jobs, stamp), config)):
+            file.write(json.dumps(row, ensure_ascii=False, separators=(",", ":")) + "\n")
+            file.flush()
+            count += row["study"] not in ("machine", "reference")
+            wrong += "failed" in row
+            bars.update(row["key"], count, len(jobs))
+    print(f"{config.rows}: {count} rows more, {wrong} of them of cases that failed")
+
+
+def _rows(jobs: list[study.Job | str], config: StudyConfig) -> Iterator[dict[str, Any]]:
+    for done in finished(work, jobs, config.workers, config.limit_s):
+        if done.result is not None:
+            yield done.result
+        elif isinstance(done.job, study.Job):
+            yield study.failed(done.job, done.why)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except TaccorlError as error:
+        sys.exit(f"diagnosis_study: {error}")

@@ -1,19 +1,26 @@
 """How often the search is right, on surrogate robots whose hidden effects are known: one case at a time, as a row of numbers.
 
-Rows of any number of machines and sessions add up in one file; ``pipelines/diagnosis_study.py`` makes them and writes the page.
+Under which conditions a robot is recorded (sampled loop, efforts, weighed mass, coloured noise) hangs on its seed and on what is
+hidden in it. Rows of any number of machines and sessions add up in one file; ``pipelines/diagnosis_study.py`` makes them,
+``pipelines/diagnosis_page.py`` writes the page.
 """
 
 import dataclasses
 import time
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
+from taccorl.alignment.measurement import Measurement
 from taccorl.diagnosis.joint_problem import JointProblem
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
-from taccorl.diagnosis.surrogate.cases import draw_case
+from taccorl.diagnosis.surrogate.cases import Case, draw_case
+from taccorl.diagnosis.surrogate.hidden import KINDS
 from taccorl.diagnosis.surrogate.recordings import recordings
-from taccorl.diagnosis.surrogate.touch import draw_touch_case, touch_recordings
+from taccorl.diagnosis.surrogate.touch import TouchCase, draw_touch_case, touch_recordings
 from taccorl.diagnosis.touch_problem import TouchProblem
 from taccorl.sim.effects import effects as registry
 
@@ -52,13 +59,54 @@ class Job:
         return f"{self.study} {self.design} {'+'.join(self.hidden) or 'none'}{strength} seed {self.seed}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """How a robot is recorded, beside what is hidden in it."""
+
+    effort: bool
+    """The search uses the motor's efforts, too."""
+    sampled: bool
+    """The drive's loop is sampled."""
+    loaded: bool
+    """A weighed mass is held in every recording."""
+    coloured: bool
+    """The encoder's noise is correlated over time."""
+
+
+def conditions(job: Job) -> Conditions:
+    """Every combination of them equally often over neighbouring seeds.
+
+    Efforts and sampled loops in half of the cases, coloured noise in a quarter, a weighed mass in none (packs have a recording
+    with one); where nothing is hidden a weighed mass, a sampled loop and coloured noise in a third each.
+    """
+    if not job.hidden:
+        k = job.seed
+        return Conditions(effort=k // 27 % 2 == 0, loaded=k % 3 == 0, sampled=k // 3 % 3 == 0, coloured=k // 9 % 3 == 0)
+    k = job.seed + zlib.crc32("+".join(job.hidden).encode())
+    return Conditions(effort=k % 2 == 0, sampled=k // 2 % 2 == 0, coloured=k // 4 % 4 == 0, loaded=False)
+
+
+def run_job(job: Job) -> dict[str, Any]:
+    """A row, of whatever the job is about."""
+    return run_touch(job) if job.design == "press" else run(job)
+
+
 def run(job: Job) -> dict[str, Any]:
-    """Draw the robot, record it, diagnose it with gains that nobody knows and positions only: the hardest case."""
+    """Draw the robot, record it, diagnose it with gains that nobody knows: the hardest case."""
     began = time.process_time()
-    case = draw_case(job.hidden, job.seed, strength=job.strength, design=job.design)
+    how = conditions(job)
+    case = draw_case(
+        job.hidden,
+        job.seed,
+        strength=job.strength,
+        design=job.design,
+        sampled=how.sampled,
+        loaded=how.loaded,
+        coloured=how.coloured,
+    )
     made = recordings(case, job.design)
     recorded = time.process_time()
-    problem = JointProblem(case.twin, case.signal, made, gains="fitted", effort=False)
+    problem = JointProblem(case.twin, case.signal, made, gains="fitted", effort=how.effort)
     found = diagnose(
         problem,
         problem.fit,
@@ -69,13 +117,16 @@ def run(job: Job) -> dict[str, Any]:
         config=SearchConfig(max_effects=len(job.hidden) + 1),
     )
     done = time.process_time()
+    loop = (
+        {} if case.loop is None else {"loop_hz": round(1 / case.loop.period_s), "filter_s": _short(case.loop.filter_s)}
+    )
     return {
-        "key": job.key,
-        **dataclasses.asdict(job),
-        "signal": case.signal,
-        "left_floors": round(case.left_floors, 3),
+        **_head(job, case.signal, case),
+        "conditions": [name for name, on in dataclasses.asdict(how).items() if on],
+        **loop,
         **told(found),
-        "true": [{k: float(f"{v:.5g}") for k, v in h.values.items()} for h in case.hidden],
+        "findings": findings(made.all, case.signal),
+        "numbers": numbers(found, case.values(), commanded=problem.commanded, effort=problem.effort),
         "recording_cpu_s": round(recorded - began, 2),
         "cpu_s": round(done - recorded, 2),
     }
@@ -92,16 +143,39 @@ def run_touch(job: Job) -> dict[str, Any]:
     config = SearchConfig(max_effects=len(job.hidden) + 1)
     found = diagnose(problem, fit_to, validation, test, start=problem.start, without=job.without, config=config)
     done = time.process_time()
+    truth = {"k_n": case.k_n, "k_d": case.k_d} | _hidden_values(case)
     return {
-        "key": job.key,
-        **dataclasses.asdict(job),
-        "signal": f"{case.arm} pads",
-        "left_floors": round(case.left_floors, 3),
+        **_head(job, f"{case.arm} pads", case),
+        "conditions": [],
         **told(found),
-        "true": [{k: float(f"{v:.5g}") for k, v in h.values.items()} for h in case.hidden],
+        "findings": [],
+        "numbers": numbers(found, truth, commanded=True, effort=False),
         "recording_cpu_s": round(recorded - began, 2),
         "cpu_s": round(done - recorded, 2),
     }
+
+
+def failed(job: Job, why: str) -> dict[str, Any]:
+    """The row of a case that gave no diagnosis: it is counted and shown, never dropped."""
+    return {"key": job.key, **dataclasses.asdict(job), "failed": why}
+
+
+def _head(job: Job, signal: str, case: Case | TouchCase) -> dict[str, Any]:
+    return {
+        "key": job.key,
+        **dataclasses.asdict(job),
+        "signal": signal,
+        "left_floors": round(case.left_floors, 3),
+        "true": [{k: _short(v) for k, v in h.values.items()} for h in case.hidden],
+    }
+
+
+def _hidden_values(case: TouchCase) -> dict[str, float]:
+    return {f"{h.name}.{name}": value for h in case.hidden for name, value in h.values.items()}
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.5g}")
 
 
 def told(found: Diagnosis) -> dict[str, Any]:
@@ -115,10 +189,45 @@ def told(found: Diagnosis) -> dict[str, Any]:
         "swapped": [list(pair) for pair in found.swapped],
         "rivals": {name: list(others) for name, others in found.rivals.items()},
         "errors": {k: {use: round(e, 4) for use, e in of.items()} for k, of in found.errors.items()},
-        "estimate": {k: float(f"{v:.5g}") for k, v in found.after.values.items()},
-        "interval": {k: [float(f"{v:.5g}") for v in ends] for k, ends in found.intervals.items()},
+        "remarks": [str(remark)[:160] for remark in getattr(found, "remarks", ())],
         "evaluations": found.evaluations,
     }
+
+
+def numbers(found: Diagnosis, truth: Mapping[str, float], *, commanded: bool, effort: bool) -> dict[str, list[float]]:
+    """Identifiable number → value, 95 % interval, truth. Effects that are not hidden have no truth; theirs are not here."""
+    out = {}
+    for name, value, low, high, true in _identified(found, truth, commanded=commanded, effort=effort):
+        out[name] = [_short(v) for v in (value, low, high, true)]
+    return out
+
+
+def _identified(
+    found: Diagnosis, truth: Mapping[str, float], *, commanded: bool, effort: bool
+) -> Iterable[tuple[str, float, float, float, float]]:
+    """Numbers as ``taccorl.diagnosis.identifiable`` has them; without that module every fitted number as it is."""
+    module = "taccorl.diagnosis.identifiable"
+    if find_spec(module) is None:
+        for name, (low, high) in found.intervals.items():
+            if name in truth:
+                yield name, found.after.values[name], low, high, truth[name]
+        return
+    identifiable = import_module(module)
+    for n in identifiable.identifiable_numbers(found.after, commanded, effort):
+        try:
+            yield n.name, n.value, n.low, n.high, identifiable.identified_value(n.name, truth)
+        except KeyError:
+            continue
+
+
+def findings(measurements: Sequence[Measurement], signal: str) -> list[str]:
+    """What the recordings by themselves show: ``dropped_commands``, ``does_not_repeat``; nothing without that module."""
+    module = "taccorl.alignment.unrepeated"
+    if find_spec(module) is None:
+        return []
+    found = import_module(module).check_repeatability(measurements)
+    said = {f.check for of in found.values() for f in of if f.severity != "note" and f.feature == signal}
+    return sorted(said & {"dropped_commands", "does_not_repeat"})
 
 
 def material(row: dict[str, Any]) -> bool:
@@ -140,7 +249,7 @@ def named(row: dict[str, Any]) -> bool:
         said |= {*row["ties"].get(name, ()), *row["rivals"].get(name, ()), *registry.get(name).near_twins}
     for name, other in row["swapped"]:
         said |= {name, other, *row["ties"].get(name, ())}
-    return set(row["hidden"]) <= said
+    return all(h in said or (h not in registry and h in KINDS and said & set(KINDS[h].near)) for h in row["hidden"])
 
 
 def exact_but_for_algebra(row: dict[str, Any]) -> bool:
@@ -152,6 +261,22 @@ def exact_but_for_algebra(row: dict[str, Any]) -> bool:
 def silently_wrong(row: dict[str, Any]) -> bool:
     """At the floor with effects none of which is hidden, and without a word of those that are."""
     return row["status"] == "at_floor" and not set(row["found"]) & set(row["hidden"]) and not named(row)
+
+
+def drop_said(row: dict[str, Any]) -> bool:
+    """Lost commands are a finding, or an effect that was found."""
+    return "dropped_commands" in {*row["findings"], *row["found"]}
+
+
+def inside(row: dict[str, Any], *, hidden_only: bool = False) -> list[bool]:
+    """Of each identifiable number that has a truth, whether its 95 % interval holds it.
+
+    Args:
+        hidden_only: numbers of the hidden effects, and not those that are always fitted.
+    """
+    own = tuple(f"{name}." for name in row["hidden"])
+    held = {name: low <= true <= high for name, (_, low, high, true) in row["numbers"].items()}
+    return [held[name] for name in held if not hidden_only or name.startswith(own)]
 
 
 def single(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
@@ -172,6 +297,11 @@ def amplitude(design: str, names: Sequence[str], strengths: Sequence[float], see
 def touch(names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
     """One hidden effect of the pads each, press–hold–release."""
     return [Job(study="touch", hidden=(n,), seed=s, design="press") for s in seeds for n in names]
+
+
+def dropped(design: str, seeds: Sequence[int]) -> list[Job]:
+    """Nothing but lost commands."""
+    return [Job(study="dropped", hidden=("dropped_commands",), seed=s, design=design) for s in seeds]
 
 
 def nothing(design: str, seeds: Sequence[int]) -> list[Job]:

@@ -18,9 +18,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
-from taccorl.diagnosis.motions import CHIRP, JUDGED_ON, POSES, RATE_HZ, Room, joint_number
+from taccorl.diagnosis.motions import CHIRP, JUDGED_ON, POSES, RATE_HZ, Motion, Room, joint_number
 from taccorl.diagnosis.surrogate.hidden import (
     KINDS,
+    NOT_FITTED,
     OUTSIDE,
     REGISTERED,
     Change,
@@ -32,12 +33,20 @@ from taccorl.diagnosis.surrogate.hidden import (
     selectors,
     within_bounds,
 )
-from taccorl.diagnosis.surrogate.plant import Run
-from taccorl.diagnosis.surrogate.robot import NOISE_RAD, Robot, inertia_and_weight
+from taccorl.diagnosis.surrogate.plant import STEP_S, Run
+from taccorl.diagnosis.surrogate.robot import (
+    NOISE_RAD,
+    PAYLOAD_LINK6_M,
+    PAYLOAD_OFF_M,
+    Robot,
+    free_inertia,
+    inertia_and_weight,
+)
+from taccorl.diagnosis.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop, draw_loop, is_stable
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, ControllerConfig
-from taccorl.sim.robot import ARMS
+from taccorl.sim.robot import ARMS, RobotConfig
 from taccorl.sim.twin import TwinConfig
 
 SEVERITY_FLOORS = (1.0, 30.0)
@@ -45,6 +54,15 @@ SEARCHES, CLOSE_ENOUGH = 6, 0.15
 """Tries for a severity; log of the ratio to what was wanted."""
 OMEGA_RAD_PER_S, ZETA = (11.0, 24.0), (0.7, 1.5)
 """Natural frequency and damping of soft drives (MIT mode)."""
+LOOP_FLOORS = 0.5
+"""What a sampled loop may leave by itself, gains refitted: a slower one is an effect of its own (``slow_velocity_filter``)."""
+LOOP_DRAWS, GAIN_DRAWS, SLOWEST_S = 8, 5, PERIODS_STEPS[-1] * STEP_S + FILTER_S[1]
+PAYLOAD_KG = (0.1, 0.5)
+"""Of a weighed mass that is held in every recording."""
+COLOUR_S = (0.01, 0.1)
+"""Time constants of coloured encoder noise."""
+_RUNAWAY_RAD = 3.0
+_GEARED = ("backlash", "joint_compliance")
 
 
 @dataclass(frozen=True)
@@ -55,7 +73,7 @@ class Case:
     signal: str
     """``left_joint5``: the joint under test."""
     gains: tuple[float, float, float]
-    """True K_p, K_d, T_ref of its drive, as a continuous controller's."""
+    """True K_p, K_d, T_ref of its drive, as a continuous controller's (``sampled_loop``)."""
     hidden: tuple[Hidden, ...]
     twin: TwinConfig
     """What the user starts from: without the hidden effects, and with wrong gains where those are unknown."""
@@ -69,6 +87,16 @@ class Case:
     left_floors: float = 0.0
     """What the hidden effects leave of an error once K_p, K_d, T_ref have been refitted, in floors."""
     design: str = "pack"
+    loop: SampledLoop | None = None
+    """None: the velocity loop is continuous."""
+    loop_floors: float = 0.0
+    """What the loop's sampling alone leaves once the gains have been refitted."""
+    payload_kg: float = 0.0
+    """Known mass that is held in every recording; a design may have recordings with one besides."""
+    payload_m: tuple[float, float, float] = PAYLOAD_LINK6_M
+    """Where masses are really held, in link 6."""
+    colour_s: float = 0.0
+    """Time constant of the encoder's noise; 0 is white."""
 
     @property
     def name(self) -> str:
@@ -85,11 +113,40 @@ class Case:
             "floor_rad": self.floor_rad,
             "left_floors": self.left_floors,
             "design": self.design,
+            "loop_hz": None if self.loop is None else 1.0 / self.loop.period_s,
+            "velocity_filter_s": None if self.loop is None else self.loop.filter_s,
+            "loop_floors": self.loop_floors,
+            "payload_kg": self.payload_kg,
+            "payload_link6_m": list(self.payload_m),
+            "noise_colour_s": self.colour_s,
+            "ratios": self.ratios(),
         }
+
+    def values(self) -> dict[str, float]:
+        """``kp``, ``kd``, ``torque_ff``, ``coulomb_friction.torque_nm`` → the true number."""
+        numbers = dict(zip(("kp", "kd", "torque_ff"), self.gains, strict=True))
+        return numbers | {f"{h.name}.{name}": value for h in self.hidden for name, value in h.values.items()}
+
+    def ratios(self) -> dict[str, float]:
+        """What angles alone can show: every torque, stiffness, damping, inertia and mass over K_p, all else as it is."""
+        own = {n: v for n, v in self.values().items() if n != "kp"}
+        return {f"{n}/kp" if _is_torque(n) else n: v / self.gains[0] if _is_torque(n) else v for n, v in own.items()}
+
+    def motion(self, motion: Motion) -> Motion:
+        """``motion`` with what this robot holds."""
+        return dataclasses.replace(motion, payload_kg=motion.payload_kg + self.payload_kg)
 
     @cached_property
     def robot(self) -> "Robot":
-        return Robot(self.signal, self.gains, [h.change for h in self.hidden], self.pose)
+        changes = [h.change for h in self.hidden]
+        return Robot(self.signal, self.gains, changes, self.pose, loop=self.loop, payload_m=self.payload_m)
+
+
+def _is_torque(name: str) -> bool:
+    """By its unit, which is in its name."""
+    if name in ("kd", "torque_ff"):
+        return True
+    return "per_nm" not in name and bool({"nm", "nms", "nms2", "kg", "kgm2"} & set(name.split("_")))
 
 
 def draw_case(
@@ -100,6 +157,9 @@ def draw_case(
     strength: float | None = None,
     gains_known: bool = False,
     design: str = "pack",
+    sampled: bool = False,
+    loaded: bool = False,
+    coloured: bool = False,
 ) -> Case:
     """A robot in which these effects are hidden; none of them is a robot as the twin has it.
 
@@ -109,6 +169,9 @@ def draw_case(
         strength: noise floors that each of them leaves after a refit of the gains; drawn from 1 to 30.
         gains_known: the twin has the true K_p and K_d, and recordings say so.
         design: which recordings will be made, and strength is measured on: ``chirp`` or ``pack``.
+        sampled: the drive's whole loop is sampled, at 0.5 to 4 kHz with a low-pass of the velocity.
+        loaded: a weighed mass is held in every recording.
+        coloured: the encoder's noise is correlated over time.
 
     Raises:
         TaccorlError: nothing of that name can be hidden, a joint on which it cannot be seen, or no such joint.
@@ -131,40 +194,92 @@ def draw_case(
     pose = list(POSES[joint - 1])
     pose[joint - 1] += rng.uniform(-0.1, 0.1)
     inertia, weight = inertia_and_weight(np.array(pose), joint)
-    room = Room.of(joint, pose[joint - 1], inertia, weight)
     gains = _draw_gains(rng, joint, inertia, stiff=all(k.stiff for k in kinds))
-    plain = Robot(signal, gains, [], tuple(pose))
-    quiet = [plain.run(motion, room) for motion in JUDGED_ON[design]]
-    scale = Scale(
-        kp=gains[0],
-        kd=gains[1],
-        inertia=inertia,
-        torque=max(float(np.abs(run.effort[:, joint - 1] + plain.carried_nm(run)).max()) for run in quiet),
-        speed=float(np.abs(np.diff(CHIRP.target(room))).max() * RATE_HZ),
-        centre=room.middle_rad,
-    )
-    noisy = plain.run(CHIRP, room, np.random.default_rng([seed, 1]))
-    moved = (plain.reported(noisy) - plain.reported(quiet[0]))[:, joint - 1]
-    floor = math.hypot(NOISE_RAD, float(np.sqrt(np.mean(moved**2))))
+    dice = np.random.default_rng([seed, zlib.crc32(b"conditions")])  # apart, so that they change nothing else
     case = Case(
         seed=seed,
         signal=signal,
         gains=gains,
         hidden=(),
-        twin=_twin(rng, joint, gains, gains_known),
+        twin=TwinConfig(),
         gains_known=gains_known,
-        room=room,
+        room=Room.of(joint, pose[joint - 1], inertia, weight),
         pose=tuple(pose),
-        floor_rad=floor,
+        floor_rad=0.0,
         design=design,
+        payload_m=_about(PAYLOAD_LINK6_M, dice),
+        payload_kg=float(dice.uniform(*PAYLOAD_KG)) * loaded,
+        colour_s=float(np.exp(dice.uniform(*np.log(COLOUR_S)))) * coloured,
     )
+    case, quiet = _quiet(case)
+    if sampled:
+        case, quiet = _with_sampled_loop(case, quiet, dice, geared=any(n in _GEARED for n in effect_names))
+    plain = case.robot
+    scale = Scale(
+        kp=case.gains[0],
+        kd=case.gains[1],
+        inertia=inertia,
+        torque=max(float(np.abs(run.effort[:, joint - 1] + plain.carried_nm(run)).max()) for run in quiet),
+        speed=float(np.abs(np.diff(CHIRP.target(case.room))).max() * RATE_HZ),
+        centre=case.room.middle_rad,
+        sweep=case.room.sweep_rad,
+    )
+    case = dataclasses.replace(case, twin=_twin(rng, joint, case.gains, gains_known))
     refit = _Refit(case, plain, quiet)
     hidden = []
     for name, k in zip(effect_names, kinds, strict=True):
         wanted = math.exp(rng.uniform(*np.log(SEVERITY_FLOORS))) if strength is None else strength
+        if name in NOT_FITTED:  # as often as it happens, whatever that leaves
+            severity = math.exp(rng.uniform(*np.log(k.severity(scale))))
+            where = selectors(name, signal)
+            values = k.values(severity, scale, {})
+            hidden.append(Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where))
+            continue
         hidden.append(_as_strong_as(wanted, refit, name, k, scale, k.shape(rng, scale)))
     left = refit.left_floors([h.change for h in hidden])
     return dataclasses.replace(case, hidden=tuple(hidden), left_floors=left)
+
+
+def _about(middle_m: tuple[float, float, float], rng: np.random.Generator) -> tuple[float, float, float]:
+    x, y, z = (float(m + PAYLOAD_OFF_M * n) for m, n in zip(middle_m, rng.standard_normal(3), strict=True))
+    return x, y, z
+
+
+def _quiet(case: Case) -> tuple[Case, list[Run]]:
+    """The case with its noise floor, and its undisturbed runs without what is hidden."""
+    plain = case.robot
+    quiet = [plain.run(case.motion(motion), case.room) for motion in JUDGED_ON[case.design]]
+    noisy = plain.run(case.motion(CHIRP), case.room, np.random.default_rng([case.seed, 1]))
+    moved = (plain.reported(noisy) - plain.reported(quiet[0]))[:, plain.joint]
+    return dataclasses.replace(case, floor_rad=math.hypot(NOISE_RAD, float(np.sqrt(np.mean(moved**2))))), quiet
+
+
+def _with_sampled_loop(
+    case: Case, quiet: list[Run], rng: np.random.Generator, *, geared: bool
+) -> tuple[Case, list[Run]]:
+    """With a loop that is stable with these gains or, if none is, with other ones, and which alone leaves next to nothing.
+
+    Args:
+        geared: there will be play or a spring between motor and link.
+    """
+    joint = joint_number(case.signal)
+    inertia, _ = inertia_and_weight(np.array(case.pose), joint)
+    inertias = [inertia, free_inertia(np.array(case.pose), joint), *([RobotConfig().armature_kgm2] if geared else [])]
+    for _ in range(GAIN_DRAWS):
+        refit, most_late_s = _Refit(case, case.robot, quiet), SLOWEST_S
+        for _ in range(LOOP_DRAWS):
+            loop = draw_loop(rng, most_late_s)
+            most_late_s *= 0.7
+            if not is_stable(loop, *case.gains[:2], inertias):
+                continue
+            sampled = dataclasses.replace(case, loop=loop)
+            left = refit.left_of(sampled.robot)
+            if left <= LOOP_FLOORS:
+                return _quiet(dataclasses.replace(sampled, loop_floors=left))
+        case, quiet = _quiet(dataclasses.replace(case, gains=_draw_gains(rng, joint, inertia, stiff=False)))
+    raise TaccorlError(
+        f"surrogate: no sampled loop of {case.signal}, seed {case.seed}, is stable and hardly seen; take another seed"
+    )
 
 
 def _draw_gains(rng: np.random.Generator, joint: int, inertia: float, *, stiff: bool) -> tuple[float, float, float]:
@@ -194,7 +309,7 @@ class _Refit:
     """
 
     def __init__(self, case: Case, plain: Robot, quiet: Sequence[Run]) -> None:
-        self.case, self.motions = case, JUDGED_ON[case.design]
+        self.case, self.motions = case, [case.motion(m) for m in JUDGED_ON[case.design]]
         pose, joint = np.array(case.pose), plain.joint + 1
         self._inertias = [inertia_and_weight(pose, joint, m.payload_kg)[0] for m in self.motions]
         self._plain = self._reports(plain, quiet)
@@ -218,9 +333,17 @@ class _Refit:
 
     def left_floors(self, changes: Sequence[Change]) -> float:
         """RMS of the rest, in floors."""
-        robot = Robot(self.case.signal, self.case.gains, changes, self.case.pose)
+        case = self.case
+        return self.left_of(
+            Robot(case.signal, case.gains, changes, case.pose, loop=case.loop, payload_m=case.payload_m)
+        )
+
+    def left_of(self, robot: Robot) -> float:
+        """The same of a robot in the place of this case's; a loop that runs away leaves more than anything."""
         error = self._reports(robot, [robot.run(m, self.case.room) for m in self.motions]) - self._plain
         scale = self.case.floor_rad * math.sqrt(len(error))
+        if not np.abs(error).max() < _RUNAWAY_RAD:  # nor is NaN
+            return math.inf
 
         def rest(x: np.ndarray) -> np.ndarray:
             log_kp, log_kd = (0.0, 0.0) if self.case.gains_known else x[1:]
@@ -248,7 +371,7 @@ def find_severity(wanted: float, ends: tuple[float, float], left: Callable[[floa
     found: list[tuple[float, float]] = []  # log severity, log of what is left over what is wanted
     at = 0.5 * (low + high)
     for _ in range(SEARCHES):
-        found.append((at, math.log(max(left(math.exp(at)), 1e-6) / wanted)))
+        found.append((at, math.log(min(max(left(math.exp(at)), 1e-6), 1e6) / wanted)))
         below = max((f for f in found if f[1] < 0), default=None)
         above = min((f for f in found if f[1] >= 0), default=None)
         if abs(found[-1][1]) < CLOSE_ENOUGH or (below is None and at <= low) or (above is None and at >= high):

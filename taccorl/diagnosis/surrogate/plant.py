@@ -5,9 +5,13 @@
 
 What differs from the twin on purpose: no MuJoCo anywhere; 0.125 ms steps (the twin: 0.83 ms), M, c and g renewed each
 millisecond half a millisecond ahead, the drive's damping implicit; friction of bristles (Canudas de Wit et al. 1995) instead of
-a constraint; a controller sampled at 1 kHz with jitter, in whose drive the velocity loop is continuous (K_d / J is up to 6000/s,
-which a 1 kHz loop could not damp); weight carried by a model that the controller evaluates at the encoders' angles; a gear with
-contact stiffness; coloured disturbance torques on every joint.
+a constraint; weight carried by a model that the controller evaluates at the encoders' angles; a gear with contact stiffness;
+coloured disturbance torques on every joint. The controller of the joint under test is one of two:
+
+    continuous   positions are sampled at 1 kHz with jitter, the drive's velocity loop is continuous
+                 (K_d / J is up to 6000/s on the paper's drives, which no loop at 1 kHz could damp)
+    sampled      the whole loop runs at ``1 / loop_s``: velocity is the difference of two encoder readings through a first-order
+                 low-pass, and the torque is held until the next sample
 
 Letters in shapes: 6 joints, T commands (200 Hz), M milliseconds.
 """
@@ -47,7 +51,14 @@ class Drive(NamedTuple):
     angle_share: float = 0.0
     """Outside the registry: friction torque grows and falls with the angle by this share, twice a turn."""
     angle_phase: float = 0.0
+    spot: float = 0.0
+    """Friction torque that a tight spot adds in its middle."""
+    spot_angle: float = 0.0
+    spot_width: float = 0.1
     # torques that hang on the angle
+    stop: float = 0.0
+    """N·m/rad of an end stop, on the far side of ``stop_angle`` from where the joint starts."""
+    stop_angle: float = 0.0
     cogging: float = 0.0
     cogging_periods: float = 12.0
     cogging_phase: float = 0.0
@@ -57,6 +68,12 @@ class Drive(NamedTuple):
     """Outside the registry: magnetic hysteresis, a Bouc–Wen torque with this most …"""
     hysteresis_width: float = 0.05
     """… reached after so many rad of travel."""
+    hung_inertia: float = 0.0
+    """Outside the registry: kg·m² that hang on the link by a spring …"""
+    hung_rad_per_s: float = 30.0
+    """… of this natural frequency …"""
+    hung_damping: float = 0.05
+    """… and damping ratio."""
     # setpoint
     delay: float = 0.0
     lag: float = 0.0
@@ -66,11 +83,25 @@ class Drive(NamedTuple):
     deadband: float = 0.0
     integral: float = 0.0
     gravity_carried: float = 1.0
+    loop_steps: int = 0
+    """Of a sampled loop: integration steps between two samples. 0: the velocity loop is continuous."""
+    velocity_filter: float = 0.0
+    """Time constant of a sampled loop's low-pass of the velocity."""
     loop_delay: float = 0.0
     """Outside the registry: from the encoder to the torque, velocity included."""
     torque_lag: float = 0.0
     torque_max: float = math.inf
+    stall: float = math.inf
+    """Torque that the motor has at rest; driving, it falls in proportion to the speed …"""
+    no_load: float = math.inf
+    """… and is 0 here."""
     torque_scale: float = 1.0
+    one_way: float = 0.0
+    """Outside the registry: torques upwards are larger by this share, downwards smaller."""
+    sag: float = 0.0
+    """Outside the registry: torques are divided by 1 + this times the motor's power (1/W): the supply's voltage sags …"""
+    sag_time: float = 0.05
+    """… after so long."""
     fade: float = 0.0
     warm_up: float = 0.0
     """Outside the registry: friction torque falls by this share a second, as grease warms up."""
@@ -121,11 +152,11 @@ def encoder(d: Drive, angle):
 
 
 @numba.njit(cache=True, inline="always")
-def _arrived(target, joint, ms, delay_ms):
-    """Command of the millisecond that begins at ``ms``, on average over it; rows change every 5 ms."""
+def _arrived(target, joint, ms, delay_ms, window_ms):
+    """Command on average over the window that begins at ``ms``; rows change every 5 ms."""
     begin = ms - delay_ms
     row = math.floor(begin / COMMAND_MS)
-    share = min(1.0, (row + 1) * COMMAND_MS - begin)
+    share = min(1.0, ((row + 1) * COMMAND_MS - begin) / window_ms)
     last = target.shape[0] - 1
     now, following = min(max(row, 0), last), min(max(row + 1, 0), last)
     return target[now, joint] * share + target[following, joint] * (1.0 - share)
@@ -139,7 +170,8 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
         joint: of the six, counted from 0, that ``d`` belongs to.
         start: (6,) rad where the lead begins, at rest.
         disturbance: (lead_ms + 5 T, 6) N·m.
-        jitter: (lead_ms + 5 T) of the controller's milliseconds, in steps of 0.125 ms.
+        jitter: (lead_ms + 5 T) of the controller's milliseconds, in steps of 0.125 ms; 0 with a sampled loop, whose timer is the
+            drive's own.
     """
     h = STEP_S
     total = lead_ms + COMMAND_MS * target.shape[0]
@@ -167,7 +199,9 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     lag_share = 1.0 - math.exp(-h / d.torque_lag) if d.torque_lag > 0.0 else 1.0
     command_share = 1.0 - math.exp(-1e-3 / d.lag) if d.lag > 0.0 else 1.0
     bristle, wound = 0.0, 0.0
-    most = d.coulomb + d.stribeck + 3.0 * d.load_share  # of friction, for the bristles' stiffness; loads are of 3 N·m
+    most = (
+        d.coulomb + d.stribeck + d.spot + 3.0 * d.load_share
+    )  # of friction, for the bristles' stiffness; loads are of 3 N·m
     s0 = most / d.presliding
     s1_rest = 1.4 * math.sqrt(s0 * d.motor_inertia)
     inverse = np.empty(6)
@@ -177,6 +211,15 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     torque, most_step = 0.0, 0.0
     stiffness = 0.0
     rub = 0.0
+    sampled = d.loop_steps > 0
+    loop_s = d.loop_steps * h
+    window_ms = max(1.0, loop_s * 1e3)
+    filter_share = 1.0 - math.exp(-loop_s / d.velocity_filter) if d.velocity_filter > 0.0 else 1.0
+    seen, seen_rate, rate = encoder(d, q[joint]), 0.0, 0.0
+    stop_side = math.copysign(1.0, d.stop_angle - q[joint])
+    hung, hung_v, power = q[joint], 0.0, 0.0
+    hung_k = d.hung_inertia * d.hung_rad_per_s**2
+    hung_c = 2.0 * d.hung_damping * d.hung_rad_per_s * d.hung_inertia
     tick, next_tick = 0, max(0, int(jitter[0]))
     for s in range(total * SUBSTEPS):
         if s % SUBSTEPS == 0:
@@ -211,9 +254,9 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             for i in range(6):
                 carried[i] = arm.carried * load[i]
                 if i != joint:
-                    goal = _arrived(target, i, ms, 0.0)
+                    goal = _arrived(target, i, ms, 0.0, 1.0)
                     held[i] = kp[i] * (goal - q[i]) + arm.torque_ff[i]
-            goal = _arrived(target, joint, ms, d.delay * 1e3)
+            goal = _arrived(target, joint, ms, d.delay * 1e3, window_ms)
             if tick % COMMAND_MS == 0:  # the driver limits what it sends, from one command to the next
                 most_step = d.slew * COMMAND_MS * 1e-3
             step = (goal - setpoint) * command_share
@@ -222,19 +265,34 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             setpoint += step
             rate = (setpoint - setpoints[tick % COMMAND_MS]) / (COMMAND_MS * 1e-3)
             setpoints[tick % COMMAND_MS] = setpoint
-            error = setpoint - encoder(d, own)
-            error = math.copysign(max(abs(error) - d.deadband, 0.0), error)
-            if ms > -lead_ms // 2:
-                integral += d.kp * d.integral * error * 1e-3
-            held[joint] = d.kp * error + integral + d.kd * d.feedforward * rate + d.torque_ff
+            if not sampled:
+                error = setpoint - encoder(d, own)
+                error = math.copysign(max(abs(error) - d.deadband, 0.0), error)
+                if ms > -lead_ms // 2:
+                    integral += d.kp * d.integral * error * 1e-3
+                held[joint] = d.kp * error + integral + d.kd * d.feedforward * rate + d.torque_ff
             tick += 1
             if tick < total:
                 next_tick = tick * SUBSTEPS + int(jitter[tick])
+        if sampled and s % d.loop_steps == 0:
+            now = encoder(d, qm if two else q[joint])
+            seen_rate += filter_share * ((now - seen) / loop_s - seen_rate)
+            seen = now
+            error = setpoint - now
+            error = math.copysign(max(abs(error) - d.deadband, 0.0), error)
+            if s > lead_ms * SUBSTEPS // 2:
+                integral += d.kp * d.integral * error * loop_s
+            held[joint] = d.kp * error + integral + d.kd * (d.feedforward * rate - seen_rate) + d.torque_ff
         ms = s // SUBSTEPS
         time_s = max(0.0, s * h - lead_ms * 1e-3)
         for i in range(6):
             kick[i] = h * (held[i] + carried[i] - kd[i] * v[i] - bias[i] + disturbance[ms, i])
         kick[joint] = h * (disturbance[ms, joint] - bias[joint])
+        if d.hung_inertia > 0.0:
+            back = hung_k * (hung - q[joint]) + hung_c * (hung_v - v[joint])
+            kick[joint] += h * back
+            hung_v -= h * back / d.hung_inertia
+            hung += h * hung_v
         solve(a, kick)
         # What follows is one scalar problem: the joint's velocity is free + mobility × torque.
         mobility = h * inverse[joint]
@@ -242,16 +300,25 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
         motor_v = vm if two else v[joint]
         motor_q = qm if two else q[joint]
         turning = d.encoder_waves * d.encoder_wave * math.cos(d.encoder_waves * motor_q + d.encoder_phase)
-        ask, damp = held[joint], d.kd * (d.encoder_scale + turning)
+        ask, damp = held[joint], 0.0 if sampled else d.kd * (d.encoder_scale + turning)
         if late > 0:
             ring[at] = ask - damp * motor_v
             at = (at + 1) % (late + 1)
             ask, damp = ring[at], 0.0
         ask, damp = filtered + lag_share * (ask - filtered), lag_share * damp
         gain = d.torque_scale * (1.0 - d.fade * time_s)
+        if d.one_way != 0.0:
+            gain *= 1.0 + d.one_way * math.copysign(1.0, torque + carried[joint])
+        if d.sag > 0.0:
+            power += h / d.sag_time * (max(0.0, (torque + carried[joint]) * motor_v) - power)
+            gain /= 1.0 + d.sag * power
         lift = gain * carried[joint]
         other = d.cogging * math.sin(d.cogging_periods * motor_q + d.cogging_phase) if d.cogging != 0.0 else 0.0
         other -= d.spring * (motor_q - d.spring_rest)
+        if d.stop > 0.0:
+            deep = stop_side * (motor_q - d.stop_angle)
+            if deep > 0.0:  # 5 ms of damping
+                other -= stop_side * max(0.0, d.stop * (deep + 0.005 * stop_side * motor_v))
         if d.hysteresis > 0.0:
             turn = h * motor_v / d.hysteresis_width
             wound = (wound + turn) / (1.0 + abs(turn))
@@ -259,6 +326,8 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
         limit = d.coulomb
         if d.stribeck > 0.0:
             limit += d.stribeck * math.exp(-((motor_v / d.stribeck_speed) ** 2))
+        if d.spot > 0.0:
+            limit += d.spot * math.exp(-(((motor_q - d.spot_angle) / d.spot_width) ** 2))
         if d.load_share > 0.0:
             limit += d.load_share * abs(torque + lift + bias[joint])
         if d.asymmetry != 0.0:
@@ -295,9 +364,14 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             torque = ask - damp * new
             if attempt == 0:
                 filtered = torque / gain
-            if abs(torque + lift) <= d.torque_max:
+            ceiling = d.torque_max
+            if d.stall < math.inf:
+                driving = (torque + lift) * motor_v > 0.0
+                left = max(0.0, 1.0 - abs(motor_v) / d.no_load) if driving else 1.0
+                ceiling = min(ceiling, d.stall * left)
+            if abs(torque + lift) <= ceiling:
                 break
-            ask, damp = math.copysign(d.torque_max, torque + lift) - lift, 0.0
+            ask, damp = math.copysign(ceiling, torque + lift) - lift, 0.0
         if most > 0.0:
             bristle = (bristle + h * new) / shrink
         for i in range(6):

@@ -3,10 +3,12 @@
 Letters in shapes: T rows, J 14 signals.
 """
 
+import math
 import zlib
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import lfilter
 
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements, split
@@ -47,7 +49,7 @@ def recordings(case: Case, design: str | None = None) -> Measurements:
 def record(case: Case, motion: Motion) -> Measurement:
     """One recording. The same case and motion give the same numbers, bit for bit."""
     rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(motion.name.encode())])
-    robot = case.robot
+    robot, motion = case.robot, case.motion(motion)
     run = robot.run(motion, case.room, rng)
     first = 7 * robot.arm
     own = slice(first, first + 6)
@@ -66,7 +68,9 @@ def record(case: Case, motion: Motion) -> Measurement:
         name=motion.name,
         time_s=np.arange(num_rows) / RATE_HZ,
         target=_rounded(target, QUANTUM_RAD, OPENING_QUANTUM_M),
-        measured=_rounded(_noisy(rng, measured, NOISE_RAD, OPENING_NOISE_M), QUANTUM_RAD, OPENING_QUANTUM_M),
+        measured=_rounded(
+            _noisy(rng, measured, NOISE_RAD, OPENING_NOISE_M, case.colour_s), QUANTUM_RAD, OPENING_QUANTUM_M
+        ),
         velocity=_rounded(_noisy(rng, velocity, SPEED_NOISE_RAD_PER_S, 0.0), SPEED_QUANTUM_RAD_PER_S, 1e-3),
         effort=_rounded(_noisy(rng, effort, _effort_noise(effort), 0.0), EFFORT_QUANTUM_NM, 1e-3),
         origin=f"{ORIGIN}; {case.signal} under test",
@@ -88,10 +92,17 @@ def _stated(case: Case, motion: Motion) -> dict[str, dict[str, float]]:
     return {name: {case.signal: gain * motion.gain} for name, gain in gains.items()}
 
 
-def _noisy(rng: np.random.Generator, values: np.ndarray, joints: float | np.ndarray, grippers: float) -> np.ndarray:
+def _noisy(
+    rng: np.random.Generator, values: np.ndarray, joints: float | np.ndarray, grippers: float, colour_s: float = 0.0
+) -> np.ndarray:
     size = np.broadcast_to(np.asarray(joints, dtype=float), (14,)).copy()
     size[_GRIPPERS] = grippers
-    return values + size * rng.standard_normal(values.shape)
+    noise = rng.standard_normal(values.shape)
+    if colour_s > 0.0:
+        keep = math.exp(-1.0 / (colour_s * RATE_HZ))
+        noise[0] /= math.sqrt(1.0 - keep**2)
+        noise = math.sqrt(1.0 - keep**2) * lfilter([1.0], [1.0, -keep], noise, axis=0)
+    return values + size * noise
 
 
 def _effort_noise(effort: np.ndarray) -> np.ndarray:

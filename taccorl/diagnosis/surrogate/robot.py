@@ -13,8 +13,9 @@ from taccorl.diagnosis.motions import OPENING_M, Motion, Room, joint_number
 from taccorl.diagnosis.surrogate.arm import GRAVITY, bodies, mass_matrix, torques
 from taccorl.diagnosis.surrogate.hidden import Change, changed
 from taccorl.diagnosis.surrogate.plant import COMMAND_MS, SUBSTEPS, Arm, Drive, Run, encoder, simulate
+from taccorl.diagnosis.surrogate.sampled_loop import SampledLoop
 from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
-from taccorl.sim.robot import ARMS, RobotConfig
+from taccorl.sim.robot import ARMS, TCP_FROM_LINK6_M, RobotConfig
 from taccorl.sim.twin import PhysicsConfig
 
 LEAD_MS = 1500
@@ -30,31 +31,52 @@ EFFORT_NOISE_SHARE, EFFORT_QUANTUM_NM = 0.01, 1e-3
 """Noise of efforts over the joint's largest on the chirp: a choice. PiPER reports N·m in steps of a thousandth."""
 JITTER_S = 2e-4
 """Of each of the controller's milliseconds."""
-LATE_S = 0.5e-3 + 0.5 * PhysicsConfig().timestep_s
+TWIN_LATE_S = 0.5 * PhysicsConfig().timestep_s
+LATE_S = 0.5e-3 + TWIN_LATE_S
 """Gains are stated as the twin would need them. A controller that samples positions a millisecond apart acts half of one late,
-which takes K_p · 0.5 ms of damping; the twin's implicit steps add half a step of K_p to it."""
-PAYLOAD_LINK6_M = (0.0, 0.0, 0.1)
-"""Where a known mass is held: as the twin's ``payload`` has it by default."""
+which takes K_p · 0.5 ms of damping (a sampled loop: half of its period); the twin's implicit steps add half a step of K_p."""
+PAYLOAD_LINK6_M = (0.0, 0.0, TCP_FROM_LINK6_M)
+"""Where a known mass is held: its centre in the middle between the pads …"""
+PAYLOAD_OFF_M = 0.002
+"""… but for so much (standard deviation along each axis, of one robot to the next): nobody grips a weight in its very middle."""
+LOST_RUN = (0.8, 0.15, 0.05)
+"""Shares of one, two, three commands lost in a row."""
 DISTURBANCE_SHARE = 0.01
 """Torque that nobody accounts for, over the one that weight and a swing at 1.5 Hz take."""
 DISTURBANCE_HZ = 5.0
 
 
 class Robot:
-    """The plant with its sensors: commands in, reports out."""
+    """The plant with its sensors: commands in, reports out.
+
+    Args:
+        gains: K_p, K_d, T_ref as a continuous controller's.
+        loop: of the joint under test; None is the drive whose velocity loop is continuous.
+        payload_m: (3,) where known masses are held, in link 6.
+    """
 
     def __init__(
-        self, signal: str, gains: tuple[float, float, float], changes: Sequence[Change], pose: tuple[float, ...]
+        self,
+        signal: str,
+        gains: tuple[float, float, float],
+        changes: Sequence[Change],
+        pose: tuple[float, ...],
+        *,
+        loop: SampledLoop | None = None,
+        payload_m: tuple[float, float, float] = PAYLOAD_LINK6_M,
     ) -> None:
         self.joint = joint_number(signal) - 1
         self.arm = ARMS.index(signal.partition("_")[0])
         self.pose = np.array(pose)
         config = RobotConfig()
         self._config, self._changes = config, list(changes)
+        self._payload_m = payload_m
         kp, kd, torque_ff = gains
-        self.drive = changed(
-            Drive(kp=kp, kd=kd + kp * LATE_S, torque_ff=torque_ff, motor_inertia=config.armature_kgm2), self._changes
-        )
+        late_s = LATE_S if loop is None else 0.5 * loop.period_s + TWIN_LATE_S
+        drive = Drive(kp=kp, kd=kd + kp * late_s, torque_ff=torque_ff, motor_inertia=config.armature_kgm2)
+        if loop is not None:
+            drive = drive._replace(loop_steps=loop.steps, velocity_filter=loop.filter_s)
+        self.drive = changed(drive, self._changes)
         self._believed = bodies(config, OPENING_M)
 
     def run(self, motion: Motion, room: Room, rng: np.random.Generator | None = None, **drive: float) -> Run:
@@ -67,6 +89,8 @@ class Robot:
         target = np.tile(self.pose, (len(own), 1))
         target[:, self.joint] = own
         d = self.drive._replace(**drive)
+        lost = self._lost(len(own), np.random.default_rng(len(own)) if rng is None else rng)
+        target[:, self.joint] = own[lost]
         d = d._replace(kp=d.kp * motion.gain, kd=d.kd * motion.gain)
         total = LEAD_MS + COMMAND_MS * len(target)
         start = target[0].copy()
@@ -74,15 +98,28 @@ class Robot:
         if rng is not None:
             start[self.joint] += APPROACH_RAD * rng.choice([-1.0, 1.0])
             disturbance = _disturbance(rng, total, self._disturbed_nm(room))
-            jitter = np.clip(np.rint(rng.normal(0, JITTER_S * SUBSTEPS * 1e3, total)), -3, 3).astype(np.int64)
+            if d.loop_steps == 0:
+                jitter = np.clip(np.rint(rng.normal(0, JITTER_S * SUBSTEPS * 1e3, total)), -3, 3).astype(np.int64)
         arm = self._arm(motion)
         start[self.joint] += self._rest(arm, d, target[0])
         return simulate(arm, self.joint, d, target, start, disturbance, jitter, LEAD_MS)
 
+    def _lost(self, rows: int, rng: np.random.Generator) -> np.ndarray:
+        """(T,) which command is in force at each row: where one is lost, the one before it is held."""
+        share = sum(c.dropped for c in self._changes)
+        arrived = np.arange(rows)
+        if share == 0.0:
+            return arrived
+        runs = np.arange(1, len(LOST_RUN) + 1)
+        begins = np.flatnonzero(rng.random(rows) < share / (runs @ LOST_RUN))
+        for begin, run in zip(begins, rng.choice(runs, len(begins), p=LOST_RUN), strict=True):
+            arrived[begin : begin + run] = arrived[max(begin - 1, 0)]
+        return arrived
+
     def _arm(self, motion: Motion) -> Arm:
         balls = tuple(c.ball for c in self._changes if c.ball is not None)
         if motion.payload_kg > 0:
-            balls += ((motion.payload_kg, *PAYLOAD_LINK6_M),)
+            balls += ((motion.payload_kg, *self._payload_m),)
         carried = math.prod(c.carried for c in self._changes) * self._config.gravity_compensation
         armature = np.full(6, self._config.armature_kgm2)
         gains = (np.array(g) for g in (KP_NM_PER_RAD, KD_NMS_PER_RAD, TORQUE_FF_NM))
@@ -132,6 +169,13 @@ def inertia_and_weight(pose: np.ndarray, joint: int, payload_kg: float = 0.0) ->
     arm = bodies(config, OPENING_M, ((payload_kg, *PAYLOAD_LINK6_M),))
     inertia = mass_matrix(arm, pose)[joint - 1, joint - 1] + config.armature_kgm2
     return float(inertia), float(torques(arm, pose, np.zeros(6), np.zeros(6), GRAVITY)[joint - 1])
+
+
+def free_inertia(pose: np.ndarray, joint: int) -> float:
+    """kg·m² of joint 1 to 6 at ``pose`` while the others give way: what a fast loop moves; 1 / (M⁻¹)_jj."""
+    config = RobotConfig()
+    moved = mass_matrix(bodies(config, OPENING_M), pose) + config.armature_kgm2 * np.eye(6)
+    return float(1.0 / np.linalg.inv(moved)[joint - 1, joint - 1])
 
 
 def _disturbance(rng: np.random.Generator, milliseconds: int, sizes_nm: np.ndarray) -> np.ndarray:

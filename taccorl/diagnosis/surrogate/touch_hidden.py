@@ -80,6 +80,7 @@ TOUCH_KINDS: dict[str, TouchKind] = {
 }
 """Name → kind."""
 REGISTERED_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if k.registered)
+OUTSIDE_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if not k.registered)
 
 
 def material(name: str, values: Values, reading: np.ndarray, rate_mps: np.ndarray) -> np.ndarray:
