@@ -7,6 +7,9 @@ import pytest
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("SVT_LOG", "1")
+# Tests run side by side (make test): one thread each, also in the processes that they start. Before NumPy is imported.
+for _threads in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
+    os.environ.setdefault(f"{_threads}_NUM_THREADS", "1")
 
 SPEC = "piper_flexitac_mcap"
 

@@ -149,6 +149,7 @@ def test_numbers_hold_the_diagnosis_and_no_residuals(diagnosed: tuple[JointFindi
     assert len(content) < 200_000
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.skipif(
     not (shutil.which("chromium") and find_spec("playwright")),
