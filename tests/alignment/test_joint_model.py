@@ -63,7 +63,7 @@ def test_a_plain_joint_moves_as_in_mujoco(joint: str) -> None:
 
 
 @pytest.mark.parametrize("name", KNOWN)
-@pytest.mark.parametrize("signal", ["left_joint2", "left_joint5"])
+@pytest.mark.parametrize("signal", ["left_joint2", pytest.param("left_joint5", marks=pytest.mark.slow)])
 def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: str) -> None:
     model, effect = JointModel(TWIN, signal), typical(name, signal)
     gains = model.gains._replace(torque_ff=0.0)  # so that a motion from rest is in balance

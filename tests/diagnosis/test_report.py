@@ -193,6 +193,7 @@ def test_primary_numbers_are_those_that_are_identified(diagnosed: tuple[JointFin
     assert "identified: coulomb_friction.torque_nm/kp" in finding.diagnosis.effects[0].evidence
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.skipif(
     not (shutil.which("chromium") and find_spec("playwright")),
