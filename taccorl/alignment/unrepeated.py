@@ -206,8 +206,8 @@ def _dropped_finding(s: Unrepeated, d: Dropped, worst: str) -> Finding:
     text = (
         f"{s.signal}: commands were dropped or repeated: {d.found} times in {len(d.times_s)} recordings the joint moved "
         f"as if the previous target stayed in force for {d.hold_rows:.1f} commands on average ({d.mirrored} events of "
-        f"the opposite sign, which only noise and unmodelled physics produce); at least {d.rate:.1%} of {d.commands} commands. In {worst} at {where}"
-        f" s{more}. No effect of the twin explains that: look for lost frames on the bus (taccorl inspect, candump) or a driver "
+        f"the opposite sign, which only noise and unmodelled physics produce); at least {d.rate:.1%} of {d.commands} commands. "
+        f"In {worst} at {where} s{more}. No effect of the twin explains that: look for lost frames on the bus (taccorl inspect, candump) or a driver "
         "that skips commands when its queue is full"
     )
     return Finding("dropped_commands", "warning", s.signal, text)
