@@ -76,7 +76,7 @@ class EndStop(JointEffect):
                 stiffness.name: float(np.clip(torque_nm / (gives * reach), 1.0, stiffness.high)),
                 angle.name: float(np.clip(place, angle.low, angle.high)),
             }
-            for inside, gives in ((0.02, 0.02), (0.1, 0.02), (0.1, 0.2), (0.3, 0.2))
+            for inside, gives in ((0.02, 0.02), (0.1, 0.1), (0.3, 0.2))
             for place in (low + inside * reach, high - inside * reach)
         ]
 

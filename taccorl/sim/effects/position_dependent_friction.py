@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 class PositionDependentFriction(JointEffect):
     """τ = −F(q) sign q̇ with F(q) = F₀ exp(−((q − q₀) / w)²); at rest any τ with |τ| ≤ F(q).
 
-    One tight spot: a dent in a bearing, a bent shaft, a gear that runs out of true, a cable guide. Friction of gears was found to
-    vary with the position by Armstrong-Hélouvry, "Control of Machines with Friction", 1991, ch. 3 (tens of percent on a PUMA
-    arm). Narrow, it is a spot; with w of a radian it also is the crest of F (1 + a cos(2 (q − q₀))), since
-    cos² x ≈ exp(−x²): what remains even of a large a is Coulomb friction besides. A sinusoid over many turns, as of a bent shaft
-    before the gear, it is not. q is the motor's angle at the end of each physics step, for the next.
+    One tight spot: a dent in a bearing, a cable guide, a gear that runs out of true. That friction of gears hangs on the position
+    was measured by Armstrong-Hélouvry, "Control of Machines with Friction", 1991, ch. 3. Narrow, it is a spot; with w of a radian
+    it also is the crest of F (1 + a cos(2 (q − q₀))), since cos² x ≈ exp(−x²): for a from 0.6 on, no Coulomb friction besides is
+    needed over a range of ± 1 rad. A sinusoid of several turns, as of a bent shaft before the gear, it is not. q is the motor's
+    angle at the end of each physics step, for the next.
     """
 
     name: ClassVar = "position_dependent_friction"
@@ -68,19 +68,18 @@ class PositionDependentFriction(JointEffect):
         symbol="w",
         absent=None,
         low=0.005,
-        high=3.0,
+        high=2.0,
         typical=0.1,
         source="a choice: a tooth or a cable guide is narrow, a gear out of true is as wide as a radian",
     )
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Spots of an eighth and of a third of the range that was recorded, side by side, and a wide one at either end."""
+        """Narrow spots side by side over the range that was recorded, and wide ones at its middle and its ends."""
         torque, angle, width = cls.parameters()
         span = max(seen["span_rad"], 0.02)
         low = seen.get("lowest_rad", -0.5 * span)
-        spots = [(place, 0.125) for place in np.arange(1, 16, 2) / 16]
-        spots += [(place, 0.35) for place in (0.0, 0.25, 0.5, 0.75, 1.0)]
+        spots = [(place, 0.12) for place in np.arange(1, 12, 2) / 12] + [(place, 0.35) for place in (0.0, 0.5, 1.0)]
         spots.sort()  # the middle one stands for all where one is enough
         most_nm = float(np.clip(0.1 * seen["peak_torque_nm"], 1e-3, torque.high))
         return [

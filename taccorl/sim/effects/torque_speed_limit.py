@@ -72,7 +72,7 @@ class TorqueSpeedLimit(JointEffect):
                 stall.name: float(np.clip(share * peak_nm, stall.low, stall.high)),
                 speed.name: float(np.clip(times * fastest, speed.low, speed.high)),
             }
-            for share, times in ((0.7, 2.0), (0.95, 4.0), (1.3, 1.3), (3.0, 1.1), (3.0, 0.9), (1.3, 0.8))
+            for share, times in ((0.7, 2.0), (1.3, 1.3), (3.0, 1.1), (1.3, 0.85))
         ]
 
     def drive(self) -> dict[str, float]:
