@@ -231,8 +231,8 @@ def findings(measurements: Sequence[Measurement], signal: str) -> list[str]:
 
 
 def material(row: dict[str, Any]) -> bool:
-    """Whether there was something to find."""
-    return row["errors"]["fitted"]["validation"] >= MATERIAL
+    """Whether there was something to find; a case that failed counts, so that it is counted as wrong."""
+    return "failed" in row or row["errors"]["fitted"]["validation"] >= MATERIAL
 
 
 def exact(row: dict[str, Any]) -> bool:
