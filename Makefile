@@ -1,6 +1,9 @@
 # Each target sets up what it needs, from a bare clone.
 PYTHON ?= python3.12
 BIN := .venv/bin
+# Processes that run tests side by side; each needs about 3 GB and, on its own, one core: make test JOBS=8.
+JOBS ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder
 export HF_HUB_OFFLINE := 1
 
 .PHONY: demo test test-slow lint bench pictures lock clean
@@ -11,10 +14,10 @@ demo: .venv/.ready
 
 test: .venv/.ready
 	@echo "test: everything but the tests marked slow (make test-slow)"
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-slow: .venv/.ready
-	$(BIN)/python -m pytest -m slow
+	$(PYTEST) -m slow
 
 lint: .venv/.ready
 	$(BIN)/ruff check .

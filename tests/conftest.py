@@ -1,14 +1,36 @@
 """Shared by all tests: one small stand-in recording, the dataset made from it by the real commands, and demonstrations."""
 
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("SVT_LOG", "1")
+# Tests run side by side (make test): one thread each, also in the processes that they start. Before NumPy is imported.
+for _threads in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
+    os.environ.setdefault(f"{_threads}_NUM_THREADS", "1")
 
 SPEC = "piper_flexitac_mcap"
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that ``make`` fills, one for all processes of a run. Tests read it and change copies only."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        folder = factory.mktemp(name)
+        make(folder)
+        return folder
+    folder = factory.getbasetemp().parent / name
+    with FileLock(folder.with_suffix(".lock")):
+        if not folder.with_suffix(".made").exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that failed half-way
+            folder.mkdir()
+            make(folder)
+            folder.with_suffix(".made").touch()
+    return folder
 
 
 @pytest.fixture(scope="session")
@@ -16,10 +38,11 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two 4 s stand-in recordings, three cameras at 240×320."""
     from taccorl.demos.stand_in import StandInConfig, write_mcap
 
-    folder = tmp_path_factory.mktemp("recordings")
-    for k in range(2):
-        write_mcap(folder / f"stand_in_{k}.mcap", StandInConfig(duration_s=4.0, seed=k, camera_size=(240, 320)))
-    return folder
+    def make(folder: Path) -> None:
+        for k in range(2):
+            write_mcap(folder / f"stand_in_{k}.mcap", StandInConfig(duration_s=4.0, seed=k, camera_size=(240, 320)))
+
+    return made_once(tmp_path_factory, "recordings", make)
 
 
 @pytest.fixture(scope="session")
@@ -27,10 +50,11 @@ def dataset(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset that ``taccorl ingest`` makes of ``recordings``."""
     from taccorl.cli.main import main
 
-    folder = tmp_path_factory.mktemp("ingested")
-    out = folder / "dataset"
-    assert main(["ingest", str(recordings), f"--spec={SPEC}", f"--out={out}", f"--store={folder / 'store'}"]) == 0
-    return out
+    def make(folder: Path) -> None:
+        words = [f"--spec={SPEC}", f"--out={folder / 'dataset'}", f"--store={folder / 'store'}"]
+        assert main(["ingest", str(recordings), *words]) == 0
+
+    return made_once(tmp_path_factory, "ingested", make) / "dataset"
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +63,8 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from taccorl.demos.collect import Plan, collect
     from taccorl.lineage.store import Store
 
-    folder = tmp_path_factory.mktemp("mimicgen_sources")
-    plan = Plan(task="assembly_2", episodes=2, images=False, seed=3)
-    collect(plan, folder / "dataset", Store(folder / "store"), lambda _: None)
-    return folder / "dataset"
+    def make(folder: Path) -> None:
+        plan = Plan(task="assembly_2", episodes=2, images=False, seed=3)
+        collect(plan, folder / "dataset", Store(folder / "store"), lambda _: None)
+
+    return made_once(tmp_path_factory, "mimicgen_sources", make) / "dataset"

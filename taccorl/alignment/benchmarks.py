@@ -20,7 +20,7 @@ from taccorl.alignment.controller import PAPER_BOUNDS, REFERENCE, identify_contr
 from taccorl.alignment.joint_model import Gains, JointModel
 from taccorl.alignment.joint_motion import JointMotion, joint_motion
 from taccorl.alignment.measurement import Measurement
-from taccorl.benchmark import Row, benchmark, spread
+from taccorl.benchmark import Row, against_reference, benchmark, spread
 from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects import effects, make_effect
@@ -83,6 +83,20 @@ def _cpu_ms(work: Callable[[], object], repeats: int) -> list[float]:
     return times
 
 
+def _of_mujoco(name: str, times_ms: list[float], rival_ms: float) -> Row:
+    shares = [100 * t / rival_ms for t in times_ms]
+    return Row(
+        name=name,
+        value=median(shares),
+        unit="% of MuJoCo's",
+        goal="≤ 3",
+        rival="MuJoCo, the arm with this joint alone, ms",
+        rival_value=rival_ms,
+        n=len(shares),
+        spread=spread(shares),
+    )
+
+
 @benchmark("joint_model")
 def joint_model() -> Iterator[Row]:
     """Cost of one simulated recording, and how far it is from MuJoCo."""
@@ -99,25 +113,10 @@ def joint_model() -> Iterator[Row]:
             known += [effect] * (effect.drive() is not None)
     plain = _cpu_ms(lambda: model.simulate(motion, gains), 20)
     rival = _cpu_ms(lambda: in_mujoco(motion, signal, gains, config), 5)
-    yield Row(
-        name="one joint, 10 s at 200 Hz, 12 000 physics steps, CPU",
-        value=median(plain),
-        unit="ms",
-        goal="≤ 1.5",
-        rival="MuJoCo, the arm with this joint alone",
-        rival_value=median(rival),
-        n=len(plain),
-        spread=spread(plain),
-    )
+    yield _of_mujoco("one joint, 10 s at 200 Hz, 12 000 physics steps, CPU", plain, median(rival))
     costs = [median(_cpu_ms(lambda effect=effect: model.simulate(motion, gains, [effect]), 5)) for effect in known]
-    yield Row(
-        name=f"the same with the most expensive of {len(known)} effects of joints, CPU",
-        value=max(costs),
-        unit="ms",
-        goal="≤ 1.5",
-        n=len(costs),
-        spread=spread(costs),
-    )
+    dearest = _cpu_ms(lambda: model.simulate(motion, gains, [known[costs.index(max(costs))]]), 20)
+    yield _of_mujoco(f"the same with the most expensive of {len(known)} effects of joints, CPU", dearest, median(rival))
     away = [
         float(
             np.abs(model.simulate(motion, gains, [e]).reported - in_mujoco(motion, signal, gains, config, (e,))).max()
@@ -162,16 +161,9 @@ def controller_sysid() -> Iterator[Row]:
             rival_cost.append(time.process_time() - begin)
             rival_ratio.append(_ratio_error(found, truth))
     rival = "mujoco.sysid, its scipy optimiser" if rival_cost else "mujoco.sysid is not installed"
-    yield Row(
-        name="controller of one joint from a 10 s sweep, CPU",
-        value=median(cost),
-        unit="s",
-        goal="≤ 3",
-        rival=rival,
-        rival_value=median(rival_cost) if rival_cost else None,
-        n=len(cost),
-        spread=spread(cost),
-    )
+    yield against_reference("controller of one joint from a 10 s sweep", cost, "≤ 300,000")
+    if rival_cost:
+        yield against_reference(f"the same by {rival}", rival_cost)
     yield Row(
         name="K_d / K_p off by, worst of six joints",
         value=max(ratio),

@@ -19,6 +19,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from taccorl.sim.effects import dropped_commands
+
 # Of the twin's own constraints: effects/coulomb_friction.py and backlash.py (solref, solimp), transmission.py (gear's inertia).
 _FRICTION_RATE = 2.0 / (0.9999 * 0.002)  # 1/s, MuJoCo's b = 2 / (d_max · time constant)
 _FRICTION_SOFTNESS = (1.0 - 0.9999) / 0.9999
@@ -27,6 +29,9 @@ _LIMIT_STIFFNESS = 1.0 / (0.99 * 0.002) ** 2 * 0.99  # 1/s², times the impedanc
 _LIMIT_SOFTNESS = (1.0 - 0.99) / 0.99
 _GEAR_INERTIA = 1e-5  # kg m²
 _BRISTLE_DAMPING_S = 0.001  # over their stiffness, effects/stribeck_friction.py
+_STOP_DAMPING_S = 0.005  # over its stiffness, effects/end_stop.py
+_mixed = numba.njit(dropped_commands.mixed)
+_STRIDE = dropped_commands.STRIDE
 
 
 class Drive(NamedTuple):
@@ -62,15 +67,26 @@ class Drive(NamedTuple):
     presliding: float = 5e-4
     load_friction: float = 0.0
     """μ in |τ| ≤ μ |τ_motor − τ_load|."""
+    spot_friction: float = 0.0
+    """F₀ in F₀ exp(−((q − q₀) / w)²), besides ``coulomb``, at q₀ …"""
+    spot_angle: float = 0.0
+    spot_width: float = 0.1
+    """… and w."""
     cogging_torque: float = 0.0
     cogging_periods: float = 1.0
     """A turn."""
     cogging_phase: float = 0.0
     spring_stiffness: float = 0.0
     spring_rest: float = 0.0
+    stop_stiffness: float = 0.0
+    """Of a stop that the joint meets at …"""
+    stop_angle: float = 0.0
     # The command's way.
     command_delay: float = 0.0
     command_lag: float = 0.0
+    drop_probability: float = 0.0
+    """Of each command to be lost; which ones follows from …"""
+    drop_seed: float = 0.0
     slew_rate: float = math.inf
     feedforward: float = 0.0
     """Share of K_d q̇* that is added."""
@@ -81,6 +97,9 @@ class Drive(NamedTuple):
     """r in K_p r ∫ e dt, 1/s."""
     torque_lag: float = 0.0
     torque_max: float = math.inf
+    stall_torque: float = math.inf
+    """|τ| ≤ stall torque × (1 − |v| / no-load speed) where the motor drives, ≤ stall torque where it brakes."""
+    no_load_speed: float = math.inf
     torque_scale: float = 1.0
     fade_rate: float = 0.0
     """1/s: torque × (1 − rate · t)."""
@@ -98,14 +117,23 @@ class Drive(NamedTuple):
 
 
 @numba.njit(cache=True)
+def _uniform(seed: float, count: int) -> float:
+    """``dropped_commands.uniform`` of one command, in episode 0."""
+    bits = _mixed(_mixed(np.uint64(seed) << np.uint64(32)) + np.uint64(count + 1) * np.uint64(_STRIDE))
+    return (bits >> np.uint64(11)) * 2.0**-53
+
+
+@numba.njit(cache=True)
 def _arriving(drive: Drive, sent: np.ndarray, hold: int, step_s: float) -> np.ndarray:
     """(S hold,) what the controller works on in each physics step, of targets (S,) held for ``hold`` steps each."""
     held_s = hold * step_s
     reached = 1.0 if drive.command_lag <= 0.0 else 1.0 - math.exp(-held_s / drive.command_lag)
-    at, before = sent[0], sent[0]
+    lagging, goal, at, before = sent[0], sent[0], sent[0], sent[0]
     commands = np.empty(sent.size * hold)
     for k in range(sent.size):
-        goal = at + (sent[k] - at) * reached
+        lagging += (sent[k] - lagging) * reached
+        if drive.drop_probability <= 0.0 or _uniform(drive.drop_seed, k) >= drive.drop_probability:
+            goal = lagging
         furthest = drive.slew_rate * held_s
         at = min(max(goal, at - furthest), at + furthest)
         ahead = 0.0
@@ -134,6 +162,12 @@ def _friction(force: float, metric: float, mobility: float, v: float, limit: flo
     reference = -_FRICTION_RATE * v / (1.0 + step_s * _FRICTION_RATE)
     a = (force + reference / soft) / (metric + 1.0 / soft)
     return min(max((reference - a) / soft, -limit), limit)
+
+
+@numba.njit(cache=True)
+def _limit(p: Drive, torque: float, v: float) -> float:
+    """The most that the motor's torque–speed line leaves of ``torque``."""
+    return p.stall_torque * max(1.0 - abs(v) / p.no_load_speed, 0.0) if torque * v > 0.0 else p.stall_torque
 
 
 @numba.njit(cache=True)
@@ -206,6 +240,7 @@ def simulate(
     for _ in range(20):
         q += start - _reading(p, q)
     gear, gear_v = 0.0, 0.0  # angle of the link against the motor, and its rate
+    stop_side = 1.0 if q <= p.stop_angle else -1.0  # it is free where it stands
     weight, carried = 0.0, 0.0
     for _ in range(20):
         sine, cosine = math.sin(q + gear), math.cos(q + gear)
@@ -259,8 +294,11 @@ def simulate(
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
         stiffness, damping = gain * stiffness, gain * damping
-        if abs(drawn) > p.torque_max:
-            drawn = math.copysign(p.torque_max, drawn)
+        most = p.torque_max
+        if p.stall_torque < math.inf:
+            most = min(most, _limit(p, drawn, v))
+        if abs(drawn) > most:
+            drawn = math.copysign(most, drawn)
             stiffness, damping = 0.0, 0.0
 
         # What else turns the motor's shaft.
@@ -271,6 +309,12 @@ def simulate(
         if p.spring_stiffness != 0.0:
             force -= p.spring_stiffness * (q - p.spring_rest)
             stiffness += p.spring_stiffness
+        if p.stop_stiffness > 0.0:
+            deep = stop_side * (q - p.stop_angle)
+            if deep > 0.0 and deep + _STOP_DAMPING_S * stop_side * v > 0.0:
+                force -= p.stop_stiffness * (q - p.stop_angle + _STOP_DAMPING_S * v)
+                stiffness += p.stop_stiffness
+                damping += _STOP_DAMPING_S * p.stop_stiffness
         if p.cogging_torque != 0.0:
             wave = p.cogging_periods * q + p.cogging_phase
             force += p.cogging_torque * math.sin(wave)
@@ -287,8 +331,11 @@ def simulate(
         force -= p.coulomb * p.asymmetry
         limit = p.coulomb
         if p.load_friction > 0.0:
-            passed = min(max(strength * (given + carried), -p.torque_max), p.torque_max)
-            limit += p.load_friction * abs(passed + load)
+            passed = strength * (given + carried)
+            most = min(p.torque_max, _limit(p, passed, v) if p.stall_torque < math.inf else math.inf)
+            limit += p.load_friction * abs(min(max(passed, -most), most) + load)
+        if p.spot_friction > 0.0:
+            limit += p.spot_friction * math.exp(-(((q - p.spot_angle) / p.spot_width) ** 2))
 
         f1 = force - load - h * stiffness * v
         m11 = inertia + h * damping + h * h * stiffness

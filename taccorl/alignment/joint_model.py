@@ -116,6 +116,16 @@ class JointModel:
         body = self._body(motion, [])
         return body.compensation_sin * np.sin(angles) + body.compensation_cos * np.cos(angles)
 
+    def inertia_kgm2(self, motion: JointMotion) -> float:
+        """Of the joint with all that it moves in the recording's pose, rotor and known payload included."""
+        return self._body(motion, []).inertia
+
+    def weight_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
+        """(T,) weight that the controller has to hold at ``angles`` (T,) rad: what is not carried for it."""
+        body = self._body(motion, [])
+        sine, cosine = body.gravity_sin - body.compensation_sin, body.gravity_cos - body.compensation_cos
+        return sine * np.sin(angles) + cosine * np.cos(angles)
+
     def _effects(self, effects: Sequence[Effect]) -> list[Effect]:
         if self._config is None:
             return [effect for effect in effects if not effect.is_absent]

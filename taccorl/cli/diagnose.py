@@ -2,7 +2,8 @@
 
 Every joint that the recordings sweep is looked at by itself, then the pads of every arm for which measurements.yaml says what
 they pressed. First what the recordings can show and tell apart at all; then all
-known effects are tried, refitted together with the controller's numbers and judged on recordings that nothing was fitted to.
+known effects are tried, refitted together with the controller's numbers and chosen by their error on validation recordings, to
+which nothing is fitted. Test recordings, where there are any, take no part in any choice and give the final error.
 Effects that do as well as each other are shown as ties, with the recording that would tell them apart; structure that no known
 effect explains is called "something else".
 
@@ -25,11 +26,16 @@ if TYPE_CHECKING:
     from taccorl.diagnosis.comparison import Comparison
     from taccorl.diagnosis.joints import JointFinding
     from taccorl.diagnosis.pads import PadFinding
+    from taccorl.diagnosis.regimes import RegimeErrors
+    from taccorl.diagnosis.report import Report
+    from taccorl.diagnosis.verdict import Verdict
     from taccorl.sim.twin import TwinConfig
 
 
 FAR_GAIN = 3.0
 """Fitted gains that are so many times the twin's are doubted."""
+COLORS = {"high": "green", "moderate": "yellow", "low": "red"}
+"""Of a verdict by its confidence."""
 MOST_NAMES = 6
 """In one line; the report has the others."""
 
@@ -104,12 +110,13 @@ def main(argv: list[str]) -> int:
         )
         return 1
     joints, pads = _diagnosed(config, twin, signals, arms, measurements)
-    for finding in (*joints, *pads):
-        print_finding(finding)
     mended, disagree = _mended(twin, joints, pads)
-    after = compare(mended, measurements, name="mended twin")
     said = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
-    _write(config, argv, twin, [*joints, *pads], before, after, mended, said)
+    report = _report(config, argv, twin, [*joints, *pads], before, measurements, mended, said)
+    verdicts, regimes = report.verdicts(), report.regimes()
+    for finding in (*joints, *pads):
+        print_finding(finding, verdicts[finding.part], regimes.get(finding.part))
+    _write(config, report, [*joints, *pads], mended)
     if disagree:
         print(f"the mended twin's pads are as they were: {disagree}")
     done = all(f.diagnosis.status in ("nothing_missing", "at_floor") for f in (*joints, *pads))
@@ -206,8 +213,10 @@ def _mended(
         return mended, str(error)
 
 
-def print_finding(finding: "JointFinding | PadFinding") -> None:
-    """What was found at one joint or pair of pads: what can be told, the evidence, the verdict."""
+def print_finding(
+    finding: "JointFinding | PadFinding", first: "Verdict", regimes: "RegimeErrors | None" = None
+) -> None:
+    """What was found at one joint or pair of pads: the verdict first, then what can be told, the evidence and the numbers."""
     from rich.table import Table
     from rich.text import Text
 
@@ -216,9 +225,16 @@ def print_finding(finding: "JointFinding | PadFinding") -> None:
 
     out, d = console(), finding.diagnosis
     out.print(Text(f"\n{finding.part}", "bold"))
+    out.print(Text(f"  {first.finding}", COLORS[first.level]), soft_wrap=True)
+    out.print(Text(f"  {first.confidence}"), soft_wrap=True)
+    out.print(Text(f"  Record next: {first.record_next}"), soft_wrap=True)
+    if first.command:
+        out.print(Text(f"    {first.command}"), soft_wrap=True)
+    for remark in first.remarks:
+        out.print(Text(f"  Remark: {remark}"), soft_wrap=True)
     out.print(f"  noise floor {finding.noise}", highlight=False)
     judged = "the last rows of each" if finding.rows_split else ", ".join(finding.recordings["validation"])
-    out.print(f"  {finding.numbers}; judged on {judged}", highlight=False, soft_wrap=True)
+    out.print(f"  {finding.numbers}; chosen by the error on {judged} (validation)", highlight=False, soft_wrap=True)
     hardly = [_why_invisible(finding, name) for name in finding.can_tell.invisible if name not in d.names]
     if hardly:
         text = f"  of a typical strength these recordings would not show: {_some(hardly)}"
@@ -249,7 +265,12 @@ def print_finding(finding: "JointFinding | PadFinding") -> None:
                 trouble,
             )
         out.print(table)
-    for line in verdict(finding):
+    for line in details(finding):
+        out.print(line, highlight=False, soft_wrap=True)
+    worst = regimes.worst if regimes is not None else None
+    if worst is not None:
+        place = f"{worst.recording} ({worst.use}), {worst.regime}"
+        line = f"  worst after the fit: {place}: {worst.error:.2f} noise floors, n {worst.n}"
         out.print(line, highlight=False, soft_wrap=True)
 
 
@@ -266,9 +287,11 @@ def _why_invisible(finding: "JointFinding | PadFinding", name: str) -> str:
     return f"{name} (taken up by {' and '.join(twins)})" if twins else name
 
 
-def verdict(finding: "JointFinding | PadFinding") -> list[str]:
-    """In words: what is missing, what does as well, what remains, what to record."""
-    from taccorl.diagnosis.evidence_words import to_record, unit_words, unjudged
+def details(finding: "JointFinding | PadFinding") -> list[str]:
+    """The numbers behind the verdict: errors, identified and absolute numbers, near-twins, what does as well."""
+    from taccorl.diagnosis.evidence_words import to_record, unit_words
+    from taccorl.diagnosis.identifiable import Known
+    from taccorl.diagnosis.verdict import remarks
 
     d = finding.diagnosis
     errors = d.errors["fitted"]["validation"], d.errors["after"]["validation"]
@@ -276,15 +299,19 @@ def verdict(finding: "JointFinding | PadFinding") -> list[str]:
     told = [f"{d.errors['before']['validation']:.2f} as it was", f"{errors[0]:.2f} with its numbers refitted"]
     told += [f"{errors[1]:.2f} with {', '.join(added)}"] * bool(added)
     lines = [f"  {d.words}", f"  validation error in noise floors ({finding.measured}): {', '.join(told)}"]
-    lines += [f"    {words}" for words in (unjudged(d),) if words]
     for name in ("kp", "kd"):
         ratio = d.base.get(name, 1.0) / d.start.get(name, 1.0) if name in d.base else 1.0
-        if not 1 / FAR_GAIN < ratio < FAR_GAIN:
+        if not remarks(d) and not 1 / FAR_GAIN < ratio < FAR_GAIN:
             lines.append(f"    {name} became {ratio:.3g} times the twin's: state the commanded gains, or doubt this")
     for name in ("k_n", "k_d"):
         if name in d.base:
             low, high = d.intervals.get(name, (float("nan"), float("nan")))
             lines.append(f"    {name} {d.base[name]:.4g} ({low:.4g} … {high:.4g}), the twin had {d.start[name]:.4g}")
+    known: Known | None = getattr(finding, "known", None)
+    if known is not None:
+        own = [n.words() for n in known.identifiable if "." not in n.name]
+        pinned = f"; scale of torques fixed by {' and '.join(known.pinned_by)}" if known.pinned_by else ""
+        lines.append(f"    identified: {', '.join(own)}{pinned}")
     for effect in d.effects:
         if effect.name in d.present:
             continue
@@ -292,7 +319,14 @@ def verdict(finding: "JointFinding | PadFinding") -> list[str]:
         for p in effect.parameters():
             low, high = effect.interval.get(p.name, (float("nan"), float("nan")))
             numbers.append(f"{p.name} {getattr(effect, p.name):.4g}{unit_words(p.unit)} ({low:.4g} … {high:.4g})")
-        lines.append(f"  → {effect.name}: {', '.join(numbers)}")
+        own = [n for n in known.identifiable if n.name.startswith(f"{effect.name}.")] if known is not None else []
+        primary = [n.words().removeprefix(f"{effect.name}.") for n in own]
+        plain = [f"{p.name}" for p in effect.parameters()]
+        if known is None or known.pinned_by or all(n.name.split(".", 1)[1] in plain for n in own):
+            lines.append(f"  → {effect.name}: {', '.join(numbers)}")
+        else:
+            lines.append(f"  → {effect.name}: {', '.join(primary)}")
+            lines.append(f"    in the twin, with kp {d.base['kp']:.4g}: {', '.join(numbers)}")
         if effect.in_words:
             lines.append(f"    {effect.in_words}")
         rivals = d.rivals.get(effect.name, ())
@@ -316,26 +350,40 @@ def verdict(finding: "JointFinding | PadFinding") -> list[str]:
     return lines
 
 
-def _write(
+def _report(
     config: DiagnoseConfig,
     argv: Sequence[str],
     twin: "TwinConfig",
     found: "Sequence[JointFinding | PadFinding]",
     before: "Comparison",
-    after: "Comparison",
+    measurements: "Measurements",
     mended: "TwinConfig",
     findings: dict,
-) -> None:
+) -> "Report":
+    """With the comparisons that show what refitted numbers removed, and what effects did."""
+    from taccorl.diagnosis import joints as of_joints
+    from taccorl.diagnosis import pads as of_pads
+    from taccorl.diagnosis.compare import compare
+    from taccorl.diagnosis.joints import JointFinding
     from taccorl.diagnosis.pads import PadFinding
-    from taccorl.diagnosis.report import Report, write_report
-    from taccorl.sim.twin_file import save_twin, twin_digest
+    from taccorl.diagnosis.report import Report
+    from taccorl.sim.twin_file import twin_digest
 
-    report = Report(
+    joints = [f for f in found if isinstance(f, JointFinding)]
+    pads = [f for f in found if isinstance(f, PadFinding)]
+    refitted = of_pads.refitted(of_joints.refitted(twin, joints), pads)
+    options = [f"--measurements={config.measurements}"]
+    options += [f"--twin={config.twin}"] * (config.twin is not None)
+    options += [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))
+    return Report(
         title=f"What {before.twin} lacks, from {config.measurements.name}",
         comparison=before,
-        after=after,
+        refitted=compare(refitted, measurements, name="refitted twin"),
+        after=compare(mended, measurements, name="mended twin"),
         diagnoses={f.part: f.diagnosis for f in found},
         can_tell={f.part: f.can_tell for f in found},
+        known={f.part: f.known for f in joints},
+        options=[shlex.quote(word) for word in options],
         findings=findings,
         provenance={
             "command": shlex.join(["taccorl", "diagnose", *argv]),
@@ -343,6 +391,15 @@ def _write(
             "twin, SHA-256": twin_digest(twin),
         },
     )
+
+
+def _write(
+    config: DiagnoseConfig, report: "Report", found: "Sequence[JointFinding | PadFinding]", mended: "TwinConfig"
+) -> None:
+    from taccorl.diagnosis.pads import PadFinding
+    from taccorl.diagnosis.report import write_report
+    from taccorl.sim.twin_file import save_twin
+
     written = write_report(report, config.out)
     again = f" (replaced the report of {written.replaced})" if written.replaced else ""
     print(f"\nwrote {written.page} and {written.numbers.name}{again}")

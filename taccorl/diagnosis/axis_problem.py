@@ -143,6 +143,8 @@ class AxisProblem:
         seen = self._seen(values)
         for name in registry:
             cls = registry.get(name)
+            if not cls.fitted:
+                continue
             found = candidate(cls, seen)
             knows = issubclass(cls, JointEffect) and found.make({f.name: f.start for f in found.frees}).drive()
             if knows and name != "armature":  # more inertia is the inertia, which is fitted
@@ -194,5 +196,7 @@ class AxisProblem:
             "peak_torque_nm": float(max(efforts)),
             "peak_speed_rad_per_s": float(speeds.max()),
             "span_rad": float(max(np.ptp(m.target) for m in motions)),
+            "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
+            "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
             "duration_s": float(max(m.time_s[-1] for m in motions)),
         }

@@ -1,36 +1,55 @@
 """How much better one model is than another on recordings that neither was fitted to: block by block, with its uncertainty."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from taccorl.diagnosis.correlation import block_of_rows, rate_of
 from taccorl.diagnosis.fit import Fit, residuals
 from taccorl.diagnosis.problem import Problem, Recording
 
-BLOCK_S = 0.5
-"""Residuals within half a second are alike; blocks of that length are taken as independent."""
+
+@dataclass(frozen=True)
+class Blocks:
+    """Squared residuals, block of time by block of time."""
+
+    squares: np.ndarray
+    """(B,) mean squared residual of each block, in floors²."""
+    weights: np.ndarray
+    """(B,) share of all measured entries that each block holds; they add up to 1."""
+
+    @property
+    def mean(self) -> float:
+        """Over all entries, in floors²."""
+        return float(self.weights @ self.squares)
+
+    def __sub__(self, other: "Blocks") -> "Blocks":
+        return Blocks(self.squares - other.squares, self.weights)
 
 
-def block_squares(problem: Problem, model: Fit, recordings: Sequence[Recording]) -> np.ndarray:
-    """(B,) mean squared residual, in floors, of every block of every recording."""
-    blocks = []
+def block_squares(problem: Problem, model: Fit, recordings: Sequence[Recording]) -> Blocks:
+    """Squared residuals of ``recordings`` in blocks of ``correlation.BLOCK_S``, all channels of a block together."""
+    sums, counts = [], []
     for recording in recordings:
         squares = np.square(residuals(problem, model.values, model.effects, recording))
         seen = np.isfinite(squares)
-        rate_hz = (len(recording.time_s) - 1) / (recording.time_s[-1] - recording.time_s[0])
-        edges = np.arange(0, len(squares), max(1, round(BLOCK_S * rate_hz)))
-        total = np.add.reduceat(np.where(seen, squares, 0.0).sum(1), edges)
-        count = np.add.reduceat(seen.sum(1), edges)
-        blocks.append(total[count > 0] / count[count > 0])
-    return np.concatenate(blocks)
+        edges = np.flatnonzero(np.diff(block_of_rows(len(squares), rate_of(recording.time_s)), prepend=-1))
+        sums.append(np.add.reduceat(np.where(seen, squares, 0.0).sum(1), edges))
+        counts.append(np.add.reduceat(seen.sum(1), edges))
+    total, count = np.concatenate(sums), np.concatenate(counts)
+    total, count = total[count > 0], count[count > 0]
+    return Blocks(total / count, count / max(int(count.sum()), 1))
 
 
-def standard_score(differences: np.ndarray) -> float:
-    """Mean over its standard error: 2 is hardly chance. Differences of one block only prove nothing."""
-    if len(differences) < 2:
+def standard_score(blocks: Blocks) -> float:
+    """Weighted mean over its standard error, blocks taken as independent: 2 is hardly chance. One block alone proves nothing."""
+    count = len(blocks.squares)
+    if count < 2:
         return 0.0
-    spread = float(differences.std(ddof=1)) / np.sqrt(len(differences))
-    return float(differences.mean()) / spread if spread > 0 else 0.0
+    scatter = (blocks.weights * (blocks.squares - blocks.mean)) ** 2
+    error = float(np.sqrt(scatter.sum() * count / (count - 1)))
+    return blocks.mean / error if error > 0 else 0.0
 
 
 def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:

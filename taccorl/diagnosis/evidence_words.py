@@ -10,13 +10,13 @@ from taccorl.sim.effects.effect import Effect
 OVERWHELMING_BIC, OVERWHELMING_SCORE = 100.0, 5.0
 """ΔBIC, twice the logarithm of a Bayes factor (above 10 is very strong: Kass and Raftery 1995), and standard errors."""
 UNJUDGED = 1.3
-"""Times the validation error that the error on the fit recordings is remarkable: more than another motion's noise makes it."""
+"""Ratio of the errors on fit and validation recordings that is remarkable: more than another motion's noise makes it."""
 NO_GAIN = 0.01
 """Of the validation squared error above the floor: less is none."""
 
 
 def evidence_words(e: Evidence) -> str:
-    """What speaks for an effect: on the recordings that it was fitted to (ΔBIC) and on those that judge (gain, standard errors).
+    """What speaks for an effect: ΔBIC on the recordings that it was fitted to, gain and standard errors on validation recordings.
 
     ``weak`` is what the search would not add; ``none``: nothing goes away.
     """
@@ -28,15 +28,23 @@ def evidence_words(e: Evidence) -> str:
 
 
 def unjudged(d: Diagnosis) -> str:
-    """What shows in the recordings that were fitted and hardly in those that judge, where nothing can be believed or refuted;
-    empty if there is no such thing."""
+    """Where fit and validation recordings disagree after the fit; empty if they do not.
+
+    What shows only in the recordings that were fitted can be neither confirmed nor refused; what shows only in those that
+    validate was fitted to something else.
+    """
     fit, validation = d.errors["after"]["fit"], d.errors["after"]["validation"]
-    if fit <= UNJUDGED * max(validation, 1.0):
-        return ""
-    return (
-        f"the recordings that were fitted keep {fit:.2f} floors, those that judge {validation:.2f}: something acts there that no "
-        "validation recording shows; hold one of each kind of motion out"
-    )
+    if fit > UNJUDGED * max(validation, 1.0):
+        return (
+            f"the recordings that were fitted keep {fit:.2f} noise floors, those that validate {validation:.2f}: something acts "
+            "there that no validation recording shows; mark one recording of each kind of motion for validation"
+        )
+    if validation > UNJUDGED * max(fit, 1.0):
+        return (
+            f"the recordings that validate keep {validation:.2f} noise floors, those that were fitted {fit:.2f}: something acts "
+            "there that no fit recording shows; mark one recording of each kind of motion for fitting"
+        )
+    return ""
 
 
 def unit_words(unit: str) -> str:
@@ -44,11 +52,17 @@ def unit_words(unit: str) -> str:
     return "" if unit == "1" else f" {unit}"
 
 
+def excite_command(part: str, names: Sequence[str]) -> str:
+    """The command that plans a recording which tells effects of a joint or of pads apart; empty for any other part."""
+    where = part if "_joint" in part else f"--pads={part.removesuffix(' pads')}" if part.endswith(" pads") else ""
+    return f"taccorl excite {where} --effects={','.join(names)}" if where else ""
+
+
 def to_record(part: str, name: str, rivals: Sequence[str]) -> list[str]:
     """What would tell an effect from its rivals: a command that plans it for a joint or for pads, in words for anything else."""
-    where = part if "_joint" in part else f"--pads={part.removesuffix(' pads')}" if part.endswith(" pads") else ""
-    if where:
-        return [f"taccorl excite {where} --effects={','.join((name, *rivals))}"]
+    command = excite_command(part, (name, *rivals))
+    if command:
+        return [command]
     return list(dict.fromkeys(cls.to_record for other in (name, *rivals) if (cls := effect_class(other))))
 
 

@@ -87,17 +87,23 @@ def _residuals(axes: Axes, twins: Sequence[tuple[Trace, str, str]]) -> None:
     axes.set_ylabel(f"residual\nmeasured − twin [{unit}]", fontsize=8)
 
 
-def heat_map_figure(cells: Sequence[Cell], origins: Sequence[str], title: str) -> Figure:
-    """Signal × regime: RMSE over the noise floor. An empty cell: too few rows."""
+def heat_map_figure(cells: Sequence[Cell], origins: Sequence[str], title: str, most: float = 0.0) -> Figure:
+    """Signal × regime: RMSE over the noise floor. An empty cell: too few rows.
+
+    Args:
+        most: floors that the colours reach, at least.
+    """
     shown_ones = [r for r in REGIMES if any(c.regime == r.name for c in cells)]
-    figure = ratio_map(cells, [r.name for r in shown_ones], origins, title)
+    figure = ratio_map(cells, [r.name for r in shown_ones], origins, title, most)
     for k in range(1, len(shown_ones)):
         if shown_ones[k].group != shown_ones[k - 1].group:
             figure.axes[0].axvline(k - 0.5, color="white", lw=3)
     return figure
 
 
-def ratio_map(cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[str], title: str) -> Figure:
+def ratio_map(
+    cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[str], title: str, most: float = 0.0
+) -> Figure:
     """Signal × regime, each with its number."""
     signals = list(dict.fromkeys(c.signal for c in cells))
     ratio = np.full((len(signals), len(regimes)), np.nan)
@@ -105,7 +111,7 @@ def ratio_map(cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[s
         ratio[signals.index(c.signal), regimes.index(c.regime)] = c.ratio
     figure = new_figure(max(7.0, 3.6 + 0.62 * len(regimes)), 3.0 + 0.34 * len(signals), title, origins)
     axes = figure.subplots()
-    top = max(10.0, float(np.nanmax(ratio)))
+    top = max(10.0, most, float(np.nanmax(ratio)))
     image = axes.imshow(np.maximum(ratio, 1.0), cmap="YlOrRd", norm=LogNorm(1.0, top), aspect="auto")
     for i, j in zip(*np.nonzero(np.isfinite(ratio)), strict=True):
         color = "white" if ratio[i, j] > top**0.7 else "#111111"
@@ -115,7 +121,7 @@ def ratio_map(cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[s
     bar = figure.colorbar(image, ax=axes, pad=0.02)
     bar.set_label("RMSE / noise floor", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-    axes.set_xlabel("where, never why: several causes light up the same regimes", fontsize=8)
+    axes.set_xlabel("where, not why: several causes show in the same regimes", fontsize=8)
     return figure
 
 
@@ -148,7 +154,7 @@ def residual_along_variables(
             shares.append(f"{one.explained:.0%}" + ("" if one.beyond_chance else " (may be chance)"))
             axis.fill_between(one.at, one.low * factor, one.high * factor, color=color, alpha=0.25, lw=0)
             axis.plot(one.at, one.middle * factor, color=color, lw=1.4, marker="o", ms=2.5, label=f"{name}, 95 % band")
-        axis.set_title(f"of its variance: {' → '.join(shares)}", fontsize=7.5, color="#4b5563", loc="right")
+        axis.set_title(f"explains {' → '.join(shares)} of the variance", fontsize=7.5, color="#4b5563", loc="right")
         axis.set_xlabel(f"{curve.variable} [{variable_unit(curve.variable, position_unit)}]", fontsize=8)
         axis.set_ylabel(f"{curve.measure} residual [{unit}]", fontsize=8)
         tidy(axis)

@@ -116,10 +116,14 @@ def _error_over_time(axes: Axes, before: TouchTrace, after: TouchTrace | None, p
     tidy(axes)
 
 
-def touch_heat_map_figure(cells: Sequence[Cell], origins: Sequence[str]) -> Figure:
+def touch_heat_map_figure(
+    cells: Sequence[Cell],
+    origins: Sequence[str],
+    title: str = "pads: where the twin is off (RMSE / noise floor)",
+    most: float = 0.0,
+) -> Figure:
     """Pad × regime: RMSE over the noise floor. An empty cell: too few readings."""
-    title = "pads: where the twin is off"
-    return ratio_map(cells, [name for name in REGIMES if any(c.regime == name for c in cells)], origins, title)
+    return ratio_map(cells, [name for name in REGIMES if any(c.regime == name for c in cells)], origins, title, most)
 
 
 def _origins(traces: Sequence[TouchTrace]) -> list[str]:

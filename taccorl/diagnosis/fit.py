@@ -8,15 +8,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.signal import fftconvolve
+from scipy.stats import t as student
 
+from taccorl.diagnosis.correlation import Rows, block_sums, independent_rows, rate_of, unstacked
 from taccorl.diagnosis.problem import Free, Problem, Recording, Values, chosen
 from taccorl.sim.effects.effect import Effect
 
 FAR = 1e5
 """Residual in floors where a simulation ended in NaN, and the most that one row counts."""
-BLOCK_ROWS, MANY_BLOCKS = 100, 20
-"""Rows whose residuals may pull together: half a second at 200 Hz; so many blocks say by how much."""
+MANY_BLOCKS = 20
+"""Blocks of time that are enough to estimate by how much residuals within a block pull the numbers to one side."""
 COARSE, FINE = 1e-3, 1e-4
 """Steps of finite differences, in coordinates of order 1: coarse ones see past the kinks of dry friction and limits while
 hypotheses compete; only fine ones go along the ridge of K_p and K_d to its top, and give intervals that hold."""
@@ -35,6 +36,8 @@ class Fit:
     values: Values
     residuals: np.ndarray = field(repr=False)
     """(n,) simulation − measurement in floors, all recordings one after the other."""
+    layout: tuple[Rows, ...] = field(repr=False)
+    """Which rows and channels of each recording they are."""
     jacobian: np.ndarray = field(repr=False)
     """(n, p) by the coordinates of ``frees``."""
     frees: tuple[Free, ...]
@@ -52,12 +55,16 @@ class Fit:
 
     @property
     def effective_rows(self) -> float:
-        """Rows that neighbours do not already imply: n / (1 + 2 Σ ρ_k) of the residuals' autocorrelation."""
-        return effective_rows(self.residuals)
+        """Number of independent entries among the residuals, by their autocorrelation along time (``independent_rows``)."""
+        return independent_rows(list(unstacked(self.residuals, self.layout)))
 
     def covariance(self) -> np.ndarray:
-        """(p, p) of the coordinates, with as many rows as are independent; wider where whole blocks of rows pull to one side, as
-        they do where the model is not quite right (sandwich estimate). Directions that the data leave open are huge."""
+        """(p, p) of the coordinates.
+
+        The larger, for each number, of two estimates: σ² (JᵀJ)⁻¹ with as many rows as are independent; and the sandwich
+        (JᵀJ)⁻¹ Σ_b g_b g_bᵀ (JᵀJ)⁻¹ with the gradients g_b of blocks of time, all channels of a block together, which is right
+        where the model is not quite. Directions that the data leave open are huge.
+        """
         n, p = self.jacobian.shape
         if p == 0:
             return np.zeros((0, 0))
@@ -65,36 +72,29 @@ class Fit:
         inverse = ways / np.maximum(strengths, _OPEN * max(float(strengths[-1]), 1e-300)) @ ways.T
         variance = float(self.residuals @ self.residuals) / max(n - p, 1) * n / self.effective_rows
         plain = variance * inverse
-        if n < MANY_BLOCKS * BLOCK_ROWS:
+        pulls = block_sums(self.jacobian * self.residuals[:, None], self.layout)
+        if len(pulls) < max(MANY_BLOCKS, 2 * p):
             return plain
-        pulls = np.add.reduceat(self.jacobian * self.residuals[:, None], np.arange(0, n, BLOCK_ROWS), axis=0)
-        sandwich = np.diag(inverse @ (pulls.T @ pulls) @ inverse)
+        sandwich = np.diag(inverse @ (pulls.T @ pulls) @ inverse) * len(pulls) / (len(pulls) - p)
         wider = np.sqrt(np.maximum(sandwich / np.maximum(np.diag(plain), 1e-300), 1.0))
         return plain * np.outer(wider, wider)
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Parameter → 95 % interval in its unit, cut at its bounds."""
-        spread = 1.96 * np.sqrt(np.diag(self.covariance()))
+        spread = self.quantile * np.sqrt(np.diag(self.covariance()))
         middle = [f.coordinate(self.values[f.name]) for f in self.frees]
         return {f.name: (f.value(m - s), f.value(m + s)) for f, m, s in zip(self.frees, middle, spread, strict=True)}
+
+    @property
+    def quantile(self) -> float:
+        """Standard errors to each side of a 95 % interval: Student's t with as many degrees of freedom as there are blocks of
+        time beyond the fitted numbers."""
+        blocks = len(block_sums(self.residuals, self.layout))
+        return float(student.ppf(0.975, max(blocks - len(self.frees), 3)))
 
 
 def rms(residuals: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(residuals)))) if len(residuals) else float("nan")
-
-
-def effective_rows(residuals: np.ndarray) -> float:
-    """Number of independent rows among n whose neighbours are alike, at least 10."""
-    n = len(residuals)
-    centred = residuals - residuals.mean()
-    power = float(centred @ centred)
-    if n < 20 or power == 0.0:
-        return float(max(n, 1))
-    reach = n // 2
-    correlation = fftconvolve(centred, centred[::-1])[n - 1 : n - 1 + reach] / power
-    small = np.flatnonzero(correlation < 0.05)
-    end = int(small[0]) if len(small) else reach
-    return max(10.0, n / (1.0 + 2.0 * float(correlation[1:end].sum())))
 
 
 def residuals(
@@ -129,6 +129,7 @@ def fit(
         most: steps of the solver.
         step: of its finite differences.
     """
+    layout = tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s)) for r in recordings)
     candidates = chosen(problem, names)
     frees = (*problem.base, *(f for c in candidates for f in c.frees))
     low = np.array([f.coordinate(f.low) for f in frees])
@@ -164,7 +165,9 @@ def fit(
     if len(frees) == 0:
         values, effects = at(first)
         here = left(first)
-        return Fit(tuple(names), values, here, np.empty((len(here), 0)), (), (), "", evaluations, tuple(effects))
+        return Fit(
+            tuple(names), values, here, layout, np.empty((len(here), 0)), (), (), "", evaluations, tuple(effects)
+        )
     found = least_squares(left, first, jac=slopes, bounds=(low, high), max_nfev=most, ftol=1e-5, xtol=1e-6, gtol=1e-9)  # pyright: ignore[reportArgumentType]
     values, effects = at(found.x)
     near = np.minimum(found.x - low, high - found.x) < _AT_BOUND * (high - low)
@@ -172,6 +175,7 @@ def fit(
         names=tuple(names),
         values=values,
         residuals=found.fun,
+        layout=layout,
         jacobian=found.jac,
         frees=frees,
         at_bound=tuple(f.name for f, is_near in zip(frees, near, strict=True) if is_near),

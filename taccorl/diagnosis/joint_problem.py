@@ -34,6 +34,8 @@ WIDER = 100.0
 this factor, downwards."""
 _GAIN_LIKE = ("torque_scale",)
 """No candidates where gains are fitted: those take it up, and what it does to the carried weight is ``gravity_mismatch``."""
+WEIGHS = 3.0
+"""Floors of the angle by which a weight must move the joint (standard deviation) to tell the scale of the torques. A choice."""
 EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
 """Reported effort over torque: PiPER firmware differs in it."""
 
@@ -70,7 +72,7 @@ class JointProblem:
                 "or fit them (gains=fitted)"
             )
         self.signal, self.commanded = signal, gains != "fitted" and stated
-        own = [e for e in config.effects if isinstance(e, ArmEffect) and _acts_on(e, signal)]
+        own = [e for e in config.effects if isinstance(e, ArmEffect) and e.fitted and _acts_on(e, signal)]
         self.present = tuple(effect.name for effect in own)
         others = [e for e in config.effects if not any(e is mine for mine in own)]
         self.model = JointModel(dataclasses.replace(config, effects=others), signal)
@@ -93,6 +95,30 @@ class JointProblem:
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
         }
 
+    @property
+    def inertia_kgm2(self) -> float:
+        """Of the joint: the least of the fit recordings, whose loop timing is the most uncertain."""
+        return min(self.model.inertia_kgm2(r.data) for r in self.fit)
+
+    def pinned_by(self, names: Sequence[str]) -> tuple[str, ...]:
+        """What fixes the scale of the torques (``taccorl.diagnosis.identifiable``) while the effects ``names`` are fitted."""
+        found = ["commanded gains"] * self.commanded + ["recorded effort"] * (self.effort and not self.commanded)
+        unknown = {"gravity_mismatch", "payload"} & {*names}
+        if not unknown and self._weighs():
+            found.append("known weight")
+        return tuple(found)
+
+    def _weighs(self) -> bool:
+        """Whether known weight that the controller holds varies more than the torque J q̈ of the motion, which else decides."""
+        motions: list[JointMotion] = [r.data for r in self.fit]
+        weights = np.concatenate([self.model.weight_nm(m, m.target) for m in motions])
+        torques = []
+        for m in motions:
+            angle = self.model.simulate(m, self.model.gains).reported
+            torques.append(self.model.inertia_kgm2(m) * np.gradient(np.gradient(angle, m.time_s), m.time_s))
+        seen = WEIGHS * self.floors[0].value * self.model.gains.kp
+        return float(np.std(weights)) > max(float(np.std(np.concatenate(torques))), seen)
+
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """(T, C) angle [rad], and effort [N·m] as the driver would report it."""
         answer = self.model.simulate(recording.data, self._gains(base), effects)
@@ -104,9 +130,10 @@ class JointProblem:
         """Starts of searches hang on the torques that the motor would give with these gains."""
         seen = self._seen(values)
         for name in registry:
-            where = selectors(registry.get(name), self.signal)
+            cls = registry.get(name)
+            where = selectors(cls, self.signal) if cls.fitted else None
             if where is not None and (self.commanded or name not in _GAIN_LIKE):
-                self.candidates[name] = candidate(registry.get(name), seen, **where)
+                self.candidates[name] = candidate(cls, seen, **where)
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
@@ -153,6 +180,8 @@ class JointProblem:
             "peak_motor_nm": max(float(np.abs(a.effort + w).max()) for a, w in zip(answers, weights, strict=True)),
             "peak_speed_rad_per_s": float(speeds.max()),
             "span_rad": float(np.ptp(angles)),
+            "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
+            "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
             "duration_s": max(float(m.time_s[-1]) for m in motions),
         }
 

@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +14,7 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.noise_floor import SignalFloor
 from taccorl.diagnosis.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.identifiable import Known, absolute_numbers, identifiable_numbers
 from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.problem import split_rows
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
@@ -43,6 +44,8 @@ class JointFinding:
     """fit, validation, test → names."""
     rows_split: bool
     """No recording was marked for validation: rows at the end of each were."""
+    known: Known
+    """The numbers that the recordings identify, and what they leave open of the others."""
 
     @property
     def part(self) -> str:
@@ -111,9 +114,11 @@ def diagnose_joint(
         without=without,
         config=search,
     )
+    known = known_numbers(problem, found)
     return JointFinding(
         signal=signal,
-        diagnosis=found,
+        known=known,
+        diagnosis=with_intervals(found, known),
         can_tell=can_tell,
         floors=tuple(problem.floors),
         commanded=problem.commanded,
@@ -122,6 +127,30 @@ def diagnose_joint(
         },
         rows_split=not problem.validation,
     )
+
+
+def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
+    """What the recordings of a joint identify of the numbers that were fitted to them."""
+    pinned_by = problem.pinned_by(found.names)
+    kd = problem.model.gains.kd if problem.commanded else None
+    return Known(
+        identifiable=identifiable_numbers(found.after, problem.commanded, bool(pinned_by), kd),
+        absolute=absolute_numbers(found.after, inertia_kgm2=problem.inertia_kgm2, pinned=bool(pinned_by), kd=kd),
+        pinned_by=pinned_by,
+    )
+
+
+def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
+    """``found`` with the absolute numbers' intervals, in its effects too, and the identified numbers in their evidence."""
+    effects = []
+    for effect in found.effects:
+        prefix = f"{effect.name}."
+        own = [n.words() for n in known.identifiable if n.name.startswith(prefix)]
+        evidence = "; ".join(part for part in (effect.evidence, f"identified: {', '.join(own)}" * bool(own)) if part)
+        mine = [n for n in known.absolute if n.name.startswith(prefix) and np.isfinite([n.low, n.high]).all()]
+        ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in mine}
+        effects.append(dataclasses.replace(effect, interval=effect.interval | ends, evidence=evidence))
+    return dataclasses.replace(found, effects=tuple(effects), intervals=found.intervals | known.intervals)
 
 
 def diagnose_joints(
@@ -172,7 +201,18 @@ def mended(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig:
     return new
 
 
-def set_numbers(config: TwinConfig, signal: str, base: dict[str, float]) -> None:
+def refitted(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig:
+    """``config`` with its always fitted numbers refitted and no further effect: what effects are credited against."""
+    new = copy.deepcopy(config)
+    for finding in findings:
+        first = finding.diagnosis.before
+        set_numbers(new, finding.signal, first.values)
+        for effect in first.effects:
+            add_effect(new, effect)
+    return new
+
+
+def set_numbers(config: TwinConfig, signal: str, base: Mapping[str, float]) -> None:
     """Write fitted gains into one arm of ``config``."""
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))

@@ -188,6 +188,21 @@ def mended(config: TwinConfig, findings: Sequence[PadFinding]) -> TwinConfig:
     return new
 
 
+def refitted(config: TwinConfig, findings: Sequence[PadFinding]) -> TwinConfig:
+    """As ``joints.refitted``: k_n and k_d fitted without any further effect; as they are where two arms need different ones."""
+    new = copy.deepcopy(config)
+    firsts = {f.part: f.diagnosis.before for f in findings}
+    try:
+        if firsts:
+            set_numbers(new, agreed({part: (first.values, first.intervals()) for part, first in firsts.items()}))
+    except TaccorlError:
+        return new
+    for first in firsts.values():
+        for effect in first.effects:
+            add_effect(new, effect)
+    return new
+
+
 def set_numbers(config: TwinConfig, base: Mapping[str, float]) -> None:
     """Write fitted k_n and k_d into ``config``: they are those of all its pads."""
     fields = {field: float(base[name]) for name, field in FIELDS.items()}

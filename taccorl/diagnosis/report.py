@@ -20,9 +20,12 @@ from taccorl.data.finding import Finding
 from taccorl.diagnosis.along import curves
 from taccorl.diagnosis.comparison import Comparison
 from taccorl.diagnosis.identifiability import Identifiability
+from taccorl.diagnosis.identifiable import Known
 from taccorl.diagnosis.localise import WHERE_NOT_WHY, Cell, heat_map
 from taccorl.diagnosis.localise_touch import touch_heat_map
+from taccorl.diagnosis.regimes import RegimeErrors, regime_errors
 from taccorl.diagnosis.search import Diagnosis
+from taccorl.diagnosis.verdict import Verdict, verdict
 from taccorl.errors import TaccorlError
 
 PAGE, NUMBERS = "report.html", "report.json"
@@ -32,17 +35,23 @@ HEAD_BYTES = 2048
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """What a page tells."""
+    """The content of a page."""
 
     title: str
     comparison: Comparison
     """Of the twin as it was."""
     after: Comparison | None = None
     """Of the mended twin, or of another one, on the same recordings."""
+    refitted: Comparison | None = None
+    """Of the twin with its always fitted numbers refitted and no further effect: what an effect is credited against."""
     diagnoses: Mapping[str, Diagnosis] = field(default_factory=dict)
     """Part ("left_joint5", "left pads") → what was found there."""
     can_tell: Mapping[str, Identifiability] = field(default_factory=dict)
     """Part → what its recordings can tell, whatever they say."""
+    known: Mapping[str, Known] = field(default_factory=dict)
+    """Part → the numbers that its recordings identify, and what they leave open of the others."""
+    options: Sequence[str] = ()
+    """Of commands that are suggested, such as ``--twin=twin.yaml``."""
     findings: Mapping[str, Sequence[Finding]] = field(default_factory=dict)
     """Recording → what the checks before said."""
     pictures: Mapping[str, bytes] = field(default_factory=dict)
@@ -54,10 +63,55 @@ class Report:
     def origins(self) -> tuple[str, ...]:
         return self.comparison.origins
 
+    @property
+    def without_effects(self) -> Comparison:
+        """What effects are credited against: the refitted twin, or the twin as it was where nothing was refitted."""
+        return self.comparison if self.refitted is None else self.refitted
+
     def cells(self) -> list[Cell]:
-        """Where the twin as it was is off: positions, efforts, pads."""
-        c = self.comparison
-        return [*heat_map(c, "position"), *heat_map(c, "effort"), *touch_heat_map(c.touches)]
+        """Where the twin without further effects is off: positions, efforts, pads."""
+        return cells_of(self.without_effects)
+
+    def regimes(self) -> dict[str, RegimeErrors]:
+        """Diagnosed joint → errors by recording and regime, of the twin as it ends."""
+        last = self.comparison if self.after is None else self.after
+        return {part: regime_errors(traces) for part in self.diagnoses if (traces := last.of(part))}
+
+    def verdicts(self) -> dict[str, Verdict]:
+        """Diagnosed part → the sentences that come first."""
+        regimes = self.regimes()
+        return {
+            part: verdict(
+                part,
+                d,
+                can_tell=self.can_tell.get(part),
+                known=self.known.get(part),
+                data=self.unsettled(),
+                doubts=regimes[part].remarks if part in regimes else (),
+                options=self.options,
+            )
+            for part, d in self.diagnoses.items()
+        }
+
+    def unsettled(self) -> list[str]:
+        """What is wrong with the recordings: errors that the checks found in them.
+
+        An offset of the clock counts if the fitted twin sees it: one that lacks an effect may see an offset that is not there.
+        """
+        last = self.comparison if self.after is None else self.after
+        own = [
+            (name, f)
+            for name, found in self.findings.items()
+            for f in found
+            if f not in self.comparison.clock.get(name, ())
+        ]
+        own += [(name, f) for name, found in last.clock.items() for f in found]
+        return [f"{name}: {f.text}" for name, f in own if f.severity == "error"]
+
+
+def cells_of(c: Comparison) -> list[Cell]:
+    """Positions, efforts, pads, regime by regime."""
+    return [*heat_map(c, "position"), *heat_map(c, "effort"), *touch_heat_map(c.touches)]
 
 
 @dataclass(frozen=True)
@@ -119,7 +173,8 @@ def write_report(report: Report, folder: Path) -> Written:
 
 def as_json(report: Report) -> dict[str, Any]:
     """Every number of the page."""
-    c, after = report.comparison, report.after
+    c, after, refitted = report.comparison, report.after, report.refitted
+    drawn = report.without_effects
     return {
         "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
         "title": report.title,
@@ -129,10 +184,16 @@ def as_json(report: Report) -> dict[str, Any]:
         "mended_twin": None if after is None else {"name": after.twin, "effects": list(after.effects)},
         "recordings": c.split,
         "findings": {name: [_plain(f) for f in found] for name, found in report.findings.items()},
+        "verdicts": {part: _plain(v) for part, v in report.verdicts().items()},
+        "identified": {part: _plain(known) for part, known in report.known.items()},
         "scores": [_scored(s) for s in (*c.scores(), *c.pad_scores())],
+        "scores_refitted": []
+        if refitted is None
+        else [_scored(s) for s in (*refitted.scores(), *refitted.pad_scores())],
         "scores_after": [] if after is None else [_scored(s) for s in (*after.scores(), *after.pad_scores())],
-        "where": {"note": WHERE_NOT_WHY, "cells": [_plain(cell) for cell in report.cells()]},
-        "along": [_plain(curve) for signal, kind in c.signals for curve in curves(c, signal, kind)],
+        "where": {"note": WHERE_NOT_WHY, "twin": drawn.twin, "cells": [_plain(cell) for cell in report.cells()]},
+        "along": [_plain(curve) for signal, kind in drawn.signals for curve in curves(drawn, signal, kind)],
+        "regimes": {part: _plain(found) for part, found in report.regimes().items()},
         "diagnoses": {part: _diagnosis(d) for part, d in report.diagnoses.items()},
         "can_tell": {part: _plain(found) for part, found in report.can_tell.items()},
         "not_compared": list(c.left_out),

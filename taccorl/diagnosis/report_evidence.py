@@ -3,19 +3,42 @@
 import html
 from collections.abc import Sequence
 
-from taccorl.diagnosis.evidence_words import effect_class, evidence_words, to_record, unit_words, unjudged
+from taccorl.diagnosis.comparison import USES
+from taccorl.diagnosis.evidence_words import effect_class, evidence_words, to_record, unit_words
 from taccorl.diagnosis.figure_style import data_uri, png
 from taccorl.diagnosis.figures_evidence import Step, waterfall
 from taccorl.diagnosis.identifiability import Identifiability
+from taccorl.diagnosis.identifiable import TIMING_S, Known
+from taccorl.diagnosis.regimes import ALL, AT_FLOOR, RegimeError, RegimeErrors
 from taccorl.diagnosis.report_html import figure, note, table
 from taccorl.diagnosis.search import Diagnosis, Evidence, Round
+from taccorl.diagnosis.verdict import Verdict, refitted_words
 from taccorl.sim.effects.effect import Effect
 
-ALWAYS_FITTED = "numbers refitted, no effect"
+
+def first_read(v: Verdict) -> str:
+    """What a reader needs first: verdict, confidence, what to record next with the command."""
+    lines = [
+        f"<b>{html.escape(v.finding)}</b>",
+        html.escape(v.confidence),
+        f"Record next: {html.escape(v.record_next)}",
+    ]
+    if v.command:
+        lines.append(f"<code>{html.escape(v.command)}</code>")
+    lines += [f"Remark: {html.escape(remark)}" for remark in v.remarks]
+    return f'<div class="verdict {v.level}">{"<br>".join(lines)}</div>'
 
 
-def diagnosis_section(part: str, d: Diagnosis, can_tell: Identifiability | None, origins: Sequence[str]) -> str:
-    """Verdict, waterfall, evidence of each round, and the effects in words."""
+def diagnosis_section(
+    part: str,
+    d: Diagnosis,
+    can_tell: Identifiability | None,
+    origins: Sequence[str],
+    *,
+    known: Known | None = None,
+    regimes: RegimeErrors | None = None,
+) -> str:
+    """Errors, waterfall, numbers, errors by regime, evidence of each round, and the effects in words."""
     found = [e for e in d.effects if e.name not in d.present]
     named = ", ".join(e.name for e in found) or "nothing was added"
     parts = [
@@ -24,14 +47,16 @@ def diagnosis_section(part: str, d: Diagnosis, can_tell: Identifiability | None,
     ]
     if d.trouble:
         parts.append(note(f"The last fit: {d.trouble}."))
-    if unjudged(d):
-        parts.append(note(f"{unjudged(d)[0].upper()}{unjudged(d)[1:]}."))
     if d.at_bound:
         parts.append(note(f"At the end of its range: {', '.join(d.at_bound)}. Its value says little."))
     drawn = waterfall(_steps(d), origins, f"{part}: validation error, effect by effect")
     parts.append(figure(data_uri(png(drawn)), "validation error over the noise floor; down is better"))
-    parts += [_effect(part, d, e) for e in found]
-    parts.append(_numbers(d))
+    if known is not None:
+        parts.append(_identified(known))
+    parts += [_effect(part, d, e, known) for e in found]
+    parts.append(_numbers(d, known))
+    if regimes is not None:
+        parts.append(_regimes(regimes))
     for k, r in enumerate(d.rounds, start=1):
         parts += [f"<h3>Evidence, round {k}</h3>", _evidence(r)]
     if d.rounds:
@@ -77,32 +102,91 @@ def _errors(d: Diagnosis) -> str:
 
 
 def _steps(d: Diagnosis) -> list[Step]:
-    first = [Step("twin as it was", d.errors["before"]["validation"])]
-    steps = first + [Step(name or ALWAYS_FITTED, error) for name, error in d.steps]
+    first = [Step("as given", d.errors["before"]["validation"])]
+    steps = first + [Step(name or refitted_words(d), error) for name, error in d.steps]
     if d.removed or d.swapped:
         steps.append(Step("superfluous ones removed, ties tried again", d.errors["after"]["validation"]))
     return steps
 
 
-def _numbers(d: Diagnosis) -> str:
-    """The always fitted ones and those of the effects, with intervals."""
+def _identified(known: Known) -> str:
+    """The primary numbers, and what pins the others."""
+    rows = [
+        [html.escape(n.name), f"{n.value:.4g}{html.escape(unit_words(n.unit))}", f"{n.low:.4g} … {n.high:.4g}"]
+        for n in known.identifiable
+    ]
+    text = "<h3>Identified numbers</h3>" + table(("number", "fitted", "95 %"), rows, numbers=(1, 2))
+    if known.pinned_by:
+        return text + note(f"The scale of the torques is fixed by {' and '.join(known.pinned_by)}.")
+    return text + note(
+        "Positions identify torques only over K_p: all torques of a joint times one factor move it the same way, but for its "
+        f"inertia, and a control loop whose speed is up to {1e3 * TIMING_S:g} ms late looks like another inertia. Record the "
+        "motor's effort, or hold a known payload, to know the absolute numbers."
+    )
+
+
+def _numbers(d: Diagnosis, known: Known | None) -> str:
+    """The always fitted ones and those of the effects, with intervals: what the twin's file holds."""
     rows = []
     values = d.base | {f"{e.name}.{p.name}": getattr(e, p.name) for e in d.effects for p in e.parameters()}
+    units = {n.name: unit_words(n.unit) for n in known.absolute} if known is not None else {}
     for name, value in values.items():
         low, high = d.intervals.get(name, (None, None))
         ends = "" if low is None else f"{low:.4g} … {high:.4g}"
         start = f"{d.start[name]:.4g}" if name in d.start else ""
-        rows.append([html.escape(name), start, f"{value:.4g}", ends])
-    return table(("number", "before", "fitted", "95 %"), rows, numbers=range(1, 4))
+        rows.append([html.escape(name), start, f"{value:.4g}{html.escape(units.get(name, ''))}", ends])
+    text = table(("number of the twin", "before", "fitted", "95 %"), rows, numbers=range(1, 4))
+    if known is not None and not known.pinned_by and "kp" in d.base:
+        text += note(
+            "Together these numbers reproduce the recordings. Their intervals include what the loop's timing leaves open."
+        )
+    return text
 
 
-def _effect(part: str, d: Diagnosis, e: Effect) -> str:
+def _regimes(found: RegimeErrors) -> str:
+    """Error after the fit, recording × regime, with the ranges that the recordings cover."""
+    regimes = list(dict.fromkeys(r.regime for r in found.rows))
+    cells = {(r.use, r.recording, r.regime): r for r in found.rows}
+    rows, classes = [], []
+    for use, recording in dict.fromkeys((r.use, r.recording) for r in found.rows):
+        own = [cells.get((use, recording, regime)) for regime in regimes]
+        n = cells[use, recording, ALL].n if (use, recording, ALL) in cells else 0
+        name = html.escape(recording) if recording else "<b>all of them</b>"
+        rows.append([use, name, f"{n:,}", *(_ratio(r) for r in own)])
+        classes.append("tie" if not recording else "")
+    heads = ("use", "recording", "n", *regimes)
+    text = "<h3>Error after the fit, by recording and regime</h3>" + table(
+        heads, rows, numbers=range(2, len(heads)), classes=classes
+    )
+    text += note("RMSE over the noise floor; 1 is as good as any twin can be. Regimes with hardly a row are left out.")
+    ranges = [
+        [f"{c.variable} [{html.escape(c.unit)}]", *(_range(c.ranges.get(use)) for use in USES)] for c in found.coverage
+    ]
+    text += table(("range covered", *USES), ranges, numbers=range(1, 4))
+    if found.remarks:
+        text += f"<ul>{''.join(f'<li>{html.escape(remark)}</li>' for remark in found.remarks)}</ul>"
+    return text
+
+
+def _ratio(r: RegimeError | None) -> str:
+    if r is None:
+        return ""
+    return f'<span class="{"good" if r.error <= AT_FLOOR else "bad"}">{r.error:.3g}</span>'
+
+
+def _range(ends: tuple[float, float] | None) -> str:
+    return "" if ends is None else f"{ends[0]:.3g} … {ends[1]:.3g}"
+
+
+def _effect(part: str, d: Diagnosis, e: Effect, known: Known | None) -> str:
     """What it is, on a robot and for a policy, who looks like it, and what to do next."""
     cls = type(e)
     values = [f"{p.symbol} = {getattr(e, p.name):.4g}{unit_words(p.unit)}" for p in e.parameters()]
+    own = [n.words() for n in known.identifiable if n.name.startswith(f"{e.name}.")] if known is not None else []
     rows = [
         ["equation", f"<code>{html.escape(cls.equation)}</code>"],
-        ["here", html.escape(", ".join(values))],
+        *([["identified", "<br>".join(html.escape(line) for line in own)]] if own else []),
+        ["in the twin", html.escape(", ".join(values))],
         ["what this is", html.escape(cls.in_words)],
         ["what it does to a policy", html.escape(cls.at_a_policy)],
         ["what shows it best", html.escape(cls.to_record)],

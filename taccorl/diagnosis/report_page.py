@@ -9,9 +9,9 @@ from taccorl.diagnosis.comparison import Comparison, Kind, Score, Trace, origin_
 from taccorl.diagnosis.figure_style import data_uri, png
 from taccorl.diagnosis.figures import heat_map_figure, joint_response, residual_along_variables
 from taccorl.diagnosis.figures_touch import touch_heat_map_figure, touch_histogram, touch_maps, touch_over_time
-from taccorl.diagnosis.localise import WHERE_NOT_WHY, worst_regime
-from taccorl.diagnosis.report import GENERATOR, Report
-from taccorl.diagnosis.report_evidence import diagnosis_section
+from taccorl.diagnosis.localise import WHERE_NOT_WHY, Cell, worst_regime
+from taccorl.diagnosis.report import GENERATOR, Report, cells_of
+from taccorl.diagnosis.report_evidence import diagnosis_section, first_read
 from taccorl.diagnosis.report_html import figure, note, table
 
 STYLE = """
@@ -23,10 +23,11 @@ h3{font-size:16px;margin:24px 0 6px}
 .data{background:#fef3c7;border:1px solid #f59e0b;border-radius:6px;padding:8px 12px;font-weight:600}
 .note{color:#4b5563;font-size:13.5px;margin:6px 0}
 .verdict{font-size:17px;background:#ecfeff;border:1px solid #06b6d4;border-radius:6px;padding:10px 14px;margin:12px 0}
+.verdict.moderate{background:#fffbeb;border-color:#f59e0b}.verdict.low{background:#fef2f2;border-color:#ef4444}
 .scroll{overflow-x:auto}
 table{border-collapse:collapse;background:#fff;font-size:13px;margin:8px 0}
 th,td{padding:5px 9px;border-bottom:1px solid #e5e7eb;text-align:left;vertical-align:top}
-th{background:#f1f5f9;white-space:nowrap}td.n{text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums}
+th{background:#f1f5f9}td.n{text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums}
 tr.added td{background:#ecfdf5}tr.tie td{background:#fffbeb}
 img{max-width:100%;height:auto;background:#fff;border:1px solid #e5e7eb;border-radius:6px;margin:8px 0}
 figure{margin:12px 0}figcaption{color:#4b5563;font-size:13px}
@@ -42,17 +43,26 @@ USE_WORDS = {"fit": "fit", "validation": "validation", "test": "test"}
 
 def page(report: Report) -> str:
     """The whole page."""
-    c, after = report.comparison, report.after
+    c, after = report.without_effects, report.after
+    regimes = report.regimes()
     parts = [
         f"<h1>{html.escape(report.title)}</h1>",
         f'<p class="data">{html.escape(origin_words(report.origins))}</p>',
+        *(first_read(v) for v in report.verdicts().values()),
         _about(report),
         *(
-            diagnosis_section(part, d, report.can_tell.get(part), report.origins)
+            diagnosis_section(
+                part,
+                d,
+                report.can_tell.get(part),
+                report.origins,
+                known=report.known.get(part),
+                regimes=regimes.get(part),
+            )
             for part, d in report.diagnoses.items()
         ),
         "<h2>How far off</h2>",
-        _score_table(c, after),
+        _score_table(report),
         *_where(report),
         *_pictures(report),
         "<h2>Signal by signal</h2>" if c.signals else "",
@@ -70,11 +80,10 @@ def page(report: Report) -> str:
 
 
 def _about(report: Report) -> str:
-    c, after = report.comparison, report.after
-    twins = [(c.twin, c.effects)] + ([(after.twin, after.effects)] if after is not None else [])
+    c = report.comparison
     rows = [
-        ("twin" if k == 0 else "beside it", f"{name}: {', '.join(effects) or 'no added effects'}")
-        for k, (name, effects) in enumerate(twins)
+        ("twin" if k == 0 else "beside it", f"{one.twin}: {', '.join(one.effects) or 'no added effects'}")
+        for k, one in enumerate(_compared(report))
     ]
     names = {use: ", ".join(map(str, c.split.get(use) or ())) for use in USE_WORDS}  # pyright: ignore[reportArgumentType]
     rows += [(f"recordings, {USE_WORDS[use]}", listed or "none") for use, listed in names.items()]
@@ -83,30 +92,38 @@ def _about(report: Report) -> str:
     return table((), [[html.escape(k), html.escape(v)] for k, v in rows])
 
 
-def _score_table(c: Comparison, after: Comparison | None) -> str:
-    """Before and after in one line: signal and use."""
-    others = [*after.scores(), *after.pad_scores()] if after is not None else []
-    later = {(s.signal, s.kind, s.use): s for s in others}
-    heads = ["signal", "recordings", f"RMSE, {c.twin}", "95 %", "× floor"]
-    heads += [f"RMSE, {after.twin}", "95 %", "× floor", "change"] if after is not None else []
+def _compared(report: Report) -> list[Comparison]:
+    """The twin as it was, with refitted numbers, and as it ends: those that there are."""
+    return [one for one in (report.comparison, report.refitted, report.after) if one is not None]
+
+
+def _score_table(report: Report) -> str:
+    """One line for each signal and use; beside each other the twin as it was, with refitted numbers, and as it ends."""
+    c, *others = _compared(report)
+    later = [{(s.signal, s.kind, s.use): s for s in (*o.scores(), *o.pad_scores())} for o in others]
+    heads = ["signal", "recordings", f"RMSE, {c.twin} (95 %)", "× floor"]
+    for other in others:
+        heads += [f"RMSE, {other.twin} (95 %)", "× floor", "change"]
     heads += ["NRMSE", "noise floor", "n"]
     rows = []
     for s in (*c.scores(), *c.pad_scores()):
-        other = later.get((s.signal, s.kind, s.use))
         row = [
             f"{s.signal} {'' if s.signal == 'touch' else s.kind}",
             f"{USE_WORDS[s.use]} ({s.recordings})",
             *_errors(s),
         ]
-        if after is not None:
-            row += [*_errors(other), f"{other.rmse / s.rmse - 1:+.0%}"] if other is not None else [""] * 4
+        before = s
+        for found in later:
+            other = found.get((s.signal, s.kind, s.use))
+            row += [*_errors(other), f"{other.rmse / before.rmse - 1:+.0%}"] if other is not None else [""] * 3
+            before = other or before
         floor = f'<span title="{html.escape(s.floor_words)}">{shown(s.floor, s.unit)}{" (lower bound)" * s.lower_bound}</span>'
         row += [f"{s.nrmse:.2%}", floor, f"{s.n:,}"]
         rows.append(row)
     text = note(
-        "RMSE of measurement − replay. × floor: RMSE over the noise floor; 1 is as good as any twin can be. NRMSE: share of the "
-        "standard deviation of what was measured. 95 %: from half-second blocks drawn again. Validation recordings judge; test "
-        "recordings were not looked at for any choice."
+        "RMSE of measurement − replay. × floor: RMSE over the noise floor; 1 is as good as any twin can be. change: against the "
+        "twin to its left. NRMSE: RMSE of the first twin over the standard deviation of what was measured. 95 %: interval from "
+        "half-second blocks drawn again. Validation recordings choose effects; test recordings were used for no choice."
     )
     if any(s.lower_bound for s in c.scores()):
         text += note("A floor that is a lower bound makes the twin look worse than it may be: record one motion twice.")
@@ -116,12 +133,20 @@ def _score_table(c: Comparison, after: Comparison | None) -> str:
 def _errors(s: Score) -> list[str]:
     grade = "good" if s.ratio <= 1.25 else "bad"
     low, high = (f"{x * shown_unit(s.unit)[0]:.3g}" for x in s.interval)
-    return [shown(s.rmse, s.unit), f"{low} … {high}", f'<span class="{grade}">{s.ratio:.3g}</span>']
+    return [f"{shown(s.rmse, s.unit)} ({low} … {high})", f'<span class="{grade}">{s.ratio:.3g}</span>']
 
 
 def _where(report: Report) -> list[str]:
     cells = report.cells()
-    found = ["<h2>Where it is off</h2>", note(WHERE_NOT_WHY)]
+    found = ["<h2>Where it is off</h2>"]
+    if report.refitted is not None:
+        found.append(
+            note(
+                f"The first map of each kind is the {report.refitted.twin}: its gains (of pads: stiffness and damping) are "
+                "fitted, and no effect is added. The second is the twin with the effects: the difference is what they removed."
+            )
+        )
+    found.append(note(WHERE_NOT_WHY))
     lines = []
     for signal, kind in dict.fromkeys((cell.signal, cell.kind) for cell in cells):
         worst = worst_regime(cells, signal, kind)
@@ -131,20 +156,28 @@ def _where(report: Report) -> list[str]:
                 f"{worst.share_of_error:.0%} of its squared error in {worst.share_of_time:.0%} of its time</li>"
             )
     found.append(f"<ul>{''.join(lines)}</ul>")
-    for kind in ("position", "effort"):
-        own = [cell for cell in cells if cell.kind == kind]
-        if own:
-            drawn = heat_map_figure(own, report.origins, f"{kind}s: where the twin is off (RMSE / noise floor)")
-            found.append(figure(data_uri(png(drawn)), f"{kind}: joint × regime, all recordings together"))
-    own = [cell for cell in cells if cell.kind == "touch"]
-    if own:
-        found.append(
-            figure(
-                data_uri(png(touch_heat_map_figure(own, report.origins))),
-                "touch: pad × contact, phase, and third of the pad; all recordings together",
-            )
-        )
+    drawn = [(report.without_effects, cells)]
+    if report.refitted is not None and report.after is not None:
+        drawn.append((report.after, cells_of(report.after)))
+    for kind in ("position", "effort", "touch"):
+        most = max((cell.ratio for _, own in drawn for cell in own if cell.kind == kind), default=0.0)
+        for one, all_cells in drawn:
+            own = [cell for cell in all_cells if cell.kind == kind]
+            if own:
+                found.append(_heat_map(own, kind, one.twin, report.origins, most))
     return found
+
+
+def _heat_map(cells: Sequence[Cell], kind: str, twin: str, origins: Sequence[str], most: float) -> str:
+    """With colours up to ``most`` floors, the same for maps that are compared."""
+    if kind == "touch":
+        title = f"touch: where the {twin} is off (RMSE / noise floor)"
+        drawn = touch_heat_map_figure(cells, origins, title, most)
+        return figure(
+            data_uri(png(drawn)), "touch: pad × contact, phase, and third of the pad; all recordings together"
+        )
+    drawn = heat_map_figure(cells, origins, f"{kind}s: where the {twin} is off (RMSE / noise floor)", most)
+    return figure(data_uri(png(drawn)), f"{kind}: joint × regime, all recordings together")
 
 
 def _pictures(report: Report) -> list[str]:

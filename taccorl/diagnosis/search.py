@@ -1,13 +1,15 @@
 """Which physical effect is missing: fit, screen, refit, judge on validation recordings, accept or say that it is something else.
 
     1. The numbers that are always fitted are fitted to the fit recordings.
-    2. While the validation error is above ``stop_at`` noise floors:
+    2. While the error of the validation or of the fit recordings is above ``stop_at`` noise floors:
        a. every effect is probed once (``screen``); the likeliest are refitted together with all numbers;
        b. they are ranked by their error on the validation recordings;
-       c. the best is accepted if it takes away enough of what lies above the floor, more than chance and more than its
-          parameters explain (BIC). Those that do as well are its ties, and the simplest of them is taken;
-       d. else the search ends with "something else".
-    3. Effects that others have made superfluous go; each is tried against its ties once more, now that the others are in.
+       c. an effect is accepted if it takes away enough of what lies above the floor, more than chance and more than its
+          parameters explain (BIC), and if it was not fitted to nothing. The best of those is added. Those that do as
+          well are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else;
+       d. if none is accepted, the search ends with "something else".
+    3. Effects that others have made superfluous go; each is tried against its ties once more, now that the others are in. An
+       effect that contains a simpler one (Stribeck contains Coulomb friction) must do better than the simpler one and another.
     4. The test recordings, which no choice has seen, give the final figures.
 
 Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
@@ -21,17 +23,21 @@ from typing import Literal
 
 import numpy as np
 
-from taccorl.diagnosis.evidence import bic_gain, block_squares, standard_score
+from taccorl.diagnosis.evidence import Blocks, bic_gain, block_squares, standard_score
 from taccorl.diagnosis.fit import FINE, Fit, best_fit, fit, rms, stacked
 from taccorl.diagnosis.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
 from taccorl.diagnosis.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
 
-Status = Literal["nothing_missing", "at_floor", "something_else", "too_many", "not_converged"]
+Status = Literal["nothing_missing", "gains_moved", "at_floor", "something_else", "too_many", "not_converged"]
 BESIDE = (0.9, 0.97, 1.03, 1.1)
 """Factors to an effect's numbers from which it is fitted once more."""
+GAINS_MOVED = 2.0
+"""Factor to the twin's gains from which a refit of them is a finding of its own: late positions, a wrong unit of time, or gains
+other than the commanded ones cause it."""
 WORDS: dict[Status, str] = {
     "nothing_missing": "nothing is missing: the error is at the noise floor",
+    "gains_moved": "at the noise floor without any effect, but only with gains far from the twin's",
     "at_floor": "at the noise floor",
     "something_else": "something else: structure remains that no known effect explains",
     "not_converged": "not converged: the numbers were still moving, so nothing follows from the error",
@@ -44,7 +50,7 @@ class SearchConfig:
     """When an effect is believed. The values of research/discrepancy.md §4.1, checked in docs/diagnosis.md."""
 
     stop_at: float = 1.25
-    """Validation error in noise floors at which nothing more is looked for."""
+    """Error in noise floors, of fit and of validation recordings, at which nothing more is looked for."""
     min_gain: float = 0.10
     """Of the validation error squared that lies above the floor, an effect must take away so much,"""
     min_score: float = 2.0
@@ -161,6 +167,8 @@ class Diagnosis:
     in floors. Test recordings were not looked at for any choice."""
     steps: tuple[tuple[str, float], ...]
     """(what was added, validation error in floors) for the waterfall."""
+    remarks: tuple[str, ...]
+    """What else must be known about the result, a sentence each."""
     at_bound: tuple[str, ...]
     trouble: str
     evaluations: int
@@ -225,19 +233,15 @@ class _Search:
         given = {f.name: start.get(f.name, f.start) for f in (*self.problem.base, *(f for x in there for f in x.frees))}
         self.given = given
         self.progress("fitting the numbers that are always fitted")
-        first = model = self._fitted(present, [given], most=60)
+        self.first = first = self._fitted(present, [given], most=60)
         self.problem.learn(first.values)
         names = [name for name in self.problem.candidates if name not in without]
-        rounds: list[Round] = []
-        while self.error(model) > c.stop_at and len(model.names) - len(present) < c.max_effects:
-            found, better = self._round(model, names)
-            rounds.append(found)
-            if better is None:
-                break
-            model = better
+        model, rounds = self._search(first, names, c.max_effects)
+        model, rounds, contained = self._with_simpler(model, rounds, names)
         steps = [("", self.error(first)), *((r.added, r.validation_error) for r in rounds if r.added)]
         model = self._without_superfluous(model)
         model, rivals = self._against_ties(model, rounds)
+        rivals |= {name: (*others, *rivals.get(name, ())) for name, others in contained.items() if name in model.names}
         model = self._finished(model)
         return Diagnosis(
             status=self._status(model),
@@ -257,6 +261,7 @@ class _Search:
                 "after": self._errors(model.values, model.effects, test),
             },
             steps=tuple(steps),
+            remarks=tuple(self._remarks(model)),
             at_bound=model.at_bound,
             trouble=model.trouble,
             evaluations=self.evaluations,
@@ -264,6 +269,17 @@ class _Search:
             before=first,
             after=model,
         )
+
+    def _search(self, model: Fit, names: Sequence[str], most: int) -> tuple[Fit, list[Round]]:
+        """``model`` with up to ``most`` effects more, one a round, until its error is at the floor or none is accepted."""
+        rounds: list[Round] = []
+        while not self._at_floor(model) and len(rounds) < most:
+            found, better = self._round(model, names)
+            rounds.append(found)
+            if better is None:
+                break
+            model = better
+        return model, rounds
 
     # one more effect -------------------------------------------------------------------------------------------------
 
@@ -296,16 +312,14 @@ class _Search:
                 self.progress(f"refitting with {name}")
                 model = self._child(parent, name, [model.values, *starts[name][1:]])
             rows.append(_Row(self, parent, before, model, best[name][0]))
-        rows.sort(key=lambda row: row.squares.mean())
-        if not rows:
+        rows.sort(key=lambda row: row.squares.mean)
+        accepted = [row for row in rows if not row.refused()]
+        if not accepted:
             return self._told(parent, rows, order, None, []), None
-        refused = rows[0].refused()
-        if refused:
-            return self._told(parent, rows, order, None, []), None
-        tied = [row for row in rows if row is rows[0] or self._tie(row, rows[0], before)]
-        pick = min(tied, key=lambda row: (row.num_parameters, row.squares.mean()))
-        if pick.refused() or not self._as_good(pick, rows[0]):
-            pick = rows[0]
+        best_row = accepted[0]
+        tied = [row for row in accepted if row is best_row or self._tie(row, best_row, before)]
+        as_good = [row for row in tied if self._as_good(row, best_row)]
+        pick = min(as_good, key=lambda row: (row.num_parameters, row.squares.mean))
         pick.model = self._polished(pick.model)
         return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
 
@@ -357,18 +371,18 @@ class _Search:
         self.evaluations += fine.evaluations
         return fine
 
-    def _tie(self, row: "_Row", best: "_Row", before: np.ndarray) -> bool:
+    def _tie(self, row: "_Row", best: "_Row", before: Blocks) -> bool:
         """Whether validation recordings do not tell the two apart."""
-        lost = float(row.squares.mean() - best.squares.mean())
-        won = float(before.mean() - best.squares.mean())
+        lost = above_floor(row.squares) - above_floor(best.squares)
+        won = before.mean - best.squares.mean
         c = self.config
-        close = lost < c.tie_share * won and lost < c.tie_rise * float(best.squares.mean())
+        close = lost <= c.tie_share * won and lost <= c.tie_rise * best.squares.mean
         unclear = lost < c.wide_tie_share * won and standard_score(row.squares - best.squares) < c.min_score
         return close or unclear
 
     def _as_good(self, row: "_Row", best: "_Row") -> bool:
         """Whether a simpler effect may stand for the best one."""
-        return float(row.squares.mean()) <= self.config.simpler * float(best.squares.mean())
+        return above_floor(row.squares) <= self.config.simpler * above_floor(best.squares)
 
     def _told(
         self, parent: Fit, rows: "list[_Row]", order: list[str], pick: "_Row | None", ties: "list[_Row]"
@@ -404,6 +418,39 @@ class _Search:
                 model = smaller
         return model
 
+    def _with_simpler(
+        self, model: Fit, rounds: list[Round], names: Sequence[str]
+    ) -> tuple[Fit, list[Round], dict[str, tuple[str, ...]]]:
+        """What is found without an effect that contains a simpler one, if that is at the floor with no more numbers.
+
+        Two effects often look like one with many numbers: Coulomb friction and a soft gear like Stribeck friction.
+
+        Returns:
+            model, its rounds, and added effect → the effect with more numbers that does as well.
+        """
+        if not self._at_floor(model):
+            return model, rounds, {}
+        for k, name in enumerate(r.added for r in rounds):
+            if name is None or not self.problem.candidates[name].cls.reduces_to:
+                continue
+            self.progress(f"looking for simpler effects than {name}")
+            before = tuple(n for r in rounds[:k] if (n := r.added))
+            parent = self._fitted((*self.present, *before), [model.values], self.config.steps) if before else self.first
+            allowed = self.config.max_effects - k
+            other, found = self._search(parent, [n for n in names if n != name], allowed)
+            here, there = (block_squares(self.problem, m, self.validation) for m in (model, other))
+            if (
+                self._at_floor(other)
+                and self._num_parameters(other) <= self._num_parameters(model)
+                and above_floor(there) <= self.config.simpler * above_floor(here)
+            ):
+                first = next(r.added for r in found if r.added)
+                return other, [*rounds[:k], *found], {first: (name,)}
+        return model, rounds, {}
+
+    def _num_parameters(self, model: Fit) -> int:
+        return sum(c.num_parameters for c in chosen(self.problem, model.names))
+
     def _against_ties(self, model: Fit, rounds: Sequence[Round]) -> tuple[Fit, dict[str, tuple[str, ...]]]:
         """Each effect against its ties, with the others in place: the better one stays, those that do as well are rivals."""
         ties = {r.added: r.ties for r in rounds if r.added}
@@ -417,20 +464,21 @@ class _Search:
                 starts = [model.values | start for start in self.problem.candidates[other].starts]
                 swapped = self._fitted(others, starts, self.config.steps)
                 found.append((other, swapped, block_squares(self.problem, swapped, self.validation)))
-            found.sort(key=lambda item: item[2].mean())
+            found.sort(key=lambda item: item[2].mean)
             kept = name
             if found:
                 other, swapped, squares = found[0]
                 better = here - squares
                 fewer = len(swapped.frees) <= len(model.frees) + 1
-                if fewer and better.mean() > 0.03 * here.mean() and standard_score(better) > 1.5:
+                above = here.mean > 1.0 or len(swapped.frees) < len(model.frees)
+                if fewer and above and better.mean > 0.03 * here.mean and standard_score(better) > 1.5:
                     self.swapped.append((name, other))
                     found[0] = (name, model, here)
                     model, here, kept = swapped, squares, other
             as_good = [
                 o
                 for o, _, squares in found
-                if squares.mean() < 1.5 * here.mean() and standard_score(squares - here) < self.config.min_score
+                if squares.mean < 1.5 * here.mean and standard_score(squares - here) < self.config.min_score
             ]
             if as_good:
                 rivals[kept] = tuple(as_good)
@@ -443,6 +491,10 @@ class _Search:
         self.evaluations += model.evaluations
         return model
 
+    def _at_floor(self, model: Fit) -> bool:
+        """Whether neither the validation nor the fit recordings have an error that another effect could explain."""
+        return max(self.error(model), model.error) <= self.config.stop_at
+
     def error(self, model: Fit) -> float:
         """RMS on the validation recordings, in floors."""
         return rms(stacked(self.problem, model.values, model.effects, self.validation))
@@ -454,10 +506,27 @@ class _Search:
     def _status(self, model: Fit) -> Status:
         if model.trouble:
             return "not_converged"
-        if self.error(model) <= self.config.stop_at:
-            return "at_floor" if len(model.names) > len(self.present) else "nothing_missing"
+        if self._at_floor(model):
+            if len(model.names) > len(self.present):
+                return "at_floor"
+            return "gains_moved" if self._moved(self.first) else "nothing_missing"
         full = len(model.names) - len(self.present) >= self.config.max_effects
         return "too_many" if full else "something_else"
+
+    def _moved(self, model: Fit) -> dict[str, tuple[float, float]]:
+        """Gain → (the twin's, fitted) of those that are more than ``GAINS_MOVED`` times off."""
+        pairs = {g: (self.given[g], model.values[g]) for g in ("kp", "kd") if g in model.values and self.given.get(g)}
+        return {g: (old, new) for g, (old, new) in pairs.items() if not 1 / GAINS_MOVED <= new / old <= GAINS_MOVED}
+
+    def _remarks(self, model: Fit) -> list[str]:
+        """Sentences on what the error does not show."""
+        units = {f.name: f.unit for f in model.frees}
+        return [
+            f"{gain} had to move from the twin's {old:.4g} to {new:.4g} {units[gain]} (× {new / old:.2g}) before any effect was "
+            "considered. Check the time stamps (positions reported late, wrong unit of time) and which gains were commanded "
+            "(kp, kd of the recording in measurements.yaml)."
+            for gain, (old, new) in self._moved(self.first).items()
+        ]
 
     def _described(self, model: Fit, first: Fit) -> list[Effect]:
         """Effects with their intervals and why they are believed."""
@@ -473,27 +542,55 @@ class _Search:
         return list(model.effects)
 
 
-def gain_of(better: np.ndarray, before: np.ndarray) -> float:
-    """Share of the validation squared error above the floor that goes away: (B,) how much better, (B,) before."""
-    return float(better.mean()) / max(float(before.mean()) - 1.0, 1e-12)
+def gain_of(better: Blocks, before: Blocks) -> float:
+    """Share of the validation squared error above the floor that goes away: how much better, and the error before."""
+    return better.mean / max(before.mean - 1.0, 1e-12)
+
+
+def above_floor(squares: Blocks) -> float:
+    """Mean squared validation error in floors², at least that of one floor: below it no model is better than another."""
+    return max(squares.mean, 1.0)
 
 
 class _Row:
     """One refitted effect beside its parent, on the validation recordings."""
 
-    def __init__(self, search: _Search, parent: Fit, before: np.ndarray, model: Fit, seen: Probe) -> None:
+    def __init__(self, search: _Search, parent: Fit, before: Blocks, model: Fit, seen: Probe) -> None:
         self.name, self.model, self.seen, self._config = model.names[-1], model, seen, search.config
         self.squares = block_squares(search.problem, model, search.validation)
         self.validation_error = search.error(model)
         better = before - self.squares
         self.gain = gain_of(better, before)
         self.score = standard_score(better)
-        self.num_parameters = search.problem.candidates[self.name].num_parameters
+        self.candidate = search.problem.candidates[self.name]
+        self.num_parameters = self.candidate.num_parameters
         self.bic = bic_gain(parent, model, self.num_parameters)
 
     def refused(self) -> str:
         """Why it is not believed; empty if it is."""
-        return self._config.refusal(self.gain, self.score, self.bic)
+        return self._at_its_end() or self._config.refusal(self.gain, self.score, self.bic)
+
+    def _at_its_end(self) -> str:
+        """Why the fitted numbers are those of no effect, or of another one; empty if they are not."""
+        cls = self.candidate.cls
+        for name, shape in cls.reduces_to.items():
+            if self._at_bound(shape) == "low":
+                return f"with {shape} at {self.model.values[f'{cls.name}.{shape}']:.3g} it is {name}"
+        for p in cls.parameters():
+            side = self._at_bound(p.name)
+            if (side and p.absent == (p.low if side == "low" else p.high)) or (side == "high" and p.absent == np.inf):
+                value = self.model.values[f"{cls.name}.{p.name}"]
+                return f"fitted to nothing: {p.name} is at {value:.3g} {p.unit}, where the effect is absent"
+        return ""
+
+    def _at_bound(self, parameter: str) -> Literal["", "low", "high"]:
+        """At which end of its range a parameter of the effect was fitted."""
+        name = f"{self.candidate.name}.{parameter}"
+        if name not in self.model.at_bound:
+            return ""
+        free = next(f for f in self.model.frees if f.name == name)
+        place, low, high = (free.coordinate(x) for x in (self.model.values[name], free.low, free.high))
+        return "low" if place - low < high - place else "high"
 
     def evidence(self, verdict: str) -> Evidence:
         own = f"{self.name}."

@@ -3,6 +3,7 @@
 Solids of one body that touch or overlap are one part, whose inner faces are no surface (``part_surface``).
 """
 
+import functools
 from collections.abc import Sequence
 
 import mujoco
@@ -55,7 +56,8 @@ def shapes_of(model: mujoco.MjModel, geoms: Sequence[int]) -> list[Shapes]:
 
 def _polyhedra(model: mujoco.MjModel, solids: list[int], planes: list[int]) -> list[Shapes]:
     """Grouped by number of faces, rounded up, so that a wedge costs no more calls than the boxes beside it."""
-    shape = {g: _polyhedron_of(model, g) for g in solids}
+    vertices = {g: _vertices_of(model, g) for g in solids}
+    shape = {g: _polyhedron_of(model, g, vertices[g]) for g in solids}
     upward = Polyhedron(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), [])
     shape |= dict.fromkeys(planes, upward)
     body_from_geom = {g: np.column_stack([_matrix(model.geom_quat[g]), model.geom_pos[g]]) for g in shape}
@@ -63,7 +65,7 @@ def _polyhedra(model: mujoco.MjModel, solids: list[int], planes: list[int]) -> l
     surfaces: dict[int, Surface] = {}
     for body in np.unique(model.geom_bodyid[solids]) if solids else []:
         members = [g for g in solids if model.geom_bodyid[g] == body]
-        surface, covered_by_others = surface_of([_moved(shape[g], body_from_geom[g]) for g in members])
+        surface, covered_by_others = _part_of(tuple((vertices[g], body_from_geom[g].tobytes()) for g in members))
         for geom, of_geom in zip(members, covered_by_others, strict=True):
             if of_geom.faces.any():
                 covered[geom], surfaces[geom] = of_geom, surface
@@ -115,15 +117,22 @@ def _rounded_up(num_faces: int) -> int:
     return next((n for n in (1, 6, 8) if num_faces <= n), -(-num_faces // 8) * 8)
 
 
-def _polyhedron_of(model: mujoco.MjModel, geom: int) -> Polyhedron:
-    """A box or mesh geom in its own frame; MuJoCo has moved a mesh's vertices into the frame of its inertia."""
+def _vertices_of(model: mujoco.MjModel, geom: int) -> bytes:
+    """(V, 3) float64 of a box or mesh geom in its own frame; MuJoCo has moved a mesh's into the frame of its inertia."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
         signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
-        return polyhedron(signs * model.geom_size[geom])
+        return (signs * model.geom_size[geom]).tobytes()
     mesh = model.mesh(model.geom_dataid[geom])
-    vertices = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
-    facets = vertices[model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]]
-    solid = polyhedron(vertices)
+    return model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float).tobytes()
+
+
+def _polyhedron_of(model: mujoco.MjModel, geom: int, vertices: bytes) -> Polyhedron:
+    """A box or mesh geom in its own frame."""
+    solid = _hull_of(vertices)
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        return solid
+    mesh = model.mesh(model.geom_dataid[geom])
+    facets = _points(vertices)[model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]]
     inside_m = (solid.offsets_m - facets.mean(axis=1) @ solid.normals.T).min(axis=1).max()
     if inside_m > FLAT_M:
         raise TaccorlError(
@@ -131,6 +140,22 @@ def _polyhedron_of(model: mujoco.MjModel, geom: int) -> Polyhedron:
             "convex hull, which is what MuJoCo collides and pads feel; cut it into convex meshes (taccorl.sim.shapes.extrude)"
         )
     return solid
+
+
+# The twins that one process compiles share most of their solids, and a part of many solids takes up to 2 CPU-s.
+@functools.lru_cache(maxsize=1024)
+def _hull_of(vertices: bytes) -> Polyhedron:
+    return polyhedron(_points(vertices))
+
+
+@functools.lru_cache(maxsize=256)
+def _part_of(solids: tuple[tuple[bytes, bytes], ...]) -> tuple[Surface, list[Covered]]:
+    """``surface_of`` solids given as their vertices and poses (3, 4) in the body's frame."""
+    return surface_of([_moved(_hull_of(vertices), np.frombuffer(pose).reshape(3, 4)) for vertices, pose in solids])
+
+
+def _points(vertices: bytes) -> np.ndarray:
+    return np.frombuffer(vertices).reshape(-1, 3)
 
 
 def _moved(solid: Polyhedron, pose: np.ndarray) -> Polyhedron:

@@ -155,7 +155,7 @@ class Simulation(SeenScene):
     def _settle(self, ids: np.ndarray) -> None:
         """Effects of ``ids`` forget, delayed values included: the controls in force have been so for ever."""
         self.targets[ids] = self.arrays["ctrl"][ids][:, self.action_actuators]
-        self.effects.reset(ids, self.targets)
+        self.effects.reset(ids, self.targets, self.seeds[ids])
         fill_histories(self.batch, ids)
         self.batch.forward(ids)
         self.effects.feel(ids, 0.0)

@@ -54,7 +54,7 @@ def fitted(camera: str) -> CameraFit:
 # the whole ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("camera", ["front", "left_wrist"])
+@pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
 def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off(camera: str):
     truth, fit = made(camera)[0], fitted(camera)
     angle_deg, distance_mm = pose_error(fit.offset, truth)
@@ -66,7 +66,7 @@ def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off(camera: str):
     assert (fit.noise_half_width < fit.half_width).all()
 
 
-@pytest.mark.parametrize("camera", ["front", "left_wrist"])
+@pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
 def test_held_out_frames_are_closer_to_the_twin_afterwards(camera: str):
     fit = fitted(camera)
     assert fit.num_held_out == 4  # the fourth and the eighth frame, and the two stages

@@ -44,7 +44,7 @@ def test_the_same_frames_again_shrink_the_noise_but_not_what_the_twin_has_wrong(
     assert (np.linalg.eigvalsh(once.total) > 0).all()
 
 
-@pytest.mark.parametrize("camera", ["front", "left_wrist"])
+@pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
 def test_wrong_joint_zeros_move_points_as_kinematics_says_and_not_the_hand_that_carries_the_camera(camera: str):
     rng = np.random.default_rng(0)
     joints, points = random_poses(rng, 1), rng.uniform(-0.1, 0.1, (3, 3))

@@ -31,7 +31,10 @@ def _on_joints(name: str) -> bool:
 
 KNOWN = [name for name in effects if _on_joints(name) and effects.get(name)().drive() is not None]
 START_MRAD = {"torque_scale": 0.1}  # the twin's first physics step after it is built still carries the whole weight
-LIMIT_NM = {"left_joint2": 8.0, "left_joint5": 0.6}  # of torque, in reach of the motion below
+IN_REACH = {  # of the motion below: limits of torque and speed, and a place in the range
+    "left_joint2": {"torque_max_nm": 8.0, "stall_nm": 8.0, "no_load_rad_per_s": 2.0, "angle_rad": 1.85},
+    "left_joint5": {"torque_max_nm": 0.6, "stall_nm": 0.6, "no_load_rad_per_s": 2.0, "angle_rad": 0.1},
+}
 
 
 def typical(name: str, signal: str) -> Effect:
@@ -42,7 +45,7 @@ def typical(name: str, signal: str) -> Effect:
         value = p.typical
         if p.absent is not None and np.isfinite(p.absent):
             value = min(max(p.absent + 3 * (p.typical - p.absent), p.low), p.high)
-        values[p.name] = LIMIT_NM[signal] if p.name == "torque_max_nm" else value
+        values[p.name] = IN_REACH[signal].get(p.name, value)
     arm, joint = signal.split("_")
     where = {"arm": arm, "joints": [joint]} if issubclass(cls, JointEffect) else {"arm": arm}
     return make_effect(name, **where, **values)
@@ -60,7 +63,7 @@ def test_a_plain_joint_moves_as_in_mujoco(joint: str) -> None:
 
 
 @pytest.mark.parametrize("name", KNOWN)
-@pytest.mark.parametrize("signal", ["left_joint2", "left_joint5"])
+@pytest.mark.parametrize("signal", ["left_joint2", pytest.param("left_joint5", marks=pytest.mark.slow)])
 def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: str) -> None:
     model, effect = JointModel(TWIN, signal), typical(name, signal)
     gains = model.gains._replace(torque_ff=0.0)  # so that a motion from rest is in balance

@@ -109,7 +109,20 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     code, text = said(sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep)
     assert code == 0
     assert f"\n{SIGNAL}\n" in text and "noise floor 0.3" in text
-    assert "commanded gains; judged on held_chirp.csv" in text
+    assert "commanded gains; chosen by the error on held_chirp.csv (validation)" in text
+    lines = text.split(f"\n{SIGNAL}\n", 1)[1].splitlines()
+    assert lines[0].startswith(f"  {SIGNAL} lacks coulomb_friction or asymmetric_friction: ")
+    assert lines[1].startswith("  Confidence moderate: ") and "no test recording" in lines[1]
+    assert lines[2].startswith("  Record next: ")
+    assert lines[3].startswith(
+        f"    taccorl excite {SIGNAL} --effects=coulomb_friction,asymmetric_friction --measurements="
+    )
+    assert f"--twin={sweeps.parent / 'twin.yaml'}" in lines[3] and f"--diagnosis={out}" in lines[3]
+    assert "scale of torques fixed by commanded gains" in text and "worst after the fit: " in text
+    found = json.loads((out / "report.json").read_text())
+    assert found["identified"][SIGNAL]["pinned_by"] == ["commanded gains"]
+    friction = {n["name"]: n for n in found["identified"][SIGNAL]["identifiable"]}["coulomb_friction.torque_nm"]
+    assert friction["low"] <= TRUTH_NM <= friction["high"]
     assert "of a typical strength these recordings would not show: encoder_bias (taken up by torque_ff)" in text
     assert "tied with coulomb_friction" in text and "cannot be told from asymmetric_friction" in text
     assert "→ coulomb_friction: torque_nm 0.028" in text and "N·m (0.028" in text
@@ -221,4 +234,4 @@ def test_a_recording_s_stated_gains_are_needed_only_if_they_are_to_be_believed(s
     note = {"recordings": {"steps.csv": {"kp": {"left_joint5": 151.1}, "kd": {"left_joint5": 17.1}}}}
     (folder / "measurements.yaml").write_text(yaml.safe_dump(note))
     code, text = said(folder, f"--out={tmp_path / 'out'}", "--gains=commanded", few("backlash"))
-    assert code == 0 and "commanded gains; judged on the last rows of each" in text
+    assert code == 0 and "commanded gains; chosen by the error on the last rows of each" in text

@@ -17,7 +17,7 @@ def test_every_task_but_the_empty_bench_has_an_expert():
     assert set(tasks) - {"bench"} == set(WITH_EXPERT)
 
 
-@pytest.mark.parametrize("task", WITH_EXPERT)
+@pytest.mark.parametrize("task", ["assembly_1", *(pytest.param(t, marks=pytest.mark.slow) for t in WITH_EXPERT[1:])])
 def test_an_expert_s_grip_is_felt_and_saturates_no_taxel(task):
     sim = Simulation(tasks.get(task)())
     sim.reset([3])
@@ -34,6 +34,7 @@ def test_an_expert_s_grip_is_felt_and_saturates_no_taxel(task):
     assert above > 60  # twice the contact threshold
 
 
+@pytest.mark.slow
 def test_looking_at_every_physics_step_sees_at_least_as_deep_and_changes_nothing():
     coarse, fine = (score_expert("assembly_1", 1, every_step=every) for every in (False, True))
     assert fine.duration_s == coarse.duration_s

@@ -83,7 +83,7 @@ def test_heat_map_shows_every_cell_s_number():
     figure = heat_map_figure(cells, [ORIGIN], "where")
     shown = [t.get_text() for t in figure.axes[0].texts]
     assert sorted(shown) == sorted(f"{c.ratio:.3g}" for c in cells)
-    assert "never why" in words(figure) and "noise floor" in words(figure)
+    assert "not why" in words(figure) and "noise floor" in words(figure)
     drawn(figure)
 
 

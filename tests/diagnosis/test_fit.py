@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from made_problem import MadeProblem, Ripple, Square, record
 
-from taccorl.diagnosis.evidence import bic_gain, block_squares, standard_score
-from taccorl.diagnosis.fit import FAR, effective_rows, fit, residuals, rms
+from taccorl.diagnosis.evidence import Blocks, bic_gain, block_squares, standard_score
+from taccorl.diagnosis.fit import FAR, fit, residuals, rms
 from taccorl.diagnosis.problem import Free, free
 from taccorl.diagnosis.screen import alike, probe
 
@@ -17,18 +17,6 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
         low, high = model.intervals()["gain"]
         inside += low <= 3.0 <= high
     assert 88 <= inside <= 100  # 95 of 100; fewer than 88 happens once in 1000
-
-
-def test_coloured_noise_counts_as_few_rows():
-    rng = np.random.default_rng(0)
-    white = rng.standard_normal(20000)
-    coloured = np.zeros_like(white)
-    for k in range(1, len(white)):
-        coloured[k] = 0.9 * coloured[k - 1] + white[k]
-    # AR(1): n (1 − a) / (1 + a) = n / 19
-    assert effective_rows(white) == pytest.approx(20000, rel=0.1)
-    assert effective_rows(coloured) == pytest.approx(20000 / 19, rel=0.2)
-    assert effective_rows(np.zeros(5)) == 5
 
 
 def test_a_number_at_its_bound_is_said_to_be_there():
@@ -64,15 +52,27 @@ def test_blocks_are_means_of_half_a_second():
     recording = record(0, seconds=2.0)
     model = fit(MadeProblem(), [recording], (), {})
     blocks = block_squares(MadeProblem(), model, [recording])
-    assert len(blocks) == 4  # 400 rows at 200 Hz
-    assert blocks.mean() == pytest.approx(rms(model.residuals) ** 2)
+    assert len(blocks.squares) == 4  # 400 rows at 200 Hz
+    assert blocks.mean == pytest.approx(rms(model.residuals) ** 2)
 
 
 def test_standard_score_is_mean_over_its_error():
     # mean 2, deviation √(((1−2)² + 0 + (3−2)²) / 2) = 1, error 1/√3
-    assert standard_score(np.array([1.0, 2.0, 3.0])) == pytest.approx(2 * np.sqrt(3))
-    assert standard_score(np.array([5.0])) == 0.0
-    assert standard_score(np.zeros(4)) == 0.0
+    even = np.full(3, 1 / 3)
+    assert standard_score(Blocks(np.array([1.0, 2.0, 3.0]), even)) == pytest.approx(2 * np.sqrt(3))
+    assert standard_score(Blocks(np.array([5.0]), np.ones(1))) == 0.0
+    assert standard_score(Blocks(np.zeros(4), np.full(4, 0.25))) == 0.0
+
+
+def test_a_block_with_little_weight_decides_little():
+    # 24 blocks of 100 rows gain 1 ± 0.2, and one of a single row loses 100. With equal weights it would outweigh them all.
+    gains = np.append(1.0 + 0.2 * (-1.0) ** np.arange(24), -100.0)
+    weights = np.append(np.full(24, 100.0), 1.0) / 2401.0
+    equal = Blocks(gains, np.full(25, 1 / 25))
+    assert equal.mean == pytest.approx((24 - 100) / 25)
+    weighed = Blocks(gains, weights)
+    assert weighed.mean == pytest.approx((2400 - 100) / 2401)
+    assert standard_score(weighed) > 10 > 0 > standard_score(equal)
 
 
 def test_bic_of_a_needless_parameter_falls_below_zero():

@@ -34,6 +34,23 @@ def chirps():
     return tuple(recorded(NOMINAL, motion, seed, effort=True) for seed, motion in enumerate((CHIRP, AGAIN)))
 
 
+# what fixes the scale of the torques ----------------------------------------------------------------------------------
+
+
+def test_commanded_gains_efforts_or_known_weight_pin_the_torques_and_nothing_else_does(chirps):
+    def pinned(recordings, gains="fitted", effort=False, names=()):
+        return JointProblem(NOMINAL, SIGNAL, Measurements(recordings), gains=gains, effort=effort).pinned_by(names)
+
+    assert pinned(chirps) == ()
+    assert pinned(chirps, gains="auto") == ("commanded gains",)
+    assert pinned(chirps, effort=True) == ("recorded effort",)
+    # Slowly with 0.5 kg: weight varies by 0.14 N·m (standard deviation; 4.7 floors × K_p), J q̈ by 0.02 N·m.
+    loaded = recorded(NOMINAL, dataclasses.replace(WIDE_TRIANGLE, payload_kg=0.5), 3)
+    assert pinned((loaded,)) == ("known weight",)
+    assert pinned((recorded(NOMINAL, WIDE_TRIANGLE, 3),)) == (), "the arm's own weight is carried: nothing to be held"
+    assert pinned((loaded,), names=("payload",)) == (), "an unknown mass beside it: the weight is not known"
+
+
 # which numbers are free ------------------------------------------------------------------------------------------------
 
 

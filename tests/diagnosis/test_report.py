@@ -14,7 +14,7 @@ from simulated_sweeps import SIGNAL, friction, sweeps
 
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.compare import compare
-from taccorl.diagnosis.joints import JointFinding, diagnose_joint, mended
+from taccorl.diagnosis.joints import JointFinding, diagnose_joint, mended, refitted
 from taccorl.diagnosis.report import NUMBERS, PAGE, Report, check_folder, write_report
 from taccorl.diagnosis.search import SearchConfig
 from taccorl.errors import TaccorlError
@@ -112,9 +112,11 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointFinding, P
     report = Report(
         title="what is missing",
         comparison=compare(TwinConfig(), measured, name="nominal twin"),
+        refitted=compare(refitted(TwinConfig(), [finding]), measured, name="refitted twin"),
         after=compare(mended(TwinConfig(), [finding]), measured, name="mended twin"),
         diagnoses={SIGNAL: finding.diagnosis},
         can_tell={SIGNAL: finding.can_tell},
+        known={SIGNAL: finding.known},
     )
     return finding, write_report(report, tmp_path_factory.mktemp("diagnosed")).page
 
@@ -149,6 +151,49 @@ def test_numbers_hold_the_diagnosis_and_no_residuals(diagnosed: tuple[JointFindi
     assert len(content) < 200_000
 
 
+def test_verdict_confidence_and_next_recording_come_before_every_table(diagnosed: tuple[JointFinding, Path]):
+    _, path = diagnosed
+    text, found = path.read_text(), json.loads((path.parent / NUMBERS).read_text())["verdicts"][SIGNAL]
+    body = Tags(text).text
+    places = [body.index(found[key]) for key in ("finding", "confidence", "record_next")]
+    assert places == sorted(places) and found["level"] in ("high", "moderate")
+    assert text.index('class="verdict') < text.index("<table") < text.index("<h2>")
+    assert "coulomb_friction" in found["finding"]
+
+
+def test_heat_maps_are_of_the_twin_whose_gains_are_refitted(diagnosed: tuple[JointFinding, Path]):
+    """The first row of a score is the twin as given; the map must not credit an effect with what gains removed."""
+    finding, path = diagnosed
+    found = json.loads((path.parent / NUMBERS).read_text())
+    assert found["where"]["twin"] == "refitted twin"
+    given, refitted_, after = (
+        next(s["ratio"] for s in found[k] if s["kind"] == "position" and s["use"] == "fit")
+        for k in ("scores", "scores_refitted", "scores_after")
+    )
+    cells = [c for c in found["where"]["cells"] if c["kind"] == "position"]
+    thirds = [c for c in cells if c["regime"] in ("first third", "second third", "last third")]
+    over_all = np.sqrt(sum(c["ratio"] ** 2 * c["n"] for c in thirds) / sum(c["n"] for c in thirds))
+    assert over_all == pytest.approx(refitted_, rel=0.3)
+    assert given > refitted_ > 2 * after, "gains took some of it, the effect the rest"
+    assert finding.diagnosis.steps[0][0] == "" and len(finding.diagnosis.steps) == 2
+    page = Tags(path.read_text()).text
+    assert "Error after the fit, by recording and regime" in page and "range covered" in page
+
+
+def test_primary_numbers_are_those_that_are_identified(diagnosed: tuple[JointFinding, Path]):
+    """Efforts were recorded here: they fix the scale of the torques, and the absolute friction of 1 N·m is identified."""
+    finding, path = diagnosed
+    found = json.loads((path.parent / NUMBERS).read_text())["identified"][SIGNAL]
+    assert found["pinned_by"] == list(finding.known.pinned_by) == ["recorded effort"]
+    numbers = {n["name"]: n for n in found["identifiable"]}
+    assert numbers["kd/kp"]["unit"] == "s" and numbers["coulomb_friction.torque_nm/kp"]["unit"] == "rad"
+    assert numbers["coulomb_friction.torque_nm"]["value"] == pytest.approx(1.0, rel=0.03)
+    page = Tags(path.read_text()).text
+    assert page.index("coulomb_friction.torque_nm/kp") < page.index("number of the twin")
+    assert "identified: coulomb_friction.torque_nm/kp" in finding.diagnosis.effects[0].evidence
+
+
+@pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.skipif(
     not (shutil.which("chromium") and find_spec("playwright")),

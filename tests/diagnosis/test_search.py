@@ -1,6 +1,7 @@
 """The search on problems whose answers can be written down (made_problem)."""
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -145,3 +146,133 @@ def test_a_direction_that_the_recordings_leave_open_is_wide_and_no_trouble(monke
     assert found.trouble == ""
     low, high = found.effects[0].interval["idle"]  # nothing hangs on it: the whole of its range
     assert (low, high) == (0.5, 2.0)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Overtone(Ripple):
+    """Most of a ripple, and something that is not there."""
+
+    name: ClassVar = "overtone"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Ripple.signal(t, seed) + 0.3 * np.sin(90.0 * t)
+
+
+def test_a_round_goes_on_to_the_next_effect_when_the_best_one_is_refused():
+    """The map has the least error, but a million numbers; the overtone is acceptable."""
+    fit, validation, _ = made(Ripple(strength=1.0))
+    problem = MadeProblem(Ripple, Overtone)
+    problem.candidates["ripple"] = dataclasses.replace(problem.candidates["ripple"], num_maps=10**6)
+    found = diagnose(problem, fit, validation, config=SearchConfig(max_effects=1))
+    first, second = found.rounds[0].evidence[:2]
+    assert (first.name, second.name) == ("ripple", "overtone")
+    assert "does not pay" in first.verdict
+    assert second.verdict == "added"
+    assert found.names == ("overtone",)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Richer(Squire):
+    """A square and a sine: explains a little more of what lies below the floor."""
+
+    name: ClassVar = "richer"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Square.signal(t, seed) + 0.0775 / 2.0 * np.sin(7.0 * t)
+
+
+def test_below_one_floor_the_simplest_effect_is_taken_and_not_the_one_with_less_error():
+    """Noise 0.1, floor 0.12: squared error 0.69 with the sine and 0.69 + 0.0775² / 2 / 0.12² = 0.90 without, both below 1."""
+    sine = 0.0775 * np.sin(7.0 * np.arange(0.0, 10.0, 0.005))
+    fit, validation = (
+        [dataclasses.replace(record(k, Square(strength=2.0), extra=sine), floor=np.array([0.12]))] for k in (0, 1)
+    )
+    found = diagnose(MadeProblem(Square, Richer), fit, validation)
+    errors = {row.name: row.validation_error for row in found.rounds[0].evidence}
+    assert errors["richer"] ** 2 == pytest.approx(0.69, abs=0.06)
+    assert errors["square"] ** 2 == pytest.approx(0.90, abs=0.06)
+    assert found.names == ("square",)
+    assert found.rivals == {"square": ("richer",)}
+
+
+def test_an_effect_that_was_fitted_to_nothing_is_not_added():
+    class ShapeOnly(MadeProblem):
+        """Ripple's own strength is not in the data; its base numbers can do more as soon as the effect is there."""
+
+        def simulate(self, base, effects, recording):
+            total = super().simulate(base, effects, recording)
+            return total + len(effects) * np.sin(5.0 * recording.time_s)[:, None]
+
+    t = np.arange(0.0, 10.0, 0.005)
+    fit, validation, _ = made(extra=np.sin(5.0 * t))
+    found = diagnose(ShapeOnly(Ripple), fit, validation)
+    assert found.names == ()
+    row = found.rounds[0].evidence[0]
+    assert row.gain > 0.9  # it would explain nearly all …
+    assert row.at_bound == ("ripple.strength",)  # … with a strength of nothing
+    assert "strength is at 0.001 1" in row.verdict
+
+
+@dataclasses.dataclass(kw_only=True)
+class Both(Squire):
+    """A ripple and a bump in one effect, with two numbers more; without the bump it is a ripple."""
+
+    name: ClassVar = "both"
+    reduces_to: ClassVar = {"ripple": "idle"}
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Ripple.signal(t, seed) + 3.0 * np.exp(-(((t % 2.0 - 0.6) / 0.1) ** 2))
+
+
+@dataclasses.dataclass(kw_only=True)
+class Bumps(Ripple):
+    name: ClassVar = "bumps"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return np.exp(-(((t % 2.0 - 0.6) / 0.1) ** 2))
+
+
+def test_two_simple_effects_are_preferred_to_one_with_as_many_numbers_that_contains_one_of_them():
+    fit, validation, test = made(Ripple(strength=1.0), Bumps(strength=3.0))
+    found = diagnose(MadeProblem(Ripple, Bumps, Both), fit, validation, test)
+    assert set(found.names) == {"ripple", "bumps"}
+    assert found.status == "at_floor"
+    assert any("both" in others for others in found.rivals.values())
+    assert [name for name, _ in found.steps] == ["", *[r.added for r in found.rounds]]
+
+
+class Driven(MadeProblem):
+    """The first number is a gain that the twin states."""
+
+    base = (dataclasses.replace(MadeProblem.base[0], name="kp", unit="N·m/rad"), MadeProblem.base[1])
+
+    def simulate(self, base, effects, recording):
+        return super().simulate({"gain": base["kp"], **base}, effects, recording)
+
+
+@pytest.mark.parametrize(("stated", "moved"), [(7.0, True), (1.0, True), (5.0, False), (2.0, False)])
+def test_gains_that_move_by_more_than_twice_are_a_finding_of_their_own(stated: float, moved: bool):
+    """They are 3 in the data."""
+    found = diagnose(Driven(Ripple), [record(0)], [record(1)], start={"kp": stated, "offset": 0.0})
+    assert found.names == ()
+    assert found.status == ("gains_moved" if moved else "nothing_missing")
+    assert len(found.remarks) == moved
+    if moved:
+        remark = found.remarks[0]
+        assert remark.startswith("kp ")
+        assert f"{stated:.4g}" in remark
+        assert f"{3 / stated:.2g}" in remark
+        assert "measurements.yaml" in remark
+
+
+def test_an_error_that_only_the_fit_recordings_show_is_searched_too():
+    """A ripple of 0.25: √(1 + 0.03 / 0.01) = 2 floors where noise is 0.1, √(1 + 0.03 / 0.09) = 1.16 where it is 0.3."""
+    fit, validation = [record(0, Ripple(strength=0.25))], [record(1, Ripple(strength=0.25), noise=0.3)]
+    found = diagnose(MadeProblem(Ripple, Square), fit, validation)
+    assert found.errors["fitted"]["fit"] == pytest.approx(2.0, abs=0.1)
+    assert found.errors["fitted"]["validation"] < 1.25
+    assert found.names == ("ripple",)

@@ -21,6 +21,7 @@ from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
 from taccorl.sim.twin import TwinConfig
 
 CONFIG = TwinConfig()
+FEW = ("taxel_saturation", "touch_lag", "baseline_drift", "taxel_gain_map")  # all of them with make test-slow
 PLACES = ((0.001, 0.003), (-0.004, -0.012))
 GAINS = np.exp(0.25 * np.random.default_rng(5).standard_normal((2, 32, 12)))
 GAINS[0, 16, 6] = GAINS[1, 17, 5] = 0.0
@@ -91,7 +92,7 @@ def problem(name: str, num: int = 2) -> tuple[TouchProblem, list]:
     return made, [made.recording(motion) for motion in motions]
 
 
-@pytest.mark.parametrize("name", list(PLANTED))
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in FEW else pytest.mark.slow) for n in PLANTED])
 def test_the_planted_effect_explains_most_at_first_sight(name: str) -> None:
     """Of all candidates the probe of the true one takes up most of what is left, or is among the first three."""
     made, recordings = problem(name, 1)

@@ -115,6 +115,7 @@ def kill_and_resume(recordings: Path, tmp_path: Path, num_kills: int, seed: int)
         ingests.close()
 
 
+@pytest.mark.slow
 def test_three_kills_then_the_same_dataset(recordings: Path, tmp_path: Path) -> None:
     kill_and_resume(recordings, tmp_path, num_kills=3, seed=0)
 

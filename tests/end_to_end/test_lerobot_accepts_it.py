@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 BIN = Path(sys.executable).parent
 OFFLINE = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONWARNINGS": "ignore"}
@@ -61,6 +62,7 @@ def test_lerobot_doctor_finds_nothing_to_fail(dataset: Path) -> None:
     assert summary["PASS"] >= 8
 
 
+@pytest.mark.slow
 def test_lerobot_dataset_viz_writes_a_recording(dataset: Path, tmp_path: Path) -> None:
     done = run(
         "lerobot-dataset-viz", "--repo-id=local/demo", f"--root={dataset}", "--episode-index=0",
@@ -70,6 +72,7 @@ def test_lerobot_dataset_viz_writes_a_recording(dataset: Path, tmp_path: Path) -
     assert sum(p.stat().st_size for p in tmp_path.rglob("*.rrd")) > 100_000
 
 
+@pytest.mark.slow
 def test_lerobot_trains_act_on_it_for_two_steps(dataset: Path, tmp_path: Path) -> None:
     done = run(
         "lerobot-train", "--policy.type=act", "--policy.push_to_hub=false", "--policy.device=cpu",

@@ -28,6 +28,7 @@ def run(*words: str) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_act_trains_on_a_collected_dataset_and_is_scored_in_the_twin(tmp_path):
     dataset, trained, scored = tmp_path / "dataset", tmp_path / "trained", tmp_path / "scored"

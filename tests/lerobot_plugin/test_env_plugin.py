@@ -76,7 +76,7 @@ def test_synchronous_environments_reach_the_policy_under_the_names_of_the_datase
     envs.close()
 
 
-@pytest.mark.parametrize("in_processes", [False, True])
+@pytest.mark.parametrize("in_processes", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_lerobots_own_rollout_runs(in_processes: bool) -> None:
     """The loop of ``lerobot-eval``, with a policy that stays where it is."""
     import torch

@@ -9,6 +9,8 @@ import threading
 import time
 from pathlib import Path
 
+import pytest
+
 from taccorl.lineage.explain import trace
 from taccorl.lineage.store import Store
 
@@ -37,6 +39,7 @@ def go(process: subprocess.Popen) -> None:
     process.stdin.flush()
 
 
+@pytest.mark.slow
 def test_sigkill_at_20_random_moments_never_leaves_a_half_artefact_and_a_rerun_gives_the_same_digest(tmp_path):
     rng = random.Random(0)
     raw, start_s = make_raw(tmp_path / "raw"), time.perf_counter()

@@ -9,6 +9,7 @@ from nbclient import NotebookClient
 FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # each cell has 240 s
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem)
 def test_notebook_runs_and_every_plot_appears(path):

@@ -90,6 +90,7 @@ def test_a_viewer_without_data_does_not_pass(episode: Episode, tmp_path: Path):
         assert_every_view_shows_its_things(tmp_path / "empty.png", episode)
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 @needs_browser
 def test_a_browser_draws_every_view(episode: Episode, tmp_path: Path):

@@ -113,11 +113,14 @@ class AddedEffects:
             picture[inside] = np.clip(np.round(values), 0, 255)
         return pictures
 
-    def reset(self, ids: np.ndarray, targets: np.ndarray) -> None:
-        """Forget what ``ids`` have been through; of the ``targets`` (N, 14) theirs have stood for ever."""
-        for memory, start in zip(self._memory, self._start, strict=True):
+    def reset(self, ids: np.ndarray, targets: np.ndarray, seeds: np.ndarray | None = None) -> None:
+        """Forget what ``ids`` have been through; of the ``targets`` (N, 14) theirs have stood for ever. ``seeds`` (n,) of their
+        episodes, 0 by default."""
+        seeds = np.zeros(len(ids), dtype=np.int64) if seeds is None else seeds
+        for effect, memory, start in zip(self.present, self._memory, self._start, strict=True):
             for name, values in memory.items():
                 values[ids] = start[name][ids]
+            effect.begin(memory, ids, seeds)
         self.command(targets, np.zeros(len(targets)))
         self._scanned_s[ids] = self._time_s[ids]
         if self.past:

@@ -39,6 +39,7 @@ class Armature(JointEffect):
         low=0.0,
         high=1.0,
         typical=0.05,
+        over="kp",
         source="a choice; 0.007–0.020 on a Unitree Go2, research/discrepancy.md §4.6",
     )
 

@@ -41,6 +41,7 @@ class AsymmetricFriction(JointEffect):
         low=0.0,
         high=20.0,
         typical=0.4,
+        over="kp",
         source="as coulomb_friction",
     )
     asymmetry: float = parameter(

@@ -29,6 +29,10 @@ class CableSpring(JointEffect):
         "gravity_mismatch": (
             "Over a small range both are a slope in the angle; turn the base, which weight does not load."
         ),
+        "end_stop": (
+            "A soft stop is a spring that begins at an angle: sweep slowly over the whole range, the slope of the error must "
+            "have a kink."
+        ),
         "kp": "At one gain the spring only makes the loop softer by k / K_p; twice the gain halves that.",
         "torque_ff": "With k small, k q₀ is a constant torque; the slope about it needs a wide range.",
     }
@@ -39,6 +43,7 @@ class CableSpring(JointEffect):
         low=0.0,
         high=50.0,
         typical=1.0,
+        over="kp",
         source="a choice",
     )
     rest_rad: float = parameter(

@@ -43,6 +43,7 @@ class Cogging(JointEffect):
         low=0.0,
         high=5.0,
         typical=0.3,
+        over="kp",
         source="a choice: as much as friction",
     )
     periods: float = parameter(

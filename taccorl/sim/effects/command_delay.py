@@ -41,6 +41,9 @@ class CommandDelay(JointEffect):
             " clock tell which it is."
         ),
         "velocity_feedforward": "It takes K_d / K_p off the lag as a delay adds to it; steps and 2× gain tell.",
+        "dropped_commands": (
+            "On average commands are older by p / (1 − p) periods; a delay repeats, drops do not: record twice."
+        ),
         "joint_compliance": "A small phase in either; a delay leaves no resonance: small, fast chirp.",
     }
     possible: ClassVar = (*JOINTS, "gripper")

@@ -34,6 +34,9 @@ class CoulombFriction(JointEffect):
             "From angles alone Coulomb's friction and a constant torque are identical to it: pick either; efforts can tell."
         ),
         "load_friction": "Alike while the load is the same; move slowly where the arm reaches out and where it hangs.",
+        "position_dependent_friction": (
+            "Over a range that is small against the spot both are alike; sweep slowly over the whole range."
+        ),
         "stribeck_friction": "Alike but at the slowest; hold, then creep at 0.01 rad/s.",
         "error_deadband": (
             "Both stop short of the target; a dead band gives way to a push, friction holds: efforts, or twice the "
@@ -47,6 +50,7 @@ class CoulombFriction(JointEffect):
         low=0.0,
         high=20.0,
         typical=0.4,
+        over="kp",
         source="0.2–0.8 N·m on a Unitree Go2, research/discrepancy.md §4.6; 0.3 in Menagerie’s PiPER",
     )
 

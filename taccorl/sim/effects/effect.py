@@ -65,6 +65,9 @@ class Parameter:
     typical: float
     """Of a robot like this one: where a search starts."""
     source: str
+    over: Literal["", "kp"] = ""
+    """``kp``: a torque, stiffness, damping, inertia or mass. Positions alone identify only (value − absent) / K_p of it
+    (``taccorl.diagnosis.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""
 
 
 def parameter(
@@ -76,10 +79,13 @@ def parameter(
     typical: float,
     absent: float | None,
     source: str,
+    over: Literal["", "kp"] = "",
 ) -> float:
     """A dataclass field that holds a ``Parameter``; its default is the absent value, or else the typical one."""
     meta = {"unit": unit, "symbol": symbol, "absent": absent, "low": low, "high": high, "typical": typical}
-    return field(default=typical if absent is None else absent, metadata={"parameter": meta | {"source": source}})
+    return field(
+        default=typical if absent is None else absent, metadata={"parameter": meta | {"source": source, "over": over}}
+    )
 
 
 @dataclass(kw_only=True)
@@ -100,6 +106,11 @@ class Effect:
     """Name of another effect, or of a number that is always fitted (kp, kd, torque_ff, k_n, k_d) → why measurements can hardly
     tell them apart, and which recording can."""
 
+    reduces_to: ClassVar[dict[str, str]] = {}
+    """Name of a simpler effect → own parameter at whose lower bound this effect equals it. The search prefers the simpler one."""
+    fitted: ClassVar[bool] = True
+    """Whether a search may fit it. False for what does not repeat from one recording to the next: least squares cannot find its
+    numbers, so it is no candidate, and a twin that has it keeps it as it is."""
     rewrites: ClassVar[tuple[str, ...]] = ()
     """Fields of ``mujoco.MjModel``, or ``qfrc_applied`` of ``mujoco.MjData``, that ``rewrite`` changes."""
 
@@ -158,7 +169,7 @@ class Effect:
         Args:
             seen: facts of the recordings that the parameters may hang on. Of joints: ``peak_torque_nm`` that the twin's
                 controller asks for, ``peak_motor_nm`` with the weight that is carried, ``peak_speed_rad_per_s`` of the targets,
-                ``span_rad``, ``duration_s``.
+                ``span_rad`` of the targets, ``lowest_rad`` and ``highest_rad`` that were measured, ``duration_s``.
         """
         strength = next((p for p in cls.parameters() if p.absent is not None), None)
         if strength is None:
@@ -197,6 +208,10 @@ class Effect:
     def memory(self, num_sims: int) -> Memory:
         """Arrays (N, …) as they are after a reset, before ``command`` is told the targets at rest."""
         return {}
+
+    def begin(self, memory: Memory, ids: np.ndarray, seeds: np.ndarray) -> None:
+        """An episode of simulations ``ids`` begins, their memory is as ``memory`` gave it: for what is random, ``seeds`` (n,) of
+        the episodes. Recordings that are simulated for a diagnosis have the seed 0."""
 
     def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
         """What arrives at the controllers of the targets (N, 14) that are now sent.

@@ -44,6 +44,7 @@ class GravityMismatch(ArmEffect):
         low=0.0,
         high=2.0,
         typical=0.9,
+        over="kp",
         source="the two published mass sets of this arm: 3.6 and 2.2 kg moving (taccorl/sim/robot.py)",
     )
 

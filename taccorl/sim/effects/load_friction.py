@@ -38,6 +38,9 @@ class LoadFriction(JointEffect):
         "coulomb_friction": (
             "Alike while the load is the same; move slowly where the arm reaches out and where it hangs."
         ),
+        "position_dependent_friction": (
+            "Where weight grows with the angle both follow it; repeat the slow sweep with a payload, which moves the load only."
+        ),
     }
     rewrites: ClassVar = ("dof_frictionloss",)
     share: float = parameter(

@@ -42,6 +42,7 @@ class Payload(ArmEffect):
         low=0.0,
         high=1.5,
         typical=0.2,
+        over="kp",
         source="a choice; the rated payload is 1.5 kg (PiPER manual)",
     )
     x_link6_m: float = parameter(

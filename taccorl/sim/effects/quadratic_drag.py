@@ -40,6 +40,7 @@ class QuadraticDrag(JointEffect):
         low=0.0,
         high=50.0,
         typical=2.0,
+        over="kp",
         source="a choice: 0.3 N·m at 0.4 rad/s",
     )
 

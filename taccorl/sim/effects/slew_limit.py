@@ -29,6 +29,7 @@ class SlewLimit(JointEffect):
     to_record: ClassVar = "A chirp or steps that are faster than the limit, and the same at half the amplitude."
     near_twins: ClassVar = {
         "command_lag": "Both round corners; a lag does so at any size: the same motion at half the amplitude.",
+        "torque_speed_limit": "Both cut fast motion; a torque-speed limit moves with the load: repeat with a payload.",
         "torque_saturation": "Both cut fast, large motion; a torque limit moves with the load: repeat with a payload.",
     }
     speed_rad_per_s: float = parameter(

@@ -37,6 +37,7 @@ class StribeckFriction(JointEffect):
     near_twins: ClassVar = {
         "coulomb_friction": "Alike but at the slowest; hold, then creep at 0.01 rad/s.",
     }
+    reduces_to: ClassVar = {"coulomb_friction": "stiction_share"}
     torque_nm: float = parameter(
         unit="N·m",
         symbol="F",
@@ -44,6 +45,7 @@ class StribeckFriction(JointEffect):
         low=0.0,
         high=20.0,
         typical=0.3,
+        over="kp",
         source="as coulomb_friction",
     )
     stiction_share: float = parameter(

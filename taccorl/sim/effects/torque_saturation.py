@@ -33,6 +33,9 @@ class TorqueSaturation(JointEffect):
         "torque_scale": (
             "At the peaks both give less; a limit leaves small motion alone: the same chirp at half the amplitude."
         ),
+        "torque_speed_limit": (
+            "At one speed both are a limit of the torque; large steps from rest and fast sweeps together tell them apart."
+        ),
         "slew_limit": "Both cut fast, large motion; a torque limit moves with the load: repeat with a payload.",
     }
     torque_max_nm: float = parameter(
@@ -42,6 +45,7 @@ class TorqueSaturation(JointEffect):
         low=0.05,
         high=200.0,
         typical=8.0,
+        over="kp",
         source="torque range of the MIT mode, ±8 N·m by default (research/mujoco.md §2)",
     )
 

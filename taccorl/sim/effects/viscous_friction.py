@@ -39,6 +39,7 @@ class ViscousFriction(JointEffect):
         low=0.0,
         high=50.0,
         typical=1.0,
+        over="kp",
         source="a choice; 0.15 on a Unitree Go2, research/discrepancy.md §4.6",
     )
 

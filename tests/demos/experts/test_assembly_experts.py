@@ -95,6 +95,7 @@ def test_the_subtasks_end_in_order_and_the_last_two_together(human, name):
     assert path == sorted(path, key=sum)  # none begins again
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_exact_hands_need_no_correction(sims, name):
     told = episode(sims[name], 3, EXACT)

@@ -77,6 +77,7 @@ def test_home_is_a_fifth_of_a_radian_from_the_joint_limits():
         assert np.minimum(home - low, high - home).min() > 0.2
 
 
+@pytest.mark.slow
 def test_exact_hands_need_no_correction(sim):
     episode = Episode(sim, 0, EXACT)
     assert episode.outcome.success[0]
@@ -102,6 +103,7 @@ def test_human_hands_feel_the_rim_and_one_is_at_the_tray_at_a_time(sim):
     assert np.linalg.norm(hands[:, 0] - hands[:, 1], axis=1).min() > 0.09
 
 
+@pytest.mark.slow
 def test_a_piece_that_rests_on_the_rim_is_picked_up_again_before_it_is_lost(sim, monkeypatch):
     monkeypatch.setattr(puzzle, "_LONGEST_S", 1.0)  # no patience: it lets go on the rim
     episodes = [Episode(sim, seed) for seed in (0, 1, 7)]

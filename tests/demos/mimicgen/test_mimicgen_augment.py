@@ -65,6 +65,7 @@ def test_the_dataset_holds_successes_that_say_what_they_are_made_of(augmented, c
     assert len(read_sources(folder / "new", load_mimic_spec("assembly_2"))) == 2
 
 
+@pytest.mark.slow
 def test_another_spec_never_mixes_with_what_the_store_holds(augmented, collected, tmp_path):
     folder, _ = augmented
     before = sorted((folder / "store" / "mimicgen").iterdir())
@@ -123,6 +124,7 @@ def deadly_attempt(some, sources, store, k):
     return run_attempt(some, sources, store, k)
 
 
+@pytest.mark.slow
 def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again(
     augmented, collected, tmp_path, monkeypatch
 ):

@@ -16,6 +16,8 @@ from taccorl.diagnosis.surrogate.recordings import recordings
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
 
+FEW = ("coulomb_friction", "command_delay", "backlash", "payload")  # of the registry: all of them with make test-slow
+
 
 def errors_floors(
     case: Case, measurements: tuple[Measurement, ...], gains: Gains, floor: float, hidden=()
@@ -42,7 +44,7 @@ def refitted(case: Case, measurements, floor: float, hidden=()) -> Gains:
     return gains(found.x)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_without_hidden_effects_the_twin_with_the_true_gains_is_at_the_noise_floor(seed):
     case = draw_case([], seed, design="chirp")
     made = recordings(case)
@@ -107,7 +109,7 @@ def test_viscous_friction_cannot_be_seen_at_one_gain():
     assert draw_case(["viscous_friction"], 3, design="pack", strength=4.0).left_floors == pytest.approx(4.0, rel=0.25)
 
 
-@pytest.mark.parametrize("name", REGISTERED)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in FEW else pytest.mark.slow) for n in REGISTERED])
 def test_the_truth_can_be_written_as_the_registrys_effect(name):
     [hidden] = draw_case([name], 2, design="chirp").hidden
     effect = hidden.effect()

@@ -9,6 +9,7 @@ import pytest
 
 from taccorl.alignment.measurements import read_measurements
 from taccorl.cli.main import main
+from taccorl.diagnosis.surrogate import recordings as module
 from taccorl.diagnosis.surrogate.cases import draw_case
 from taccorl.diagnosis.surrogate.recordings import recordings
 from taccorl.diagnosis.surrogate.writing import SWEEPS, TRUTH, TWIN, reveal, write_recordings
@@ -24,6 +25,15 @@ def _note(event: str, args: tuple) -> None:
 
 
 sys.addaudithook(_note)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_motions():
+    """Four recordings instead of eight: which motions there are is tested in test_recordings.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("VALIDATION", "TEST"):
+            patch.setattr(module, name, getattr(module, name)[:1])
+        yield
 
 
 @pytest.fixture(scope="module")

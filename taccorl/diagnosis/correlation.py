@@ -1,0 +1,109 @@
+"""Correlation of residuals along time: how many rows are independent, and blocks of time that may be taken as independent.
+
+Channels of one row (taxels of a pad, angle and effort of a joint) are no neighbours in time: correlation is computed along time,
+channel by channel, within one recording.
+
+Letters in shapes: T rows, C channels of one recording, n measured entries of all recordings.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+
+BLOCK_S = 0.5
+"""Length of a block. Residuals within one are correlated, as a misfit lasts as long as a motion; blocks count as independent."""
+SMALL = 0.05
+"""Autocorrelation below which later lags are taken as noise of the estimate."""
+FEWEST = 10.0
+"""Independent rows that are assumed at least."""
+
+
+class Rows(NamedTuple):
+    """Which entries of one recording are in a stacked vector of residuals."""
+
+    measured: np.ndarray
+    """(T, C) bool."""
+    rate_hz: float
+
+
+def rate_of(time_s: np.ndarray) -> float:
+    """Mean rate [Hz] of the rows at ``time_s`` (T,)."""
+    return (len(time_s) - 1) / float(time_s[-1] - time_s[0])
+
+
+def block_of_rows(num_rows: int, rate_hz: float) -> np.ndarray:
+    """(T,) number of the block of ``BLOCK_S`` that each row of a recording belongs to.
+
+    A rest at the end that is shorter than half a block joins the block before it: a block of one row would weigh as much as a
+    whole one.
+    """
+    length = max(1, round(BLOCK_S * rate_hz))
+    block = np.arange(num_rows) // length
+    last = int(block[-1]) if num_rows else 0
+    if last > 0 and 2 * (num_rows - last * length) < length:
+        block[last * length :] = last - 1
+    return block
+
+
+def unstacked(values: np.ndarray, layout: Sequence[Rows]) -> Iterator[np.ndarray]:
+    """(T, C) of each recording from the stacked ``values`` (n,); NaN where nothing was measured."""
+    at = 0
+    for rows in layout:
+        count = int(rows.measured.sum())
+        part = np.full(rows.measured.shape, np.nan)
+        part[rows.measured] = values[at : at + count]
+        at += count
+        yield part
+
+
+def block_sums(values: np.ndarray, layout: Sequence[Rows]) -> np.ndarray:
+    """(B, …) sums of the stacked ``values`` (n, …) over every block of every recording, all channels together."""
+    first, number = 0, []
+    for rows in layout:
+        block = block_of_rows(len(rows.measured), rows.rate_hz)
+        number.append(first + np.broadcast_to(block[:, None], rows.measured.shape)[rows.measured])
+        first += int(block[-1]) + 1
+    where = np.concatenate(number)
+    starts = np.flatnonzero(np.diff(where, prepend=-1))  # entries of a block stand together: rows are in order of time
+    return np.add.reduceat(values, starts, axis=0)
+
+
+def independent_rows(parts: Sequence[np.ndarray]) -> float:
+    """Number of independent entries among those of ``parts``: Σ n / (1 + 2 Σ_k ρ_k), the sum over recordings and channels.
+
+    ρ_k is the autocorrelation of one channel of one recording at a lag of k rows, up to the first lag at which it is below
+    ``SMALL``; n counts its measured rows (effective sample size, e.g. Sokal 1997, §3).
+
+    Args:
+        parts: (T, C) residuals of each recording; NaN where nothing was measured.
+
+    Returns:
+        At least ``FEWEST``, or the number of entries where there are fewer than 20.
+    """
+    total = sum(int(np.isfinite(part).sum()) for part in parts)
+    if total < 20:
+        return float(max(total, 1))
+    return max(FEWEST, sum(_independent(part) for part in parts))
+
+
+def _independent(part: np.ndarray) -> float:
+    measured = np.isfinite(part)
+    seen = measured.any(axis=1)
+    if not seen.any():
+        return 0.0
+    rows = np.flatnonzero(seen)
+    part, measured = part[rows[0] : rows[-1] + 1], measured[rows[0] : rows[-1] + 1]
+    count = measured.sum(axis=0)
+    filled = np.where(measured, part, 0.0)
+    filled = np.where(measured, filled - filled.sum(axis=0) / np.maximum(count, 1), 0.0)
+    length = next_fast_len(2 * len(part), real=True)
+    spectrum = rfft(filled, length, axis=0)
+    correlation = np.asarray(irfft(spectrum.real**2 + spectrum.imag**2, length, axis=0))[: max(len(part) // 2, 1)]
+    power = correlation[0]
+    varies = power > 1e-20 * np.maximum((np.where(measured, part, 0.0) ** 2).sum(axis=0), 1e-300)
+    correlation = correlation[:, varies] / power[varies]
+    alike = np.logical_and.accumulate(correlation[1:] >= SMALL, axis=0)
+    implied = 1.0 + 2.0 * (correlation[1:] * alike).sum(axis=0)
+    return float((count[varies] / implied).sum() + count[~varies].sum())

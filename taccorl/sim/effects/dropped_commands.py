@@ -1,0 +1,98 @@
+"""Dropped commands: now and then a command is lost, and the drive keeps the one before it."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import CHANNELS, JointEffect, Memory, parameter
+from taccorl.sim.robot import JOINTS
+
+STRIDE, _FIRST, _SECOND = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+"""SplitMix64's constants: between two numbers of a stream, and of its finaliser."""
+_WORD = 0xFFFFFFFF
+
+
+@effects.register("dropped_commands")
+@dataclass(kw_only=True)
+class DroppedCommands(JointEffect):
+    """r_k = q*_k with probability 1 − p, else r_{k−1}; the controller works on r.
+
+    Each command that is sent is lost or arrives by itself, and with it those of all chosen joints: they travel in one message.
+    Which ones are lost follows from ``seed``, the episode's seed and k, the number of commands since the reset; a greater p loses
+    more commands besides those of a smaller one. It comes after ``command_lag`` and before ``slew_limit``,
+    ``velocity_feedforward`` and ``command_delay``. SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) makes the numbers: the compiled
+    one-joint model draws the same ones.
+
+    No search fits it: two recordings of one motion lose different commands, so no p makes the simulation repeat the measurement.
+    """
+
+    name: ClassVar = "dropped_commands"
+    equation: ClassVar = "r_k = q*_k with probability 1 − p, else r_{k−1}; τ = K_p (r − q) − K_d q̇ + T_ref"
+    in_words: ClassVar = (
+        "A busy bus or computer loses a command now and then; the drive keeps the one before until the next arrives."
+    )
+    at_a_policy: ClassVar = "Motion stutters, the more the faster it is, and differently each time."
+    to_record: ClassVar = "The same fast chirp at least twice: what differs between them does not repeat."
+    near_twins: ClassVar = {
+        "command_delay": "On average commands are older by p / (1 − p) periods; a delay repeats, drops do not: record twice.",
+    }
+    fitted: ClassVar = False
+    possible: ClassVar = (*JOINTS, "gripper")
+    probability: float = parameter(
+        unit="1",
+        symbol="p",
+        absent=0.0,
+        low=0.0,
+        high=0.95,
+        typical=0.1,
+        source="a choice; one in ten shows in a second of motion",
+    )
+    seed: int = 0
+    """Of the bus: another one loses other commands."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed <= _WORD:
+            raise TaccorlError(f"effect {self.name}: seed is {self.seed!r}; give a whole number in 0 … {_WORD}")
+
+    def drive(self) -> dict[str, float]:
+        return {"drop_probability": self.probability, "drop_seed": float(self.seed)}
+
+    def memory(self, num_sims: int) -> Memory:
+        return {
+            "target": np.full((num_sims, len(CHANNELS)), np.nan),
+            "count": np.zeros(num_sims),
+            "episode": np.zeros(num_sims),
+        }
+
+    def begin(self, memory: Memory, ids: np.ndarray, seeds: np.ndarray) -> None:
+        seeds = np.asarray(seeds, dtype=np.uint64)
+        memory["episode"][ids] = (seeds ^ (seeds >> np.uint64(32))) & np.uint64(_WORD)
+
+    def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+        held, sent = memory["target"], dt_s > 0
+        lost = uniform(self.seed, memory["episode"], memory["count"]) < self.probability
+        keeps = np.where(sent, lost, True)[:, None] & ~np.isnan(held)
+        held[:] = np.where(keeps, held, targets)
+        memory["count"] += sent
+        targets = targets.copy()
+        targets[:, self.columns] = held[:, self.columns]
+        return targets
+
+
+def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """(…) in [0, 1) for each bus, episode and command, all whole numbers below 2³²: the same ones on every machine."""
+    # Arrays of at least one number: they wrap around, scalars warn.
+    key = (np.atleast_1d(seed).astype(np.uint64) << np.uint64(32)) + np.asarray(episode, dtype=np.uint64)
+    bits = mixed(mixed(key) + (np.asarray(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(STRIDE))
+    return (bits >> np.uint64(11)) * 2.0**-53
+
+
+def mixed(bits: Any) -> Any:
+    """(…) uint64: SplitMix64's finaliser, of arrays here and of numbers where ``joint_kernel`` compiles it."""
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(_FIRST)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(_SECOND)
+    return bits ^ (bits >> np.uint64(31))
