@@ -23,7 +23,7 @@ from taccorl.diagnosis.study import (
 PAGE = Path("docs/diagnosis.md")
 ORIGIN = ["surrogate robots, simulated; no robot was near"]
 SIGNAL_BINS = (0.1, 0.5, 0.75, 1.1, 1.6, 2.4, 4.0, 8.0, 16.0, 64.0)
-RUN = "pack chirp pairs none outside removed dropped touch touch_none touch_outside"
+RUN = "pack chirp pairs none loop outside removed dropped touch touch_none touch_outside"
 HEAD = f"""# Is the search for missing effects right?
 
 Written by `python -m pipelines.diagnosis_study --page`; do not edit. **Every case is a surrogate robot, simulated; no number
@@ -38,8 +38,9 @@ ms and the torque held between samples; drawn are rates that are stable at 3.2 t
 0.5 noise floors once the gains are refitted (a slower one is an effect of its own: `slow_velocity_filter`, among those that
 are unknown to the search). The encoder's noise is **coloured** (10 to 100 ms) in a quarter. **Packs** have a recording with
 0.3 kg between the pads, a few millimetres off their middle. Where nothing is hidden, a third of the robots hold a **weighed
-mass** of 0.1 to 0.5 kg in every recording, a third have a sampled loop and a third coloured noise. Pads are judged by all
-their taxels, each a channel.
+mass** of 0.1 to 0.5 kg in every recording, a third have a sampled loop and a third coloured noise; efforts are used in half
+of those whose loop is not sampled. With efforts, which fix all torques, a sampled loop is no clean robot: it shows as an
+inertia of −K_d (T + τ) that the twin lacks, and has a row of its own. Pads are judged by all their taxels, each a channel.
 
 *Material*: the validation error, gains refitted, is at least {MATERIAL:g} noise floors; below that there is nothing to find.
 *Exact*: the hidden effect is the one that was added first; of two, both are found. *Named*: it is that, or named with it as a
@@ -91,6 +92,11 @@ def write_page(rows: list[dict]) -> None:
             lines.append(_share("… both found, counted as one", both, exact_but_for_algebra))
             lines.append(_share("… both found to the letter", both, exact))
     lines += _clean([r for r in _of(cases, "none") if r["design"] != "press"], "nothing hidden, joints", 0.98)
+    timing = _of(cases, "loop")
+    lines.append(
+        _share("nothing hidden but a sampled loop that efforts show: no effect added", timing, lambda r: not r["found"])
+    )
+    lines.append(_share("… a remark, or another status than “at the floor”", timing, _worded))
     lines += _clean([r for r in _of(cases, "none") if r["design"] == "press"], "nothing hidden, pads", 0.98)
     lines += _unknown([r for r in _of(cases, "removed") if material(r)])
     lost = _of(cases, "dropped")
@@ -129,6 +135,10 @@ def _of(rows: list[dict], study: str) -> list[dict]:
 
 def _has(row: dict[str, Any], condition: str) -> bool:
     return condition in row.get("conditions", ())
+
+
+def _worded(row: dict[str, Any]) -> bool:
+    return row["status"] != "at_floor" or bool(row["remarks"])
 
 
 def _cpu(rows: list[dict]) -> list[float]:
@@ -192,11 +202,8 @@ def _unknown(rows: list[dict]) -> list[str]:
 
 
 def _intervals(rows: list[dict], what: str, asked: float) -> list[str]:
-    right = [
-        r
-        for r in rows
-        if "failed" not in r and r["numbers"] and set(r["found"]) == set(r["hidden"]) - {"dropped_commands"}
-    ]
+    known = [r for r in rows if "failed" not in r and r["study"] not in ("dropped", "loop", "amplitude")]
+    right = [r for r in known if r["numbers"] and set(r["found"]) == set(r["hidden"])]
     everything = [t for r in right for t in inside(r)]
     hidden = [t for r in right for t in inside(r, hidden_only=True)]
     lines = [_count(f"95 % intervals of identifiable numbers that hold the truth, {what}", everything, asked)]

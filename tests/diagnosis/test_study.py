@@ -16,6 +16,7 @@ from taccorl.diagnosis.study import (
     exact_but_for_algebra,
     failed,
     inside,
+    loop,
     material,
     named,
     nothing,
@@ -138,9 +139,10 @@ def test_every_condition_is_as_frequent_as_it_is_said_to_be():
         return sum(getattr(conditions(job), name) for job in jobs) / len(jobs)
 
     clean = nothing("chirp", range(20000, 20162))
-    assert [share(clean, n) for n in ("loaded", "sampled", "coloured", "effort")] == pytest.approx(
-        [1 / 3] * 3 + [0.5], abs=0.01
-    )
+    shares = [share(clean, n) for n in ("loaded", "sampled", "coloured", "effort")]
+    assert shares == pytest.approx([1 / 3] * 4, abs=0.01)  # efforts: half of the two thirds without a sampled loop
+    assert not any(conditions(j).sampled and conditions(j).effort for j in clean)
+    assert all(conditions(j).sampled and conditions(j).effort for j in loop("chirp", [1, 2]))
     hidden = single("pack", ["cogging", "backlash", "payload"], range(20000, 20016))
     assert [share(hidden, n) for n in ("effort", "sampled", "coloured", "loaded")] == [0.5, 0.5, 0.25, 0.0]
     both = {(conditions(j).effort, conditions(j).sampled) for j in single("chirp", ["cogging"], range(4))}
