@@ -61,6 +61,7 @@ STUDIES: dict[str, Callable[[int, float], Jobs]] = {
         *study.nothing("chirp", _seeds(first, 11 * n)),
         *study.nothing("pack", _seeds(first, 5.5 * n)),
     ],
+    "loop": lambda first, n: study.loop("chirp", _seeds(first + 3500, 2 * n)),
     "outside": lambda first, n: [
         *study.removed("chirp", OUTSIDE, _seeds(first + 2000, n / 2)),
         *study.removed("pack", OUTSIDE, _seeds(first + 2500, n / 2)),

@@ -7,9 +7,16 @@ import pytest
 from taccorl.diagnosis.study import (
     IDENTICAL,
     MATERIAL,
+    Conditions,
     Job,
+    conditions,
+    drop_said,
+    dropped,
     exact,
     exact_but_for_algebra,
+    failed,
+    inside,
+    loop,
     material,
     named,
     nothing,
@@ -19,11 +26,13 @@ from taccorl.diagnosis.study import (
     silently_wrong,
     single,
 )
+from taccorl.diagnosis.surrogate.hidden import KINDS
 from taccorl.sim.effects import effects
 
 
 def row(hidden: tuple[str, ...], found: tuple[str, ...], **fields: Any) -> dict[str, Any]:
     plain = {"status": "at_floor", "ties": {}, "swapped": [], "rivals": {}, "errors": {"fitted": {"validation": 5.0}}}
+    plain |= {"findings": [], "numbers": {}}
     return {"hidden": list(hidden), "found": list(found)} | plain | fields
 
 
@@ -95,6 +104,53 @@ def test_material_is_what_refitted_gains_leave():
     assert material(row((), (), **at)) and not material(row((), (), **below))
 
 
+def test_a_near_twin_of_a_kind_outside_the_registry_is_named_and_another_effect_is_not():
+    assert KINDS["magnetic_hysteresis"].near == ("coulomb_friction", "stribeck_friction")
+    assert named(row(("magnetic_hysteresis",), ("stribeck_friction",)))
+    assert not named(row(("magnetic_hysteresis",), ("cogging",)))
+    assert silently_wrong(row(("magnetic_hysteresis",), ("cogging",)))
+
+
+def test_near_twins_of_kinds_outside_are_joint_effects_or_will_be():
+    for name, k in KINDS.items():
+        if not k.registered:
+            assert set(k.near) <= set(KINDS) - {name}, name
+
+
+def test_lost_commands_are_said_by_a_finding_or_an_effect():
+    assert drop_said(row(("dropped_commands",), (), findings=["does_not_repeat", "dropped_commands"]))
+    assert not drop_said(row(("dropped_commands",), ("backlash",), findings=["does_not_repeat"]))
+
+
+def test_intervals_hold_the_truth_or_do_not():
+    numbers = {"kd/kp": [0.1, 0.09, 0.11, 0.105], "backlash.play_rad": [0.01, 0.009, 0.011, 0.012]}
+    r = row(("backlash",), ("backlash",), numbers=numbers)
+    assert inside(r) == [True, False]
+    assert inside(r, hidden_only=True) == [False]
+
+
+def test_a_failed_case_is_material_so_that_it_counts():
+    r = failed(Job(study="single", hidden=("cogging",), seed=1, design="pack"), "ValueError: no")
+    assert material(r) and r["failed"] == "ValueError: no" and r["key"] == "single pack cogging seed 1"
+
+
+def test_every_condition_is_as_frequent_as_it_is_said_to_be():
+    def share(jobs: list[Job], name: str) -> float:
+        return sum(getattr(conditions(job), name) for job in jobs) / len(jobs)
+
+    clean = nothing("chirp", range(20000, 20162))
+    shares = [share(clean, n) for n in ("loaded", "sampled", "coloured", "effort")]
+    assert shares == pytest.approx([1 / 3] * 4, abs=0.01)  # efforts: half of the two thirds without a sampled loop
+    assert not any(conditions(j).sampled and conditions(j).effort for j in clean)
+    assert all(conditions(j).sampled and conditions(j).effort for j in loop("chirp", [1, 2]))
+    hidden = single("pack", ["cogging", "backlash", "payload"], range(20000, 20016))
+    assert [share(hidden, n) for n in ("effort", "sampled", "coloured", "loaded")] == [0.5, 0.5, 0.25, 0.0]
+    both = {(conditions(j).effort, conditions(j).sampled) for j in single("chirp", ["cogging"], range(4))}
+    assert len(both) == 4  # every combination within four seeds
+    assert conditions(clean[5]) == conditions(nothing("pack", [20005])[0])
+    assert isinstance(conditions(clean[0]), Conditions)
+
+
 def test_keys_tell_jobs_apart_and_are_the_same_for_the_same_job():
     assert Job(study="single", hidden=("cogging",), seed=3, design="pack").key == "single pack cogging seed 3"
     strong = Job(study="single", hidden=("cogging",), seed=3, design="pack", strength=2.0)
@@ -106,8 +162,9 @@ def test_keys_tell_jobs_apart_and_are_the_same_for_the_same_job():
         *nothing("chirp", [0, 1]),
         *removed("chirp", ["cogging"], [0, 1]),
         *pairs("chirp", couples, [0, 1]),
+        *dropped("chirp", [0, 1]),
     ]
-    assert len({job.key for job in jobs}) == len(jobs) == 16
+    assert len({job.key for job in jobs}) == len(jobs) == 18
     assert {job.key for job in nothing("chirp", [0])} == {"none chirp none seed 0"}
 
 

@@ -123,8 +123,9 @@ class Case:
         }
 
     def values(self) -> dict[str, float]:
-        """``kp``, ``kd``, ``torque_ff``, ``coulomb_friction.torque_nm`` → the true number."""
-        numbers = dict(zip(("kp", "kd", "torque_ff"), self.gains, strict=True))
+        """``kp``, ``kd``, ``coulomb_friction.torque_nm`` → the true number. K_d as it is set in the drive:
+        more than a continuous controller's, by what the loop's timing takes of it."""
+        numbers = {"kp": self.gains[0], "kd": self.robot.drive.kd, "torque_ff": self.gains[2]}
         return numbers | {f"{h.name}.{name}": value for h in self.hidden for name, value in h.values.items()}
 
     def ratios(self) -> dict[str, float]:
