@@ -5,9 +5,10 @@
     residue       RMS about a Savitzky–Golay smooth that lets the motion through untouched, / √(1 − h₀)
     quantisation  q / √12, q the encoder's step
 
-Repeats are used where there are any: only they see what the robot itself does not repeat. Else the surer one of rest and residue
-(the other one if it lies clearly above), which is then a lower bound. The floor is never below the quantisation, and never 0.
-All estimates are reported.
+Repeats are used where there are any: only they see what the robot itself does not repeat. Where few blocks hold most of their
+difference (bursts), their median is taken, so that the floor does not contain the bursts. Without repeats the surer one of rest
+and residue (the other one if it lies clearly above), which is then a lower bound. The floor is never below the
+quantisation, and never 0. All estimates are reported.
 
 Letters in shapes: T rows, J signals, B blocks of rows, K taxels.
 """
@@ -49,6 +50,9 @@ OTHER_START = 5.0
 """Two recordings of one motion that differ by so many times what they usually do began at different places."""
 MOVING = 1e-3
 """rad, m: a command that stays within this is no motion whose bandwidth could matter."""
+BURST_POWER, BURST_SHARE, BURST_RATIO = 0.8, 0.25, 3.0
+"""Repeats differ in bursts where less than such a share of the blocks holds so much of the squared difference, and the RMS of all
+is so many times that of the usual block."""
 NUMBER = 2.0**-24
 """Last bit of a 32-bit number of size 1: no floor is smaller than that of the numbers."""
 
@@ -64,6 +68,8 @@ class Estimate:
     """95 % interval."""
     n: int
     """Samples it rests on."""
+    without_bursts: bool = False
+    """Of repeats: the median of the blocks, since few of them hold most of the difference."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,8 @@ class SignalFloor:
         factor, prefix = (1e3, "m") if self.kind != "effort" else (1.0, "")
         a, b, c = (f"{x * factor:.3g}" for x in (self.used.value, self.used.low, self.used.high))
         bound = "; a lower bound: record the motion twice" if self.lower_bound else ""
-        return f"{a} {prefix}{self.unit} ({b} … {c}, from {self.used.method}, n = {self.used.n}{bound})"
+        bursts = ", bursts left out" if self.used.without_bursts else ""
+        return f"{a} {prefix}{self.unit} ({b} … {c}, from {self.used.method}{bursts}, n = {self.used.n}{bound})"
 
 
 def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") -> dict[str, SignalFloor]:
@@ -303,13 +310,23 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int) -> list[E
         if len(own) == 0:
             found.append(None)
             continue
-        # Repeats in the mean: what happens once in a motion belongs to it. The others in the median: a stretch that
+        # Repeats in the mean (unless in bursts): what happens once belongs to it. The others in the median: a stretch that
         # still creeps, or a kink that the smooth cuts, is not noise.
-        square = float(own.mean()) if method == "repeats" else float(_median(own[:, None], freedom)[0])
-        spread = _log_spread(own, freedom, robust=method != "repeats")
+        bursts = method == "repeats" and _in_bursts(own, freedom)
+        robust = method != "repeats" or bursts
+        square = float(_median(own[:, None], freedom)[0]) if robust else float(own.mean())
+        spread = _log_spread(own, freedom, robust=robust)
         value = math.sqrt(square)
-        found.append(Estimate(method, value, value / spread, value * spread, len(own) * rows))
+        found.append(Estimate(method, value, value / spread, value * spread, len(own) * rows, bursts))
     return found
+
+
+def _in_bursts(squares: np.ndarray, freedom: float) -> bool:
+    """True if few of the blocks (B,) hold most of the squared difference."""
+    ordered = np.sort(squares)[::-1]
+    few = math.ceil(BURST_SHARE * len(ordered))
+    usual = float(_median(squares[:, None], freedom)[0])
+    return bool(ordered[:few].sum() > BURST_POWER * ordered.sum() and ordered.mean() > BURST_RATIO**2 * usual)
 
 
 def _median(squares: np.ndarray, freedom: float) -> np.ndarray:

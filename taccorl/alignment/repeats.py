@@ -29,6 +29,8 @@ class Overlay:
     """Time in the second recording − time in the first, at the same command."""
     difference: dict[str, np.ndarray]
     """position, velocity, effort → (M, J) second − first while the motion lasts."""
+    time_s: np.ndarray
+    """(M,) time in the first recording."""
     target_rms: float
     """What is left between the commands (rad, m)."""
     noise_gain: float
@@ -78,7 +80,9 @@ def overlay(first: Measurement, second: Measurement) -> Overlay:
         )
     }
     zero_s = first.time_s[0] - second.time_s[0]
-    return Overlay((lag + share) / rate_hz - zero_s, difference, rms, 1.0 + float((weights**2).sum()))
+    return Overlay(
+        (lag + share) / rate_hz - zero_s, difference, a.time_s[rows][moving], rms, 1.0 + float((weights**2).sum())
+    )
 
 
 def repeats(first: Measurement, second: Measurement) -> bool:

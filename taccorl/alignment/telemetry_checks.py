@@ -3,7 +3,7 @@
     error    time_backwards, time_unit, not_finite, lost_samples, too_short, no_motion, dead_channel, frozen_channel,
              saturated_channel, unit, reversed, swapped_joints, swapped_arms, measured_before_command
     warning  dropped_rows, jitter, low_rate, row_times, out_of_order, not_at_rest, start_offset, blocked, short, dead_effort,
-             velocity_unit, no_baseline
+             velocity_unit, no_baseline, dropped_commands, does_not_repeat
     note     late_answer, effort_limit, not_judged, same_motion
 
 Every finding names joint, value and place, and what to record or change. The parts are here (values, motion, start), in
@@ -22,6 +22,7 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.noise_floor import noise_floor
 from taccorl.alignment.repeats import repeats
 from taccorl.alignment.time_checks import check_time
+from taccorl.alignment.unrepeated import check_repeatability
 from taccorl.alignment.wiring_checks import check_wiring
 from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
@@ -87,6 +88,9 @@ def check_measurements(measurements: Sequence[Measurement], joints: Sequence[str
                 "from both"
             )
             found[b.name].append(Finding("same_motion", "note", "", text))
+    sound = [m for m in measurements if not _broken(found[m.name])]
+    for name, findings in (check_repeatability(sound) if sound else {}).items():
+        found[name] += findings
     return found
 
 
