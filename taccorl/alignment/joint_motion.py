@@ -76,7 +76,8 @@ def joint_motion(measurement: Measurement, config: TwinConfig | None, signal: st
         row = int(np.argmax(np.abs(gaps - m.period_s)))
         raise TaccorlError(
             f"{m.name}: time is not even, {gaps[row] * 1e3:.1f} ms at {m.time_s[row]:.3f} s where {m.period_s * 1e3:.1f} ms "
-            "are usual; bring it to an even rate first (Measurement.resampled)"
+            "are usual. Tables with less jitter than half a row and gaps below 0.25 s are brought to an even rate when they are "
+            "read; this has more: log the driver's or the bus's own stamps, or cut the recording at the gap"
         )
     start = _start(m, j)
     if config is None:

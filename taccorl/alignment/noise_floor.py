@@ -214,7 +214,8 @@ def _repeat_blocks(first: Measurement, second: Measurement, kind: Kind) -> _Bloc
 def _without_beginning(squares: np.ndarray) -> np.ndarray:
     """(B, J) with NaN at first, while the two differ ``OTHER_START`` times as much as later: a joint with dry friction rests
     elsewhere each time, until it is moved. That is no noise: the twin begins where the recording began."""
-    usual = OTHER_START**2 * np.median(squares, axis=0)
+    measured = np.where(np.isfinite(squares).any(axis=0), squares, 0.0)
+    usual = OTHER_START**2 * np.nanmedian(measured, axis=0)
     still_off = np.logical_and.accumulate(squares > usual, axis=0)
     return np.where(still_off, np.nan, squares)
 

@@ -23,6 +23,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from taccorl.alignment.even_rows import even_rows
 from taccorl.alignment.measurement import Measurement, unit_of
 from taccorl.alignment.quantisation import find_quantum
 from taccorl.data.strict_yaml import Document
@@ -190,7 +191,7 @@ def own_spec(path: Path, header: list[str]) -> TableSpec:
 
 
 def read_table(path: Path, spec: TableSpec | None = None) -> Measurement:
-    """A CSV or parquet file as a measurement; its rows stay as they are.
+    """A CSV or parquet file as a measurement. Even rows stay as they are; others come to an even grid (``even_rows``).
 
     Raises:
         RecordingError: a column is missing, a cell is empty or no number; names file, line and column.
@@ -214,7 +215,7 @@ def read_table(path: Path, spec: TableSpec | None = None) -> Measurement:
         raise RecordingError(f"{path}: target_rows_late {late} leaves nothing of {len(time_s)} rows")
     rows = slice(max(0, -late), len(time_s) - max(0, late))  # rows for which the target in force is in the file
     start = time_s[rows][0]
-    return Measurement(
+    found = Measurement(
         name=path.name,
         time_s=time_s[rows] - start,
         target=values["q_target"][rows.start + late : rows.stop + late],
@@ -229,6 +230,7 @@ def read_table(path: Path, spec: TableSpec | None = None) -> Measurement:
         instruction=spec.instruction,
         start_ns=round(start * 1e9),
     )
+    return even_rows(found)
 
 
 def _wanted(spec: TableSpec) -> list[str]:

@@ -3,7 +3,7 @@
     error    time_backwards, time_unit, not_finite, lost_samples, too_short, no_motion, dead_channel, frozen_channel,
              saturated_channel, unit, reversed, swapped_joints, swapped_arms, measured_before_command
     warning  dropped_rows, jitter, low_rate, row_times, out_of_order, not_at_rest, start_offset, blocked, short, dead_effort,
-             velocity_unit, no_baseline, dropped_commands, does_not_repeat, same_commands, sticking_joint
+             velocity_unit, no_baseline, dropped_commands, does_not_repeat, same_commands, sticking_joint, resampled
     note     late_answer, effort_limit, not_judged, same_motion
 
 An error that a user has looked into can be accepted by its name: it stays in the report as a warning. Every finding names joint,
@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from taccorl.alignment.clock_checks import check_clock
+from taccorl.alignment.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.noise_floor import noise_floor
 from taccorl.alignment.repeats import Overlay, overlay
@@ -198,7 +199,10 @@ def check_values(m: Measurement) -> list[Finding]:
             f"{listed(names)}: nothing was measured in {_place(m, first, end)}, {len(holes)} such holes: no row "
             "there can be compared. Record again with less load on the logger, or cut the recording there"
         )
-        findings.append(Finding("lost_samples", "error", names[0], text, (first, end)))
+        # Short gaps of a table were judged where it was brought to an even grid.
+        even = any(f.check == "resampled" for f in m.findings)
+        if not even or (end - first) * m.period_s > LONGEST_GAP_S:
+            findings.append(Finding("lost_samples", "error", names[0], text, (first, end)))
     seconds = _motion_s(m)
     if seconds < SHORT_S and any(_moves(m)):
         check, severity = ("too_short", "error") if seconds < TOO_SHORT_S else ("short", "warning")

@@ -194,7 +194,7 @@ def _table(found: "Plan[PlannedMotion]") -> None:
     ]
     floor = f"{found.floor * 1e3:.3g} mrad"
     same = "from angles they are the same thing, pick either, or record efforts"
-    _show(found, floor, ("motion", "gains", "payload", "peak torque"), rows, same)
+    _show(found, floor, ("motion", "gains", "payload", "peak torque with weight"), rows, same)
 
 
 def _press_table(found: "Plan[PlannedPress]") -> None:
@@ -234,6 +234,9 @@ def _show(found: "Plan", floor: str, heads: Sequence[str], rows: Sequence[Sequen
     out = console()
     out.print(f"{found.part}: noise floors ({floor}) that stay between rivals after a refit")
     out.print(table)
+    if found.pose:
+        stand = ", ".join(f"{name} {value:g}" for name, value in found.pose.items())
+        out.print(f"meanwhile the arm stands at (rad; gripper m): {stand}", soft_wrap=True, highlight=False)
     for name, why in found.refused.items():
         out.print(f"not {name}: {why}")
     for pair in found.hopeless:
@@ -280,7 +283,9 @@ def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
         "tells_apart": list(found.rivals),
         "rate_hz": RATE_HZ,
         "units": "t in s, q_target in rad",
-        "how": "begin and end at rest; hold the other joints; record one motion twice",
+        "pose": found.pose,
+        "how": "begin and end at rest; hold the other joints where `pose` says (rad, gripper m); record one motion twice; "
+        "payload_kg is held at the TCP, peak_torque_nm includes the carried weight",
         "motions": entries,
     }
     _write_plan(config.out, words, len(entries))

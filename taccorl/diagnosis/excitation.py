@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -67,7 +67,7 @@ class PlannedMotion(Planned):
     target: np.ndarray
     """(T,) rad at 200 Hz."""
     peak_torque_nm: float
-    """That the motor would need, as the twin says."""
+    """That the motor would need, carried weight included, as the twin says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +82,8 @@ class Plan[PlannedT: Planned]:
     planned: tuple[PlannedT, ...]
     refused: dict[str, str]
     """Motion or press → why it must not be recorded."""
+    pose: dict[str, float] = field(default_factory=dict)
+    """Other joints and gripper of the arm → where they stand meanwhile [rad, m]; empty for presses."""
 
     @property
     def hopeless(self) -> tuple[str, ...]:
@@ -127,7 +129,7 @@ def plan(
     planned, refused = [], {}
     for motion in LIBRARY:
         target = motion.target(room)
-        peak = _peak_torque(config, signal, pose, motion, target)
+        peak = peak_torque_nm(config, signal, pose, motion, target)
         limit = TORQUE_NM[joint_number(signal) - 1]
         column = ACTION_NAMES.index(signal)
         if target.min() < ACTION_LOW[column] or target.max() > ACTION_HIGH[column]:
@@ -138,7 +140,21 @@ def plan(
             apart = _apart(config, signal, rivals, pose, motion, target, floor_rad, measurements, fitted or {}, gains)
             planned.append(PlannedMotion(motion=motion, target=target, peak_torque_nm=peak, ways=apart))
         done(motion.name)
-    return Plan(part=signal, rivals=tuple(rivals), floor=floor_rad, planned=best_first(planned), refused=refused)
+    return Plan(
+        part=signal,
+        rivals=tuple(rivals),
+        floor=floor_rad,
+        planned=best_first(planned),
+        refused=refused,
+        pose=other_joints(signal, pose),
+    )
+
+
+def other_joints(signal: str, pose: np.ndarray) -> dict[str, float]:
+    """``pose`` (7,) by name, without the joint under test."""
+    arm = signal.split("_", 1)[0]
+    names = [f"{arm}_{joint}" for joint in (*JOINTS, "gripper")]
+    return {name: round(float(value), 4) for name, value in zip(names, pose, strict=True) if name != signal}
 
 
 def check_rivals(rivals: Sequence[str]) -> None:
@@ -206,10 +222,13 @@ def imagined(
     return m
 
 
-def _peak_torque(config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray) -> float:
+def peak_torque_nm(config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray) -> float:
+    """Largest torque of the motor on a motion, what it needs to carry its load's weight included."""
     m = imagined(config, signal, pose, motion, target, 0.0)
-    model = JointModel(config, signal)
-    return float(np.abs(model.simulate(joint_motion(m, config, signal), model.gains).effort).max())
+    model, seen = JointModel(config, signal), joint_motion(m, config, signal)
+    answer = model.simulate(seen, model.gains)
+    # Effort is what the motor gives beyond the weight that its controller carries (gravity compensation).
+    return float(np.abs(answer.effort + model.carried_nm(seen, answer.reported)).max())
 
 
 def _apart(

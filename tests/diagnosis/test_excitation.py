@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 from imagined_motions import SIGNAL, recorded
 
+from taccorl.alignment import arm_bench
 from taccorl.alignment.measurements import Measurements
-from taccorl.diagnosis.excitation import SAME, TELLS, Plan, imagined, plan, rest_pose, room_of
+from taccorl.diagnosis.excitation import (
+    SAME,
+    TELLS,
+    Plan,
+    imagined,
+    other_joints,
+    peak_torque_nm,
+    plan,
+    rest_pose,
+    room_of,
+)
 from taccorl.diagnosis.motions import CHIRP, LIBRARY, MARGIN_RAD, POSES, REST_S, STIFFER_CHIRP
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
@@ -141,3 +152,18 @@ def test_the_arm_stands_as_in_the_recordings_that_sweep_the_joint():
     expected = np.array(POSES[4])
     expected[1] += 0.1
     assert rest_pose(SIGNAL, Measurements((m,)))[:6] == pytest.approx(expected)
+
+
+def test_peak_torque_includes_the_carried_weight_and_the_pose_is_stated():
+    """Joint 3 at POSES[2], 0.3 kg at the TCP: at rest the motor carries the weight of what is beyond it."""
+    signal = "left_joint3"
+    pose = rest_pose(signal, None)
+    still = dataclasses.replace(CHIRP, target=lambda room: np.full(200, room.middle_rad))
+    target = still.target(room_of(NOMINAL, signal, pose))
+    body = arm_bench.rigid(NOMINAL, signal, pose, 0.0, [])
+    weight_nm = abs(body.compensation_sin * np.sin(pose[2]) + body.compensation_cos * np.cos(pose[2]))
+    assert weight_nm > 0.5
+    assert peak_torque_nm(NOMINAL, signal, pose, still, target) == pytest.approx(weight_nm, rel=0.02)
+    found = other_joints(signal, pose)
+    assert list(found) == ["left_joint1", "left_joint2", "left_joint4", "left_joint5", "left_joint6", "left_gripper"]
+    assert found["left_joint2"] == POSES[2][1]

@@ -115,7 +115,8 @@ def test_recordings_are_divided_and_hold_what_readers_want(measurements):
 def test_checks_of_telemetry_find_no_fault(measurements):
     for name, findings in check_measurements(measurements.all).items():
         # A soft drive sags under a load: that is so, and a check may say so.
-        allowed = {"start_offset"} if name == "chirp_payload" else set()
+        # Dry friction lets the joint stand elsewhere after the same steps: that is so, too.
+        allowed = {"chirp_payload": {"start_offset"}, "held_steps_again": {"does_not_repeat"}}.get(name, set())
         assert {f.check for f in findings if f.severity in ("error", "warning")} <= allowed, name
 
 
