@@ -84,7 +84,8 @@ def cpu_s(*, children: bool = False) -> float:
 def reference_step_s(repeats: int = 3) -> float:
     """CPU-seconds of one step of the reference loop, median of ``repeats`` loops: a chain of 12 links that swings in MuJoCo.
 
-    10 to 12 µs on two cores of an Intel Xeon (November 2026). Goals that once were CPU-seconds count 10 µs a step.
+    10 to 12 µs on two cores of an Intel Xeon (November 2026). Goals that once were CPU-seconds count 10 µs a step. The loop stays
+    in the cache: what memory bounds, or a disk, wants a rival of its own kind.
     """
     import mujoco
 

@@ -17,10 +17,13 @@ from taccorl.sim.effects.added import AddedEffects, present
 from taccorl.sim.effects.effect import CHANNELS, ArmEffect, Effect, JointEffect
 from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.effects.payload import Payload
-from taccorl.sim.robot import ARMS, JOINTS
+from taccorl.sim.robot import ARMS, JOINTS, TCP_FROM_LINK6_M
 from taccorl.sim.twin import TwinConfig, empty_bench
 
 ArmName = Literal["left", "right"]
+Position = tuple[float, float, float]
+AT_TCP: Position = (0.0, 0.0, TCP_FROM_LINK6_M)
+"""m, in link 6's frame: the middle between the pads, where a gripper holds what it carries."""
 _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
 
 
@@ -66,9 +69,18 @@ def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
 
 
 def arm_spec(
-    config: TwinConfig, arm: ArmName, pose: np.ndarray, free: Sequence[str], payload_kg: float = 0.0
+    config: TwinConfig,
+    arm: ArmName,
+    pose: np.ndarray,
+    free: Sequence[str],
+    payload_kg: float = 0.0,
+    payload_at_m: Position = AT_TCP,
 ) -> mujoco.MjSpec:
-    """One arm, its joints ``free`` with their motors and encoders, the others and the gripper held at ``pose`` (7,) [rad, m]."""
+    """One arm, its joints ``free`` with their motors and encoders, the others and the gripper held at ``pose`` (7,) [rad, m].
+
+    Args:
+        payload_at_m: centre of mass of the known payload, in link 6's frame.
+    """
     spec = empty_bench(config)
     for other in ARMS:
         if other != arm:
@@ -103,15 +115,28 @@ def arm_spec(
             objname=name,
         )
     if payload_kg > 0:
-        Payload(arm=arm, mass_kg=payload_kg).edit(spec, config)
+        held_payload(arm, payload_kg, payload_at_m).edit(spec, config)
         spec.body(f"{arm}_payload").name = f"{arm}_held"  # so that the arm may have another, hidden one
     return spec
 
 
-def rigid(config: TwinConfig, signal: str, pose: np.ndarray, payload_kg: float, effects: Sequence[Effect]) -> Rigid:
+def held_payload(arm: ArmName, mass_kg: float, at_m: Position = AT_TCP) -> Payload:
+    """A known mass in the gripper, at ``at_m`` in link 6's frame."""
+    x_m, y_m, z_m = at_m
+    return Payload(arm=arm, mass_kg=mass_kg, x_link6_m=x_m, y_link6_m=y_m, z_link6_m=z_m)
+
+
+def rigid(
+    config: TwinConfig,
+    signal: str,
+    pose: np.ndarray,
+    payload_kg: float,
+    effects: Sequence[Effect],
+    payload_at_m: Position = AT_TCP,
+) -> Rigid:
     """Inertia and weight of a joint with the others at ``pose``; of ``effects`` those that only change bodies."""
     arm, joint = split_signal(signal)
-    spec = arm_spec(config, arm, pose, [joint], payload_kg)
+    spec = arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m)
     for effect in effects:
         effect.edit(spec, config)
     model = spec.compile()
@@ -137,6 +162,7 @@ def run(
     pose: np.ndarray,
     payload_kg: float,
     effects: Sequence[Effect],
+    payload_at_m: Position = AT_TCP,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The joint in MuJoCo, its effects as the twin builds them, from rest; what a gear lets hang hangs already.
 
@@ -150,7 +176,7 @@ def run(
         (S,) reported [rad] and motor torque [N·m] when each target is sent, before it acts.
     """
     arm, joint = split_signal(signal)
-    spec = arm_spec(config, arm, pose, [joint], payload_kg)
+    spec = arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m)
     kp, kd, torque_ff = gains
     motor = spec.actuator(signal)
     motor.gainprm[0], motor.biasprm[:3] = kp, [torque_ff, -kp, -kd]

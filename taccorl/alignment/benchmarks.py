@@ -20,6 +20,7 @@ from taccorl.alignment.controller import PAPER_BOUNDS, REFERENCE, identify_contr
 from taccorl.alignment.joint_model import Gains, JointModel
 from taccorl.alignment.joint_motion import JointMotion, joint_motion
 from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.sweep_range import SWEEP_HZ, SWEEP_S
 from taccorl.benchmark import Row, against_reference, benchmark, spread
 from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.controller import ControllerConfig
@@ -30,20 +31,19 @@ from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 NOISE_RAD = 2e-4
-SECONDS = 10.0
 RATE_HZ = 200.0
 
 
 def sweep(signal: str, config: TwinConfig) -> tuple[JointMotion, np.ndarray]:
-    """The paper's sweep, 0.1 to 2 Hz in 10 s, answered by MuJoCo with the gains of ``config``, as its joint sees it.
+    """The sweep of ``sweep_range``, answered by MuJoCo with the gains of ``config``, as its joint sees it.
 
     Returns:
         the motion, and (T,) what MuJoCo says without noise.
     """
-    time_s = np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ
+    time_s = np.arange(round(SWEEP_S * RATE_HZ)) / RATE_HZ
     home = np.array([*Bench().home_rad["left"], 0.06, *Bench().home_rad["right"], 0.06])
     target, column = np.tile(home, (len(time_s), 1)), ACTION_NAMES.index(signal)
-    phase = 2 * np.pi * (0.1 * time_s + 1.9 * time_s**2 / (2 * SECONDS))
+    phase = 2 * np.pi * (SWEEP_HZ[0] * time_s + (SWEEP_HZ[1] - SWEEP_HZ[0]) * time_s**2 / (2 * SWEEP_S))
     target[:, column] += 0.25 * np.clip((time_s - 0.5) / 0.5, 0, 1) * np.sin(phase)
     gains = JointModel(config, signal).gains
     measured = target.copy()
@@ -142,7 +142,7 @@ def controller_sysid() -> Iterator[Row]:
             kp_nm_per_rad=[REFERENCE.kp] * 6, kd_nms_per_rad=[REFERENCE.kd] * 6, torque_ff_nm=[REFERENCE.torque_ff] * 6
         )
     )
-    cost, ratio, rival_cost, rival_ratio, spsa_ratio, spsa_cost = ([] for _ in range(6))
+    cost, ratio, rival_cost, rival_ratio, spsa_ratio, spsa_cost, kp_off, spsa_kp_off = ([] for _ in range(8))
     for joint in JOINTS:
         signal = f"left_{joint}"
         truth = JointModel(config, signal).gains
@@ -152,9 +152,11 @@ def controller_sysid() -> Iterator[Row]:
         fit = identify_controller([motion], model)
         cost.append(fit.cpu_s)
         ratio.append(_ratio_error(fit.gains, truth))
+        kp_off.append(100.0 * abs(fit.gains.kp / truth.kp - 1.0))
         fit = identify_controller([motion], model, method="spsa")
         spsa_cost.append(fit.cpu_s)
         spsa_ratio.append(_ratio_error(fit.gains, truth))
+        spsa_kp_off.append(100.0 * abs(fit.gains.kp / truth.kp - 1.0))
         begin = time.process_time()
         found = _mujoco_sysid(motion, signal, unknowing)
         if found is not None:
@@ -173,6 +175,20 @@ def controller_sysid() -> Iterator[Row]:
         rival_value=max(rival_ratio) if rival_ratio else None,
         n=len(ratio),
         spread=spread(ratio),
+    )
+    yield Row(
+        name="K_p off by, worst of six joints",
+        value=max(kp_off),
+        unit="%",
+        n=len(kp_off),
+        spread=spread(kp_off),
+    )
+    yield Row(
+        name="K_p off by, worst of six joints, SPSA with the paper's constants from the paper's start",
+        value=max(spsa_kp_off),
+        unit="%",
+        n=len(spsa_kp_off),
+        spread=spread(spsa_kp_off),
     )
     yield Row(
         name="K_d / K_p off by, worst of six joints, SPSA with the paper's constants",

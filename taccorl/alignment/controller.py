@@ -188,7 +188,12 @@ def _by_spsa(search: GainSearch, start: Gains, seed: int) -> tuple[np.ndarray, l
     low, high = np.array([[into[name](end) for end in search.bounds[name]] for name in search.free]).T
     begin = np.array([into[name](getattr(start, name)) for name in search.free])
     found = spsa.minimise(loss, begin, low, high, np.random.default_rng(seed))
-    why = [] if found.stopped_early else [f"SPSA still got better after {found.iterations} iterations"]
+    why = [
+        f"SPSA stopped after {found.iterations} iterations, {spsa.PATIENCE} of them without a better iterate: that ends the "
+        "search and proves no minimum; use least_squares"
+        if found.out_of_patience
+        else f"SPSA still got better after {found.iterations} iterations"
+    ]
     return search.at(gains(found.x)), why
 
 

@@ -135,11 +135,13 @@ class JointModel:
     def _body(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         if self._config is None:
             return self._rigid[()]
-        key = (motion.pose.tobytes(), motion.payload_kg, *map(repr, bodies))
+        key = (motion.pose.tobytes(), motion.payload_kg, motion.payload_at_m, *map(repr, bodies))
         if key not in self._rigid:
             if len(self._rigid) > 1000:  # a search that changes bodies would fill the memory
                 self._rigid.clear()
-            self._rigid[key] = arm_bench.rigid(self._config, self.signal, motion.pose, motion.payload_kg, bodies)
+            self._rigid[key] = arm_bench.rigid(
+                self._config, self.signal, motion.pose, motion.payload_kg, bodies, motion.payload_at_m
+            )
         return self._rigid[key]
 
     def _sent(self, motion: JointMotion) -> tuple[np.ndarray, int, int]:
@@ -181,6 +183,7 @@ class JointModel:
             start=motion.start,
             pose=motion.pose,
             payload_kg=motion.payload_kg,
+            payload_at_m=motion.payload_at_m,
             effects=effects,
         )
         return JointResponse(reported[::parts], effort[::parts])

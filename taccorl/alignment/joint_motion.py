@@ -51,6 +51,8 @@ class JointMotion:
     kd_known: bool = False
     payload_kg: float = 0.0
     """Known mass in the gripper."""
+    payload_at_m: arm_bench.Position = arm_bench.AT_TCP
+    """Its centre of mass in link 6's frame."""
 
 
 def joint_motion(measurement: Measurement, config: TwinConfig | None, signal: str) -> JointMotion:
@@ -79,12 +81,14 @@ def joint_motion(measurement: Measurement, config: TwinConfig | None, signal: st
     start = _start(m, j)
     if config is None:
         pose, coupling, payload, commanded = np.zeros(7), np.zeros(m.num_rows), 0.0, {}
+        payload_at_m = arm_bench.AT_TCP
     else:
         arm, joint = split_signal(signal)
         names = [f"{arm}_{name}" for name in (*JOINTS, "gripper")]
         pose = np.array([_start(m, m.column(name)) if name in m.signals else 0.0 for name in names])
         payload = m.payload_kg.get(arm, 0.0)
-        coupling = _coupling(m, config, signal, pose, payload)
+        payload_at_m = m.payload_position_m.get(arm, arm_bench.AT_TCP)
+        coupling = _coupling(m, config, signal, pose, payload, payload_at_m)
         k, control = JOINTS.index(joint), config.controller_of(arm)
         commanded = {
             "kp": m.kp.get(signal, math.nan) / control.kp_nm_per_rad[k],
@@ -106,6 +110,7 @@ def joint_motion(measurement: Measurement, config: TwinConfig | None, signal: st
         kp_known="kp" in known,
         kd_known="kd" in known,
         payload_kg=payload,
+        payload_at_m=payload_at_m,
     )
 
 
@@ -123,7 +128,14 @@ def _start(m: Measurement, j: int) -> float:
     return float(m.target[0, j])
 
 
-def _coupling(m: Measurement, config: TwinConfig, signal: str, pose: np.ndarray, payload_kg: float) -> np.ndarray:
+def _coupling(
+    m: Measurement,
+    config: TwinConfig,
+    signal: str,
+    pose: np.ndarray,
+    payload_kg: float,
+    payload_at_m: arm_bench.Position,
+) -> np.ndarray:
     """(T,) what the joint must hold beyond its own inertia and weight, because other joints of its arm move."""
     arm, joint = split_signal(signal)
     moving = [joint]
@@ -141,7 +153,7 @@ def _coupling(m: Measurement, config: TwinConfig, signal: str, pose: np.ndarray,
         return np.zeros(m.num_rows)
     both = []
     for free in (moving, [joint]):
-        model = arm_bench.arm_spec(config, arm, pose, free, payload_kg).compile()
+        model = arm_bench.arm_spec(config, arm, pose, free, payload_kg, payload_at_m).compile()
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         data, dof = mujoco.MjData(model), model.joint(f"{arm}_{joint}").dofadr[0]
         q = np.column_stack([angles[name] for name in JOINTS if name in free])

@@ -89,6 +89,9 @@ class Measurement:
     """Signal → factor of both gains over the other recordings', where no more than that is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
     """Arm → known mass in its gripper."""
+    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Arm → where the payload's centre of mass is, in link 6's frame (origin at the flange, z along the hand); the TCP,
+    (0, 0, 0.168) m, where it is not stated."""
     pressed: "PressedObject | None" = None
     """Known object between the fingers of one arm, where somebody wrote it down: what its pads are judged by."""
     time_error_s: float = 0.0

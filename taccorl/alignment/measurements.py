@@ -8,11 +8,14 @@ A folder of recordings may hold a ``measurements.yaml`` that says what the files
     recordings:
       sweep_05.mcap: {use: validation}
       sweep_02.mcap: {repeat_of: sweep_01.mcap}
-      sweep_03.mcap: {kp: {left_joint5: 40}, kd: {left_joint5: 4}, payload_kg: {left: 0.5}, effort_scale: {left_joint1: 0.25}}
+      sweep_03.mcap: {kp: {left_joint5: 40}, kd: {left_joint5: 4}, effort_scale: {left_joint1: 0.25}}
+      sweep_04.mcap: {payload_kg: {left: 0.5}, payload_position_m: {left: [0, 0, 0.2]}}
       press_01.mcap: {pressed: &ball {shape: sphere, radius_m: 0.012, arm: left, position_m: [0.001, 0, 0.003]}}
       press_02.mcap: {pressed: *ball, use: validation}
       press_03.mcap: {pressed: {shape: rod, radius_m: 0.008, length_m: 0.04, arm: left, rpy_rad: [0, 1.5708, 0]}}
 
+``payload_kg`` is a known mass in the gripper. Its centre of mass is ``payload_position_m`` [m] in link 6's frame: origin at the
+flange, z along the hand towards the fingers, y the direction in which they close. Not stated, it is the TCP, [0, 0, 0.168].
 ``pressed`` is a known object between the fingers of one arm; with it ``taccorl compare`` and ``diagnose`` look at the arm's pads.
 """
 
@@ -36,8 +39,11 @@ from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_record
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.sim.actions import OPEN_M
+from taccorl.sim.robot import ARMS
 
 INDEX = "measurements.yaml"
+FARTHEST_PAYLOAD_M = 1.0
+"""Of a payload's centre of mass from the flange: the arm itself reaches 0.63 m (PiPER manual)."""
 Use = Literal["fit", "validation", "test"]
 
 
@@ -79,6 +85,8 @@ class RecordingNote:
     """Signal → factor of both gains over the other recordings', where no more than that is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
     """Arm → mass held."""
+    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Arm → centre of mass of what is held, in link 6's frame (flange, z along the hand); the TCP, [0, 0, 0.168], by default."""
     effort_scale: dict[str, float] = field(default_factory=dict)
     """Signal → factor to N·m, N: PiPER's firmware 1.5 to 1.8 reports joints 1 to 3 four times too large
     (piper_sdk issue 73)."""
@@ -237,14 +245,23 @@ def _load_index(folder: Path) -> MeasurementIndex:
             bad = next((s for s, v in getattr(note, key).items() if v < 0), None)
             if bad:
                 raise document.error(f"recordings/{name}/{key}/{bad}", f"{getattr(note, key)[bad]:g} is below 0")
-        arm = next((a for a in note.payload_kg if a not in ("left", "right")), None)
-        if arm:
-            raise document.error(f"recordings/{name}/payload_kg/{arm}", f"no arm {arm!r}; left, right")
+        for key in ("payload_kg", "payload_position_m"):
+            arm = next((a for a in getattr(note, key) if a not in ARMS), None)
+            if arm:
+                raise document.error(f"recordings/{name}/{key}/{arm}", f"no arm {arm!r}; left, right")
+        _check_payload_positions(document, f"recordings/{name}/payload_position_m", note)
         if note.pressed is not None:
             _check_pressed(document, f"recordings/{name}/pressed", note.pressed)
     if index.columns and not (folder / index.columns).is_file():
         raise document.error("columns", f"no file {index.columns!r} beside it")
     return index
+
+
+def _check_payload_positions(document: Document[MeasurementIndex], key: str, note: RecordingNote) -> None:
+    for arm, at_m in note.payload_position_m.items():
+        if not all(math.isfinite(x) and abs(x) <= FARTHEST_PAYLOAD_M for x in at_m):
+            text = f"{list(at_m)} is further than {FARTHEST_PAYLOAD_M:g} m from the flange; is it in millimetres?"
+            raise document.error(f"{key}/{arm}", text)
 
 
 def _check_pressed(document: Document[MeasurementIndex], key: str, pressed: PressedNote) -> None:
@@ -291,6 +308,12 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
                         f"{folder / INDEX}: recordings → {m.name} → {key}: no signal {name!r}; "
                         f"{nearest(name, m.signals)}"
                     )
+        for arm in note.payload_position_m:
+            if not (m.payload_kg | note.payload_kg).get(arm):
+                raise TaccorlError(
+                    f"{folder / INDEX}: recordings → {m.name} → payload_position_m: {arm} holds no payload; state payload_kg, "
+                    "or leave it out"
+                )
         if note.pressed is not None and m.touch is None:
             why = next((f" ({f.text})" for f in m.findings if f.check == "no_baseline"), "")
             raise TaccorlError(
@@ -312,6 +335,7 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
                 kd=m.kd | note.kd,
                 gain_scale=m.gain_scale | note.gain_scale,
                 payload_kg=m.payload_kg | note.payload_kg,
+                payload_position_m=m.payload_position_m | note.payload_position_m,
                 pressed=note.pressed.made() if note.pressed is not None else None,
                 effort=m.effort * scale,
             )

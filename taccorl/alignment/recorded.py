@@ -155,6 +155,8 @@ class _Notes:
     repeat_of: str | None
     numbers: dict[str, dict[str, float]]
     """``kp``, ``kd``, ``gain_scale`` (signal → number) and ``payload_kg`` (arm → number), each as JSON."""
+    payload_position_m: dict[str, tuple[float, float, float]]
+    """Arm → centre of mass in link 6's frame, as JSON."""
 
     @classmethod
     def of(cls, recording: Recording, spec: RecordingSpec) -> "_Notes":
@@ -171,7 +173,15 @@ class _Notes:
                 raise RecordingError(
                     f'{recording.source.name}: metadata {key} is {written[key]!r}, not like {{"left_joint5": 40.0}}'
                 ) from error
-        return cls(written.get("origin", ""), told, written.get("repeat_of") or None, numbers)
+        try:
+            stated = json.loads(written.get("payload_position_m", "{}")).items()
+            places = {str(arm): (float(x), float(y), float(z)) for arm, (x, y, z) in stated}
+        except (ValueError, TypeError, AttributeError) as error:
+            raise RecordingError(
+                f"{recording.source.name}: metadata payload_position_m is {written['payload_position_m']!r}, not like "
+                '{"left": [0, 0, 0.168]}'
+            ) from error
+        return cls(written.get("origin", ""), told, written.get("repeat_of") or None, numbers, places)
 
 
 class _Rows:
@@ -271,6 +281,7 @@ class _Rows:
             kd=notes.numbers["kd"],
             gain_scale=notes.numbers["gain_scale"],
             payload_kg=notes.numbers["payload_kg"],
+            payload_position_m=notes.payload_position_m,
             time_error_s=self.period_ns / NS_PER_S if no_clock else 0.0,
             timing=tuple(self._timing(c, key) for key in (STATE, ACTION) for c in self.spec.features[key].channels),
             findings=findings,

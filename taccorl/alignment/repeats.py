@@ -46,7 +46,7 @@ def overlay(first: Measurement, second: Measurement) -> Overlay:
     """
     if first.signals != second.signals:
         raise TaccorlError(f"{second.name} and {first.name} hold different signals; one cannot repeat the other")
-    for what in ("kp", "kd", "gain_scale", "payload_kg"):
+    for what in ("kp", "kd", "gain_scale", "payload_kg", "payload_position_m"):
         one, other = getattr(first, what), getattr(second, what)
         silent = what in ("kp", "kd") and not (one and other)  # nobody wrote them down: not known to differ
         if one != other and not silent:

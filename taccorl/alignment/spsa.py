@@ -1,4 +1,8 @@
-"""Simultaneous perturbation stochastic approximation (Spall 1992) with the constants of the paper's App. B.1."""
+"""Simultaneous perturbation stochastic approximation (Spall 1992) with the constants of the paper's App. B.1.
+
+The two perturbed points of an iteration only estimate the gradient: at the first step they lie c = 0.08 from the iterate, so they
+say little about it. Loss, best point and patience are therefore those of the iterate x_k, which costs a third evaluation.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,21 +18,23 @@ MAX_ITERATIONS = 400  # not in the paper
 
 @dataclass(frozen=True)
 class Spsa:
-    """The best point that was looked at."""
+    """The best iterate."""
 
     x: np.ndarray
     loss: float
     iterations: int
-    stopped_early: bool
-    """Nothing better in ``PATIENCE`` iterations, as opposed to out of iterations."""
+    out_of_patience: bool
+    """No iterate was better than the best for ``PATIENCE`` iterations, as opposed to out of iterations. That stops the search; it
+    is no proof of a minimum."""
 
 
 def minimise(
     loss: Callable[[np.ndarray], float], start: np.ndarray, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
 ) -> Spsa:
-    """x_{k+1} = x_k − a_k g_k with a_k = a / (k + 1 + A)^α, from two evaluations at x_k ± c_k Δ, Δ of random signs.
+    """x_{k+1} = x_k − a_k g_k with a_k = a / (k + 1 + A)^α, from evaluations at x_k ± c_k Δ, Δ of random signs.
 
-    g_k = clip((L₊ − L₋) / (2 c_k) · Δ, ± 5), c_k = c / (k + 1)^γ.
+    g_k = clip((L₊ − L₋) / (x₊ − x₋), ± 5) per coordinate, c_k = c / (k + 1)^γ. Without bounds x₊ − x₋ = 2 c_k Δ; where a bound
+    clips an end it is shorter, and 0 in a coordinate means no gradient along it.
     """
     x = np.clip(np.asarray(start, dtype=float), low, high)
     best, best_loss, since = x.copy(), loss(x), 0
@@ -37,10 +43,11 @@ def minimise(
         step, reach = A_SPSA / (k + 1 + STABILITY) ** ALPHA, C_SPSA / (k + 1) ** GAMMA
         signs = rng.choice([-1.0, 1.0], len(x))
         ends = [np.clip(x + reach * signs, low, high), np.clip(x - reach * signs, low, high)]
-        losses = [loss(end) for end in ends]
-        gradient = (losses[0] - losses[1]) / (2 * reach) * signs
+        apart = ends[0] - ends[1]
+        rise = loss(ends[0]) - loss(ends[1])
+        gradient = np.divide(rise, apart, out=np.zeros_like(x), where=apart != 0)
         x = np.clip(x - step * np.clip(gradient, -GRADIENT_CLIP, GRADIENT_CLIP), low, high)
-        k, since, better = k + 1, since + 1, int(losses[1] < losses[0])
-        if losses[better] < best_loss:
-            best, best_loss, since = ends[better], losses[better], 0
+        k, since, now = k + 1, since + 1, loss(x)
+        if now < best_loss:
+            best, best_loss, since = x.copy(), now, 0
     return Spsa(best, best_loss, k, since >= PATIENCE)

@@ -3,11 +3,12 @@
     error    time_backwards, time_unit, not_finite, lost_samples, too_short, no_motion, dead_channel, frozen_channel,
              saturated_channel, unit, reversed, swapped_joints, swapped_arms, measured_before_command
     warning  dropped_rows, jitter, low_rate, row_times, out_of_order, not_at_rest, start_offset, blocked, short, dead_effort,
-             velocity_unit, no_baseline, dropped_commands, does_not_repeat
+             velocity_unit, no_baseline, dropped_commands, does_not_repeat, same_commands, sticking_joint
     note     late_answer, effort_limit, not_judged, same_motion
 
-Every finding names joint, value and place, and what to record or change. The parts are here (values, motion, start), in
-``time_checks``, ``wiring_checks`` (which joint follows which command, units) and ``clock_checks`` (offsets in time).
+An error that a user has looked into can be accepted by its name: it stays in the report as a warning. Every finding names joint,
+value and place, and what to record or change. The parts are here (values, motion, start), in ``time_checks``, ``wiring_checks``
+(which joint follows which command, units), ``clock_checks`` (offsets in time) and ``unrepeated`` (recordings of one motion).
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ import numpy as np
 from taccorl.alignment.clock_checks import check_clock
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.noise_floor import noise_floor
-from taccorl.alignment.repeats import repeats
+from taccorl.alignment.repeats import Overlay, overlay
 from taccorl.alignment.time_checks import check_time
 from taccorl.alignment.unrepeated import check_repeatability
 from taccorl.alignment.wiring_checks import check_wiring
@@ -50,48 +51,111 @@ START_OFFSET_RAD = 0.1
 AT_LIMIT_SHARE = 0.01
 """Of the rows with exactly the largest effort: more than chance."""
 _ORDER = ("error", "warning", "note")
+STICK_STEPS = 4.0
+"""A joint that sticks moves on by no more than so many of its usual steps between rows, or of its encoder's; a driver that
+repeated old values jumps to where the joint has gone meanwhile."""
+DIFFERENT = 3.0
+"""Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""
+ERRORS = (
+    "time_backwards", "time_unit", "not_finite", "lost_samples", "too_short", "no_motion", "dead_channel", "frozen_channel",
+    "saturated_channel", "unit", "reversed", "swapped_joints", "swapped_arms", "measured_before_command", "shifted_from_twin",
+)  # fmt: skip
+"""Checks that can end in an error, and so be accepted."""
 _NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")
 """With these nothing else can be judged."""
 
 
+def check_names(accept: Sequence[str]) -> None:
+    """
+    Raises:
+        TaccorlError: a name that is no check's.
+    """
+    for name in accept:
+        if name not in ERRORS:
+            raise TaccorlError(f"--accept={name}: no check of that name ends in an error; {nearest(name, ERRORS)}")
+
+
+def accepted(findings: Sequence[Finding], accept: Sequence[str]) -> list[Finding]:
+    """``findings`` with errors of the checks ``accept`` turned into warnings that say so."""
+    return [
+        dataclasses.replace(f, severity="warning", text=f"{f.text}. An error, accepted by --accept={f.check}")
+        if f.severity == "error" and f.check in accept
+        else f
+        for f in findings
+    ]
+
+
 def check_measurement(
-    m: Measurement, joints: Sequence[str] = (), floor: dict[str, float] | None = None
+    m: Measurement,
+    joints: Sequence[str] = (),
+    floor: dict[str, float] | None = None,
+    accept: Sequence[str] = (),
 ) -> list[Finding]:
     """All findings on one measurement, worst first.
 
     Args:
         joints: signals that are to be fitted; each must move.
         floor: signal → noise floor of positions (rad, m); estimated from this measurement alone by default.
+        accept: names of checks whose errors are known and become warnings.
     """
     for name in joints:
         if name not in m.signals:
             raise TaccorlError(f"{m.name}: no signal {name!r} to check; {nearest(name, m.signals)}")
-    findings = [*m.findings, *check_time(m), *check_values(m)]
+    findings = accepted([*m.findings, *check_time(m), *check_values(m)], accept)
     if not any(f.check in _NO_MORE for f in findings):
-        findings += check_motion(m, joints) + check_start(m) + check_effort(m) + check_wiring(m)
+        findings += accepted(check_motion(m, joints) + check_start(m) + check_effort(m) + check_wiring(m), accept)
         if not any(f.severity == "error" and f.check != "lost_samples" for f in findings):
-            findings += check_clock(m, floor or _own_floor(m))
+            findings += accepted(check_clock(m, floor or _own_floor(m)), accept)
     return sorted(findings, key=lambda f: _ORDER.index(f.severity))
 
 
-def check_measurements(measurements: Sequence[Measurement], joints: Sequence[str] = ()) -> dict[str, list[Finding]]:
+def check_measurements(
+    measurements: Sequence[Measurement], joints: Sequence[str] = (), accept: Sequence[str] = ()
+) -> dict[str, list[Finding]]:
     """Name → findings, for several; joints need to move in one of them. Says where one repeats another untold."""
-    found = {m.name: check_measurement(m) for m in measurements}
+    found = {m.name: check_measurement(m, accept=accept) for m in measurements}
     moved = {name for m in measurements for name, far in zip(m.signals, _moves(m), strict=True) if far}
     for m in measurements[:1]:
         found[m.name] += [_no_motion(m, name) for name in joints if name not in moved]
     for a, b in itertools.combinations([m for m in measurements if not _broken(found[m.name])], 2):
         told = b.name in (a.name, a.repeat_of) or a.name == b.repeat_of or (a.repeat_of and a.repeat_of == b.repeat_of)
-        if not told and repeats(a, b):
-            text = (
-                f"{b.name} was given the same commands as {a.name}: say `repeat_of: {a.name}`, and the noise floor comes "
-                "from both"
-            )
-            found[b.name].append(Finding("same_motion", "note", "", text))
+        if not told:
+            try:
+                found[b.name].append(_same_commands(a, b, overlay(a, b)))
+            except TaccorlError:
+                continue  # other commands
     sound = [m for m in measurements if not _broken(found[m.name])]
     for name, findings in (check_repeatability(sound) if sound else {}).items():
         found[name] += findings
     return found
+
+
+def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
+    """What to write into the index of two recordings that were given the same commands."""
+    floors = [_own_floor(a), _own_floor(b)]
+    ratios = {}
+    for j, name in enumerate(a.signals):
+        difference = laid.difference["position"][:, j]
+        noise = math.sqrt(sum(floor[name] ** 2 for floor in floors))
+        if np.isfinite(difference).any() and math.isfinite(noise):
+            ratios[name] = (float(np.sqrt(np.nanmean(difference**2))), noise)
+    worst = max(ratios, key=lambda name: ratios[name][0] / ratios[name][1], default="")
+    if not worst or ratios[worst][0] <= DIFFERENT * ratios[worst][1]:
+        text = (
+            f"{b.name} was given the same commands as {a.name}: say `repeat_of: {a.name}`, and the noise floor comes "
+            "from both"
+        )
+        return Finding("same_motion", "note", "", text)
+    rms, noise = ratios[worst]
+    arm = next((arm for arm in ("left", "right") if worst.startswith(arm)), "left")
+    text = (
+        f"{b.name} was given the same commands as {a.name}, but {worst} moved differently: by {rms:.2g} "
+        f"{a.units[a.column(worst)]} (RMS), {rms / noise:.0f} times what noise allows. Had it other gains? Write `{b.name}: "
+        f"{{gain_scale: {{{worst}: 2.0}}}}` with their factor, or kp and kd, under `recordings:` in measurements.yaml. Did it "
+        f"hold something? Write `payload_kg: {{{arm}: 0.5}}`. Only if nothing was changed and the robot does not repeat, write "
+        f"`repeat_of: {a.name}`"
+    )
+    return Finding("same_commands", "warning", worst, text)
 
 
 def _own_floor(m: Measurement) -> dict[str, float]:
@@ -201,6 +265,15 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
         held_s = m.time_s[end - 1] - m.time_s[first - 1]
         if held_s < FROZEN_S or np.ptp(target[rows[0] : rows[1]]) < FROZEN_MOVE:
             continue
+        if (jump := _moves_on(m, j, rows)) is not None:
+            text = (
+                f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command goes "
+                f"{np.ptp(target[rows[0] : rows[1]]):.3f}, {_place(m, *rows)}; its readings stay within one step of its encoder "
+                f"({m.quantum[j]:.2g} {m.units[j]}) and go on from there ({jump:.2g} to the next row): it sticks, as dry "
+                "friction does (effects coulomb_friction, stribeck_friction), or something held it. If its driver repeated "
+                "old values, cut this out"
+            )
+            return [Finding("sticking_joint", "warning", name, text, rows)]
         edge = measured[first] in (np.nanmax(measured), np.nanmin(measured))
         check = "saturated_channel" if edge else "frozen_channel"
         why = (
@@ -228,6 +301,29 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
                 )
                 return [Finding("blocked", "warning", name, text, (first, end))]
     return []
+
+
+def _moves_on(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
+    """Step to the row after a hold if the joint itself stood still: its encoder's step hides its noise, and it neither jumps
+    after the hold nor stands at an end of its range that its command is beyond. None otherwise."""
+    first, end = rows
+    measured, target, quantum = m.measured[:, j], m.target[:, j], float(m.quantum[j])
+    if quantum <= 0 or end >= m.num_rows or not np.isfinite(measured[end]):
+        return None
+    steps = np.abs(np.diff(measured[np.isfinite(measured)]))
+    moving = steps[steps > 0.5 * quantum]
+    still = np.diff(target) == 0
+    noisy = still & (np.abs(np.diff(measured)) > 1.5 * quantum)
+    if len(moving) == 0 or (still.any() and noisy.sum() > 0.05 * still.sum()):
+        return None
+    jump = abs(float(measured[end] - measured[end - 1]))
+    if jump > STICK_STEPS * max(quantum, float(np.median(moving))):
+        return None
+    for sign in (1.0, -1.0):
+        at_end = sign * measured[first] >= np.nanmax(sign * measured)
+        if at_end and (sign * (target[first:end] - measured[first]) > -quantum).all():
+            return None
+    return jump
 
 
 def check_start(m: Measurement) -> list[Finding]:

@@ -204,11 +204,11 @@ def _dropped_finding(s: Unrepeated, d: Dropped, worst: str) -> Finding:
     where = ", ".join(f"{t:.2f}" for t in d.times_s[worst][:MOST_TIMES])
     more = f" and {len(d.times_s[worst]) - MOST_TIMES} more" if len(d.times_s[worst]) > MOST_TIMES else ""
     text = (
-        f"{s.signal}: commands were dropped or repeated: {d.found} times in {len(d.times_s)} recordings the joint moved "
-        f"as if the previous target stayed in force for {d.hold_rows:.1f} commands on average ({d.mirrored} events of "
-        f"the opposite sign, which only noise and unmodelled physics produce); at least {d.rate:.1%} of {d.commands} commands. In {worst} at {where}"
-        f" s{more}. No effect of the twin explains that: look for lost frames on the bus (taccorl inspect, candump) or a driver "
-        "that skips commands when its queue is full"
+        f"{s.signal}: commands were dropped or repeated: {d.found} times in {len(d.times_s)} recordings the joint moved as "
+        f"if the previous target stayed in force for {d.hold_rows:.1f} commands on average ({d.mirrored} events of the "
+        "opposite sign, which only noise and unmodelled physics produce); at least "
+        f"{d.rate:.1%} of {d.commands} commands. In {worst} at {where} s{more}. No effect of the twin explains that: "
+        "look for lost frames on the bus (taccorl inspect, candump) or a driver that skips commands when its queue is full"
     )
     return Finding("dropped_commands", "warning", s.signal, text)
 

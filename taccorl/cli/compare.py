@@ -61,6 +61,8 @@ class CompareConfig:
     """Columns file of tables with other names or units than ours."""
     validation_every: int | None = None
     """Every k-th motion is for validation; else as measurements.yaml says."""
+    accept: list[str] = field(default_factory=list)
+    """Checks whose errors are known, such as frozen_channel: they become warnings, which stay in the report."""
     pressed: PressedConfig = field(default_factory=PressedConfig)
     """What the fingers pressed in recordings with pads of which measurements.yaml does not say it."""
     out: Path | None = None
@@ -74,7 +76,10 @@ def main(argv: list[str]) -> int:
     config = parse(CompareConfig, argv, positional="measurements")
     _check_outputs(config)
     from taccorl.alignment.measurements import read_measurements
-    from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of
+    from taccorl.alignment.telemetry_checks import accepted, check_names
+    from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of, unused_accepts
+
+    check_names(config.accept)
 
     twins = [
         (name_of(path), twin_of(path)) for path in (config.twin, config.against)[: 1 + (config.against is not None)]
@@ -82,11 +87,12 @@ def main(argv: list[str]) -> int:
     measurements = read_measurements(
         config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
     )
-    findings = checked(measurements, "not compared")
+    findings = checked(measurements, "not compared", config.accept)
     if findings is None:
         return 1
     comparisons = _compared(config, twins, measurements)
-    late = {name: list(found) for name, found in comparisons[0].clock.items() if found}
+    late = {name: accepted(found, config.accept) for name, found in comparisons[0].clock.items() if found}
+    unused_accepts(config.accept, findings, late)
     print_findings({f"replay of {name}": found for name, found in late.items()})
     if clock_is_off(late, len(measurements.all)):
         print(
@@ -94,7 +100,7 @@ def main(argv: list[str]) -> int:
         )
         return 1
     score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
-    _write(config, comparisons, findings, twins, argv)
+    _write(config, comparisons, findings, late, twins, argv)
     return 0
 
 
@@ -208,6 +214,7 @@ def _write(
     config: CompareConfig,
     comparisons: "Sequence[Comparison]",
     findings: dict[str, list["Finding"]],
+    late: dict[str, list["Finding"]],
     twins: "Sequence[tuple[str, TwinConfig]]",
     argv: Sequence[str],
 ) -> None:
@@ -219,7 +226,7 @@ def _write(
         provenance = {"command": shlex.join(["taccorl", "compare", *argv])}
         for name, twin in twins:
             provenance[f"{name}, SHA-256"] = twin_digest(twin)
-        clock = {name: [*findings.get(name, []), *found] for name, found in first.clock.items()}
+        clock = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
         title = f"{first.twin} beside {config.measurements.name}" + (f", and {after.twin}" if after else "")
         report = Report(title=title, comparison=first, after=after, findings=clock, provenance=provenance)
         written = write_report(report, config.out)

@@ -69,6 +69,8 @@ class DiagnoseConfig:
     """Columns file of tables with other names or units than ours."""
     validation_every: int | None = None
     """Every k-th motion is for validation; else as measurements.yaml says."""
+    accept: list[str] = field(default_factory=list)
+    """Checks whose errors are known, such as frozen_channel: they become warnings, which stay in the report."""
 
 
 def main(argv: list[str]) -> int:
@@ -78,19 +80,21 @@ def main(argv: list[str]) -> int:
 
     check_folder(config.out)
     from taccorl.alignment.measurements import read_measurements
-    from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of
+    from taccorl.alignment.telemetry_checks import accepted, check_names
+    from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of, unused_accepts
     from taccorl.diagnosis.compare import compare
     from taccorl.diagnosis.joints import swept_joints
     from taccorl.diagnosis.pads import pressed_arms
     from taccorl.sim.effects import effects
 
+    check_names(config.accept)
     twin = twin_of(config.twin)
     for name in config.without:
         effects.get(name)
     measurements = read_measurements(
         config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
     )
-    findings = checked(measurements, "not diagnosed")
+    findings = checked(measurements, "not diagnosed", config.accept)
     if findings is None:
         return 1
     swept, pressed = swept_joints(measurements), pressed_arms(measurements)
@@ -102,7 +106,8 @@ def main(argv: list[str]) -> int:
     arms = arms_named(config.pads, pressed) if config.pads or not config.joints else ()
     signals = joints_named(config.joints, swept) if config.joints or (swept and not config.pads) else ()
     before = compare(twin, measurements, name=name_of(config.twin))
-    late = {name: list(found) for name, found in before.clock.items() if found}
+    late = {name: accepted(found, config.accept) for name, found in before.clock.items() if found}
+    unused_accepts(config.accept, findings, late)
     print_findings({f"replay of {name}": found for name, found in late.items()})
     if clock_is_off(late, len(measurements.all)):
         print(

@@ -1,6 +1,7 @@
 """What the verbs that look at measurements share: the twin they start from, and the checks before anything is concluded."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,20 +25,37 @@ def name_of(path: Path | None) -> str:
     return "nominal twin" if path is None else path.stem
 
 
-def checked(measurements: "Measurements", verdict: str) -> dict[str, list["Finding"]] | None:
-    """What the checks of telemetry say, printed; None where they found errors, which ``verdict`` then says first."""
+def checked(
+    measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
+) -> dict[str, list["Finding"]] | None:
+    """What the checks of telemetry say, printed; None where they found errors, which ``verdict`` then says first.
+
+    Args:
+        accept: checks whose errors become warnings.
+    """
     from taccorl.alignment.telemetry_checks import check_measurements
 
-    found = check_measurements(measurements.all)
+    found = check_measurements(measurements.all, accept=accept)
     found = {m.name: [*_judged(m, found.get(m.name, [])), *_pose_unknown(m)] for m in measurements.all}
     print_findings(found)
     for line in measurements.skipped:
         print(f"not read: {line}")
     wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
     if wrong:
-        print(f"{verdict}: errors in {', '.join(wrong)}, each with what to record or mend instead, see above")
+        print(
+            f"{verdict}: errors in {', '.join(wrong)}, each with what to record or mend instead, see above; an error "
+            "that is none here is accepted by --accept=CHECK"
+        )
         return None
     return found
+
+
+def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) -> None:
+    """Say which accepted checks found nothing: they hide nothing, and need not be given."""
+    checks = {f.check for findings in found for own in findings.values() for f in own}
+    for name in dict.fromkeys(accept):
+        if name not in checks:
+            print(f"--accept={name}: no recording has that finding; leave it out")
 
 
 def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:

@@ -1,6 +1,6 @@
 """Motions to record of one joint: the paper's sweep and what else tells effects apart. 200 Hz, at rest at both ends.
 
-    chirp            0.1 to 2.5 Hz in 10 s, as the paper's (App. B.1)
+    chirp            10 s as the paper's sweep (App. B.1), 0.1 to 2.5 Hz (a choice, the paper gives no frequencies)
     wide triangle    there and back over a wide range in 14 s: friction, weight, what hangs on the angle
     steps            nine holds of a second: delays, slipping, integrators
     small chirp      0.02 rad up to 4 Hz: play, dead bands, stiction
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taccorl.alignment.sweep_range import SWEEP_HZ, SWEEP_S
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.robot import ARMS, JOINTS, LINKS
 
@@ -32,7 +33,7 @@ MARGIN_RAD = 0.05
 """Kept from the joint's limits."""
 SWEEP_RAD = 0.35
 """Amplitude of the chirp where speed and torque allow it."""
-FAST_HZ = 2.5
+SLOW_HZ, FAST_HZ = SWEEP_HZ
 KNOWN_KG = 0.3
 """Weighed, and gripped for one recording."""
 OPENING_M = 0.02
@@ -138,7 +139,7 @@ def _rested(motion: np.ndarray, middle_rad: float) -> np.ndarray:
 
 
 def _chirp(room: Room) -> np.ndarray:
-    return _rested(chirp(10.0, 0.1, FAST_HZ, room.sweep_rad), room.middle_rad)
+    return _rested(chirp(SWEEP_S, SLOW_HZ, FAST_HZ, room.sweep_rad), room.middle_rad)
 
 
 def _steps(levels: tuple[float, ...], off: float, hold_s: float = 1.0) -> Callable[[Room], np.ndarray]:

@@ -11,12 +11,12 @@ from typing import Literal
 
 import numpy as np
 
+from taccorl.alignment.arm_bench import AT_TCP, held_payload
 from taccorl.alignment.joint_model import JointModel, joint_motion
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.touch_motion import PressedObject, TouchMotion, touch_motion
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
-from taccorl.sim.effects import make_effect
 from taccorl.sim.replay import replay
 from taccorl.sim.robot import ARMS, JOINTS
 from taccorl.sim.simulation import Simulation
@@ -87,7 +87,11 @@ def _as_recorded(config: TwinConfig, m: Measurement) -> TwinConfig:
             ]
             control = dataclasses.replace(control, **{key: values})
         controllers[arm] = control
-    held = [make_effect("payload", arm=arm, mass_kg=mass) for arm, mass in m.payload_kg.items() if mass > 0]
+    held = [
+        held_payload("left" if arm == "left" else "right", mass, m.payload_position_m.get(arm, AT_TCP))
+        for arm, mass in m.payload_kg.items()
+        if mass > 0
+    ]
     return dataclasses.replace(config, arm_controllers=controllers, effects=[*config.effects, *held])
 
 

@@ -461,7 +461,9 @@ class _Search:
             for other in (t for t in ties.get(name, ()) if t not in model.names):
                 self.progress(f"trying {other} in place of {name}")
                 others = tuple(other if n == name else n for n in model.names)
-                starts = [model.values | start for start in self.problem.candidates[other].starts]
+                # From where its round ended; some effects have a hundred starts, nearly all of them far off.
+                ended = [e.values for r in rounds if r.added == name for e in r.evidence if e.name == other]
+                starts = [model.values | start for start in (*ended, *self.problem.candidates[other].starts[:3])]
                 swapped = self._fitted(others, starts, self.config.steps)
                 found.append((other, swapped, block_squares(self.problem, swapped, self.validation)))
             found.sort(key=lambda item: item[2].mean)

@@ -91,7 +91,9 @@ def twin_speed() -> Iterator[Row]:
         spread=spread(shares),
     )
     touch = [t / NUM_SIMS for t in _cpu_s(lambda: sim.pads.touch(sim.batch))]
-    yield against_reference(f"touch, depth and rate of 4 × 384 taxels, per env in a batch of {NUM_SIMS}", touch, "≤ 9")
+    # Its goal is the share of a control step, below: memory bounds both, and a step of the reference loop stays in the cache.
+    name = f"touch, depth and rate of 4 × 384 taxels, per env in a batch of {NUM_SIMS}"
+    yield Row(name=name, value=1e6 * median(touch), unit="µs/env", n=len(touch), spread=1e6 * spread(touch))
     alone, goal_alone = holding(1)
     alone.step(goal_alone)
     single = [1e6 * t / 20 for t in _cpu_s(lambda: [alone.pads.touch(alone.batch) for _ in range(20)])]

@@ -56,6 +56,7 @@ def in_mujoco(
         start=motion.start,
         pose=motion.pose,
         payload_kg=motion.payload_kg,
+        payload_at_m=motion.payload_at_m,
         effects=of_joint(effects, signal),
     )
     return JointResponse(reported, effort)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
 
+from taccorl.alignment import arm_bench
 from taccorl.alignment.joint_kernel import Drive, simulate
 from taccorl.alignment.joint_model import Gains, JointModel
 from taccorl.alignment.joint_motion import joint_motion
@@ -224,19 +225,31 @@ def test_the_whole_twin_agrees_with_its_joints_one_by_one() -> None:
 
 
 def test_a_known_payload_is_carried_and_weighs() -> None:
-    # 0.5 kg, 0.1 m along the hand's z: its weight turns the joint by torque / K_p.
+    # 0.5 kg at the TCP, 0.168 m along the hand's z: its weight turns the joint by torque / K_p.
     signal = "left_joint5"
     model = JointModel(TWIN, signal)
     m = chirp(signal, 4.0, amplitude=0.0)
     m.target[3:, 4] += 1e-3  # so that it does not only rest
     bare, loaded = (joint_motion(dataclasses.replace(m, payload_kg=kg), TWIN, signal) for kg in ({}, {"left": 0.5}))
     sag = model.simulate(loaded, model.gains).reported[-1] - model.simulate(bare, model.gains).reported[-1]
-    hidden = model.simulate(bare, model.gains, [make_effect("payload", mass_kg=0.5)]).reported
+    hidden = model.simulate(bare, model.gains, [make_effect("payload", mass_kg=0.5, z_link6_m=0.168)]).reported
     np.testing.assert_allclose(model.simulate(loaded, model.gains).reported, hidden, atol=1e-12)
-    torque_nm = 0.5 * 9.81 * 0.1
+    torque_nm = 0.5 * 9.81 * 0.168
     assert 0.3 * torque_nm / model.gains.kp < abs(sag) <= 3 * torque_nm / model.gains.kp
-    both = model.simulate(loaded, model.gains, [make_effect("payload", mass_kg=0.5)]).reported
+    both = model.simulate(loaded, model.gains, [make_effect("payload", mass_kg=0.5, z_link6_m=0.168)]).reported
     assert both[-1] - hidden[-1] == pytest.approx(sag, rel=0.05), "a hidden one adds to a known one"
+
+
+def test_a_payload_s_position_sets_its_lever_arm() -> None:
+    # The same weight further out: joint 5's axis is 0.091 m behind the flange.
+    signal = "left_joint5"
+    pose = np.array([0.0, 1.2, -1.4, 0.0, 0.0, 0.0, 0.02])
+    masses = {at: arm_bench.rigid(TWIN, signal, pose, 0.5, [], (0.0, 0.0, at)) for at in (0.0, 0.1, 0.168)}
+    bare = arm_bench.rigid(TWIN, signal, pose, 0.0, [])
+    assert arm_bench.rigid(TWIN, signal, pose, 0.5, []) == masses[0.168]
+    for at, body in masses.items():
+        weight_nm = np.hypot(body.gravity_sin - bare.gravity_sin, body.gravity_cos - bare.gravity_cos)
+        assert weight_nm == pytest.approx(0.5 * 9.81 * (0.091 + at), rel=0.01)
 
 
 def test_commanded_gains_scale_what_the_model_is_given() -> None:

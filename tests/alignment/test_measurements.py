@@ -56,7 +56,8 @@ def test_an_index_says_what_files_cannot(folder):
     (folder / "measurements.yaml").write_text(
         "recordings:\n"
         "  sweep_2.csv: {repeat_of: sweep_1.csv}\n"
-        "  sweep_3.csv: {use: validation, kp: {left_joint5: 40}, payload_kg: {left: 0.5}, effort_scale: {left_joint5: 0.25}}\n"
+        "  sweep_3.csv: {use: validation, kp: {left_joint5: 40}, payload_kg: {left: 0.5}, effort_scale: {left_joint5: 0.25},\n"
+        "    payload_position_m: {left: [0.01, 0, 0.2]}}\n"
         "  sweep_10.csv: {use: test}\n"
     )
     found = read_measurements(folder)
@@ -68,6 +69,7 @@ def test_an_index_says_what_files_cannot(folder):
     assert found.fit[1].repeat_of == "sweep_1.csv"
     (held,) = found.validation
     assert (held.kp, held.payload_kg) == ({"left_joint5": 40.0}, {"left": 0.5})
+    assert held.payload_position_m == {"left": (0.01, 0.0, 0.2)}
     np.testing.assert_array_equal(held.effort[:, 0], 1.0)
     (alone,) = read_measurements(folder / "sweep_3.csv").fit  # asked for by itself
     assert alone.kp == {"left_joint5": 40.0}
@@ -87,6 +89,17 @@ def test_an_index_says_what_files_cannot(folder):
         ("recordings: {sweep_1.csv: {kp: {left_joint9: 3}}}", TaccorlError, "kp: no signal 'left_joint9'"),
         ("recordings: {sweep_1.csv: {kp: {left_joint5: -3}}}", SpecError, "measurements.yaml:1: .*-3 is below 0"),
         ("recordings: {sweep_1.csv: {payload_kg: {middle: 1}}}", SpecError, "no arm 'middle'"),
+        (
+            "recordings: {sweep_1.csv: {payload_kg: {left: 1}, payload_position_m: {middle: [0, 0, 0.1]}}}",
+            SpecError,
+            "no arm 'middle'",
+        ),
+        (
+            "recordings: {sweep_1.csv: {payload_kg: {left: 1}, payload_position_m: {left: [0, 0, 168]}}}",
+            SpecError,
+            "is it in millimetres",
+        ),
+        ("recordings: {sweep_1.csv: {payload_position_m: {left: [0, 0, 0.1]}}}", TaccorlError, "holds no payload"),
         ("columns: none.yaml", SpecError, "no file 'none.yaml' beside it"),
         (
             pressed("shape: spere, radius_m: 0.012, arm: left"),

@@ -11,7 +11,7 @@ from taccorl.alignment.clock_checks import check_against_twin, check_clock
 from taccorl.alignment.first_order import fit_first_order
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.noise_floor import noise_floor
-from taccorl.alignment.telemetry_checks import check_measurement, check_measurements
+from taccorl.alignment.telemetry_checks import ERRORS, check_measurement, check_measurements, check_names
 from taccorl.data.episode import ChannelTiming
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
@@ -291,6 +291,42 @@ def test_frozen_channel_is_placed(clean):
     assert next(f for f in check_measurement(m) if f.check == "frozen_channel").rows == (600, 700)
 
 
+def stuck(m: Measurement, width: float) -> Measurement:
+    """A joint that dry friction holds until its target is ``width`` away: it stands still, then follows without a jump."""
+    values = m.measured[:, 1].copy()
+    at = values[0]
+    for k, goal in enumerate(m.target[:, 1]):
+        at = values[k] = min(max(at, goal - width), goal + width)
+    step = math.radians(0.001)
+    quantum = m.quantum.copy()
+    quantum[1] = step
+    return dataclasses.replace(with_column(m, "left_joint2", np.round(values / step) * step), quantum=quantum)
+
+
+def test_a_joint_that_sticks_is_a_warning_and_a_driver_that_repeats_old_values_an_error(clean):
+    m = stuck(clean, 0.06)
+    by = {f.check: f for f in check_measurement(m) if f.feature == "left_joint2"}
+    assert "frozen_channel" not in by and "saturated_channel" not in by
+    assert by["sticking_joint"].severity == "warning"
+    assert "dry friction" in by["sticking_joint"].text
+    values = stuck(clean, 0.0).measured[:, 1].copy()
+    values[600:700] = values[600]
+    again = with_column(stuck(clean, 0.0), "left_joint2", values)
+    assert found(again)["frozen_channel"] == ["left_joint2"]
+
+
+def test_an_accepted_error_is_a_warning_that_stays(clean):
+    values = clean.measured[:, 1].copy()
+    values[600:700] = values[600]
+    m = with_column(clean, "left_joint2", values)
+    (finding,) = [f for f in check_measurement(m, accept=["frozen_channel"]) if f.check == "frozen_channel"]
+    assert finding.severity == "warning"
+    assert "accepted by --accept=frozen_channel" in finding.text
+    with pytest.raises(TaccorlError, match=r"--accept=frozen_chanel: no check.*frozen_channel"):
+        check_names(["frozen_chanel"])
+    check_names(ERRORS)
+
+
 def test_saturated_channel_is_placed(clean):
     top = np.quantile(clean.measured[:, 0], 0.9)
     m = with_column(clean, "left_joint1", np.minimum(clean.measured[:, 0], top))
@@ -403,9 +439,20 @@ def test_an_untold_repeat_is_pointed_out(clean):
     by = check_measurements([clean, again, other], joints=["left_joint5"])
     assert [f.check for f in by["again"]] == ["same_motion"]
     assert "repeat_of: sweep" in by["again"][0].text
-    assert by["sweep"] == by["other"] == []
+    assert by["other"] == []
+    assert [f.check for f in by["sweep"]] == ["not_judged"]  # what does not repeat, without repeats
     told = dataclasses.replace(again, repeat_of="sweep")
-    assert check_measurements([clean, told])["again"] == []
+    assert check_measurements([clean, told]) == {"sweep": [], "again": []}
+
+
+def test_same_commands_with_another_answer_ask_about_gains_and_payload_not_for_repeat_of(clean):
+    slower = np.apply_along_axis(lambda c: np.interp(clean.time_s - 0.02, clean.time_s, c), 0, clean.measured)
+    found = check_measurements([clean, dataclasses.replace(clean, name="other", measured=slower)])["other"]
+    assert "same_motion" not in {f.check for f in found}
+    (f,) = [f for f in found if f.check == "same_commands"]
+    assert f.severity == "warning"
+    assert "other: {gain_scale: {left_joint" in f.text and "payload_kg: {left" in f.text
+    assert "Only if nothing was changed" in f.text
 
 
 @pytest.mark.slow

@@ -86,6 +86,25 @@ def test_errors_of_the_data_stop_it_with_what_to_do(folder: Path, said: Any, tmp
     assert "RMSE" not in text and not (tmp_path / "report").exists()
 
 
+def test_an_error_can_be_accepted_by_name_and_stays_in_the_report(folder: Path, said: Any, tmp_path: Path):
+    good = sweeps(TwinConfig(), seconds=3.0)
+    values = good.fit[0].measured.copy()
+    j = good.fit[0].column(SIGNAL)
+    values[250:350, j] = values[250, j]
+    frozen = dataclasses.replace(good.fit[0], measured=values)
+    write_folder(tmp_path / "frozen", dataclasses.replace(good, fit=(frozen,), validation=()))
+    code, text = said(tmp_path / "frozen")
+    assert code == 1 and "--accept=CHECK" in text
+    code, text = said(tmp_path / "frozen", "--accept=[frozen_channel,unit]", f"--out={tmp_path / 'report'}")
+    assert code == 0
+    assert "--accept=unit: no recording has that finding" in text
+    findings = json.loads((tmp_path / "report" / "report.json").read_text())["findings"]
+    (kept,) = [f for own in findings.values() for f in own if f["check"] == "frozen_channel"]
+    assert kept["severity"] == "warning"
+    code, text = said(tmp_path / "frozen", "--accept=frozen_chanel")
+    assert code == 2 and "frozen_channel" in text
+
+
 def test_only_the_joints_that_were_asked_for(folder: Path, said: Any):
     code, text = said(folder / "sweeps", "--joints=[right_joint1]")
     assert code == 2

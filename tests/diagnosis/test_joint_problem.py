@@ -8,7 +8,7 @@ from imagined_motions import NOISE_NM, NOISE_RAD, SIGNAL, recorded
 
 from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.fit import fit, rms, stacked
-from taccorl.diagnosis.joint_problem import JointProblem
+from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.motions import AGAIN, CHIRP, HELD_STEPS, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
 from taccorl.diagnosis.search import SearchConfig, diagnose
 from taccorl.errors import TaccorlError
@@ -38,7 +38,7 @@ def chirps():
 
 
 def test_commanded_gains_efforts_or_known_weight_pin_the_torques_and_nothing_else_does(chirps):
-    def pinned(recordings, gains="fitted", effort=False, names=()):
+    def pinned(recordings, gains: GainsAre = "fitted", effort=False, names=()):
         return JointProblem(NOMINAL, SIGNAL, Measurements(recordings), gains=gains, effort=effort).pinned_by(names)
 
     assert pinned(chirps) == ()

@@ -41,7 +41,7 @@ def recorded(
     seed: int,
     acting: Callable[[float, float, float], float] = free,
     friction: Callable[[float], float] = frictionless,
-    **about: str,
+    repeat_of: str | None = None,
 ) -> Measurement:
     """Semi-implicit Euler; dry friction takes away at most the speed that there is."""
     dt_s, q, v, goal = 1.0 / (RATE_HZ * PARTS), float(target[0]), 0.0, float(target[0])
@@ -64,7 +64,7 @@ def recorded(
         signals=("joint",),
         units=("rad",),
         origin="simulated by the test, not a robot",
-        **about,
+        repeat_of=repeat_of,
     )
 
 
@@ -84,17 +84,18 @@ def found_in(
     validation: np.ndarray,
     *,
     without: tuple[str, ...] = ("cogging",),  # a hundred probes that no test here is about
-    **plant: Callable[..., float],
+    acting: Callable[[float, float, float], float] = free,
+    friction: Callable[[float], float] = frictionless,
 ) -> Diagnosis:
     """What the search finds in two motions, the second one recorded twice, judged on a third."""
     first, second = fit
     made = Measurements(
         (
-            recorded("one", first, 1, **plant),
-            recorded("two", second, 2, **plant),
-            recorded("again", second, 3, repeat_of="two", **plant),  # pyright: ignore[reportArgumentType]
+            recorded("one", first, 1, acting, friction),
+            recorded("two", second, 2, acting, friction),
+            recorded("again", second, 3, acting, friction, repeat_of="two"),
         ),
-        (recorded("validation", validation, 4, **plant),),
+        (recorded("validation", validation, 4, acting, friction),),
     )
     problem = AxisProblem(AXIS, made)
     config = SearchConfig(max_effects=1)
