@@ -132,7 +132,7 @@ def run(job: Job) -> dict[str, Any]:
     )
     return {
         **_head(job, case.signal, case),
-        "conditions": [name for name, on in dataclasses.asdict(how).items() if on],
+        "conditions": [name for name, on in dataclasses.asdict(how).items() if on and (name != "sampled" or case.loop)],
         **loop,
         **told(found),
         "findings": findings(made.all, case.signal),
@@ -268,9 +268,13 @@ def exact_but_for_algebra(row: dict[str, Any]) -> bool:
     return all(any(h == f or any({h, f} <= group for group in IDENTICAL) for f in found) for h in row["hidden"])
 
 
+AT_FLOOR = ("at_floor", "gains_moved")
+"""Statuses that leave nothing unexplained: that gains moved follows from the twin's, which are drawn up to a factor of 2 off."""
+
+
 def silently_wrong(row: dict[str, Any]) -> bool:
     """At the floor with effects none of which is hidden, and without a word of those that are."""
-    return row["status"] == "at_floor" and not set(row["found"]) & set(row["hidden"]) and not named(row)
+    return row["status"] in AT_FLOOR and not set(row["found"]) & set(row["hidden"]) and not named(row)
 
 
 def drop_said(row: dict[str, Any]) -> bool:

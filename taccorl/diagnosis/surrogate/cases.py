@@ -224,6 +224,7 @@ def draw_case(
         speed=float(np.abs(np.diff(CHIRP.target(case.room))).max() * RATE_HZ),
         centre=case.room.middle_rad,
         sweep=case.room.sweep_rad,
+        reach=max(float(np.abs(m.target(case.room) - case.room.middle_rad).max()) for m in JUDGED_ON[design]),
     )
     case = dataclasses.replace(case, twin=_twin(rng, joint, case.gains, gains_known))
     refit = _Refit(case, plain, quiet)
@@ -261,8 +262,10 @@ def _with_sampled_loop(
     """With a loop that is stable with these gains or, if none is, with other ones, and which alone leaves next to nothing.
 
     Args:
-        geared: there will be play or a spring between motor and link.
+        geared: there will be play or a spring between motor and link. K_d of a heavy link over the rotor's inertia is then more
+            than any of these loops can damp on some joints: their velocity loop stays continuous.
     """
+    as_drawn = case, quiet
     joint = joint_number(case.signal)
     inertia, _ = inertia_and_weight(np.array(case.pose), joint)
     inertias = [inertia, free_inertia(np.array(case.pose), joint), *([RobotConfig().armature_kgm2] if geared else [])]
@@ -278,6 +281,8 @@ def _with_sampled_loop(
             if left <= LOOP_FLOORS:
                 return _quiet(dataclasses.replace(sampled, loop_floors=left))
         case, quiet = _quiet(dataclasses.replace(case, gains=_draw_gains(rng, joint, inertia, stiff=False)))
+    if geared:
+        return as_drawn
     raise TaccorlError(
         f"surrogate: no sampled loop of {case.signal}, seed {case.seed}, is stable and hardly seen; take another seed"
     )

@@ -36,6 +36,8 @@ class Scale:
     """rad: about which it is moved."""
     sweep: float = 0.35
     """rad: amplitude of the chirp."""
+    reach: float = 0.35
+    """rad: as far as it is moved from there on the recordings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,10 +223,10 @@ KINDS: dict[str, Kind] = {
     ),
     # bodies and torques that hang on the angle
     "end_stop": Kind(
-        severity=_range(0.02, 0.5),  # test motions start 0.4 of the sweep from the middle
+        severity=lambda c: (0.02, 1.0 - 0.5 * c.sweep / c.reach),  # test motions start 0.4 of the sweep from the middle
         shape=_signed(stiffness=(3.0, 30.0)),
         values=lambda s, c, shape: {
-            "angle_rad": c.centre + shape["sign"] * (1.0 - s) * c.sweep,
+            "angle_rad": c.centre + shape["sign"] * (1.0 - s) * c.reach,
             "stiffness_nm_per_rad": shape["stiffness"] * c.kp,
         },
         plant=lambda v: Change(drive={"stop": v["stiffness_nm_per_rad"], "stop_angle": v["angle_rad"]}),

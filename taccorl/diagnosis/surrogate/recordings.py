@@ -101,7 +101,7 @@ def _noisy(
     if colour_s > 0.0:
         keep = math.exp(-1.0 / (colour_s * RATE_HZ))
         noise[0] /= math.sqrt(1.0 - keep**2)
-        noise = math.sqrt(1.0 - keep**2) * lfilter([1.0], [1.0, -keep], noise, axis=0)
+        noise = math.sqrt(1.0 - keep**2) * np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
     return values + size * noise
 
 

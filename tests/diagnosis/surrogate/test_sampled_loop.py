@@ -20,6 +20,7 @@ from taccorl.diagnosis.surrogate.sampled_loop import (
     is_stable,
     spectral_radius,
 )
+from taccorl.errors import TaccorlError
 
 JOINT = 1  # no weight
 POSE = POSES[JOINT - 1]
@@ -120,3 +121,12 @@ def test_a_drawn_case_has_a_stable_loop_that_alone_leaves_next_to_nothing():
     late_s = 0.5 * case.loop.period_s + TWIN_LATE_S  # of K_p, which the timing takes from the drive's K_d
     assert ratios["kd/kp"] == pytest.approx(case.gains[1] / case.gains[0] + late_s)
     assert math.isclose(case.left_floors, 8.0, rel_tol=0.25)
+
+
+def test_where_no_loop_is_stable_a_gear_keeps_the_continuous_one_and_any_other_robot_is_refused(monkeypatch):
+    monkeypatch.setattr("taccorl.diagnosis.surrogate.cases.is_stable", lambda *_: False)
+    case = draw_case(["backlash"], 302, signal="left_joint2", strength=8.0, design="chirp", sampled=True)
+    assert case.loop is None
+    assert case.gains == draw_case(["backlash"], 302, signal="left_joint2", strength=8.0, design="chirp").gains
+    with pytest.raises(TaccorlError, match="no sampled loop of left_joint2, seed 302, is stable"):
+        draw_case([], 302, signal="left_joint2", design="chirp", sampled=True)
