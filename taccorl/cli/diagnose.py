@@ -213,12 +213,15 @@ def print_finding(finding: "JointFinding | PadFinding") -> None:
 
     from taccorl.cli.tables import console
     from taccorl.diagnosis.evidence_words import evidence_words
+    from taccorl.diagnosis.pads import PadFinding
 
     out, d = console(), finding.diagnosis
     out.print(Text(f"\n{finding.part}", "bold"))
     out.print(f"  noise floor {finding.noise}", highlight=False)
     judged = "the last rows of each" if finding.rows_split else ", ".join(finding.recordings["validation"])
     out.print(f"  {finding.numbers}; judged on {judged}", highlight=False, soft_wrap=True)
+    if isinstance(finding, PadFinding) and finding.remark:
+        out.print(f"  {finding.remark}", highlight=False, soft_wrap=True)
     hardly = [_why_invisible(finding, name) for name in finding.can_tell.invisible if name not in d.names]
     if hardly:
         text = f"  of a typical strength these recordings would not show: {_some(hardly)}"
