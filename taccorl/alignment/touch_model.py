@@ -7,6 +7,7 @@ nothing moves but what was measured.
 Letters in shapes: T frames, P pads of the motion, B frames of a block, R × C taxels.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,14 +16,14 @@ from taccorl.alignment.touch_motion import TouchMotion
 from taccorl.data.spec import find_spec, load_sensor_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects.added import present
-from taccorl.sim.effects.effect import Effect, Memory
+from taccorl.sim.effects.effect import Effect, Memory, TouchEffect
 from taccorl.sim.effects.pad_frame import PadFrameEffect
 from taccorl.sim.effects.touch_memory import RememberingEffect
 from taccorl.sim.robot import PAD_TAXELS, PADS
 from taccorl.sim.sensors.flexitac import FlexiTacConfig, normal_reading
 from taccorl.sim.twin import TwinConfig
 
-_FRAMES_AT_ONCE = 64  # of four pads they are 0.4 MB: a core's cache holds what is being worked on
+_TAXELS_AT_ONCE = 64 * len(PADS) * math.prod(PAD_TAXELS)  # 0.4 MB: a core's cache holds what is being worked on
 
 
 class TouchModel:
@@ -43,40 +44,82 @@ class TouchModel:
         self._own = list(config.effects)
 
     def simulate(
-        self, motion: TouchMotion, stiffness_per_m: float, damping_s_per_m: float, effects: Sequence[Effect] = ()
+        self,
+        motion: TouchMotion,
+        stiffness_per_m: float,
+        damping_s_per_m: float,
+        effects: Sequence[Effect] = (),
+        start_s: float | None = None,
     ) -> np.ndarray:
         """(T, P, R, C) float32 readings, one scan after the other from pads that nothing has touched.
 
+        Args:
+            start_s: when the recording began, of a motion without its first frames; else it is at the first frame.
+
         Raises:
-            TaccorlError: two of the effects are the same one on the same pad.
+            TaccorlError: two of the effects are the same one on the same pad, or one must have whole pads and the motion is cut.
         """
         acting = present([*self._own, *effects])
         depth, rate = motion.depth(_offsets(acting, motion.pads))
-        acting = [e for e in acting if type(e).reading is not Effect.reading and e.layer != "robot"]
+        shape = depth.shape[2:]
+        acting = [e for e in acting if _reads(e)]
+        if shape != PAD_TAXELS:
+            acting = [_within(e, motion.window) for e in acting]
         slots = [PADS.index(pad) for pad in motion.pads]
         time_s = motion.time_s.mean(axis=1)
-        time_s = time_s - time_s[0]
+        time_s = time_s - (time_s[0] if start_s is None else start_s)
         dt_s = np.diff(time_s, prepend=time_s[0])
-        memories = [effect.memory(1) for effect in acting]
+        memories = [_memory(effect, motion.window) for effect in acting]
         seen = np.empty(depth.shape, np.float32)
-        for start in range(0, len(time_s), _FRAMES_AT_ONCE):
-            some = slice(start, start + _FRAMES_AT_ONCE)
+        at_once = _TAXELS_AT_ONCE // (len(PADS) * math.prod(shape))
+        for start in range(0, len(time_s), at_once):
+            some = slice(start, start + at_once)
             law = normal_reading(depth[some], rate[some], float(stiffness_per_m), float(damping_s_per_m))
             if not acting:
                 seen[some] = law
                 continue
-            reading = np.zeros((len(law), len(PADS), *PAD_TAXELS), np.float32)
+            reading = np.zeros((len(law), len(PADS), *shape), np.float32)
             reading[:, slots] = law
             for effect, memory in zip(acting, memories, strict=True):
                 reading = _through(effect, reading, memory, time_s[some], dt_s[some])
             seen[some] = reading[:, slots]
         return seen
 
+    def windowed(self, effects: Sequence[Effect]) -> bool:
+        """Whether a ``TouchMotion.cut`` can be simulated with these effects beside the twin's own."""
+        whole = (slice(None), slice(None))
+        acting = [e for e in (*self._own, *effects) if _reads(e) and not e.is_absent]
+        return all(isinstance(e, TouchEffect) and e.within(whole) is not None for e in acting)
+
+    def remembers(self, effects: Sequence[Effect]) -> bool:
+        """Whether a frame's readings hang on the frames before it."""
+        return any(bool(e.memory(1)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
+
     def counts(self, motion: TouchMotion, reading: np.ndarray) -> np.ndarray:
         """(T, P, R, C) counts above baseline, without noise and rounding; the converter's ends are kept."""
         return np.clip(
             self.sensor.gain_count * reading, -motion.baseline, self.spec.max_count - motion.baseline, dtype=np.float32
         )
+
+
+def _reads(effect: Effect) -> bool:
+    """Whether it changes readings where the taxels' depths are known."""
+    return type(effect).reading is not Effect.reading and effect.layer != "robot"
+
+
+def _within(effect: Effect, window: tuple[slice, slice]) -> Effect:
+    found = effect.within(window) if isinstance(effect, TouchEffect) else None
+    if found is None:
+        raise TaccorlError(f"touch model: effect {effect.name} must have whole pads, and the motion is a cut of them")
+    return found
+
+
+def _memory(effect: Effect, window: tuple[slice, slice]) -> Memory:
+    """As before the first scan, of the taxels in the window."""
+    return {
+        name: np.ascontiguousarray(array[..., *window]) if array.shape[-2:] == PAD_TAXELS else array
+        for name, array in effect.memory(1).items()
+    }
 
 
 def _offsets(effects: Sequence[Effect], pads: Sequence[str]) -> tuple[tuple[float, float, float], ...]:

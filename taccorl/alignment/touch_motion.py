@@ -10,10 +10,11 @@ then the arm's measured joints count as well, and 0.2 mrad of theirs are 0.1 mm 
 Letters in shapes: T frames, P pads, R × C taxels, I instants of a scan, S rows of the measurement.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -130,6 +131,8 @@ class TouchMotion:
     shapes: tuple[Shapes, ...]
     clearance_m: np.ndarray
     """(T, P, I) the object is at least so far out of the plane of the taxels; below 0 it may reach through."""
+    window: tuple[slice, slice] = (slice(0, PAD_TAXELS[0]), slice(0, PAD_TAXELS[1]))
+    """Rows and columns of the pads that R × C are: all but for a ``cut``."""
 
     @property
     def name(self) -> str:
@@ -143,15 +146,46 @@ class TouchMotion:
         Args:
             offsets_m: per pad, in its own frame, by how much its taxels lie elsewhere than on a nominal finger.
         """
+        if not any(any(offset) for offset in offsets_m):
+            offsets_m = ()
         if offsets_m not in self._known:
             while len(self._known) >= _KEPT:
                 del self._known[next(iter(self._known))]
             self._known[offsets_m] = self._depth(offsets_m)
         return self._known[offsets_m]
 
+    def cut(self, frames: np.ndarray, window: tuple[slice, slice]) -> "TouchMotion":
+        """Some frames of some rows and columns of the pads: what a fit simulates again and again, without the rest.
+
+        Args:
+            frames: (T,) bool.
+        """
+        number = np.arange(math.prod(PAD_TAXELS)).reshape(PAD_TAXELS)
+        local = np.full(number.size, -1)
+        local[number[window].ravel()] = np.arange(number[window].size)
+        groups = local[self.groups]
+        instants, places = (groups >= 0).any(axis=1), (groups >= 0).any(axis=0)
+        groups = groups[np.ix_(instants, places)]
+        if (groups < 0).any():
+            raise TaccorlError(f"touch motion: taxels {window} are no rectangle of what the board reads at one instant")
+        arrays = {
+            name: np.ascontiguousarray(getattr(self, name)[frames][:, :, instants])
+            for name in ("object_from_pad", "velocity", "clearance_m")
+        }
+        return dataclasses.replace(
+            self,
+            time_s=self.time_s[frames],
+            measured=self.measured[frames][:, :, *window],
+            baseline=self.baseline[:, *window],
+            groups=groups,
+            window=window,
+            **arrays,
+        )
+
     def _depth(self, offsets_m: tuple[tuple[float, float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
         offset = np.array(offsets_m or [(0.0, 0.0, 0.0)] * len(self.pads))
-        xyz = np.append(_TAXEL_XY.reshape(-1, 2), np.zeros((_TAXEL_XY.size // 2, 1)), axis=1)
+        taxel_xy = _TAXEL_XY[self.window]
+        xyz = np.append(taxel_xy.reshape(-1, 2), np.zeros((taxel_xy.size // 2, 1)), axis=1)
         # Taxels of a group lie in a line: what is common to them goes into the position, what differs into the grid.
         first = xyz[self.groups[:, 0]]
         along = xyz[self.groups[0]] - first[0]
@@ -173,10 +207,10 @@ class TouchMotion:
                 np.copyto(felt_mps, felt.depth_rate_mps, where=deeper)
         depth, rate = np.zeros((2, *close.shape, grid.shape[1]), np.float32)
         depth[close], rate[close] = felt_m, felt_mps
-        taxels = np.zeros((2, num_frames, num_pads, math.prod(PAD_TAXELS)), np.float32)
+        taxels = np.zeros((2, num_frames, num_pads, self.groups.size), np.float32)
         taxels[..., self.groups] = np.stack([depth, rate])
         taxels.flags.writeable = False
-        depth_m, rate_mps = taxels.reshape(2, num_frames, num_pads, *PAD_TAXELS)
+        depth_m, rate_mps = taxels.reshape(2, num_frames, num_pads, *taxel_xy.shape[:2])
         return depth_m, rate_mps
 
     def near(self, margin_m: float) -> np.ndarray:
@@ -240,7 +274,9 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
 
 
 def _only(motion: TouchMotion, pads: np.ndarray) -> TouchMotion:
-    arrays = {
+    if len(pads) == len(motion.pads):
+        return motion
+    arrays: dict[str, Any] = {
         name: np.ascontiguousarray(getattr(motion, name)[:, pads])
         for name in ("time_s", "measured", "object_from_pad", "velocity", "clearance_m")
     }

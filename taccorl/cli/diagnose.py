@@ -227,6 +227,7 @@ def print_finding(
 
     from taccorl.cli.tables import console
     from taccorl.diagnosis.evidence_words import evidence_words
+    from taccorl.diagnosis.pads import PadFinding
 
     out, d = console(), finding.diagnosis
     out.print(Text(f"\n{finding.part}", "bold"))
@@ -240,6 +241,8 @@ def print_finding(
     out.print(f"  noise floor {finding.noise}", highlight=False)
     judged = "the last rows of each" if finding.rows_split else ", ".join(finding.recordings["validation"])
     out.print(f"  {finding.numbers}; chosen by the error on {judged} (validation)", highlight=False, soft_wrap=True)
+    if isinstance(finding, PadFinding) and finding.remark:
+        out.print(f"  {finding.remark}", highlight=False, soft_wrap=True)
     hardly = [_why_invisible(finding, name) for name in finding.can_tell.invisible if name not in d.names]
     if hardly:
         text = f"  of a typical strength these recordings would not show: {_some(hardly)}"

@@ -16,13 +16,16 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.noise_floor import repeat_pairs
 from taccorl.alignment.touch_motion import TouchMotion
+from taccorl.diagnosis.evidence import block_squares, standard_score
+from taccorl.diagnosis.fit import fit
 from taccorl.diagnosis.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.joints import add_effect, each
-from taccorl.diagnosis.problem import split_rows
+from taccorl.diagnosis.problem import Recording, split_rows
 from taccorl.diagnosis.replays import matched_contact
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
-from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, TouchProblem
+from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose, gain_of
+from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
 from taccorl.sim.robot import ARMS
 from taccorl.sim.twin import TwinConfig
 
@@ -49,11 +52,20 @@ class PadFinding:
     """fit, validation, test → names."""
     rows_split: bool
     """No recording was marked for validation: rows at the end of each were."""
+    gains: GainStatistics | None = None
+    """That taxels' gains differ, which no validation recording could judge: none presses the taxels that were fitted to."""
+    not_shared: tuple[str, ...] = ()
+    """These validation recordings."""
 
     @property
     def part(self) -> str:
         """``left pads``: how tables and reports call them."""
         return part_of(self.arm)
+
+    @property
+    def remark(self) -> str:
+        """What the search could not judge, and the press that would show it; empty if there is nothing."""
+        return gain_words(self.gains, self.not_shared) if self.gains else ""
 
     @property
     def noise(self) -> str:
@@ -111,7 +123,7 @@ def diagnose_arm(
     every = [motion for some in motions.values() for motion in some]
     _check_pads(every)
     problem = TouchProblem(every, config)
-    fit_to, validation, test = ([problem.recording(m) for m in some] for some in motions.values())
+    fit_to, validation, test = problem.recordings(motions["fit"], motions["validation"], motions["test"])
     floor_count = float(np.median(np.concatenate([r.floor for r in fit_to])))
     rows_split = not validation
     if rows_split:
@@ -127,7 +139,10 @@ def diagnose_arm(
         without=without,
         config=search,
     )
+    gains = unjudged_gains(problem, found, fit_to, validation, search or SearchConfig()) if not rows_split else None
     return PadFinding(
+        gains=gains,
+        not_shared=tuple(problem.not_shared),
         arm=arm,
         pads=problem.pads,
         diagnosis=found,
@@ -152,6 +167,49 @@ def diagnose_pads(
     """The pads of several arms, as ``diagnose_joints`` does joints."""
     one = partial(diagnose_arm, config, measurements=measurements, search=search, without=without)
     return each(one, arms, workers, lambda arm: done(part_of(arm)))
+
+
+def unjudged_gains(
+    problem: TouchProblem,
+    found: Diagnosis,
+    fit_to: Sequence[Recording],
+    validation: Sequence[Recording],
+    config: SearchConfig,
+) -> GainStatistics | None:
+    """Statistics of the taxels' gains, if a map of them explains what a search has left over but cannot be judged by it, because
+    validation recordings press other taxels.
+
+    The map is then judged in time instead of on other recordings: estimated from the first rows of every recording, on the
+    others, by the search's own measures. None if it is not believed, or if the search could judge it: a map that it took
+    without a common taxel only moved k_n.
+    """
+    name = TaxelGainMap.name
+    names = tuple(n for n in found.names if n != name)
+    left_over = found.status in ("something_else", "too_many")
+    if not left_over or not problem.not_shared or name not in problem.candidates:
+        return None
+    early, late = split_rows([*fit_to, *validation])
+    without = fit(problem, early, names, found.after.values)
+    with_it = fit(problem, early, (*names, name), without.values)
+    before = block_squares(problem, without, late)
+    better = before - block_squares(problem, with_it, late)
+    # Of a map as a whole, not of each of its numbers: what its gains are is not claimed here, only that they differ.
+    if config.too_little(gain_of(better, before), standard_score(better)):
+        return None
+    return problem.gain_statistics(with_it.values, with_it.effects, [*fit_to, *validation])
+
+
+def gain_words(gains: GainStatistics, not_shared: Sequence[str]) -> str:
+    """One remark: what is the matter, why it is no finding of the search, what to record."""
+    parts = []
+    if gains.num_dead:
+        parts.append(f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({gains.dead_share:.0%}) read nothing")
+    parts.append(f"the gains of {'the others' if parts else 'taxels'} spread by {gains.log_std:.0%}")
+    return (
+        f"{' and '.join(parts)} (dead_taxels, taxel_gain_spread): this explains what is left. No taxel_gain_map could be judged, "
+        f"as {', '.join(not_shared)} press{'es' if len(not_shared) == 1 else ''} other taxels than the fit recordings; record a "
+        "validation press at a place that a fit recording presses (excite --pads: rod_across)"
+    )
 
 
 def _motion(m: Measurement, config: TwinConfig) -> TouchMotion:

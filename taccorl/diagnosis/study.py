@@ -149,7 +149,7 @@ def run_touch(job: Job) -> dict[str, Any]:
     motions = touch_recordings(case).motions(case.twin)
     recorded = time.process_time()
     problem = TouchProblem([m for side in motions.values() for m in side], case.twin)
-    fit_to, validation, test = ([problem.recording(m) for m in motions[use]] for use in ("fit", "validation", "test"))
+    fit_to, validation, test = problem.recordings(motions["fit"], motions["validation"], motions["test"])
     config = SearchConfig(max_effects=len(job.hidden) + 1)
     found = diagnose(problem, fit_to, validation, test, start=problem.start, without=job.without, config=config)
     done = time.process_time()

@@ -2,7 +2,9 @@
 
 import dataclasses
 import sys
+from functools import cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,11 +14,14 @@ from made_press import K_D, K_N, Law, ball_at, plain, press
 
 from taccorl.alignment.touch_motion import TouchMotion, touch_motion
 from taccorl.diagnosis.fit import fit
+from taccorl.diagnosis.pads import gain_words, unjudged_gains
 from taccorl.diagnosis.problem import Problem, split_rows
 from taccorl.diagnosis.screen import probe
-from taccorl.diagnosis.search import diagnose
-from taccorl.diagnosis.touch_problem import TouchProblem
+from taccorl.diagnosis.search import SearchConfig, diagnose
+from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, TouchProblem, _noise_gain, _repeat_floor
+from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.taxel_crosstalk import TaxelCrosstalk
 from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
 from taccorl.sim.twin import TwinConfig
 
@@ -24,6 +29,7 @@ CONFIG = TwinConfig()
 FEW = ("taxel_saturation", "touch_lag", "baseline_drift", "taxel_gain_map")  # all of them with make test-slow
 PLACES = ((0.001, 0.003), (-0.004, -0.012))
 GAINS = np.exp(0.25 * np.random.default_rng(5).standard_normal((2, 32, 12)))
+DEAD = ((0, 16, 6), (1, 17, 5))
 GAINS[0, 16, 6] = GAINS[1, 17, 5] = 0.0
 
 
@@ -76,6 +82,7 @@ PLANTED: dict[str, Law] = {
 }
 
 
+@cache
 def recorded(name: str, seed: int) -> TouchMotion:
     x_m, z_m = PLACES[seed % 2]
     made = press(seed, ball=ball_at(x_m, z_m), law=PLANTED.get(name, plain))
@@ -86,6 +93,7 @@ def recorded(name: str, seed: int) -> TouchMotion:
     return touch_motion(made, CONFIG, ball_at(x_m, z_m))
 
 
+@cache
 def problem(name: str, num: int = 2) -> tuple[TouchProblem, list]:
     motions = [recorded(name, seed) for seed in range(num)]
     made = TouchProblem(motions, CONFIG)
@@ -167,7 +175,8 @@ def test_what_the_pads_do_not_repeat_is_in_the_floor() -> None:
     )
     motions = [touch_motion(m, CONFIG, ball) for m in (first, deeper)]
     alone, both = TouchProblem(motions[:1], CONFIG), TouchProblem(motions, CONFIG)
-    share = motions[0].near(0.0).mean(axis=0)
+    kept = both.recording(motions[0]).data.rows[:, None] * FRAMES_A_ROW + np.arange(FRAMES_A_ROW)
+    share = motions[0].near(0.0)[kept.ravel()].mean(axis=0)  # of the rows that are judged, not of all
     often = share > 0.2
     expected = np.sqrt(np.square(alone.floor_count) + share * 9 / 2)
     np.testing.assert_allclose(both.floor_count[often], expected[often], rtol=0.2)
@@ -194,3 +203,122 @@ def test_candidates_are_all_effects_that_a_matched_replay_can_show() -> None:
     assert not {"pad_compliance", "contact_compliance", "taxel_gain_spread", "dead_taxels"} & set(made.candidates)
     assert [f.name for f in made.candidates["taxel_power_law"].frees] == ["taxel_power_law.exponent"]
     assert recordings[0].measured.shape[1] <= 64
+
+
+def test_interpolated_repeats_do_not_lower_the_floor() -> None:
+    """White noise of 4 counts a frame in both, the second shifted by half a frame: √(0.5² + 4 + 0.5²) / 5 · 4 of the laid row,
+    where an untouched one has 4 / √5. Without a correction the floor is √(1.9 / 2), 2.5 %, too low."""
+    first = press(0, ball=ball_at(*PLACES[0]), noise_count=4.0)
+    again = press(7, ball=ball_at(*PLACES[0]), noise_count=4.0, motion_seed=0, repeat_of="press_0", name="again")
+    assert again.touch is not None
+    late = dataclasses.replace(again, touch=dataclasses.replace(again.touch, time_s=again.touch.time_s + 0.005))
+    still = np.zeros((2, 32, 12))
+    exact, half = (
+        _repeat_floor([touch_motion(m, CONFIG, ball_at(*PLACES[0])) for m in (first, other)], still).taxel_count
+        for other in (again, late)
+    )
+    untouched = slice(26, 32)  # the ball is in the middle
+    known = np.sqrt((4.0**2 + 1 / 12) / FRAMES_A_ROW)
+    assert np.sqrt(np.mean(np.square(exact[:, untouched]))) == pytest.approx(known, rel=0.008)
+    assert np.sqrt(np.mean(np.square(half[:, untouched]))) == pytest.approx(known, rel=0.008)
+
+
+def test_the_noise_of_an_interpolated_row_is_that_of_its_weights() -> None:
+    np.testing.assert_allclose(_noise_gain(np.zeros(5)), [1.0])
+    np.testing.assert_allclose(_noise_gain(np.full(5, 0.5)), [(0.25 + 4 + 0.25) / 5])
+    # Weights of six frames: 1, 1 − 0.1 five times over less the last, which keeps 0.4
+    np.testing.assert_allclose(_noise_gain(np.arange(5) * 0.1), [(1 + 4 * 0.9**2 + 0.4**2) / 5])
+
+
+@pytest.mark.parametrize("name", [*PLANTED, "none"])
+def test_a_window_of_the_pads_reads_what_whole_pads_read(name: str) -> None:
+    """Also where a taxel passes its reading on, and where the pads are shifted."""
+    made, recordings = problem("none", 1)
+    (recording,), values = recordings, {f.name: f.start for f in made.base}
+    if name != "none":
+        c = made.candidates[name]
+        values |= {f.name: f.start for f in c.frees} | c.starts[0]
+        effects = made.prepare(values, [c.make(values)], recordings)
+    else:
+        effects = []
+    chosen = recording.data
+    assert chosen.window.size < 768
+    reading = made._model.simulate(chosen.motion, values["k_n"], values["k_d"], effects)
+    counts = made._model.counts(chosen.motion, reading)
+    rows = counts[: len(counts) // FRAMES_A_ROW * FRAMES_A_ROW].reshape(-1, FRAMES_A_ROW, counts[0].size).mean(axis=1)
+    quick = made.simulate(values, effects, recording)
+    np.testing.assert_allclose(quick, rows[chosen.rows][:, chosen.taxels], atol=2e-4)
+    assert quick.max() > 20
+
+
+@dataclasses.dataclass(kw_only=True)
+class Whole(TaxelCrosstalk):
+    """As an effect of another package that says nothing of windows."""
+
+    windows: ClassVar = False
+
+
+def test_an_effect_that_must_have_whole_pads_gets_them() -> None:
+    made, (recording,) = problem("none", 1)
+    values = {f.name: f.start for f in made.base}
+    one, other = (
+        made.simulate(values, [cls(share=0.3, pads=["left_a", "left_b"])], recording) for cls in (TaxelCrosstalk, Whole)
+    )
+    np.testing.assert_allclose(one, other, atol=2e-4)
+    with pytest.raises(TaccorlError, match="taxel_crosstalk must have whole pads"):
+        made._model.simulate(recording.data.cut, 900.0, 9.0, [Whole(share=0.3)])
+
+
+def with_gains(place: tuple[float, float], seed: int) -> TouchMotion:
+    law = PLANTED["taxel_gain_map"]
+    return touch_motion(press(seed, ball=ball_at(*place), law=law), CONFIG, ball_at(*place))
+
+
+def of_elsewhere(place: tuple[float, float]) -> tuple[TouchProblem, list, list]:
+    """Fitted to a ball at the first place, judged on one that is pressed elsewhere."""
+    fitted, other = with_gains(PLACES[0], 0), with_gains(place, 3)
+    made = TouchProblem([fitted, other], CONFIG)
+    return made, *made.recordings([fitted], [other])[:2]
+
+
+FEW = ("pad_shift", "depth_offset", "taxel_creep", "taxel_power_law", "taxel_hysteresis", "taxel_ghosting", "touch_lag")
+
+
+def test_a_gain_map_is_judged_on_the_taxels_that_both_fit_and_validation_press() -> None:
+    """6 mm to the side: half of the patch was never pressed in the fit, and no map can know its gains."""
+    made, fit_to, validation = of_elsewhere((0.007, 0.003))
+    assert made.not_shared == []
+    pressed = [(r.data.motion.depth()[0] > 5e-5).sum(axis=0).ravel() >= 25 for r in (fit_to[0], validation[0])]
+    judged = np.zeros(768, bool)
+    judged[validation[0].data.taxels] = True
+    assert (pressed[1] & ~pressed[0]).sum() > 5
+    assert not (judged & pressed[1] & ~pressed[0]).any()
+    assert (judged & pressed[1] & pressed[0]).sum() >= 8
+    found = diagnose(made, fit_to, validation, without=FEW)
+    assert found.names[0] == "taxel_gain_map"
+    assert found.errors["fitted"]["validation"] > 2.0 and found.errors["after"]["validation"] < 1.3
+
+
+def test_gains_that_no_validation_recording_can_judge_are_named_by_their_statistics() -> None:
+    made, fit_to, validation = of_elsewhere((-0.003, -0.018))
+    assert made.not_shared == ["press_3"]
+    found = diagnose(made, fit_to, validation, without=FEW, config=SearchConfig(max_effects=1))
+    assert found.status in ("something_else", "too_many")
+    gains = unjudged_gains(made, found, fit_to, validation, SearchConfig())
+    assert gains is not None
+    # The gains' logarithms were drawn with 0.25; of 50 of them the standard deviation has an error of a tenth.
+    assert gains.log_std == pytest.approx(0.25, rel=0.3)
+    dead = sum(bool(m.data.motion.depth()[0][:, p, r, c].max() > 2e-4) for m in fit_to for p, r, c in DEAD)
+    assert gains.num_dead == dead > 0
+    words = gain_words(gains, made.not_shared)
+    assert "dead_taxels" in words and "taxel_gain_spread" in words and "press_3 presses other taxels" in words
+    assert "excite --pads: rod_across" in words
+
+
+def test_no_statistics_are_named_where_nothing_is_left_over() -> None:
+    fitted, other = recorded("none", 0), recorded("none", 1)
+    made = TouchProblem([fitted, other], CONFIG)
+    fit_to, validation, _ = made.recordings([fitted], [other])
+    found = diagnose(made, fit_to, validation)
+    assert found.status == "nothing_missing"
+    assert unjudged_gains(made, found, fit_to, validation, SearchConfig()) is None

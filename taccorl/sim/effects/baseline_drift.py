@@ -19,6 +19,7 @@ class BaselineDrift(TouchEffect):
 
     name: ClassVar = "baseline_drift"
     layer: ClassVar = "baseline"
+    windows: ClassVar = True
     equation: ClassVar = "r = f + b t"
     in_words: ClassVar = (
         "What the pads read without contact wanders away from the zero taken at the start: warmth, and rubber "

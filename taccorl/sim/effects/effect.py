@@ -316,6 +316,8 @@ class JointEffect(ArmEffect):
 class TouchEffect(Effect):
     """An effect of pads or of their taxels."""
 
+    windows: ClassVar[bool] = False
+    """Whether ``reading`` and ``memory`` also hold for a rectangle of each pad's taxels, where nothing touches beyond its rim."""
     pads: list[str] = field(default_factory=lambda: list(PADS))
     """``left_a`` … ``right_b``."""
 
@@ -330,6 +332,10 @@ class TouchEffect(Effect):
     def slots(self) -> list[int]:
         """Where the chosen pads stand in the reading."""
         return [PADS.index(pad) for pad in self.pads]
+
+    def within(self, window: tuple[slice, slice]) -> "TouchEffect | None":
+        """The effect for readings of these rows and columns only; None if it must have whole pads (``windows``)."""
+        return self if self.windows else None
 
 
 @dataclass(kw_only=True)

@@ -25,6 +25,7 @@ class TaxelCreep(RememberingEffect):
 
     name: ClassVar = "taxel_creep"
     layer: ClassVar = "material"
+    windows: ClassVar = True
     equation: ClassVar = "r = f + a m, ṁ = (f − m) / τ"
     in_words: ClassVar = (
         "Under a load that stays, the reading goes on rising or sinking for seconds: rubber and foils flow."

@@ -19,6 +19,7 @@ class TaxelCrosstalk(TouchEffect):
 
     name: ClassVar = "taxel_crosstalk"
     layer: ClassVar = "spread"
+    windows: ClassVar = True
     equation: ClassVar = "r = f + c/4 Σ (f_neighbour − f)"
     in_words: ClassVar = "The picture of touch is blurred: covers carry load sideways, and neighbours share wires."
     at_a_policy: ClassVar = "Edges are soft and small parts look wide, so it aligns them less exactly."

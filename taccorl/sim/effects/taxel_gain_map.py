@@ -1,5 +1,6 @@
 """Gain map: each taxel's own gain, as it was measured; dead taxels are those of gain 0."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -62,14 +63,21 @@ class TaxelGainMap(TouchEffect):
         if bad:
             raise TaccorlError(f"effect {self.name}: gains hold {bad[0]!r}; each is a number of 0 or more")
         self.gains = [float(g) for g in self.gains]
+        self._window = (slice(None), slice(None))
 
     @classmethod
     def of(cls, gains: np.ndarray, pads: Sequence[str]) -> "TaxelGainMap":
         """The map of gains (P, 32, 12), rounded to six digits: fine enough to be fitted with, short enough to be read."""
         return cls(share=1.0, pads=list(pads), gains=np.round(np.asarray(gains, float), 6).reshape(-1).tolist())
 
+    def within(self, window: tuple[slice, slice]) -> "TaxelGainMap":
+        found = copy.copy(self)
+        found._window = window
+        return found
+
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         gains = np.broadcast_to(self.gains, len(self.pads) * math.prod(PAD_TAXELS)).reshape(-1, *PAD_TAXELS)
+        gains = gains[:, *self._window]
         reading = reading.copy()
         reading[:, self.slots] *= (1.0 + self.share * (gains - 1.0)).astype(reading.dtype)
         return reading

@@ -16,6 +16,7 @@ class TaxelGhosting(TouchEffect):
 
     name: ClassVar = "taxel_ghosting"
     layer: ClassVar = "spread"
+    windows: ClassVar = True
     equation: ClassVar = "r_ij = f_ij + g (Σ_{k≠j} f_ik + Σ_{k≠i} f_kj)"
     in_words: ClassVar = (
         "A faint cross through the place of contact: a pressed taxel shows on all others of its row and of its column, "

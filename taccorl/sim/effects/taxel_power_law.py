@@ -20,6 +20,7 @@ class TaxelPowerLaw(TouchEffect):
 
     name: ClassVar = "taxel_power_law"
     layer: ClassVar = "material"
+    windows: ClassVar = True
     equation: ClassVar = "r = f₀ (f / f₀)^p"
     in_words: ClassVar = (
         "A taxel's reading is not in proportion to the pressure: foils flatten out, soft covers stiffen."

@@ -18,6 +18,7 @@ class TaxelSaturation(TouchEffect):
 
     name: ClassVar = "taxel_saturation"
     layer: ClassVar = "material"
+    windows: ClassVar = True
     equation: ClassVar = "r = f / (1 + f / f_s)"
     in_words: ClassVar = (
         "The harder a taxel is pressed, the less its reading grows: its voltage divider runs out of range."

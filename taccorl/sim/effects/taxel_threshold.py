@@ -16,6 +16,7 @@ class TaxelThreshold(TouchEffect):
 
     name: ClassVar = "taxel_threshold"
     layer: ClassVar = "material"
+    windows: ClassVar = True
     equation: ClassVar = "r = [f − t]₊"
     in_words: ClassVar = "A light touch does not show: the foils of a taxel must first be pressed together."
     at_a_policy: ClassVar = "It feels contact too late and its patch too small."

@@ -22,6 +22,7 @@ class TouchDelay(RememberingEffect):
 
     name: ClassVar = "touch_delay"
     layer: ClassVar = "taxel"
+    windows: ClassVar = True
     equation: ClassVar = "r(t) = f(t − d)"
     in_words: ClassVar = (
         "Touch is reported late: the board buffers, or its driver stamps a frame when it arrives, not when it was read."

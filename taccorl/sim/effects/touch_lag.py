@@ -19,6 +19,7 @@ class TouchLag(RememberingEffect):
 
     name: ClassVar = "touch_lag"
     layer: ClassVar = "taxel"
+    windows: ClassVar = True
     equation: ClassVar = "ṙ = (f − r) / T"
     in_words: ClassVar = (
         "Readings rise and fall gradually after a touch that came at once: the board averages over scans."
