@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.joint_model import Gains, JointModel, JointMotion
+from taccorl.diagnosis.correlation import Rows
 from taccorl.diagnosis.fit import FINE, Fit, fit
 from taccorl.diagnosis.identifiable import (
     OVER_KP,
@@ -146,7 +147,8 @@ def made_fit(frees: Sequence[Free], values: dict[str, float], jacobian: np.ndarr
     """Noise of one floor, so that the covariance is (JᵀJ)⁻¹ but for the noise's own scatter."""
     rng = np.random.default_rng(0)
     residuals = rng.choice([-1.0, 1.0], len(jacobian))
-    return Fit(tuple(e.name for e in names), values, residuals, jacobian, tuple(frees), (), "", 1, names)
+    layout = (Rows(np.ones((len(jacobian), 1), bool), 200.0),)
+    return Fit(tuple(e.name for e in names), values, residuals, layout, jacobian, tuple(frees), (), "", 1, names)
 
 
 def test_variance_of_a_ratio_is_that_of_the_difference_of_logarithms():

@@ -45,6 +45,7 @@ class EndStop(JointEffect):
     stiffness_nm_per_rad: float = parameter(
         unit="N·m/rad",
         symbol="k",
+        over="kp",
         absent=0.0,
         low=0.0,
         high=1e5,

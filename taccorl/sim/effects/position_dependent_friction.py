@@ -48,6 +48,7 @@ class PositionDependentFriction(JointEffect):
     torque_nm: float = parameter(
         unit="N·m",
         symbol="F₀",
+        over="kp",
         absent=0.0,
         low=0.0,
         high=20.0,

@@ -46,6 +46,7 @@ class TorqueSpeedLimit(JointEffect):
     stall_nm: float = parameter(
         unit="N·m",
         symbol="τ_s",
+        over="kp",
         absent=math.inf,
         low=0.05,
         high=200.0,
