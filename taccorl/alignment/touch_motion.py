@@ -191,13 +191,9 @@ class TouchMotion:
         along = xyz[self.groups[0]] - first[0]
         grid = np.stack([along[:, 0], along[:, 1], np.ones(len(along))])
         start = np.append(first + offset[:, None], np.ones((len(offset), len(first), 1)), axis=2)  # (P, I, 4)
-        position = self.object_from_pad[..., [0, 1, 3]].copy()
-        velocity = self.velocity[..., [0, 1, 3]].copy()
-        position[..., 2] = np.einsum("tpixk,pik->tpix", self.object_from_pad, start)
-        velocity[..., 2] = np.einsum("tpixk,pik->tpix", self.velocity, start)
-        num_frames, num_pads = position.shape[:2]
-        close = self.clearance_m < offset[:, None, 2]
-        flat = position[close], velocity[close]
+        frame, pad, instant = np.nonzero(self.clearance_m < offset[:, None, 2])
+        at = start[pad, instant]
+        flat = _moved(self.object_from_pad[frame, pad, instant], at), _moved(self.velocity[frame, pad, instant], at)
         felt_m, felt_mps = np.zeros((2, len(flat[0]), grid.shape[1]), np.float32)
         for kind in self.shapes:
             for number in range(len(kind.geoms)):
@@ -205,12 +201,11 @@ class TouchMotion:
                 deeper = felt.depth_m > felt_m
                 np.copyto(felt_m, felt.depth_m, where=deeper)
                 np.copyto(felt_mps, felt.depth_rate_mps, where=deeper)
-        depth, rate = np.zeros((2, *close.shape, grid.shape[1]), np.float32)
-        depth[close], rate[close] = felt_m, felt_mps
-        taxels = np.zeros((2, num_frames, num_pads, self.groups.size), np.float32)
-        taxels[..., self.groups] = np.stack([depth, rate])
+        taxels = np.zeros((2, *self.clearance_m.shape[:2], self.groups.size), np.float32)
+        where = frame[:, None], pad[:, None], self.groups[instant]
+        taxels[0][where], taxels[1][where] = felt_m, felt_mps
         taxels.flags.writeable = False
-        depth_m, rate_mps = taxels.reshape(2, num_frames, num_pads, *taxel_xy.shape[:2])
+        depth_m, rate_mps = taxels.reshape(*taxels.shape[:3], *taxel_xy.shape[:2])
         return depth_m, rate_mps
 
     def near(self, margin_m: float) -> np.ndarray:
@@ -222,6 +217,13 @@ class TouchMotion:
         near = self.near(margin_m).any(axis=(2, 3))
         last = np.where(near, self.time_s, -np.inf)
         return self.time_s - np.maximum.accumulate(last, axis=0) > after_s
+
+
+def _moved(matrices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) rows x, y, 1 of a pad's plane, whose origin is moved to points (n, 4)."""
+    moved = matrices[..., [0, 1, 3]]
+    moved[..., 2] = np.einsum("nxk,nk->nx", matrices, points)
+    return moved
 
 
 def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:

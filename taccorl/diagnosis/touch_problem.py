@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 
 from taccorl.alignment.noise_floor import repeat_pairs
@@ -269,11 +270,11 @@ class TouchProblem:
         else:
             places, all_frames = taxels, True
             reading = model.simulate(chosen.motion, *numbers)
-        counts = model.sensor.gain_count * reading.reshape(len(reading), -1)[:, places]
-        counts += np.array([base[f"zero_{pad}"] for pad in self.pads], np.float32)[taxels // _TAXELS]
-        baseline = chosen.motion.baseline.reshape(-1)[taxels].astype(np.float32)
-        np.clip(counts, -baseline, np.float32(model.spec.max_count) - baseline, out=counts)
-        return _rows(counts)[chosen.rows] if all_frames else _rows(counts)
+        zero = np.array([base[f"zero_{pad}"] for pad in self.pads])[taxels // _TAXELS]
+        low = -chosen.motion.baseline.reshape(-1)[taxels].astype(float)
+        seen = reading.reshape(len(reading), -1)
+        numbers = float(model.sensor.gain_count), zero, low, low + model.spec.max_count
+        return _row_counts(seen, places, chosen.rows if all_frames else np.arange(len(chosen.rows)), *numbers)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Starts of searches hang on the recordings alone."""
@@ -347,6 +348,25 @@ def _rows(frames: np.ndarray) -> np.ndarray:
     """Means of ``FRAMES_A_ROW`` frames (T, …) → rows; frames left over at the end fall away."""
     whole = len(frames) // FRAMES_A_ROW * FRAMES_A_ROW
     return frames[:whole].reshape(-1, FRAMES_A_ROW, *frames.shape[1:]).mean(axis=1, dtype=float)
+
+
+@numba.njit(cache=True)
+def _row_counts(
+    reading: np.ndarray,
+    places: np.ndarray,
+    rows: np.ndarray,
+    gain_count: float,
+    zero: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
+    """(S, C) means of g r + zero, cut to low … high frame by frame: rows (S,) and columns ``places`` (C,) of readings (T, K)."""
+    counts = np.zeros((len(rows), len(places)))
+    for s in range(len(rows)):
+        for frame in range(rows[s] * FRAMES_A_ROW, (rows[s] + 1) * FRAMES_A_ROW):
+            for c in range(len(places)):
+                counts[s, c] += min(max(gain_count * reading[frame, places[c]] + zero[c], low[c]), high[c])
+    return counts / FRAMES_A_ROW
 
 
 def _still_floor(motions: Sequence[TouchMotion]) -> np.ndarray:
