@@ -360,11 +360,7 @@ def _row_counts(
     low: np.ndarray,
     high: np.ndarray,
 ) -> np.ndarray:
-<<<<<<< HEAD
-    """(S, C) means of g r + zero, cut to low … high frame by frame: ``rows`` (S,), columns ``places`` (C,) of readings (T, K)."""
-=======
     """(S, C) means of g r + zero, cut to low … high frame by frame: rows (S,) and columns ``places`` (C,) of readings (T, K)."""
->>>>>>> pads
     counts = np.zeros((len(rows), len(places)))
     for s in range(len(rows)):
         for frame in range(rows[s] * FRAMES_A_ROW, (rows[s] + 1) * FRAMES_A_ROW):
