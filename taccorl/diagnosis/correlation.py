@@ -99,7 +99,7 @@ def _independent(part: np.ndarray) -> float:
     filled = np.where(measured, part, 0.0)
     filled = np.where(measured, filled - filled.sum(axis=0) / np.maximum(count, 1), 0.0)
     length = next_fast_len(2 * len(part), real=True)
-    spectrum = rfft(filled, length, axis=0)
+    spectrum = np.asarray(rfft(filled, length, axis=0))
     correlation = np.asarray(irfft(spectrum.real**2 + spectrum.imag**2, length, axis=0))[: max(len(part) // 2, 1)]
     power = correlation[0]
     varies = power > 1e-20 * np.maximum((np.where(measured, part, 0.0) ** 2).sum(axis=0), 1e-300)
