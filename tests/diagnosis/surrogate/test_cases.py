@@ -119,14 +119,8 @@ def test_the_truth_can_be_written_as_the_registrys_effect(name):
 
 def test_every_joint_effect_of_the_registry_can_be_hidden():
     joint = {name for name in effects if effects.get(name).layer == "robot"}
-<<<<<<< HEAD
-    # Those of pads and parts are not seen by joints; no search fits commands that are dropped at random.
-    assert joint - set(REGISTERED) <= {
-        "dropped_commands",
-=======
     # Those of pads and parts are not seen by joints.
     assert joint - set(REGISTERED) - set(NOT_FITTED) <= {
->>>>>>> surr
         "pad_compliance",
         "contact_compliance",
         "contact_friction",
