@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from scipy.fft import next_fast_len
 
 BLOCK_S = 0.5
 """Length of a block. Residuals within one are correlated, as a misfit lasts as long as a motion; blocks count as independent."""
@@ -99,8 +99,8 @@ def _independent(part: np.ndarray) -> float:
     filled = np.where(measured, part, 0.0)
     filled = np.where(measured, filled - filled.sum(axis=0) / np.maximum(count, 1), 0.0)
     length = next_fast_len(2 * len(part), real=True)
-    spectrum = np.asarray(rfft(filled, length, axis=0))
-    correlation = np.asarray(irfft(spectrum.real**2 + spectrum.imag**2, length, axis=0))[: max(len(part) // 2, 1)]
+    spectrum = np.abs(np.fft.rfft(filled, length, axis=0))
+    correlation = np.fft.irfft(spectrum**2, length, axis=0)[: max(len(part) // 2, 1)]
     power = correlation[0]
     varies = power > 1e-20 * np.maximum((np.where(measured, part, 0.0) ** 2).sum(axis=0), 1e-300)
     correlation = correlation[:, varies] / power[varies]
