@@ -40,7 +40,7 @@ ms and the torque held between samples; drawn are rates that are stable at 3.2 t
 are unknown to the search). Heavy joints with play or a spring in the gear, which no such loop damps, keep a continuous
 velocity loop. The encoder's noise is **coloured** (10 to 100 ms) in a quarter. **Packs** have a recording with 0.3 kg between
 the pads, a few millimetres off their middle. Where nothing is hidden, a third of the robots hold a **weighed mass** of 0.1 to
-0.5 kg in every recording, a third have a sampled loop and a third coloured noise; efforts are used in half of those whose
+0.5 kg at a measured place in every recording, a third have a sampled loop and a third coloured noise; efforts are used in half of those whose
 loop is not sampled. With efforts, which fix all torques, a sampled loop is no clean robot: it shows as an inertia of −K_d (T
 + τ) that the twin lacks, and has a row of its own. Pads are judged by all their taxels, each a channel.
 

@@ -91,7 +91,8 @@ def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | No
 
     Args:
         commanded: gains are known, so every torque is.
-        effort: the motor's effort was recorded, or something else fixes the scale of all torques.
+        effort: the motor's effort was recorded, or something else fixes the scale of all torques: those of effects are absolute,
+            too. The gains are not: on sampled loops (docs/diagnosis.md) none of 52 intervals held the true K_p.
         kd: N·m·s/rad, where it is commanded and not fitted: what the loop's timing does to an inertia depends on it.
     """
     frees = {f.name: k for k, f in enumerate(fit.frees)}
@@ -108,7 +109,7 @@ def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | No
         else:
             found += _plain(fit, [fit.frees[frees[name]]])
     if effort:
-        absolute = [f for f in fit.frees if f.name in (*GAINS, *divided)]
+        absolute = [f for f in fit.frees if f.name in divided and f.name not in GAINS]
         found += [_timed(n, _kd_over(fit, "1", kd)) for n in _plain(fit, absolute)]
     return tuple(found)
 
@@ -121,13 +122,16 @@ def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float |
         pinned: commanded gains, efforts or known weight fix the scale of the torques.
     """
     plain = [_timed(n, _kd_over(fit, "1", kd)) for n in _plain(fit, fit.frees)]
-    if pinned or "kp" not in fit.values or "kd" not in fit.values:
+    if "kp" not in fit.values or "kd" not in fit.values:
         return tuple(plain)
     over = _over_kp(fit)
     kd_high = next(n.high for n in plain if n.name == "kd")
     inertia = inertia_kgm2 + sum(fit.values[f.name] for f in fit.frees if f.unit == INERTIA and f.name in over)
     most = 1.0 + kd_high * TIMING_S / inertia
-    return tuple(_scaled(n, _absent(over[n.name]), most) if n.name in over else n for n in plain)
+    open_ = [
+        name for name in over if not pinned or name in GAINS
+    ]  # efforts fix torques, and the loop's timing still shifts gains
+    return tuple(_scaled(n, _absent(over[n.name]), most) if n.name in open_ else n for n in plain)
 
 
 def identified_value(name: str, values: Mapping[str, float]) -> float:

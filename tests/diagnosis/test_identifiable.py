@@ -181,7 +181,8 @@ def test_known_gains_and_efforts_make_the_absolute_numbers_primary():
     model = fitted(swept(8000.0, 0.0, 0.4), "coulomb_friction")
     with_effort = named(identifiable_numbers(model, commanded=False, effort=True))
     assert {"kd/kp", "torque_ff/kp", "coulomb_friction.torque_nm/kp"} <= set(with_effort)
-    assert {"kp", "kd", "torque_ff", "coulomb_friction.torque_nm"} <= set(with_effort)
+    assert "coulomb_friction.torque_nm" in with_effort
+    assert not {"kp", "kd", "torque_ff"} & set(with_effort), "loops that are sampled shift them"
     known = OneJoint("coulomb_friction")
     known.base = known.base[2:]
     recording = swept(8000.0, 0.0, 0.4)

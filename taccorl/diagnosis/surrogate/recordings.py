@@ -77,6 +77,8 @@ def record(case: Case, motion: Motion) -> Measurement:
         instruction=f"sweep of {case.signal}: {motion.name}",
         repeat_of=motion.repeat_of,
         payload_kg={ARMS[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
+        # A mass that is held in every recording is one whose place was measured, too.
+        payload_position_m={ARMS[robot.arm]: case.payload_m} if case.payload_kg else {},
         kp=stated.get("kp", {}),
         kd=stated.get("kd", {}),
         gain_scale=stated.get("gain_scale", {}),
