@@ -1,7 +1,7 @@
 """Which physical effect is missing: fit, screen, refit, judge on validation recordings, accept or say that it is something else.
 
     1. The numbers that are always fitted are fitted to the fit recordings.
-    2. While the error of the validation or of the fit recordings is above ``stop_at`` noise floors:
+    2. While the validation error is above ``stop_at`` noise floors, or the fit error above ``stop_fit_at``:
        a. every effect is probed once (``screen``); the likeliest are refitted together with all numbers;
        b. they are ranked by their error on the validation recordings;
        c. an effect is accepted if it takes away enough of what lies above the floor, more than chance and more than its
@@ -50,7 +50,9 @@ class SearchConfig:
     """When an effect is believed. The values of research/discrepancy.md §4.1, checked in docs/diagnosis.md."""
 
     stop_at: float = 1.25
-    """Error in noise floors, of fit and of validation recordings, at which nothing more is looked for."""
+    """Validation error in noise floors at which nothing more is looked for,"""
+    stop_fit_at: float = 1.5
+    """if the error of the fit recordings is at most this: a sampled control loop, with nothing missing, leaves up to 1.45."""
     min_gain: float = 0.10
     """Of the validation error squared that lies above the floor, an effect must take away so much,"""
     min_score: float = 2.0
@@ -495,7 +497,7 @@ class _Search:
 
     def _at_floor(self, model: Fit) -> bool:
         """Whether neither the validation nor the fit recordings have an error that another effect could explain."""
-        return max(self.error(model), model.error) <= self.config.stop_at
+        return self.error(model) <= self.config.stop_at and model.error <= self.config.stop_fit_at
 
     def error(self, model: Fit) -> float:
         """RMS on the validation recordings, in floors."""
