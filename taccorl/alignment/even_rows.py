@@ -86,7 +86,7 @@ def _commands(grid: np.ndarray, time_s: np.ndarray, target: np.ndarray, period: 
     following = np.minimum(last + 1, len(time_s) - 1)
     in_gap = (time_s[following] - time_s[last] > GAP * period) & (grid > time_s[last] + 0.5 * period)
     changes = np.diff(target, axis=0) != 0
-    # Streamed: it changes on both sides of the gap.
+    # A command that changes on both sides of a gap was streamed: it is interpolated. Any other command was held.
     streamed = changes[np.clip(last - 1, 0, len(changes) - 1)] & changes[np.clip(following, 0, len(changes) - 1)]
     line = np.column_stack([np.interp(grid, time_s, column) for column in target.T])
     return np.where(in_gap[:, None] & streamed, line, held)

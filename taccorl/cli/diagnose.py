@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 
-FAR_GAIN = 3.0
-"""Fitted gains that are so many times the twin's are doubted."""
 COLORS = {"high": "green", "moderate": "yellow", "low": "red"}
 """Of a verdict by its confidence."""
 MOST_NAMES = 6
@@ -299,7 +297,6 @@ def details(finding: "JointFinding | PadFinding") -> list[str]:
     """The numbers behind the verdict: errors, identified and absolute numbers, near-twins, what does as well."""
     from taccorl.diagnosis.evidence_words import to_record, unit_words
     from taccorl.diagnosis.identifiable import Known
-    from taccorl.diagnosis.verdict import remarks
 
     d = finding.diagnosis
     errors = d.errors["fitted"]["validation"], d.errors["after"]["validation"]
@@ -307,10 +304,6 @@ def details(finding: "JointFinding | PadFinding") -> list[str]:
     told = [f"{d.errors['before']['validation']:.2f} as it was", f"{errors[0]:.2f} with its numbers refitted"]
     told += [f"{errors[1]:.2f} with {', '.join(added)}"] * bool(added)
     lines = [f"  {d.words}", f"  validation error in noise floors ({finding.measured}): {', '.join(told)}"]
-    for name in ("kp", "kd"):
-        ratio = d.base.get(name, 1.0) / d.start.get(name, 1.0) if name in d.base else 1.0
-        if not remarks(d) and not 1 / FAR_GAIN < ratio < FAR_GAIN:
-            lines.append(f"    {name} became {ratio:.3g} times the twin's: state the commanded gains, or doubt this")
     for name in ("k_n", "k_d"):
         if name in d.base:
             low, high = d.intervals.get(name, (float("nan"), float("nan")))

@@ -525,11 +525,16 @@ class _Search:
     def _remarks(self, model: Fit) -> list[str]:
         """Sentences on what the error does not show."""
         units = {f.name: f.unit for f in model.frees}
+        fits = {
+            "with the effects added": self._moved(model),
+            "before any effect was considered": self._moved(self.first),
+        }
+        moved = {gain: (when, *change) for when, found in fits.items() for gain, change in found.items()}
         return [
-            f"{gain} had to move from the twin's {old:.4g} to {new:.4g} {units[gain]} (× {new / old:.2g}) before any effect was "
-            "considered. Check the time stamps (positions reported late, wrong unit of time) and which gains were commanded "
-            "(kp, kd of the recording in measurements.yaml)."
-            for gain, (old, new) in self._moved(self.first).items()
+            f"{gain} had to move from the twin's {old:.4g} to {new:.4g} {units[gain]} (× {new / old:.2g}) {when}. Check the time "
+            "stamps (positions reported late, wrong unit of time) and which gains were commanded (kp, kd of the recording in "
+            "measurements.yaml)."
+            for gain, (when, old, new) in moved.items()
         ]
 
     def _described(self, model: Fit, first: Fit) -> list[Effect]:

@@ -59,7 +59,7 @@ def verdict(
         options: of the command, such as ``--twin=twin.yaml``.
     """
     kind = _kind(d, data)
-    told = (*remarks(d), *doubts[:_MOST])
+    told = (*d.remarks, *doubts[:_MOST])
     reasons = [*_doubts(d, kind), *([f"see the {_counted(len(told), 'remark')} below"] if told else [])]
     level: Level = "low" if kind in _UNCERTAIN else "moderate" if reasons or kind == "ties" else "high"
     words, command = _record_next(part, kind, d, can_tell, known)
@@ -75,13 +75,8 @@ def verdict(
     )
 
 
-def remarks(d: Diagnosis) -> tuple[str, ...]:
-    """Sentences that the search wrote about its result."""
-    return tuple(getattr(d, "remarks", ()))
-
-
 def refitted_words(d: Diagnosis) -> str:
-    """How the numbers that are always fitted are called: a joint's gains, or others."""
+    """Label of the refit without effects: it changes the gains of a joint, and other numbers of pads and axes."""
     return "gains refitted" if "kp" in d.base else "always fitted numbers refitted"
 
 

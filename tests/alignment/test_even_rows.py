@@ -50,7 +50,7 @@ def test_half_a_millisecond_of_jitter_is_taken_out():
     )  # every command in its row, bit by bit
     start_s = float(np.median(time_s - time_s[0] - rows / RATE_HZ))
     wanted = command(even.time_s + start_s - 0.05)
-    # A line misses a sine of 0.3 rad, 0.8 Hz by A ω² h² / 8 = 2.4e-5 rad at most, but where it begins and ends.
+    # Linear interpolation of a sine of 0.3 rad, 0.8 Hz errs by at most A ω² h² / 8 = 2.4e-5 rad, except where it starts and ends.
     smooth = (np.abs(even.time_s - 0.55) > 0.01) & (np.abs(even.time_s - 5.55) > 0.01) & (even.time_s > 0)
     assert np.abs(even.measured[:, 0] - wanted)[smooth].max() < 3e-5
     (finding,) = even.findings

@@ -221,8 +221,8 @@ def test_step_of_readings_is_found_and_noise_has_none():
 
 
 def test_a_joint_that_began_elsewhere_does_not_raise_the_floor_nor_does_one_late_slip(motion):
-    """Dry friction lets a joint rest 10 mrad away until it is moved for the first time; a slip once in a while is reported as
-    what does not repeat (``alignment.unrepeated``), and does not hide what happens in the rest of the motion."""
+    """With dry friction a joint rests 10 mrad off until it first moves. A rare slip is reported by ``alignment.unrepeated``; it
+    does not raise the floor of the whole motion."""
     rng = np.random.default_rng(5)
     first, second = (measured(*motion, rng, NOISE, name=name) for name in "ab")
     again = dataclasses.replace(second, repeat_of="a")

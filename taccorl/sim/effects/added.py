@@ -114,8 +114,13 @@ class AddedEffects:
         return pictures
 
     def reset(self, ids: np.ndarray, targets: np.ndarray, seeds: np.ndarray | None = None) -> None:
-        """Forget what ``ids`` have been through; of the ``targets`` (N, 14) theirs have stood for ever. ``seeds`` (n,) of their
-        episodes, 0 by default."""
+        """Start new episodes: the memory of all effects returns to its initial state.
+
+        Args:
+            ids: (n,) simulations that start anew.
+            targets: (N, 14) targets, taken as constant before the episode; rows of ``ids`` are read.
+            seeds: (n,) of the episodes, for effects that draw random numbers; 0 by default.
+        """
         seeds = np.zeros(len(ids), dtype=np.int64) if seeds is None else seeds
         for effect, memory, start in zip(self.present, self._memory, self._start, strict=True):
             for name, values in memory.items():

@@ -210,8 +210,11 @@ class Effect:
         return {}
 
     def begin(self, memory: Memory, ids: np.ndarray, seeds: np.ndarray) -> None:
-        """An episode of simulations ``ids`` begins, their memory is as ``memory`` gave it: for what is random, ``seeds`` (n,) of
-        the episodes. Recordings that are simulated for a diagnosis have the seed 0."""
+        """Prepare ``memory`` for new episodes of the simulations ``ids`` (n,), after a reset to its initial state.
+
+        Args:
+            seeds: (n,) of the episodes, for effects that draw random numbers; 0 in simulations for a diagnosis.
+        """
 
     def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
         """What arrives at the controllers of the targets (N, 14) that are now sent.
