@@ -30,6 +30,8 @@ _LIMIT_SOFTNESS = (1.0 - 0.99) / 0.99
 _GEAR_INERTIA = 1e-5  # kg m²
 _BRISTLE_DAMPING_S = 0.001  # over their stiffness, effects/stribeck_friction.py
 _STOP_DAMPING_S = 0.005  # over its stiffness, effects/end_stop.py
+MOST_LOST = 0.9
+"""Share of the inertia that a delay of the speed may take; a loop with more than all of it is unstable."""
 _mixed = numba.njit(dropped_commands.mixed)
 _STRIDE = dropped_commands.STRIDE
 
@@ -56,6 +58,8 @@ class Drive(NamedTuple):
     """Times the compensation."""
     # Bodies and friction.
     added_inertia: float = 0.0
+    speed_delay: float = 0.0
+    """s: takes K_d times it from the inertia, at most ``MOST_LOST`` of it."""
     viscous: float = 0.0
     quadratic_drag: float = 0.0
     coulomb: float = 0.0
@@ -227,6 +231,7 @@ def simulate(
     spring = 1.0 / p.compliance if p.compliance > 0.0 else 0.0
     spring_damping = p.compliance_damping * spring
     inertia = p.inertia + p.added_inertia
+    inertia -= min(p.kd * p.speed_delay, MOST_LOST * inertia)
     link = p.inertia - p.rotor_inertia  # beyond the gear
     free = inertia * (link + _GEAR_INERTIA) - link * link
     motor_mobility, gear_mobility = (link + _GEAR_INERTIA) / free, inertia / free

@@ -23,8 +23,18 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.robot import JOINTS
 from taccorl.sim.twin import TwinConfig
 
+GRAVITY_M_PER_S2 = 9.81
 _COMMAND_HZ = 150.0  # taccorl.sim.replay sends slower rows in straight lines of such steps
-_ADDITIVE = {"added_inertia", "viscous", "quadratic_drag", "coulomb", "load_friction", "command_delay", "encoder_delay"}
+_ADDITIVE = {
+    "added_inertia",
+    "viscous",
+    "quadratic_drag",
+    "coulomb",
+    "load_friction",
+    "command_delay",
+    "encoder_delay",
+    "speed_delay",
+}
 _FACTORS = {"gravity_carried", "torque_scale", "encoder_scale"}
 
 
@@ -37,6 +47,18 @@ class Gains(NamedTuple):
     """N·m·s/rad."""
     torque_ff: float
     """N·m."""
+
+
+class PayloadLever(NamedTuple):
+    """By how much a payload whose place no recording states is off the place where the twin has it: m g (s sin q + c cos q)."""
+
+    sin_m: float = 0.0
+    """s."""
+    cos_m: float = 0.0
+    """c."""
+
+
+AT_ITS_PLACE = PayloadLever()
 
 
 @dataclass(frozen=True)
@@ -88,25 +110,34 @@ class JointModel:
         model._config, model._own, model._rigid = None, [], {(): Rigid(inertia)}
         return model
 
-    def simulate(self, motion: JointMotion, gains: Gains, effects: Sequence[Effect] = ()) -> JointResponse:
+    def simulate(
+        self, motion: JointMotion, gains: Gains, effects: Sequence[Effect] = (), lever: PayloadLever = AT_ITS_PLACE
+    ) -> JointResponse:
         """Its answer to the recording's targets, from rest at ``motion.start``.
 
         Args:
             gains: those of a recording with ``kp_scale`` = 1.
             effects: besides the config's; one of the same name takes the place of the config's.
+            lever: left out where effects have no ``drive`` and MuJoCo runs.
 
         Raises:
             TaccorlError: rows that are no whole number of physics steps, or an effect that an axis cannot have.
         """
         sent, parts, hold = self._sent(motion)
         present = self._effects(effects)
-        scaled = Gains(gains.kp * motion.kp_scale, gains.kd * motion.kd_scale, gains.torque_ff)
+        kp, kd = gains.kp * motion.kp_scale, gains.kd * motion.kd_scale
+        scaled = Gains(kp, kd, gains.torque_ff)
         drives = [(effect.name, effect.drive()) for effect in present]
         numbers = _combined([(name, drive) for name, drive in drives if drive is not None])
         if numbers is None or any(drive is None for _, drive in drives):
             return self._in_mujoco(motion, scaled, present, sent, parts, hold)
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
         drive = Drive(*scaled, **self._body(motion, bodies)._asdict())._replace(**numbers)
+        weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
+        drive = drive._replace(
+            gravity_sin=drive.gravity_sin + weight * lever.sin_m,
+            gravity_cos=drive.gravity_cos + weight * lever.cos_m,
+        )
         drive = Drive(*(float(x) for x in drive))
         reported, effort = simulate(drive, sent, motion.coupling_nm, motion.start, hold, parts, self.timestep_s)
         return JointResponse(reported, effort)
@@ -125,6 +156,11 @@ class JointModel:
         body = self._body(motion, [])
         sine, cosine = body.gravity_sin - body.compensation_sin, body.gravity_cos - body.compensation_cos
         return sine * np.sin(angles) + cosine * np.cos(angles)
+
+    def is_weighed(self, motion: JointMotion) -> bool:
+        """Whether weight acts about the joint: not about one whose axis is vertical."""
+        body = self._body(motion, [])
+        return math.hypot(body.gravity_sin, body.gravity_cos) > 1e-6
 
     def _effects(self, effects: Sequence[Effect]) -> list[Effect]:
         if self._config is None:

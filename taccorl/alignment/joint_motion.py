@@ -53,6 +53,8 @@ class JointMotion:
     """Known mass in the gripper."""
     payload_at_m: arm_bench.Position = arm_bench.AT_TCP
     """Its centre of mass in link 6's frame."""
+    payload_at_known: bool = False
+    """The recording states that place."""
 
 
 def joint_motion(measurement: Measurement, config: TwinConfig | None, signal: str) -> JointMotion:
@@ -82,13 +84,13 @@ def joint_motion(measurement: Measurement, config: TwinConfig | None, signal: st
     start = _start(m, j)
     if config is None:
         pose, coupling, payload, commanded = np.zeros(7), np.zeros(m.num_rows), 0.0, {}
-        payload_at_m = arm_bench.AT_TCP
+        payload_at_m, known_place = arm_bench.AT_TCP, False
     else:
         arm, joint = split_signal(signal)
         names = [f"{arm}_{name}" for name in (*JOINTS, "gripper")]
         pose = np.array([_start(m, m.column(name)) if name in m.signals else 0.0 for name in names])
         payload = m.payload_kg.get(arm, 0.0)
-        payload_at_m = m.payload_position_m.get(arm, arm_bench.AT_TCP)
+        payload_at_m, known_place = m.payload_position_m.get(arm, arm_bench.AT_TCP), arm in m.payload_position_m
         coupling = _coupling(m, config, signal, pose, payload, payload_at_m)
         k, control = JOINTS.index(joint), config.controller_of(arm)
         commanded = {
@@ -112,6 +114,7 @@ def joint_motion(measurement: Measurement, config: TwinConfig | None, signal: st
         kd_known="kd" in known,
         payload_kg=payload,
         payload_at_m=payload_at_m,
+        payload_at_known=known_place,
     )
 
 

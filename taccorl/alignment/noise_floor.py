@@ -122,7 +122,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
         "rest": [_rest_blocks(m, kind) for m in measurements],
         "residue": [_residue_blocks(m, kind) for m in measurements],
     }
-    estimates = {method: _estimate(method, found, len(signals)) for method, found in blocks.items()}
+    estimates = {method: _estimate(method, found, len(signals), kind) for method, found in blocks.items()}
     floors = {}
     for j, (signal, unit) in enumerate(zip(signals, units, strict=True)):
         values = np.concatenate([_values(m, kind)[:, j] for m in measurements])
@@ -298,7 +298,7 @@ def _mean_squares(values: np.ndarray, rows: int) -> np.ndarray:
 # estimates -------------------------------------------------------------------------------------------------------------
 
 
-def _estimate(method: Method, blocks: list[_Blocks], num_signals: int) -> list[Estimate | None]:
+def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kind) -> list[Estimate | None]:
     """One estimate per signal over the blocks of all recordings; None where there are none."""
     blocks = [b for b in blocks if len(b.mean_squares)]
     if not blocks:
@@ -311,9 +311,10 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int) -> list[E
         if len(own) == 0:
             found.append(None)
             continue
-        # Repeats in the mean (unless in bursts): what happens once belongs to it. The others in the median: a stretch that
+        # Repeats in the mean (unless positions differ in bursts): what happens once belongs to it, and the noise of an effort
+        # grows with the motion. The others in the median: a stretch that
         # still creeps, or a kink that the smooth cuts, is not noise.
-        bursts = method == "repeats" and _in_bursts(own, freedom)
+        bursts = method == "repeats" and kind == "position" and _in_bursts(own, freedom)
         robust = method != "repeats" or bursts
         square = float(_median(own[:, None], freedom)[0]) if robust else float(own.mean())
         spread = _log_spread(own, freedom, robust=robust)

@@ -73,7 +73,7 @@ def main(argv: list[str]) -> int:
         if e.part in of_pads:
             pads.set_numbers(twin, base)
         elif base:
-            set_numbers(twin, e.part, base)
+            set_numbers(twin, e.part, base, e.intervals)
         for effect in e.effects:
             add_effect(twin, effect)
             _say(e.part, effect, base)

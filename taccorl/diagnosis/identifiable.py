@@ -107,7 +107,7 @@ def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | No
             ratio = _ratio(fit, name, divided[name], covariance)
             found.append(_timed(ratio, _kd_over(fit, "kp", kd)))
         else:
-            found += _plain(fit, [fit.frees[frees[name]]])
+            found += [_timed(n, 0.0) for n in _plain(fit, [fit.frees[frees[name]]])]
     if effort:
         absolute = [f for f in fit.frees if f.name in divided and f.name not in GAINS]
         found += [_timed(n, _kd_over(fit, "1", kd)) for n in _plain(fit, absolute)]
@@ -211,9 +211,12 @@ def _kd_over(fit: Fit, over: str, kd: float | None) -> float:
 
 
 def _timed(n: Identified, kd: float) -> Identified:
-    """An inertia is seen less K_d τ: (J + ΔJ − K_d τ) q̈; K_d / K_p is seen less a. Others are as they are."""
+    """An inertia is seen less K_d τ: (J + ΔJ − K_d τ) q̈; K_d / K_p is seen less a, a delay or lag more by a. Others are as they
+    are."""
     if n.name == "kd/kp":
         return dataclasses.replace(n, high=n.high + POSITION_AGE_S)
+    if n.name.endswith((".delay_s", ".time_constant_s")):
+        return dataclasses.replace(n, low=max(n.low - POSITION_AGE_S, 0.0))
     if n.unit not in (INERTIA, OVER_KP[INERTIA]):
         return n
     return dataclasses.replace(n, high=n.high + kd * TIMING_S)

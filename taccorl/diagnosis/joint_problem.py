@@ -10,16 +10,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from taccorl.alignment.joint_model import Gains, JointModel, JointMotion, joint_motion
+from taccorl.alignment.joint_kernel import MOST_LOST
+from taccorl.alignment.joint_model import Gains, JointModel, JointMotion, PayloadLever, joint_motion
 from taccorl.alignment.measurement import Measurement, unit_of
 from taccorl.alignment.measurements import Measurements, motions
 from taccorl.alignment.noise_floor import SignalFloor, noise_floor
+from taccorl.diagnosis.identifiable import TIMING_S
 from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.diagnosis.replays import BENCH_REST
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
+from taccorl.sim.effects.speed_delay import SpeedDelay
 from taccorl.sim.twin import TwinConfig
 
 GainsAre = Literal["auto", "commanded", "fitted"]
@@ -38,6 +41,14 @@ WEIGHS = 3.0
 """Floors of the angle by which a weight must move the joint (standard deviation) to tell the scale of the torques. A choice."""
 EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
 """Reported effort over torque: PiPER firmware differs in it."""
+SPEED_DELAY = Free(name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3)
+"""τ of the effect speed_delay: what a sampled loop does to the inertia. Fitted where something besides the inertia
+says something about the scale of the torques: else K_p takes it up (``taccorl.diagnosis.identifiable``)."""
+PAYLOAD_PLACE = tuple(
+    Free(name=name, unit="m", start=0.0, low=-0.05, high=0.05, scale=5e-3)
+    for name in ("payload_sin_m", "payload_cos_m")
+)
+"""s and c of ``PayloadLever``. Fitted where a fit recording holds a payload whose place is not stated; 50 mm are a choice."""
 
 
 class JointProblem:
@@ -71,6 +82,8 @@ class JointProblem:
                 f"{silent}: the commanded gains of {signal} are not stated; write kp and kd into its measurements.yaml, "
                 "or fit them (gains=fitted)"
             )
+        arm, joint = signal.split("_", 1)
+        self._self: dict[str, Any] = {"arm": arm, "joints": [joint]}
         self.signal, self.commanded = signal, gains != "fitted" and stated
         own = [e for e in config.effects if isinstance(e, ArmEffect) and e.fitted and _acts_on(e, signal)]
         self.present = tuple(effect.name for effect in own)
@@ -84,16 +97,19 @@ class JointProblem:
         groups = {r: [m for m in everything if root[m.name] == r] for r in repeated}
         self._own_floors = {r: floors_of(group, signal, effort=self.effort) for r, group in groups.items()}
         self._motion = root
-        self.base = self._base()
         self.fit, self.validation, self.test = (
             [self._recording(m, config) for m in side]
             for side in (measurements.fit, measurements.validation, measurements.test)
         )
+        self.base = self._base()
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.model.gains._asdict())
         self.start: Values = self.model.gains._asdict() | {
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
         }
+        if any(f.name == SPEED_DELAY.name for f in self.base):
+            delays = (e for e in config.effects if isinstance(e, SpeedDelay) and _acts_on(e, signal))
+            self.start[SPEED_DELAY.name] = sum(e.delay_s for e in delays)
 
     @property
     def inertia_kgm2(self) -> float:
@@ -108,20 +124,29 @@ class JointProblem:
             found.append("known weight")
         return tuple(found)
 
+    def _weight_shows(self, least_floors: float) -> bool:
+        """Whether known weight that the controller holds moves the joint by more than so many noise floors."""
+        weights = np.concatenate([self.model.weight_nm(r.data, r.data.target) for r in self.fit])
+        return float(np.std(weights)) > least_floors * self.floors[0].value * self.model.gains.kp
+
     def _weighs(self) -> bool:
-        """Whether known weight that the controller holds varies more than the torque J q̈ of the motion, which else decides."""
+        """Whether that weight varies more than the torque J q̈ of the motion, which else decides."""
+        if not self._weight_shows(WEIGHS):
+            return False
         motions: list[JointMotion] = [r.data for r in self.fit]
         weights = np.concatenate([self.model.weight_nm(m, m.target) for m in motions])
         torques = []
         for m in motions:
             angle = self.model.simulate(m, self.model.gains).reported
             torques.append(self.model.inertia_kgm2(m) * np.gradient(np.gradient(angle, m.time_s), m.time_s))
-        seen = WEIGHS * self.floors[0].value * self.model.gains.kp
-        return float(np.std(weights)) > max(float(np.std(np.concatenate(torques))), seen)
+        return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """(T, C) angle [rad], and effort [N·m] as the driver would report it."""
-        answer = self.model.simulate(recording.data, self._gains(base), effects)
+        lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
+        if SPEED_DELAY.name in base:
+            effects = [*effects, SpeedDelay(**self._self, delay_s=float(base[SPEED_DELAY.name]))]
+        answer = self.model.simulate(recording.data, self._gains(base), effects, lever)
         if not self.effort:
             return answer.reported[:, None]
         return np.column_stack([answer.reported, base.get("effort_scale", 1.0) * answer.effort])
@@ -146,14 +171,20 @@ class JointProblem:
 
     def _base(self) -> tuple[Free, ...]:
         kp, kd, torque_ff = self.model.gains
-        offset = dataclasses.replace(TORQUE_FF, start=torque_ff)
-        if self.commanded:
-            return (offset, EFFORT_SCALE) if self.effort else (offset,)
-        return (
-            dataclasses.replace(KP, start=kp, low=KP.low / WIDER),
-            dataclasses.replace(KD, start=kd, low=KD.low / WIDER),
-            offset,
+        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)]
+        # A loop whose speed is later than J / K_d is unstable.
+        delay = dataclasses.replace(
+            SPEED_DELAY, high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9))
         )
+        if self.commanded:
+            found += [EFFORT_SCALE] * self.effort + [delay]
+        else:
+            gains = [dataclasses.replace(f, start=v, low=f.low / WIDER) for f, v in ((KP, kp), (KD, kd))]
+            found = gains + found + [delay] * (self.effort or self._weight_shows(1.0))
+        payloads: list[JointMotion] = [
+            r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known
+        ]
+        return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
 
     def _recording(self, m: Measurement, config: TwinConfig) -> Recording:
         motion = joint_motion(m, config, self.signal)
@@ -163,10 +194,18 @@ class JointProblem:
             name=m.name,
             time_s=motion.time_s,
             measured=np.column_stack(columns),
-            floor=np.array([f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]),
+            floor=np.array(self._floor_values(m)),
             channels=tuple(names[: len(columns)]),
             data=motion,
         )
+
+    def _floor_values(self, m: Measurement) -> list[float]:
+        """Of each channel. The noise of an effort grows with gains and motion: it is at least what no smooth curve explains."""
+        values = [f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]
+        if self.effort:
+            residue = (e.value for e in noise_floor([m], "effort")[self.signal].estimates if e.method == "residue")
+            values[1] = max(values[1], *residue, 0.0)
+        return values
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""

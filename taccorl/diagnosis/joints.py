@@ -19,6 +19,7 @@ from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.problem import split_rows
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, TouchEffect
 from taccorl.sim.robot import ARMS, JOINTS
 from taccorl.sim.twin import TwinConfig
@@ -195,7 +196,8 @@ def mended(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig:
     """``config`` with the effects that were found, and with the numbers that were fitted beside them."""
     new = copy.deepcopy(config)
     for finding in findings:
-        set_numbers(new, finding.signal, finding.diagnosis.base)
+        d = finding.diagnosis
+        set_numbers(new, finding.signal, d.base, d.intervals)
         for effect in finding.diagnosis.effects:
             add_effect(new, effect)
     return new
@@ -206,14 +208,16 @@ def refitted(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig
     new = copy.deepcopy(config)
     for finding in findings:
         first = finding.diagnosis.before
-        set_numbers(new, finding.signal, first.values)
+        set_numbers(new, finding.signal, first.values, first.intervals())
         for effect in first.effects:
             add_effect(new, effect)
     return new
 
 
-def set_numbers(config: TwinConfig, signal: str, base: Mapping[str, float]) -> None:
-    """Write fitted gains into one arm of ``config``."""
+def set_numbers(
+    config: TwinConfig, signal: str, base: Mapping[str, float], intervals: Mapping[str, Sequence[float]]
+) -> None:
+    """Write fitted gains into one arm of ``config``, and the delay of the speed unless its interval holds 0."""
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
     k = JOINTS.index(joint)
@@ -221,6 +225,11 @@ def set_numbers(config: TwinConfig, signal: str, base: Mapping[str, float]) -> N
     for name, values in fields.items():
         if name in base:
             values[k] = float(base[name])
+    if "speed_delay_s" in base:
+        sure = intervals["speed_delay_s"][0] > 0.0
+        delay = make_effect("speed_delay", arm=arm, joints=[joint], delay_s=float(base["speed_delay_s"]) * sure)
+        add_effect(config, delay)
+        config.effects = [e for e in config.effects if e is not delay or not e.is_absent]
 
 
 def add_effect(config: TwinConfig, effect: Effect) -> None:

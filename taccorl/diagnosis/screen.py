@@ -52,7 +52,9 @@ def probe(
     Args:
         recordings: those that ``parent`` was fitted to.
     """
-    taken_up = _basis(parent.jacobian)
+    # A number at its bound makes up for half of what its slope says; it does not hide an effect of the other half (a delay of
+    # the loop is less inertia, an armature is more).
+    taken_up = _basis(parent.jacobian[:, [f.name not in parent.at_bound for f in parent.frees]])
     left = parent.residuals - taken_up @ (taken_up.T @ parent.residuals)
     power = float(left @ left)
     probes = []

@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 
 from taccorl.diagnosis.evidence import Blocks, bic_gain, block_squares, standard_score
-from taccorl.diagnosis.fit import FINE, Fit, best_fit, fit, rms, stacked
+from taccorl.diagnosis.fit import FINE, Fit, best_fit, fit, moved_by, rms, stacked
 from taccorl.diagnosis.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
 from taccorl.diagnosis.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
@@ -49,10 +49,13 @@ WORDS: dict[Status, str] = {
 class SearchConfig:
     """When an effect is believed. The values of research/discrepancy.md §4.1, checked in docs/diagnosis.md."""
 
-    stop_at: float = 1.25
+    stop_at: float = 1.3
     """Validation error in noise floors at which nothing more is looked for,"""
     stop_fit_at: float = 1.5
     """if the error of the fit recordings is at most this: a sampled control loop, with nothing missing, leaves up to 1.45."""
+    little: float = 1.5
+    """Where no effect is accepted, fit and validation errors up to so many floors say that nothing is missing: the floor itself
+    is known only to some tenths."""
     min_gain: float = 0.10
     """Of the validation error squared that lies above the floor, an effect must take away so much,"""
     min_score: float = 2.0
@@ -75,9 +78,9 @@ class SearchConfig:
     """Effects that are refitted after the screening: the true one was among the first 12 in every case (research §4.4)."""
     first_steps: int = 5
     """Of the refits that find out which of them are worth more;"""
-    num_finished: int = 4
+    num_finished: int = 2
     """so many are refitted to the end, from several starts, so are"""
-    num_likely: int = 3
+    num_likely: int = 2
     """so many that the screening put first, and those whose error is within"""
     near_best: float = 1.3
     """times the best."""
@@ -301,10 +304,7 @@ class _Search:
             name: [parent.values | _scaled(p, self.problem.candidates[name]) for p in self._likely(best[name])]
             for name in order
         }
-        short = {
-            name: self._fitted((*parent.names, name), starts[name][:1], c.first_steps)
-            for name in order[: c.num_refitted]
-        }
+        short = {name: self._short(parent, name, starts[name][0]) for name in order[: c.num_refitted]}
         by_error = sorted(short, key=lambda name: short[name].error)
         rows = []
         for place, name in enumerate(by_error):
@@ -331,6 +331,15 @@ class _Search:
 
     def _frees(self, name: str) -> tuple[Free, ...]:
         return self.problem.candidates[name].frees
+
+    def _short(self, parent: Fit, name: str, start: Values) -> Fit:
+        """``parent`` with one effect more, after a few steps; from where the numbers began if those of ``parent``, which have
+        made up for the effect, do not go with it."""
+        model = self._fitted((*parent.names, name), [start], self.config.first_steps)
+        if model.error > 1.001 * parent.error:
+            again = self._fitted((*parent.names, name), [start | self.given], self.config.first_steps)
+            model = min((model, again), key=lambda m: m.error)
+        return model
 
     def _child(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
         """``parent`` with one effect more; never worse than ``parent``, which it contains."""
@@ -366,7 +375,9 @@ class _Search:
             further = self._fine(fine)
             fell = (fine.error**2 - further.error**2) / further.error**2 * further.effective_rows
             fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
-        return fine
+        if not fine.frees or not self.validation:
+            return fine
+        return dataclasses.replace(fine, moved=moved_by(self.problem, fine, self.fit_to, self.validation))
 
     def _fine(self, model: Fit) -> Fit:
         fine = fit(self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)
@@ -513,6 +524,8 @@ class _Search:
         if self._at_floor(model):
             if len(model.names) > len(self.present):
                 return "at_floor"
+            return "gains_moved" if self._moved(self.first) else "nothing_missing"
+        if len(model.names) == len(self.present) and max(self.error(model), model.error) <= self.config.little:
             return "gains_moved" if self._moved(self.first) else "nothing_missing"
         full = len(model.names) - len(self.present) >= self.config.max_effects
         return "too_many" if full else "something_else"

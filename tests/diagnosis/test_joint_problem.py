@@ -57,9 +57,9 @@ def test_commanded_gains_efforts_or_known_weight_pin_the_torques_and_nothing_els
 def test_commanded_gains_stay_fixed_where_every_recording_states_them(chirps):
     problem = JointProblem(NOMINAL, SIGNAL, Measurements(chirps), effort=False)
     assert problem.commanded
-    assert names(problem) == ["torque_ff"]
+    assert names(problem) == ["torque_ff", "speed_delay_s"]
     model = fit(problem, problem.fit, (), problem.start)
-    assert set(model.values) == {"torque_ff"}
+    assert set(model.values) == {"torque_ff", "speed_delay_s"}
     assert model.error == pytest.approx(1.0, abs=0.05)  # the twin's gains are those that were commanded
 
 
@@ -213,7 +213,7 @@ def test_effort_is_a_second_channel_and_its_scale_is_found(chirps):
     """Some firmware reports four times the torque (piper_sdk issue 73)."""
     four = tuple(dataclasses.replace(m, effort=4.0 * m.effort) for m in chirps)
     problem = JointProblem(NOMINAL, SIGNAL, Measurements(four))
-    assert names(problem) == ["torque_ff", "effort_scale"]
+    assert names(problem) == ["torque_ff", "effort_scale", "speed_delay_s"]
     assert problem.fit[0].channels == ("left_joint5 [rad]", "left_joint5 effort [N·m]")
     assert problem.fit[0].floor == pytest.approx([NOISE_RAD, 4 * NOISE_NM], rel=0.15)
     model = fit(problem, problem.fit, (), problem.start)
@@ -226,4 +226,4 @@ def test_effort_that_one_recording_lacks_is_not_used(chirps):
     problem = JointProblem(NOMINAL, SIGNAL, Measurements((chirps[0], silent)))
     assert not problem.effort
     assert problem.fit[0].measured.shape[1] == 1
-    assert names(problem) == ["torque_ff"]
+    assert names(problem) == ["torque_ff", "speed_delay_s"]

@@ -165,14 +165,14 @@ def test_the_mended_twin_is_at_the_floor_and_comes_back_from_its_file(finding, t
 
 def test_gains_go_to_one_arm_and_leave_the_other(tmp_path):
     twin = TwinConfig()
-    set_numbers(twin, "left_joint3", {"kp": 500.0, "kd": 40.0, "torque_ff": -1.0, "effort_scale": 2.0})
+    set_numbers(twin, "left_joint3", {"kp": 500.0, "kd": 40.0, "torque_ff": -1.0, "effort_scale": 2.0}, {})
     plain = TwinConfig().controller
     assert twin.controller == plain == twin.controller_of("right")
     left = twin.controller_of("left")
     assert (left.kp_nm_per_rad[2], left.kd_nms_per_rad[2], left.torque_ff_nm[2]) == (500.0, 40.0, -1.0)
     for k in (0, 1, 3, 4, 5):
         assert left.kp_nm_per_rad[k] == plain.kp_nm_per_rad[k]
-    set_numbers(twin, "left_joint1", {"torque_ff": 0.25})
+    set_numbers(twin, "left_joint1", {"torque_ff": 0.25}, {})
     assert (left.torque_ff_nm[0], left.kp_nm_per_rad[2]) == (0.25, 500.0), "the second joint keeps the first"
     save_twin(twin, tmp_path / "twin.yaml")
     read = load_twin(tmp_path / "twin.yaml")

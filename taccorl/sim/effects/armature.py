@@ -31,6 +31,7 @@ class Armature(JointEffect):
             "load the hand."
         ),
         "kp": "All gains together scale like 1 / J; efforts or a known payload fix their size.",
+        "speed_delay": "An inertia with the other sign: only their difference shows, and only less inertia is a delay.",
     }
     added_kgm2: float = parameter(
         unit="kg·m²",

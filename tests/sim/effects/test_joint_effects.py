@@ -240,3 +240,17 @@ def test_only_the_chosen_joints_change(name: str, values: dict[str, float], fiel
     expected = np.zeros(plain.nv)
     expected[dofs] = next(iter(values.values()))
     np.testing.assert_allclose(difference, expected, atol=1e-15)
+
+
+def test_a_delay_never_makes_an_inertia_of_the_twin_negative():
+    late = start(
+        *(
+            make_effect("speed_delay", arm=a, joints=[f"joint{k}" for k in range(1, 7)], delay_s=3e-3)
+            for a in ("left", "right")
+        )
+    )
+    lost = start().model.dof_armature - late.model.dof_armature
+    assert (lost[[late.model.joint(f"left_joint{k}").dofadr[0] for k in range(1, 7)]] > 0).all()
+    for _ in range(50):
+        late.advance(late.targets[None] + 0.02, 6)
+    assert np.isfinite(late.arrays["qpos"]).all()

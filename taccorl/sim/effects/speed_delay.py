@@ -1,0 +1,81 @@
+"""Speed delay: the controller damps the speed of a moment ago, because its loop is sampled and filtered."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+import numpy as np
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import JointEffect, parameter
+from taccorl.sim.robot import JOINTS
+
+if TYPE_CHECKING:
+    from taccorl.sim.twin import TwinConfig
+
+MOST_LOST = 0.5
+"""Share of the inertia that may be lost in MuJoCo, where all joints move in every pose. A choice: stable with all six."""
+POSES = 64
+
+
+@effects.register("speed_delay")
+@dataclass(kw_only=True)
+class SpeedDelay(JointEffect):
+    """−K_d (q̇ − τ q̈): to first order in τ an inertia of −K_d τ.
+
+    τ is half a period for the difference of two samples, half a period for the output that is held, and the time constant of the
+    speed's filter. The diagnosis fits it with the gains wherever recordings say anything about it (recorded effort, known weight,
+    commanded gains), so it is no candidate of the search.
+    """
+
+    name: ClassVar = "speed_delay"
+    equation: ClassVar = "−K_d (q̇ − τ q̈)"
+    in_words: ClassVar = (
+        "The motor's controller computes a few hundred to a few thousand times a second, from a speed that it filters. It "
+        "damps the speed of a moment ago."
+    )
+    at_a_policy: ClassVar = "Stiff joints overshoot a little; slow motion is as before."
+    to_record: ClassVar = "A chirp up to 3 Hz or more with the motor's effort recorded, or with a known payload."
+    near_twins: ClassVar = {
+        "armature": "An inertia with the other sign.",
+        "kp": "Without efforts or known weight all torques together scale like 1 / inertia.",
+    }
+    fitted: ClassVar = False
+    delay_s: float = parameter(
+        unit="s",
+        symbol="τ",
+        absent=0.0,
+        low=0.0,
+        high=3e-3,
+        typical=2e-4,
+        source="a choice: typical is a loop of 5 kHz; at most one of 1 kHz that filters its speed over 2 ms",
+    )
+
+    def drive(self) -> dict[str, float]:
+        return {"speed_delay": self.delay_s}
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        joints = list(self.chosen(spec))
+        least = _least_inertia(spec, [joint.name for joint in joints])
+        for joint, inertia in zip(joints, least, strict=True):
+            arm, name = joint.name.split("_", 1)
+            control = config.controller_of("left" if arm == "left" else "right")
+            lost = control.kd_nms_per_rad[JOINTS.index(name)] * self.delay_s
+            joint.armature -= min(lost, MOST_LOST * inertia)
+
+
+def _least_inertia(spec: mujoco.MjSpec, names: list[str]) -> np.ndarray:
+    """(J,) kg·m² of joints, 1 / (M⁻¹)_jj, the least of ``POSES`` drawn poses: below it no pose has a mass matrix that is not
+    positive."""
+    model = spec.compile()
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    ids = [model.joint(name).id for name in names]
+    dofs, places = model.jnt_dofadr[ids], model.jnt_qposadr[ids]
+    least = np.full(len(names), np.inf)
+    unit, answer = np.eye(model.nv)[dofs], np.empty((len(dofs), model.nv))
+    for _ in range(POSES):
+        data.qpos[places] = rng.uniform(*model.jnt_range[ids].T)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_solveM(model, data, answer, unit)
+        least = np.minimum(least, 1.0 / answer[np.arange(len(dofs)), dofs])
+    return least
