@@ -35,6 +35,7 @@ def episode() -> Episode:
     return dataclasses.replace(recorder.episode("four seconds", {}), origin="surrogate: a twin whose camera is off")
 
 
+@pytest.mark.slow
 def test_a_camera_is_calibrated_from_an_episode():
     frames = camera_frames(episode(), "front", 10)
     assert frames.pictures.shape[1:] == (224, 224, 3)

@@ -425,6 +425,7 @@ def blind(spec: DatasetSpec, seed: int, instruction: str = "touch it") -> Episod
     )
 
 
+@pytest.mark.slow
 def test_every_process_writes_and_merges_the_same_bytes(tmp_path: Path) -> None:
     folders = [tmp_path / hash_seed for hash_seed in "12"]  # of the order in which Python's sets of strings go
     processes = []

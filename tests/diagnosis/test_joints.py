@@ -97,6 +97,7 @@ def test_the_friction_is_found_at_its_joint_with_fitted_gains(finding):
     assert len(finding.floors) == 1, "no effort was recorded"
 
 
+@pytest.mark.slow
 def test_recordings_that_leave_the_joint_alone_are_left_out(finding):
     made = sweeps(stated=False)
     more = dataclasses.replace(made, fit=(*made.fit, still("other", right_joint1=0.3)))

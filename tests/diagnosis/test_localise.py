@@ -117,6 +117,7 @@ def test_band_holds_the_truth_although_neighbours_are_alike():
     assert held >= 0.85 * bins
 
 
+@pytest.mark.slow
 def test_what_does_not_depend_on_a_variable_is_not_beyond_chance():
     false = 0
     for seed in range(40):

@@ -41,6 +41,7 @@ def check(root: Path, task: str) -> None:
         assert refused is None, (episode.name, refused, measured)
 
 
+@pytest.mark.slow
 def test_a_source_of_assembly_2_passes_the_gates(collected):
     check(collected, "assembly_2")
 

@@ -131,6 +131,7 @@ def test_every_joint_effect_of_the_registry_can_be_hidden():
     assert not set(OUTSIDE) & joint
 
 
+@pytest.mark.slow
 def test_the_user_starts_from_wrong_gains_unless_they_are_known():
     unknown, known = draw_case([], 6), draw_case([], 6, gains_known=True, design="chirp")
     joint = unknown.robot.joint

@@ -85,6 +85,7 @@ def test_the_truth_is_sealed_and_can_be_revealed(case, folder, capsys):
     assert json.loads(capsys.readouterr().out)["hidden"][0]["name"] == "coulomb_friction"
 
 
+@pytest.mark.slow
 def test_nothing_that_reads_measurements_opens_the_truth(folder):
     OPENED.clear()
     read_measurements(folder / SWEEPS)
