@@ -60,6 +60,7 @@ def test_frames_are_slow_rows_and_differ():
     assert min(apart) > 0.005
 
 
+@pytest.mark.slow
 def test_joints_are_taken_as_much_earlier_as_the_pictures_are_late():
     now, then = camera_frames(episode(), "front", 6), camera_frames(episode(), "front", 6, latency_s=1 / 30)
     state = episode().arrays["observation.state"]

@@ -118,6 +118,7 @@ def test_a_clock_one_row_off_is_told_before_k_p_is_believed(rows_early: int) -> 
     assert good.remarks == () and abs(good.estimates["late"].value) < 0.0015
 
 
+@pytest.mark.slow
 def test_a_number_at_its_bound_is_not_an_estimate() -> None:
     # T_ref of joint 5 is 1.73 N·m; with less allowed than that no gains rest where the joint rests.
     motion = motion_of(ELBOW)

@@ -235,6 +235,7 @@ def test_positions_one_row_too_late_are_said_to_be_a_delay_or_a_clock(said: Any,
     assert "a real delay" in " ".join(text.split())
 
 
+@pytest.mark.slow
 def test_a_recording_s_stated_gains_are_needed_only_if_they_are_to_be_believed(said: Any, tmp_path: Path):
     folder = stepped(tmp_path / "silent", 0)
     code, text = said(folder, f"--out={tmp_path / 'out'}", "--gains=commanded", few("backlash"))

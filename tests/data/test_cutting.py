@@ -362,6 +362,7 @@ def test_markers_that_make_no_sense_are_refused_with_a_word(
         assert word in str(error.value)
 
 
+@pytest.mark.slow
 def test_an_episode_after_a_channel_died_is_a_loss_not_a_silence(tmp_path: Path) -> None:
     made = Made(tmp_path / "dies.mcap", duration_s=4.0, episodes=2, gap=(FRONT, 2.0, 9.0))
     found = cut(made.path)

@@ -251,6 +251,7 @@ def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_i
     assert Dataset(ingests.out).num_episodes == 1
 
 
+@pytest.mark.slow
 def test_a_recording_whose_only_episode_is_frozen_gives_nothing(ingests: Ingests, tmp_path: Path) -> None:
     record(tmp_path / "in.mcap", duration_s=4.0, frozen_camera="front")
     assert ingests.run(tmp_path / "in.mcap") == 1
@@ -427,6 +428,7 @@ def test_another_dataset_is_left_alone_and_the_way_out_is_named(
     assert content(ingests.out) == before
 
 
+@pytest.mark.slow
 def test_a_replacement_that_fails_puts_back_what_was_there(
     ingests: Ingests, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -56,6 +56,7 @@ def test_an_episode_of_the_dataset_can_be_done_again_from_what_it_holds(collecte
     assert sim.judge.outcome.success[0]
 
 
+@pytest.mark.slow
 def test_same_command_elsewhere_gives_the_same_bytes(collected, tmp_path):
     assert cli(["collect", *ARGUMENTS, f"--out={tmp_path / 'b'}", f"--store={tmp_path / 'store'}"]) == 0
     for name in ("data/chunk-000/file-000.parquet", "meta/stats.json", "meta/info.json"):

@@ -111,6 +111,7 @@ def test_near_a_limit_the_room_is_smaller_and_the_limit_is_kept():
     assert all(p.target.max() <= ACTION_HIGH[COLUMN] - MARGIN_RAD + 1e-6 for p in found.planned)
 
 
+@pytest.mark.slow
 def test_a_motion_that_needs_more_torque_than_the_motor_may_give_is_refused():
     """A drive four times as stiff jerks joint 2: steps at 3 rad/s need more than 25 N·m, a slow triangle does not."""
     config = TwinConfig()
@@ -134,6 +135,7 @@ def test_a_constant_torque_moves_where_the_joint_rests_and_is_no_jerk_at_the_sta
     assert peaks[0] == pytest.approx(peaks[1], rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_pair_is_hopeless_where_no_motion_may_be_made():
     found = dataclasses.replace(planned("coulomb_friction", "viscous_friction"), planned=())
     assert found.best("coulomb_friction | viscous_friction") == 0.0

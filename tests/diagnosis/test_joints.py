@@ -106,6 +106,7 @@ def test_recordings_that_leave_the_joint_alone_are_left_out(finding):
     assert again.diagnosis.errors == finding.diagnosis.errors
 
 
+@pytest.mark.slow
 def test_without_validation_recordings_the_last_rows_judge():
     made = dataclasses.replace(sweeps(), validation=())
     found = diagnose_joint(TwinConfig(), SIGNAL, made, search=ONE, without=WITHOUT)

@@ -57,6 +57,7 @@ def test_an_item_whose_process_died_is_tried_once_more_and_then_has_a_result_tha
     assert [name for name, _ in done][-2:] == ["once", "always"]  # alone, after all others
 
 
+@pytest.mark.slow
 def test_an_item_that_never_ends_is_killed_at_the_limit_and_not_tried_again(tmp_path):
     began_s = time.monotonic()
     items, care = [tmp_path / name for name in ("hangs", "a", "b")], Care(limit_s=1.0, tries=2)
@@ -66,6 +67,7 @@ def test_an_item_that_never_ends_is_killed_at_the_limit_and_not_tried_again(tmp_
     assert time.monotonic() - began_s < 20
 
 
+@pytest.mark.slow
 def test_one_item_of_two_workers_does_not_take_the_command_with_it(tmp_path):
     found = LocalEngine(workers=2).map(fate, [tmp_path / "always"], care=TWICE, instead=spoken)
     assert found[0].startswith("always: crashed: ")

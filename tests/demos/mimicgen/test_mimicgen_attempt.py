@@ -247,6 +247,7 @@ def test_actions_that_were_not_the_attempts_are_not_reproduced(pool, sim, rows_s
     assert changed.outcome == "not reproduced"
 
 
+@pytest.mark.slow
 def test_a_gate_that_is_not_passed_is_the_outcome(pool, sim, rows_spec, succeeded):
     spec = dataclasses.replace(pool.spec, gates=GatesSpec(max_force_n=1.0))
     strict = dataclasses.replace(succeeded, provenance={})

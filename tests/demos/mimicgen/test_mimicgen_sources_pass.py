@@ -46,6 +46,7 @@ def test_a_source_of_assembly_2_passes_the_gates(collected):
     check(collected, "assembly_2")
 
 
+@pytest.mark.slow
 def test_the_check_can_fail(collected):
     episode = Dataset(collected).episode(0)
     measured, _ = redone(episode, simulation_of(episode, "assembly_2"))
