@@ -482,7 +482,8 @@ def _no_damage(ingests: Ingests) -> None:
     assert not list(ingests.store.glob("recording/.*")), "half an artefact"
 
 
-@pytest.mark.parametrize("limit_bytes", [pytest.param(20_000, marks=pytest.mark.slow), 120_000])
+@pytest.mark.slow
+@pytest.mark.parametrize("limit_bytes", [20_000, 120_000])
 def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(
     ingests: Ingests, good: Path, limit_bytes: int, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -190,6 +190,7 @@ def test_the_provenance_says_who_moved_the_hands_and_what_was_felt(felt, replaye
     assert all("right: blocked at" in what for _, what in corrections)
 
 
+@pytest.mark.slow
 def test_a_correction_follows_a_force_of_that_very_row_and_relieves_it(sim, felt):
     force_n, corrections = forces_n(sim, felt), felt.provenance["corrections"]
     assert isinstance(corrections, list)

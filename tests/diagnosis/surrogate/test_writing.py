@@ -16,6 +16,7 @@ from taccorl.diagnosis.surrogate.writing import SWEEPS, TRUTH, TWIN, reveal, wri
 from taccorl.errors import TaccorlError
 from taccorl.sim.twin_file import load_twin
 
+pytestmark = pytest.mark.slow
 OPENED: list[str] = []
 
 
@@ -85,7 +86,6 @@ def test_the_truth_is_sealed_and_can_be_revealed(case, folder, capsys):
     assert json.loads(capsys.readouterr().out)["hidden"][0]["name"] == "coulomb_friction"
 
 
-@pytest.mark.slow
 def test_nothing_that_reads_measurements_opens_the_truth(folder):
     OPENED.clear()
     read_measurements(folder / SWEEPS)
