@@ -75,6 +75,7 @@ def test_held_out_frames_are_closer_to_the_twin_afterwards(camera: str):
     assert fit.found_after > fit.found_before + 0.3
 
 
+@pytest.mark.slow
 def test_the_new_camera_is_saved_and_loaded_with_the_twin(tmp_path: Path):
     fit = fitted("front")
     mended = fit.twin(twin())
@@ -213,6 +214,7 @@ def test_arms_out_of_view_are_an_error():
         calibrate_camera(frames, config, "front")
 
 
+@pytest.mark.slow
 def test_pictures_of_other_poses_do_not_converge_and_the_twin_keeps_its_camera():
     frames = made("front")[1]
     mixed = dataclasses.replace(frames, joints=np.roll(frames.joints, 3, axis=0))
@@ -224,6 +226,7 @@ def test_pictures_of_other_poses_do_not_converge_and_the_twin_keeps_its_camera()
         fit.twin(twin())
 
 
+@pytest.mark.slow
 def test_pictures_without_an_edge_identify_nothing():
     frames = made("front")[1]
     fit = calibrate_camera(dataclasses.replace(frames, pictures=np.full_like(frames.pictures, 90)), twin(), "front")
@@ -232,6 +235,7 @@ def test_pictures_without_an_edge_identify_nothing():
     np.testing.assert_array_equal(fit.offset, fit.start)
 
 
+@pytest.mark.slow
 def test_frames_of_one_pose_are_called_so_with_the_direction_that_is_known_worst():
     frames = made("front")[1]
     same = dataclasses.replace(

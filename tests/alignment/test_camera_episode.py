@@ -35,6 +35,7 @@ def episode() -> Episode:
     return dataclasses.replace(recorder.episode("four seconds", {}), origin="surrogate: a twin whose camera is off")
 
 
+@pytest.mark.slow
 def test_a_camera_is_calibrated_from_an_episode():
     frames = camera_frames(episode(), "front", 10)
     assert frames.pictures.shape[1:] == (224, 224, 3)
@@ -59,6 +60,7 @@ def test_frames_are_slow_rows_and_differ():
     assert min(apart) > 0.005
 
 
+@pytest.mark.slow
 def test_joints_are_taken_as_much_earlier_as_the_pictures_are_late():
     now, then = camera_frames(episode(), "front", 6), camera_frames(episode(), "front", 6, latency_s=1 / 30)
     state = episode().arrays["observation.state"]

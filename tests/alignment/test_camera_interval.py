@@ -31,6 +31,7 @@ def of(camera: str, num_times: int, joints: np.ndarray, pictures: np.ndarray) ->
     return found
 
 
+@pytest.mark.slow
 def test_the_same_frames_again_shrink_the_noise_but_not_what_the_twin_has_wrong():
     rng = np.random.default_rng(0)
     joints = random_poses(rng, 3)

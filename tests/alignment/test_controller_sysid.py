@@ -54,6 +54,7 @@ def test_the_paper_s_gains_are_found_from_its_sweep(signal: str) -> None:
     assert json.loads(json.dumps(fit.record()))["gains"]["kp"] == fit.gains.kp
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_they_promise() -> None:
     # 95 % intervals of 30 draws of noise: less than 24 hits have a chance of 1 in 1000.
     base, model = motion_of(ELBOW, noise_rad=0.0, seconds=5.0), JointModel(REFERENCE_TWIN, ELBOW)
@@ -117,6 +118,7 @@ def test_a_clock_one_row_off_is_told_before_k_p_is_believed(rows_early: int) -> 
     assert good.remarks == () and abs(good.estimates["late"].value) < 0.0015
 
 
+@pytest.mark.slow
 def test_a_number_at_its_bound_is_not_an_estimate() -> None:
     # T_ref of joint 5 is 1.73 N·m; with less allowed than that no gains rest where the joint rests.
     motion = motion_of(ELBOW)
@@ -179,6 +181,7 @@ def test_missing_physics_is_left_over_and_known_physics_is_not() -> None:
     assert with_it.gains.kp == pytest.approx(TRUTH[ELBOW].kp, rel=0.1)
 
 
+@pytest.mark.slow
 def test_spsa_with_the_paper_s_constants_lowers_the_loss() -> None:
     motion, model = motion_of(ELBOW), JointModel(REFERENCE_TWIN, ELBOW)
     fit = identify_controller([motion], model, method="spsa", seed=3)

@@ -228,6 +228,7 @@ def test_a_long_silence_is_a_hole_of_positions_and_holds_commands(moved):
     assert hole.feature == "left_joint1"
 
 
+@pytest.mark.slow
 def test_commands_of_another_phase_keep_their_mean_time(moved, recorded):
     # Command stamps 2 ms later than positions: rows lie on the commands, positions are brought to them.
     late = {"/joint_states_ctrl_left": 0.002, "/joint_states_ctrl_right": 0.002}

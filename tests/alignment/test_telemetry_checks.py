@@ -61,7 +61,7 @@ def test_clean_sweeps_stay_clean(seed):
     assert found(m) == {}
 
 
-@pytest.mark.parametrize("friction_nm", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("friction_nm", [*(pytest.param(f, marks=pytest.mark.slow) for f in (0.3, 1.0)), 3.0])
 def test_friction_is_no_fault_of_the_telemetry(friction_nm):
     for seed in range(3):
         m = sweep(seed, friction_nm=friction_nm, seconds=6.0)
@@ -81,7 +81,7 @@ def test_steps_and_holds_are_clean_too():
 
 
 @pytest.mark.parametrize("rows", [1, 2, 5])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_positions_one_row_early_are_an_error_at_every_joint(seed, rows):
     m = shifted(sweep(seed), rows)
     leads = found(m)["measured_before_command"]
@@ -433,6 +433,7 @@ def test_channels_of_a_recording_speak_for_themselves(clean):
     assert found(dataclasses.replace(clean, time_error_s=0.005)) == {"row_times": ["time"]}
 
 
+@pytest.mark.slow
 def test_an_untold_repeat_is_pointed_out(clean):
     again = dataclasses.replace(sweep(0), name="again")
     other = dataclasses.replace(sweep(3), name="other")

@@ -56,6 +56,7 @@ def test_table_says_how_far_off_and_where(folder: Path, said: Any):
     assert "data: origin not stated" in text  # a table cannot say
 
 
+@pytest.mark.slow
 def test_before_and_after_side_by_side_with_report_and_rerun_file(folder: Path, said: Any, tmp_path: Path):
     out, rrd = tmp_path / "report", tmp_path / "x.rrd"
     words = [folder / "sweeps", f"--twin={folder / 'twin.yaml'}", f"--against={folder / 'mended.yaml'}"]
@@ -86,6 +87,7 @@ def test_errors_of_the_data_stop_it_with_what_to_do(folder: Path, said: Any, tmp
     assert "RMSE" not in text and not (tmp_path / "report").exists()
 
 
+@pytest.mark.slow
 def test_an_error_can_be_accepted_by_name_and_stays_in_the_report(folder: Path, said: Any, tmp_path: Path):
     good = sweeps(TwinConfig(), seconds=3.0)
     values = good.fit[0].measured.copy()

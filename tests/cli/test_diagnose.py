@@ -129,6 +129,12 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert "at the noise floor\n  validation error in noise floors" in text
     assert f"next: taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}" in text
     assert not (out / "twin.yaml").exists(), "one effect: add-effect writes the twin"
+
+
+@pytest.mark.slow
+def test_a_report_is_replaced_and_other_files_are_left_alone(sweeps: Path, said: Any, tmp_path: Path):
+    out, keep = tmp_path / "found", few("coulomb_friction", "asymmetric_friction", "encoder_bias")
+    assert said(sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep)[0] == 0
     (out / "notes.txt").write_text("mine")
     code, text = said(sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep, "--joints=[J3]")
     assert code == 0 and f"\n{SIGNAL}\n" in text, "the paper's name of the joint"
@@ -138,6 +144,7 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert code == 2 and (out / "report.html").read_text() == "mine, too"
 
 
+@pytest.mark.slow
 def test_without_the_true_effect_something_else_remains(sweeps: Path, said: Any, tmp_path: Path):
     out = tmp_path / "found"
     words = [sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}"]
@@ -221,12 +228,14 @@ def test_the_same_steps_on_one_clock_are_diagnosed(said: Any, tmp_path: Path):
     assert "nothing is missing" in text
 
 
+@pytest.mark.slow
 def test_positions_one_row_too_late_are_said_to_be_a_delay_or_a_clock(said: Any, tmp_path: Path):
     keep = few("command_delay", "sensor_delay", "coulomb_friction")
     _, text = said(stepped(tmp_path / "late", 1), f"--out={tmp_path / 'out'}", keep)
     assert "a real delay" in " ".join(text.split())
 
 
+@pytest.mark.slow
 def test_a_recording_s_stated_gains_are_needed_only_if_they_are_to_be_believed(said: Any, tmp_path: Path):
     folder = stepped(tmp_path / "silent", 0)
     code, text = said(folder, f"--out={tmp_path / 'out'}", "--gains=commanded", few("backlash"))

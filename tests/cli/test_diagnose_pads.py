@@ -39,14 +39,19 @@ def surrogate(folder: Path, effect: str, strength: float, patched: bool = True) 
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``sweeps/`` with three short presses, ``twin.yaml``, ``found/`` with what was diagnosed from them, ``said.txt``."""
-    folder = surrogate(tmp_path_factory.mktemp("pads") / "robot", "taxel_saturation", 8.0)
-    words = [f"--twin={folder / 'twin.yaml'}", f"--out={folder / 'found'}", FEW, "--until=noise_floor"]
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``sweeps/`` with three short presses, and ``twin.yaml``."""
+    return surrogate(tmp_path_factory.mktemp("pads") / "robot", "taxel_saturation", 8.0)
+
+
+@pytest.fixture(scope="module")
+def robot(made: Path) -> Path:
+    """What was diagnosed from it, in ``found/``, and ``said.txt``."""
+    words = [f"--twin={made / 'twin.yaml'}", f"--out={made / 'found'}", FEW, "--until=noise_floor"]
     with redirect_stdout(io.StringIO()) as said:
-        assert main(["diagnose", str(folder / "sweeps"), *words]) == 0
-    (folder / "said.txt").write_text(said.getvalue())
-    return folder
+        assert main(["diagnose", str(made / "sweeps"), *words]) == 0
+    (made / "said.txt").write_text(said.getvalue())
+    return made
 
 
 @pytest.fixture
@@ -60,6 +65,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> Any:
     return run
 
 
+@pytest.mark.slow
 def test_the_report_holds_the_effect_with_its_numbers(robot: Path):
     report = json.loads((robot / "found" / "report.json").read_text())
     assert list(report["diagnoses"]) == ["left pads"], "the gripper moves, and no joint is swept"
@@ -84,6 +90,7 @@ def test_the_report_holds_the_effect_with_its_numbers(robot: Path):
         assert after < 0.35 * before and after < 1.35
 
 
+@pytest.mark.slow
 def test_what_was_found_goes_into_a_copy_and_the_error_falls(robot: Path, said: Any, tmp_path: Path):
     out = tmp_path / "new.yaml"
     twin = f"--twin={robot / 'twin.yaml'}"
@@ -114,6 +121,7 @@ def _sealed(said: Any, robot: Path) -> str:
     return said("surrogate", f"--reveal={robot}")[1]
 
 
+@pytest.mark.slow
 def test_the_terminal_tells_noise_evidence_and_numbers(robot: Path):
     text = (robot / "said.txt").read_text()
     assert "\nleft pads\n" in text and "\n  noise floor 0." in text
@@ -125,6 +133,7 @@ def test_the_terminal_tells_noise_evidence_and_numbers(robot: Path):
     assert max(len(line) for line in text.splitlines() if "would not show" in line) < 400
 
 
+@pytest.mark.slow
 def test_until_the_noise_floor_the_mended_twin_is_written(robot: Path):
     assert "found/twin.yaml: taxel_saturation; it is what collect and training load" in (robot / "said.txt").read_text()
     new = load_twin(robot / "found" / "twin.yaml")
@@ -133,6 +142,7 @@ def test_until_the_noise_floor_the_mended_twin_is_written(robot: Path):
     assert isinstance(new.sensor, FlexiTacConfig) and new.sensor.normal_stiffness_per_m == pytest.approx(base["k_n"])
 
 
+@pytest.mark.slow
 def test_of_an_arm_that_was_not_diagnosed_there_is_nothing_to_add(robot: Path, said: Any, tmp_path: Path):
     words = ["taxel_saturation", f"--twin={robot / 'twin.yaml'}", f"--diagnosis={robot / 'found'}"]
     code, text = said("add-effect", *words, "--pads=right", f"--out={tmp_path / 'x'}")
@@ -159,11 +169,11 @@ def test_by_hand_an_effect_may_act_on_the_pads_of_one_arm(said: Any, tmp_path: P
     ("words", "message"),
     [
         (["--pads=right"], "--pads=right: no fit recording says what pads of such an arm pressed; known: left"),
-        (["--joints=J3"], "no fit recording sweeps a joint"),
+        pytest.param(["--joints=J3"], "no fit recording sweeps a joint", marks=pytest.mark.slow),
     ],
 )
-def test_what_is_not_there_is_said(words: list[str], message: str, robot: Path, said: Any, tmp_path: Path):
-    code, text = said("diagnose", robot / "sweeps", f"--out={tmp_path / 'out'}", *words)
+def test_what_is_not_there_is_said(words: list[str], message: str, made: Path, said: Any, tmp_path: Path):
+    code, text = said("diagnose", made / "sweeps", f"--out={tmp_path / 'out'}", *words)
     assert code == 2 and message in " ".join(text.split())
     assert not (tmp_path / "out").exists()
 
@@ -172,20 +182,20 @@ def test_what_is_not_there_is_said(words: list[str], message: str, robot: Path, 
     ("change", "message"),
     [
         ({"arm": "right"}, "01_press.mcap: the object never comes within 1 mm of the pads of the right arm"),
-        ({"radius_m": 0.0098}, "01_press.mcap: the object never comes within 1 mm"),
+        pytest.param({"radius_m": 0.0098}, "01_press.mcap: the object never comes within 1 mm", marks=pytest.mark.slow),
         ({"radius_m": 0.0108}, "01_press.mcap: what is pressed comes near the pads of the left arm and never touches"),
         ({"shape": "cube"}, "'cube' is none of 'sphere', 'rod'"),
     ],
 )
-@pytest.mark.parametrize("verb", ["compare", "diagnose"])
+@pytest.mark.parametrize("verb", ["compare", pytest.param("diagnose", marks=pytest.mark.slow)])
 def test_a_wrong_object_is_an_error_with_a_way_out(
-    verb: str, change: dict, message: str, robot: Path, said: Any, tmp_path: Path
+    verb: str, change: dict, message: str, made: Path, said: Any, tmp_path: Path
 ):
     sweeps = tmp_path / "sweeps"
     sweeps.mkdir()
     for name in ("01_press.mcap", "03_held.mcap"):
-        (sweeps / name).symlink_to(robot / "sweeps" / name)
-    index = yaml.safe_load((robot / "sweeps" / INDEX).read_text())
+        (sweeps / name).symlink_to(made / "sweeps" / name)
+    index = yaml.safe_load((made / "sweeps" / INDEX).read_text())
     del index["recordings"]["02_again.mcap"]
     index["recordings"]["01_press.mcap"]["pressed"] |= change
     (sweeps / INDEX).write_text(yaml.safe_dump(index))
@@ -195,8 +205,8 @@ def test_a_wrong_object_is_an_error_with_a_way_out(
     assert not (tmp_path / "out").exists()
 
 
-def test_without_a_word_of_what_was_pressed_the_way_out_is_said(robot: Path, said: Any, tmp_path: Path):
-    shutil.copy(robot / "sweeps" / "01_press.mcap", tmp_path)
+def test_without_a_word_of_what_was_pressed_the_way_out_is_said(made: Path, said: Any, tmp_path: Path):
+    shutil.copy(made / "sweeps" / "01_press.mcap", tmp_path)
     code, text = said("diagnose", tmp_path, f"--out={tmp_path / 'out'}")
     assert code == 2 and "of presses, state `pressed` in measurements.yaml" in " ".join(text.split())
 

@@ -86,6 +86,7 @@ def test_rivals_and_numbers_come_from_a_diagnosis(said: Any, tmp_path: Path):
     assert code == 0 and min(plan["motions"][0]["floors_apart"].values()) > 5.0
 
 
+@pytest.mark.slow
 def test_recordings_that_are_there_say_the_floor_and_where_the_arm_stands(sweeps: Path, said: Any, tmp_path: Path):
     out = tmp_path / "plan"
     _, text = said(SIGNAL, RIVALS, f"--measurements={sweeps}", f"--out={out}", "--num=1")
@@ -114,6 +115,7 @@ def test_what_cannot_be_done_is_said_and_nothing_written(words: list[str], messa
     assert not (tmp_path / "plan").exists()
 
 
+@pytest.mark.slow
 def test_a_table_of_the_joint_alone_is_enough(sweeps: Path, said: Any, tmp_path: Path):
     one = write_folder(tmp_path / "one", read_measurements(sweeps), (SIGNAL,))
     code, text = said(SIGNAL, RIVALS, f"--measurements={one}", f"--out={tmp_path / 'plan'}", "--num=1")

@@ -121,7 +121,7 @@ def test_without_a_topic_named_as_a_command_the_user_chooses(chosen: str, tmp_pa
     assert spec.features["observation.state"].channels == ("arm_joint_states",)
 
 
-@pytest.mark.parametrize("encoding", ["ros2", "json", "protobuf"])
+@pytest.mark.parametrize("encoding", [*(pytest.param(e, marks=pytest.mark.slow) for e in ("ros2", "json")), "protobuf"])
 def test_two_arms_with_pads_are_drafted_with_touch_in_any_encoding(encoding: Any, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_mcap(path, StandInConfig(duration_s=2.0, camera_size=(96, 128), encoding=encoding))

@@ -251,6 +251,7 @@ def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_i
     assert Dataset(ingests.out).num_episodes == 1
 
 
+@pytest.mark.slow
 def test_a_recording_whose_only_episode_is_frozen_gives_nothing(ingests: Ingests, tmp_path: Path) -> None:
     record(tmp_path / "in.mcap", duration_s=4.0, frozen_camera="front")
     assert ingests.run(tmp_path / "in.mcap") == 1
@@ -326,6 +327,7 @@ def test_a_new_recording_is_the_only_one_written(ingests: Ingests, good: Path, t
     assert Dataset(tmp_path / "out.old-1").num_episodes == 2
 
 
+@pytest.mark.slow
 def test_a_changed_spec_writes_all_again(ingests: Ingests, good: Path, tmp_path: Path, spec: Path) -> None:
     assert ingests.run(good) == 0
     assert ingests.written() == 2
@@ -359,6 +361,7 @@ def test_one_file_by_several_names_is_one_input(
     assert Dataset(ingests.out).num_episodes == 1
 
 
+@pytest.mark.slow
 def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(
     ingests: Ingests, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -378,6 +381,7 @@ def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(
         assert shlex.split(r["command"])[2] == name
 
 
+@pytest.mark.slow
 def test_a_dataset_is_an_input_like_any_other(ingests: Ingests, tmp_path: Path) -> None:
     # a baseline takes 30 frames, in a dataset a whole second; the left pads feel the part from 1.5 s on
     record(tmp_path / "in.mcap", duration_s=5.0)
@@ -424,6 +428,7 @@ def test_another_dataset_is_left_alone_and_the_way_out_is_named(
     assert content(ingests.out) == before
 
 
+@pytest.mark.slow
 def test_a_replacement_that_fails_puts_back_what_was_there(
     ingests: Ingests, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -477,6 +482,7 @@ def _no_damage(ingests: Ingests) -> None:
     assert not list(ingests.store.glob("recording/.*")), "half an artefact"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit_bytes", [20_000, 120_000])
 def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(
     ingests: Ingests, good: Path, limit_bytes: int, capfd: pytest.CaptureFixture[str]
@@ -498,6 +504,7 @@ def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(
     assert ingests.run(good) == 0, "with room again, it goes on"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", ["200k", "900k"])
 def test_a_full_disk_stops_the_run_with_one_clear_line(
     tmp_path: Path,
@@ -532,15 +539,16 @@ def test_a_store_that_is_read_only_is_told_at_once(
     tmp_path: Path, spec: Path, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ingests = Ingests(tmp_path, spec, monkeypatch)
-    assert ingests.run(good, out="/proc/nothing/out") == 2
-    assert ingests.run(good, store="/proc/nothing/store") == 2
-    assert ingests.written() <= 2
+    assert ingests.run(good / "a.mcap", out="/proc/nothing/out") == 2
+    assert ingests.run(good / "a.mcap", store="/proc/nothing/store") == 2
+    assert ingests.written() <= 1
     assert capsys.readouterr().err.count("taccorl ingest: ") == 2
 
 
 # ---- many at once ----
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_bytes_as_one(ingests: Ingests, good: Path, tmp_path: Path) -> None:
     assert ingests.run(good) == 0
     assert ingests.run(good, out=tmp_path / "out2", store=tmp_path / "store2", engine__workers=2) == 0

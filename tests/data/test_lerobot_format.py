@@ -125,6 +125,7 @@ def test_rows_keep_their_pictures_and_numbers(spec: DatasetSpec, tmp_path: Path)
     assert encoder_threads() == []
 
 
+@pytest.mark.slow
 def test_a_slow_encoder_loses_no_frame(spec: DatasetSpec, tmp_path: Path, slow_encoder: None) -> None:
     write_episodes([made_up(spec, 20)], tmp_path / "ds")
     assert row_ids(tmp_path / "ds") == list(range(20))
@@ -425,6 +426,7 @@ def blind(spec: DatasetSpec, seed: int, instruction: str = "touch it") -> Episod
     )
 
 
+@pytest.mark.slow
 def test_every_process_writes_and_merges_the_same_bytes(tmp_path: Path) -> None:
     folders = [tmp_path / hash_seed for hash_seed in "12"]  # of the order in which Python's sets of strings go
     processes = []
@@ -449,6 +451,7 @@ def test_an_episode_of_one_row_is_written(spec: DatasetSpec, tmp_path: Path) -> 
     assert row_ids(tmp_path / "ds") == [0]
 
 
+@pytest.mark.slow
 def test_data_files_are_those_of_lerobots_writer_left_alone(
     spec: DatasetSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -436,6 +436,7 @@ with tempfile.TemporaryDirectory(dir=folder) as scratch:
 """
 
 
+@pytest.mark.slow
 def test_300_mb_of_pictures_do_not_enter_memory(tmp_path):
     """Loading keeps stamps and numbers only; asking for the pictures streams them. Bound: 15 MB above the imports."""
     recording_spec(tmp_path, front={"clock": "log"})

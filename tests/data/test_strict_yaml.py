@@ -195,7 +195,7 @@ def test_an_empty_value_is_nothing_only_where_nothing_is_allowed(tmp_path):
         (b"name: pad\n---\nname: pod\n", "a.yaml:2: is not YAML: but found another document"),
         (b"name: *nowhere\n", "a.yaml:1: is not YAML: found undefined alias 'nowhere'"),
         (b"name: a: b\n", "a.yaml:1: is not YAML: mapping values are not allowed here"),
-        (b"[" * 20000, "a.yaml: is nested too deeply for a spec"),
+        (b"[" * 5000, "a.yaml: is nested too deeply for a spec"),
     ],
 )  # fmt: skip
 def test_what_is_no_spec_at_all_gets_a_plain_message(tmp_path, text, expected):

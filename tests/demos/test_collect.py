@@ -56,12 +56,14 @@ def test_an_episode_of_the_dataset_can_be_done_again_from_what_it_holds(collecte
     assert sim.judge.outcome.success[0]
 
 
+@pytest.mark.slow
 def test_same_command_elsewhere_gives_the_same_bytes(collected, tmp_path):
     assert cli(["collect", *ARGUMENTS, f"--out={tmp_path / 'b'}", f"--store={tmp_path / 'store'}"]) == 0
     for name in ("data/chunk-000/file-000.parquet", "meta/stats.json", "meta/info.json"):
         assert (tmp_path / "b" / name).read_bytes() == (collected / "a" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_more_episodes_go_on_from_those_in_the_store(collected, tmp_path):
     began = []
     plan = Plan(task="assembly_1", episodes=2, images=False, seed=5)
@@ -232,6 +234,7 @@ def told():
     return sim, recorder, TwinStory(sim, recorder.trajectory(), "success")
 
 
+@pytest.mark.slow
 def test_a_recording_tells_the_trajectory_at_its_own_times(told):
     _, recorder, story = told
     rows = recorder.episode("x", {}).arrays["observation.state"]
@@ -240,6 +243,7 @@ def test_a_recording_tells_the_trajectory_at_its_own_times(told):
     np.testing.assert_allclose(story.state(np.array([0.0, LEAD_S / 2]))[0], rows[0], atol=1e-6)  # rest before
 
 
+@pytest.mark.slow
 def test_pads_of_a_recording_read_what_the_sensor_reads_in_wire_order(told):
     sim, recorder, story = told
     trajectory = recorder.trajectory()

@@ -522,6 +522,7 @@ for k in range(10**9):
 """
 
 
+@pytest.mark.slow
 def test_process_killed_while_recording_leaves_a_readable_file(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, "-c", _WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     try:

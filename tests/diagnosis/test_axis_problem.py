@@ -69,6 +69,7 @@ def own_units(axis: AxisConfig, found: Diagnosis, name: str, unit: str) -> float
     return found.after.values[name] * axis.factor(unit)
 
 
+@pytest.mark.slow
 def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
     found = diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
     first = found.rounds[0]

@@ -204,6 +204,7 @@ def test_pads_of_the_right_law_are_at_their_noise_and_of_another_stiffness_are_n
     assert np.median((held.replayed / np.maximum(held.measured, 1))[felt]) == pytest.approx(1200 / 900, rel=0.05)
 
 
+@pytest.mark.slow
 def test_touch_of_an_unknown_object_is_not_compared_and_says_so(presses):
     with pytest.raises(TaccorlError, match="nothing to compare"):
         compare(TwinConfig(), presses)  # nothing but touch in it

@@ -59,12 +59,14 @@ def test_two_frictions_are_told_apart_and_the_best_motion_comes_first(frictions)
     assert worst[-1] < TELLS, "not any motion will do"
 
 
+@pytest.mark.slow
 def test_free_gains_hide_what_commanded_ones_show(frictions):
     """One motion alone with K_p and K_d free: K_d takes up the viscous one, and Coulomb's may be 0."""
     assert planned("viscous_friction", "coulomb_friction", gains="fitted").planned[0].worst < SAME
     assert frictions.planned[0].worst > TELLS
 
 
+@pytest.mark.slow
 def test_recordings_that_are_there_count(frictions):
     """Viscous friction and K_d: with a chirp at hand, the chirp at twice the gain tells what it could not alone."""
     known = Measurements((recorded(NOMINAL, CHIRP, 0, stated=False),))
@@ -74,6 +76,7 @@ def test_recordings_that_are_there_count(frictions):
     assert stiffer[0].worst > 10 * stiffer[1].worst
 
 
+@pytest.mark.slow
 def test_three_rivals_are_three_pairs_and_the_worst_counts():
     found = planned("viscous_friction", "coulomb_friction", "asymmetric_friction", gains="commanded")
     assert all(len(p.discrimination) == 3 for p in found.planned)
@@ -99,6 +102,7 @@ def test_every_target_keeps_the_joint_s_limits_and_rests_at_both_ends(frictions,
         assert np.ptp(p.target[:rest]) == np.ptp(p.target[-rest:]) == 0.0
 
 
+@pytest.mark.slow
 def test_near_a_limit_the_room_is_smaller_and_the_limit_is_kept():
     pose = rest_pose(SIGNAL, None)
     pose[4] = ACTION_HIGH[COLUMN] - 0.2
@@ -107,6 +111,7 @@ def test_near_a_limit_the_room_is_smaller_and_the_limit_is_kept():
     assert all(p.target.max() <= ACTION_HIGH[COLUMN] - MARGIN_RAD + 1e-6 for p in found.planned)
 
 
+@pytest.mark.slow
 def test_a_motion_that_needs_more_torque_than_the_motor_may_give_is_refused():
     """A drive four times as stiff jerks joint 2: steps at 3 rad/s need more than 25 N·m, a slow triangle does not."""
     config = TwinConfig()
@@ -118,6 +123,7 @@ def test_a_motion_that_needs_more_torque_than_the_motor_may_give_is_refused():
     assert all(p.peak_torque_nm <= 25.0 for p in found.planned)
 
 
+@pytest.mark.slow
 def test_a_constant_torque_moves_where_the_joint_rests_and_is_no_jerk_at_the_start():
     """Resting, K_p (q* − q) + T_ref = 0 whatever T_ref is: what a motion needs of the motor does not depend on it."""
     without, with_it = TwinConfig(), TwinConfig()
@@ -129,6 +135,7 @@ def test_a_constant_torque_moves_where_the_joint_rests_and_is_no_jerk_at_the_sta
     assert peaks[0] == pytest.approx(peaks[1], rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_pair_is_hopeless_where_no_motion_may_be_made():
     found = dataclasses.replace(planned("coulomb_friction", "viscous_friction"), planned=())
     assert found.best("coulomb_friction | viscous_friction") == 0.0

@@ -97,6 +97,7 @@ def test_the_friction_is_found_at_its_joint_with_fitted_gains(finding):
     assert len(finding.floors) == 1, "no effort was recorded"
 
 
+@pytest.mark.slow
 def test_recordings_that_leave_the_joint_alone_are_left_out(finding):
     made = sweeps(stated=False)
     more = dataclasses.replace(made, fit=(*made.fit, still("other", right_joint1=0.3)))
@@ -105,6 +106,7 @@ def test_recordings_that_leave_the_joint_alone_are_left_out(finding):
     assert again.diagnosis.errors == finding.diagnosis.errors
 
 
+@pytest.mark.slow
 def test_without_validation_recordings_the_last_rows_judge():
     made = dataclasses.replace(sweeps(), validation=())
     found = diagnose_joint(TwinConfig(), SIGNAL, made, search=ONE, without=WITHOUT)

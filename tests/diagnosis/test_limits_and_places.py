@@ -116,6 +116,7 @@ def torque_speed_line(torque: float, q: float, v: float) -> float:
     return math.copysign(min(abs(torque), most), torque)
 
 
+@pytest.mark.slow
 def test_a_torque_that_falls_with_the_speed_is_found_with_its_two_numbers() -> None:
     said = found_in(*LIMITED, acting=torque_speed_line)
     assert said.names == ("torque_speed_limit",)
@@ -124,6 +125,7 @@ def test_a_torque_that_falls_with_the_speed_is_found_with_its_two_numbers() -> N
     assert said.after.values["torque_speed_limit.no_load_rad_per_s"] == pytest.approx(6.0, rel=0.03)
 
 
+@pytest.mark.slow
 def test_without_that_effect_it_is_something_else() -> None:
     said = found_in(*LIMITED, without=("cogging", "torque_speed_limit"), acting=torque_speed_line)
     assert said.errors["after"]["validation"] > 3.0
@@ -143,6 +145,7 @@ def test_a_tight_spot_is_found_where_it_is_and_as_wide_as_it_is(angle_rad: float
     assert values["torque_nm"] == pytest.approx(1.5, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "phase_rad"), [(0.6, -0.8), pytest.param(0.9, 0.4, marks=pytest.mark.slow)])
 def test_friction_that_swells_twice_a_turn_is_a_wide_spot(share: float, phase_rad: float) -> None:
     # F (1 + a cos(2q + φ)): the surrogate's kind "angle_friction", which is no Gaussian. cos² x ≈ exp(−x²).
@@ -152,6 +155,7 @@ def test_friction_that_swells_twice_a_turn_is_a_wide_spot(share: float, phase_ra
     assert said.after.values["position_dependent_friction.angle_rad"] == pytest.approx(-0.5 * phase_rad, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("angle_rad", "stiffness"), [(-0.5, 60.0), pytest.param(0.6, 400.0, marks=pytest.mark.slow)])
 def test_an_end_stop_is_found_on_either_side(angle_rad: float, stiffness: float) -> None:
     side = math.copysign(1.0, angle_rad)

@@ -104,6 +104,7 @@ def test_friction_shows_as_a_step_along_velocity_within_its_band():
     assert curve.beyond_chance and curve.explained > 0.8
 
 
+@pytest.mark.slow
 def test_band_holds_the_truth_although_neighbours_are_alike():
     # The residual does not depend on the position: its mean is 0 in every bin. 20 recordings of about 14 bins; 95 % bands
     # hold 0 in at least 85 % of them. Bands from independent rows would hold it in a third.
@@ -117,6 +118,7 @@ def test_band_holds_the_truth_although_neighbours_are_alike():
     assert held >= 0.85 * bins
 
 
+@pytest.mark.slow
 def test_what_does_not_depend_on_a_variable_is_not_beyond_chance():
     false = 0
     for seed in range(40):

@@ -49,6 +49,7 @@ def ways(found: Plan[PlannedPress]) -> dict[str, tuple[float, float]]:
 # what tells apart ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_creep_shows_in_a_long_hold_and_a_lag_in_quick_taps():
     """In a hold of 8 s creep with τ = 3 s goes on, and no lag does. A lag of 30 ms is gone by then: creep that is over in 50 ms
     and doubles the reading of half a k_n is nearly the same, but for the first scans of each tap."""
@@ -67,6 +68,7 @@ def test_delay_and_lag_are_told_apart_by_quick_taps():
     assert found.hopeless == ()
 
 
+@pytest.mark.slow
 def test_recordings_that_are_there_count_and_say_the_floor():
     """Light touches alone leave k_n free, which takes up most of how saturation bends the law; a press of 1 mm says k_n."""
     one = dataclasses.replace(press(0, noise_count=2.6), pressed=ball_at(0.001, 0.003))

@@ -284,6 +284,7 @@ def of_elsewhere(place: tuple[float, float]) -> tuple[TouchProblem, list, list]:
 FEW = ("pad_shift", "depth_offset", "taxel_creep", "taxel_power_law", "taxel_hysteresis", "taxel_ghosting", "touch_lag")
 
 
+@pytest.mark.slow
 def test_a_gain_map_is_judged_on_the_taxels_that_both_fit_and_validation_press() -> None:
     """6 mm to the side: half of the patch was never pressed in the fit, and no map can know its gains."""
     made, fit_to, validation = of_elsewhere((0.007, 0.003))
@@ -299,6 +300,7 @@ def test_a_gain_map_is_judged_on_the_taxels_that_both_fit_and_validation_press()
     assert found.errors["fitted"]["validation"] > 2.0 and found.errors["after"]["validation"] < 1.3
 
 
+@pytest.mark.slow
 def test_gains_that_no_validation_recording_can_judge_are_named_by_their_statistics() -> None:
     made, fit_to, validation = of_elsewhere((-0.003, -0.018))
     assert made.not_shared == ["press_3"]

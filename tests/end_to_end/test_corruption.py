@@ -19,6 +19,7 @@ from mcap.stream_reader import StreamReader
 from taccorl.data.dataset import Dataset
 from taccorl.demos.stand_in import StandInConfig, write_mcap
 
+pytestmark = pytest.mark.slow
 SECONDS, SEED = 4.0, 7
 FAULTY_SECONDS = 8.0
 """In 8 s the grippers close one after the other, so that exchanged arms and pads can be told apart."""

@@ -86,6 +86,7 @@ def test_lerobot_trains_act_on_it_for_two_steps(dataset: Path, tmp_path: Path) -
     assert (tmp_path / "act/checkpoints/000002/pretrained_model/model.safetensors").is_file()
 
 
+@pytest.mark.slow
 def test_lerobot_train_help_loads_our_plugin_without_a_flag() -> None:
     code = (
         "import sys; sys.argv = ['lerobot-train', '--help']\n"

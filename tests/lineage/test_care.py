@@ -57,6 +57,7 @@ def test_an_item_whose_process_died_is_tried_once_more_and_then_has_a_result_tha
     assert [name for name, _ in done][-2:] == ["once", "always"]  # alone, after all others
 
 
+@pytest.mark.slow
 def test_an_item_that_never_ends_is_killed_at_the_limit_and_not_tried_again(tmp_path):
     began_s = time.monotonic()
     items, care = [tmp_path / name for name in ("hangs", "a", "b")], Care(limit_s=1.0, tries=2)
@@ -66,11 +67,13 @@ def test_an_item_that_never_ends_is_killed_at_the_limit_and_not_tried_again(tmp_
     assert time.monotonic() - began_s < 20
 
 
+@pytest.mark.slow
 def test_one_item_of_two_workers_does_not_take_the_command_with_it(tmp_path):
     found = LocalEngine(workers=2).map(fate, [tmp_path / "always"], care=TWICE, instead=spoken)
     assert found[0].startswith("always: crashed: ")
 
 
+@pytest.mark.slow
 def test_where_every_one_of_several_dies_the_machine_is_at_fault_and_nothing_is_taken_for_a_result(tmp_path):
     items = [tmp_path / "always 1", tmp_path / "always 2"]
     with pytest.raises(EngineError, match=r"(?s)2 of 2 items failed.*always 1.*exit code 7.*always 2.*exit code 7"):
@@ -110,6 +113,7 @@ def on_ray(folder: Path) -> list[Any]:
     return engine.map(fate, [folder / name for name in NAMES], care=care, instead=spoken)
 
 
+@pytest.mark.slow
 def test_a_task_of_a_cluster_outlives_its_items(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "require_datatrove", lambda: SimpleNamespace(RayPipelineExecutor=OneAfterAnother))
     assert on_ray(tmp_path) == ON_A_CLUSTER

@@ -129,6 +129,10 @@ if __name__ == "__main__":
     LocalEngine(workers=2).map(toys.sleep_and_leave_pid, [Path(sys.argv[1]) / "a", Path(sys.argv[1]) / "b"])
 """
 
+PATIENT_PARENT = PARENT.replace(
+    "if __name__", "from taccorl.lineage import processes\nprocesses.GRACE_S = 200.0\nif __name__"
+)
+
 PARENT_WITHOUT_KERNEL_HELP = """
 import multiprocessing, sys, threading
 from pathlib import Path
@@ -177,9 +181,9 @@ def test_workers_die_with_a_sigkilled_parent(tmp_path, source):
 
 
 def test_interrupted_engine_ends_its_workers_after_they_tidied_up(tmp_path):
-    parent, pids = start_parent(tmp_path, PARENT)
+    parent, pids = start_parent(tmp_path, PATIENT_PARENT)
     parent.send_signal(signal.SIGINT)
-    parent.wait(timeout=4)  # sooner than GRACE_S: they were asked to end, and did
+    parent.wait(timeout=60)  # sooner than GRACE_S: they were asked to end, and did
     try:
         assert not any(is_running(pid) for pid in pids)
         assert (tmp_path / "a.tidy").exists()

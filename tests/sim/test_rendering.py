@@ -480,6 +480,7 @@ def test_a_library_that_mujoco_gl_asks_for_and_is_not_there_is_named():
     assert "apt-get install libosmesa6" in done.stderr
 
 
+@pytest.mark.slow
 def test_demonstrations_without_images_need_no_opengl(tmp_path):
     words = ["-m", "taccorl.cli.main", "collect", "--task=assembly_1", "--episodes=1", "--images=false"]
     environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": "disable"}

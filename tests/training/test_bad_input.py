@@ -112,6 +112,7 @@ def test_the_ways_out_lead_out(place: Path) -> None:
     assert make_policy(config, ds_meta=of(place / "sim")).config.fps == 30
 
 
+@pytest.mark.slow
 def test_the_share_of_simulated_rows_is_counted_where_statistics_have_lost_it(place: Path, tmp_path: Path) -> None:
     merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
     path = tmp_path / "both/meta/stats.json"
@@ -125,6 +126,7 @@ def test_the_share_of_simulated_rows_is_counted_where_statistics_have_lost_it(pl
     assert policy.mixture.sim_share == pytest.approx(13 / 39) and policy.config.sim_share == policy.mixture.sim_share
 
 
+@pytest.mark.slow
 def test_a_co_trained_checkpoint_is_not_trained_on_one_domain_unless_that_is_said(place: Path, tmp_path: Path) -> None:
     merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
     policy_for(tmp_path / "both").save_pretrained(tmp_path / "co_trained")
@@ -143,6 +145,7 @@ def test_a_co_trained_checkpoint_is_not_trained_on_one_domain_unless_that_is_sai
     assert goes_on(sim_weight=0.0).config.sim_share is None
 
 
+@pytest.mark.slow
 def test_one_domain_left_by_a_choice_of_episodes_is_noticed(place: Path, tmp_path: Path) -> None:
     """As ``--dataset.episodes=[0]`` of a merged dataset: the share p is that of the rows that are read."""
     merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")

@@ -70,6 +70,7 @@ def assert_every_view_shows_its_things(png: Path, episode: Episode) -> None:
     assert (shown[f"provenance · {ORIGIN}"].min(axis=2) > 150).mean() > 0.005, "no text"
 
 
+@pytest.mark.slow
 @needs_vulkan
 def test_the_rerun_program_draws_every_view(episode: Episode, tmp_path: Path):
     png = tmp_path / "view.png"

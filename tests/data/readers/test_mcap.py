@@ -457,7 +457,9 @@ def test_a_file_cut_anywhere_keeps_what_was_written_before(tmp_path, layout):
             assert reader.damage[-1].byte_end == cut
 
 
-@pytest.mark.parametrize("layout", ["none", "zstd", "unchunked"])
+@pytest.mark.parametrize(
+    "layout", [pytest.param("none", marks=pytest.mark.slow), "zstd", pytest.param("unchunked", marks=pytest.mark.slow)]
+)
 def test_any_flipped_bit_in_any_kind_of_record_header_costs_only_that_record(tmp_path, layout):
     """Opcode and length of two records of each kind, bit by bit: a wrong length must not step over sound records unseen."""
     data, seen = FILES[layout], Counter()

@@ -105,6 +105,7 @@ def test_exact_hands_need_no_correction(sims, name):
     assert max(told.force_n) < 5
 
 
+@pytest.mark.slow
 def test_hands_that_feel_nothing_fail_where_touch_succeeds(sims, human):
     numb = ScriptedExpertConfig(feel_m=1.0, feel_rad=10.0, give_way=0.0)
     told = episode(sims["assembly_1"], SEED["assembly_1"], numb, longest_s=human["assembly_1"].steps / 30 + 3)

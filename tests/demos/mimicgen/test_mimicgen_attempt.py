@@ -206,6 +206,7 @@ def test_an_attempt_is_the_same_whatever_ran_before(pool, succeeded):
     assert again.provenance["subtasks"] == succeeded.provenance["subtasks"]
 
 
+@pytest.mark.slow
 def test_replay_of_commands_sends_the_source_s_commands_and_learns_nothing(collected, sim):
     spec = with_options(load_mimic_spec("assembly_2"), retarget="eef_command")
     sources = read_sources(collected, spec)
@@ -218,6 +219,7 @@ def test_replay_of_commands_sends_the_source_s_commands_and_learns_nothing(colle
     assert min(off_m) < 1e-4  # what inverse kinematics and float32 leave; an arm rests 2 mm off its command
 
 
+@pytest.mark.slow
 def test_a_success_is_done_again_bit_for_bit_and_its_last_frame_is_whole(pool, sim, rows_spec, succeeded):
     recorder = Attempts(pool, sim, seed=11).redo(succeeded, rows_spec, np.random.default_rng(0))
     assert succeeded.outcome == "success"
@@ -237,6 +239,7 @@ def test_a_success_is_done_again_bit_for_bit_and_its_last_frame_is_whole(pool, s
     ]
 
 
+@pytest.mark.slow
 def test_actions_that_were_not_the_attempts_are_not_reproduced(pool, sim, rows_spec, succeeded):
     changed = dataclasses.replace(succeeded, actions=succeeded.actions.copy(), provenance={})
     changed.actions[200, 9] += np.float32(1e-3)
@@ -244,6 +247,7 @@ def test_actions_that_were_not_the_attempts_are_not_reproduced(pool, sim, rows_s
     assert changed.outcome == "not reproduced"
 
 
+@pytest.mark.slow
 def test_a_gate_that_is_not_passed_is_the_outcome(pool, sim, rows_spec, succeeded):
     spec = dataclasses.replace(pool.spec, gates=GatesSpec(max_force_n=1.0))
     strict = dataclasses.replace(succeeded, provenance={})

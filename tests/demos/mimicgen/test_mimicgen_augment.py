@@ -45,6 +45,7 @@ def augmented(collected, tmp_path_factory):
     return folder, report
 
 
+@pytest.mark.slow
 def test_the_dataset_holds_successes_that_say_what_they_are_made_of(augmented, collected):
     folder, report = augmented
     dataset = Dataset(folder / "new")
@@ -77,6 +78,7 @@ def test_another_spec_never_mixes_with_what_the_store_holds(augmented, collected
     assert Dataset(folder / "new").num_episodes == 2
 
 
+@pytest.mark.slow
 def test_an_attempt_that_breaks_is_counted_and_the_others_go_on(collected, tmp_path, monkeypatch):
     from taccorl.demos.mimicgen.attempt import Attempts
 
@@ -94,6 +96,7 @@ def test_an_attempt_that_breaks_is_counted_and_the_others_go_on(collected, tmp_p
     assert report["episodes"] == 1
 
 
+@pytest.mark.slow
 def test_physics_that_ends_in_nan_is_counted_and_leaves_no_trace_in_the_next_attempt(
     augmented, collected, tmp_path, monkeypatch
 ):
@@ -149,6 +152,7 @@ def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again
     assert told["failed"][0]["command"] is None
 
 
+@pytest.mark.slow
 def test_an_attempt_that_hung_is_counted_with_the_limit(collected, tmp_path):
     store, some = Store(tmp_path / "store"), plan(episodes=1)
     end = Failed("no end after 600 s; the worker process was killed", process="hung")

@@ -166,6 +166,7 @@ def forces_n(sim: Simulation, done: Attempted) -> np.ndarray:
     return np.array(forces)
 
 
+@pytest.mark.slow
 def test_up_to_contact_it_is_the_replay_bit_for_bit_and_from_then_on_it_is_not(sim, felt, replayed):
     num = min(len(felt.actions), len(replayed.actions))
     differs = (felt.actions[:num] != replayed.actions[:num]).any(axis=1)
@@ -178,6 +179,7 @@ def test_up_to_contact_it_is_the_replay_bit_for_bit_and_from_then_on_it_is_not(s
     assert not forces_n(sim, felt)[:taken].any()
 
 
+@pytest.mark.slow
 def test_the_provenance_says_who_moved_the_hands_and_what_was_felt(felt, replayed):
     assert felt.provenance["contact_mode"] == "closed_loop_expert"
     assert replayed.provenance["contact_mode"] == "replay"
@@ -188,6 +190,7 @@ def test_the_provenance_says_who_moved_the_hands_and_what_was_felt(felt, replaye
     assert all("right: blocked at" in what for _, what in corrections)
 
 
+@pytest.mark.slow
 def test_a_correction_follows_a_force_of_that_very_row_and_relieves_it(sim, felt):
     force_n, corrections = forces_n(sim, felt), felt.provenance["corrections"]
     assert isinstance(corrections, list)
@@ -197,6 +200,7 @@ def test_a_correction_follows_a_force_of_that_very_row_and_relieves_it(sim, felt
         assert after < 0.25 * before
 
 
+@pytest.mark.slow
 def test_it_is_bit_identical_in_another_simulation_whatever_ran_before(pools, felt):
     attempts = Attempts(pools["closed_loop_expert"], Simulation(Assembly2()), SEED)
     attempts.run(felt.k + 1)
@@ -206,6 +210,7 @@ def test_it_is_bit_identical_in_another_simulation_whatever_ran_before(pools, fe
     assert again.provenance == {key: value for key, value in felt.provenance.items() if key != "gates"}
 
 
+@pytest.mark.slow
 def test_a_success_is_done_again_from_its_actions_under_the_gates(pools, sim, felt):
     rows = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
     done = dataclasses.replace(felt, provenance=dict(felt.provenance))

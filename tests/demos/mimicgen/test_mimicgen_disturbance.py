@@ -111,6 +111,7 @@ def tcps(actions, scene_seed):
     return np.stack(found), sim.state_rows()[0]
 
 
+@pytest.mark.slow
 def test_a_disturbed_hand_leaves_its_way_and_is_back_where_it_grips(both):
     pushed, calm = both
     assert calm.success
@@ -130,6 +131,7 @@ def test_a_disturbed_hand_leaves_its_way_and_is_back_where_it_grips(both):
         assert off_mm[grip, a] < 1.5  # 0.4 s after the last push, four time constants of the arm
 
 
+@pytest.mark.slow
 def test_rows_show_what_was_intended_and_keep_what_was_executed(both, pool):
     pushed, _ = both
     sim = Simulation(Assembly2())
@@ -148,6 +150,7 @@ def test_rows_show_what_was_intended_and_keep_what_was_executed(both, pool):
     assert np.corrcoef(off[hard], led[hard])[0, 1] < -0.5
 
 
+@pytest.mark.slow
 def test_an_attempt_that_fails_when_disturbed_says_so(pool):
     wild = with_options(SPEC, disturbance=DisturbanceSpec(joint_rad=0.3))
     done = Attempts(SourcePool(wild, pool.sources), Simulation(Assembly2()), seed=11).run(0)
@@ -156,6 +159,7 @@ def test_an_attempt_that_fails_when_disturbed_says_so(pool):
     assert done.intended is not None
 
 
+@pytest.mark.slow
 def test_a_disturbed_dataset_says_how_and_is_no_source(collected, tmp_path):
     plan = AugmentPlan(spec=SPEC, episodes=1, images=False)
     augment(plan, collected, tmp_path / "new", Store(tmp_path / "store"), progress=lambda _: None)

@@ -21,6 +21,7 @@ def test_a_stiffened_twin_has_other_gains_and_nothing_else():
     assert twin.controller.kp_nm_per_rad[0] == 1813.0
 
 
+@pytest.mark.slow
 def test_a_score_counts_every_attempt_and_what_it_took(collected):
     spec = load_mimic_spec("assembly_2")
     score = score_generation(spec, read_sources(collected, spec), TwinConfig(), 2, seed=11, check=True)

@@ -41,10 +41,12 @@ def check(root: Path, task: str) -> None:
         assert refused is None, (episode.name, refused, measured)
 
 
+@pytest.mark.slow
 def test_a_source_of_assembly_2_passes_the_gates(collected):
     check(collected, "assembly_2")
 
 
+@pytest.mark.slow
 def test_the_check_can_fail(collected):
     episode = Dataset(collected).episode(0)
     measured, _ = redone(episode, simulation_of(episode, "assembly_2"))

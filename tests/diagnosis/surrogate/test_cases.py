@@ -89,6 +89,7 @@ def test_the_same_seed_gives_the_same_robot_and_recordings_bit_for_bit():
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_robot():
     assert draw_case([], 0).gains != draw_case([], 1).gains
     one = draw_case([], 0)
@@ -104,6 +105,7 @@ def test_an_effect_is_as_strong_as_asked(name):
     assert strong.hidden[0].severity > weak.hidden[0].severity
 
 
+@pytest.mark.slow
 def test_viscous_friction_cannot_be_seen_at_one_gain():
     assert draw_case(["viscous_friction"], 3, design="chirp", strength=4.0).left_floors < 0.6
     assert draw_case(["viscous_friction"], 3, design="pack", strength=4.0).left_floors == pytest.approx(4.0, rel=0.25)
@@ -132,6 +134,7 @@ def test_every_joint_effect_of_the_registry_can_be_hidden():
     assert not set(OUTSIDE) & joint
 
 
+@pytest.mark.slow
 def test_the_user_starts_from_wrong_gains_unless_they_are_known():
     unknown, known = draw_case([], 6), draw_case([], 6, gains_known=True, design="chirp")
     joint = unknown.robot.joint

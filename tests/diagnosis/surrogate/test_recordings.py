@@ -112,6 +112,7 @@ def test_recordings_are_divided_and_hold_what_readers_want(measurements):
         assert np.isfinite(m.measured).all() and m.has_effort()[m.column("right_joint5")]
 
 
+@pytest.mark.slow
 def test_checks_of_telemetry_find_no_fault(measurements):
     for name, findings in check_measurements(measurements.all).items():
         # A soft drive sags under a load: that is so, and a check may say so.

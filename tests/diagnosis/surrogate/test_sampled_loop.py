@@ -123,6 +123,7 @@ def test_a_drawn_case_has_a_stable_loop_that_alone_leaves_next_to_nothing():
     assert math.isclose(case.left_floors, 8.0, rel_tol=0.25)
 
 
+@pytest.mark.slow
 def test_where_no_loop_is_stable_a_gear_keeps_the_continuous_one_and_any_other_robot_is_refused(monkeypatch):
     monkeypatch.setattr("taccorl.diagnosis.surrogate.cases.is_stable", lambda *_: False)
     case = draw_case(["backlash"], 302, signal="left_joint2", strength=8.0, design="chirp", sampled=True)

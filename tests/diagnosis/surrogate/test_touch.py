@@ -135,11 +135,14 @@ def test_every_hidden_effect_changes_what_is_recorded(name):
     np.testing.assert_array_equal(other[:, 2:], 0.0)  # the other arm's pads
 
 
-@pytest.mark.parametrize("name", ["taxel_creep", "depth_offset", "taxel_ghosting"])
+@pytest.mark.parametrize(
+    "name", ["depth_offset", *(pytest.param(n, marks=pytest.mark.slow) for n in ("taxel_creep", "taxel_ghosting"))]
+)
 def test_an_effect_is_as_strong_as_asked(name):
     assert draw_touch_case([name], 1, strength=3.0).left_floors == pytest.approx(3.0, rel=0.25)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_pads_and_recordings_bit_for_bit():
     one, other = (draw_touch_case(["taxel_creep"], 4) for _ in range(2))
     assert one.truth() == other.truth()

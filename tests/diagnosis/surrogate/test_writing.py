@@ -16,6 +16,7 @@ from taccorl.diagnosis.surrogate.writing import SWEEPS, TRUTH, TWIN, reveal, wri
 from taccorl.errors import TaccorlError
 from taccorl.sim.twin_file import load_twin
 
+pytestmark = pytest.mark.slow
 OPENED: list[str] = []
 
 

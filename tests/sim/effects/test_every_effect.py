@@ -59,6 +59,10 @@ def difference(seen: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dic
     return {name: float(np.sqrt(np.mean(np.square(seen[name] - other[name])))) for name in SEEN}
 
 
+ONE_OF_FOUR = [pytest.param(name, marks=[pytest.mark.slow] * (k % 4 > 0)) for k, name in enumerate(effects)]
+"""All effects; three of four are slow."""
+
+
 def check_fades_out(cls: type[Effect]) -> None:
     """It does something at typical values, and at most a tenth of that a hundredth of the way from its absent values."""
     there = difference(perform(start(cls(**typical(cls)))), nominal())
@@ -89,7 +93,7 @@ def test_an_effect_fades_out_towards_its_absent_value(name: str) -> None:
     check_fades_out(effects.get(name))
 
 
-@pytest.mark.parametrize("name", list(effects))
+@pytest.mark.parametrize("name", ONE_OF_FOUR)
 def test_at_its_bounds_the_twin_stays_sound(name: str) -> None:
     cls = effects.get(name)
     for p in cls.parameters():
@@ -102,7 +106,7 @@ def test_at_its_bounds_the_twin_stays_sound(name: str) -> None:
             assert beyond.max() < 0.25, f"{p.name} = {bound}"
 
 
-@pytest.mark.parametrize("name", list(effects))
+@pytest.mark.parametrize("name", ONE_OF_FOUR)
 def test_a_run_is_the_same_alone_and_in_a_batch_on_any_number_of_threads_and_from_a_snapshot(name: str) -> None:
     effect = effects.get(name)(**typical(effects.get(name)))
     alone = perform(start(effect))
