@@ -5,6 +5,8 @@ BIN := .venv/bin
 JOBS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder
 export HF_HUB_OFFLINE := 1
+# Compiled modules are kept, whatever the shell says: importing LeRobot takes 25 s without, and tests start many processes.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-slow lint bench pictures lock clean
 
