@@ -11,6 +11,7 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.twin import TwinConfig
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
 def test_latency_is_found_within_its_interval_and_10_ms(camera: str):
     rng = np.random.default_rng(4)

@@ -137,6 +137,7 @@ class Fades(TouchEffect):
         return reading * np.exp(-np.float32(self.rate) * memory["sum"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effects",
     [

@@ -78,6 +78,7 @@ def test_the_same_command_again_makes_nothing_anew_and_says_so_of_its_cost(
     assert report(place)["cost"]["process_s_per_success"] > 0
 
 
+@pytest.mark.slow
 def test_an_attempt_is_executed_again_bit_for_bit_from_what_the_store_holds(place: Path) -> None:
     folders = [path for path in (place / "store" / "mimicgen").iterdir() if (path / "dataset").is_dir()]
     again, same = attempt_episode(folders[0]), Dataset(place / "new").episode(0)

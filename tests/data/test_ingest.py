@@ -556,6 +556,7 @@ def test_two_workers_write_the_same_bytes_as_one(ingests: Ingests, good: Path, t
     assert json.loads((tmp_path / "out2.ingest_report.json").read_text()) == ingests.report()
 
 
+@pytest.mark.slow
 def test_two_commands_at_once_share_the_work_and_agree(ingests: Ingests, good: Path) -> None:
     import lerobot.datasets.lerobot_dataset  # noqa: F401
 

@@ -44,6 +44,7 @@ def frictions() -> Plan:
     return planned("viscous_friction", "coulomb_friction", gains="commanded")
 
 
+@pytest.mark.slow
 def test_effects_that_are_one_by_algebra_are_hopeless_on_every_motion(twins):
     pair = "coulomb_friction | asymmetric_friction"
     assert twins.hopeless == (pair,)
@@ -51,6 +52,7 @@ def test_effects_that_are_one_by_algebra_are_hopeless_on_every_motion(twins):
     assert all(p.discrimination[pair] < SAME for p in twins.planned)
 
 
+@pytest.mark.slow
 def test_two_frictions_are_told_apart_and_the_best_motion_comes_first(frictions):
     assert frictions.hopeless == ()
     assert frictions.planned[0].worst > TELLS

@@ -134,6 +134,7 @@ def test_without_that_effect_it_is_something_else() -> None:
 WIDE = ((sweep(1.0, 0.4, 4.0), sweep(0.8, 0.9)), sweep(0.9, 0.55, 4.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("angle_rad", "width_rad"), [(0.45, 0.06), pytest.param(-0.3, 0.25, marks=pytest.mark.slow)])
 def test_a_tight_spot_is_found_where_it_is_and_as_wide_as_it_is(angle_rad: float, width_rad: float) -> None:
     said = found_in(*WIDE, friction=lambda q: 1.5 * math.exp(-(((q - angle_rad) / width_rad) ** 2)))

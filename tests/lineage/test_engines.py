@@ -130,7 +130,10 @@ if __name__ == "__main__":
 """
 
 PATIENT_PARENT = PARENT.replace(
-    "if __name__", "from taccorl.lineage import processes\nprocesses.GRACE_S = 200.0\nif __name__"
+    "if __name__",
+    # A shell that starts pytest in the background makes it ignore SIGINT, and what it starts.
+    "import signal\nfrom taccorl.lineage import processes\nprocesses.GRACE_S = 200.0\n"
+    "signal.signal(signal.SIGINT, signal.default_int_handler)\nif __name__",
 )
 
 PARENT_WITHOUT_KERNEL_HELP = """

@@ -451,6 +451,7 @@ def test_a_regressed_chunk_in_real_time_begins_where_the_last_one_goes_on():
     assert share.tolist() == pytest.approx(wanted, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_regression_is_learnt_in_a_few_steps_and_kept_in_a_checkpoint(tmp_path):
     policy = tiny_policy(objective="regression", image_randomization=False, image_noise_std=0.0)
     batch, optimizer = batch_of(True, False), torch.optim.AdamW(policy.parameters(), lr=3e-3)

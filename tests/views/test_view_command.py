@@ -136,6 +136,7 @@ def test_printed_commands_can_be_pasted_whatever_the_path(dataset: Path, tmp_pat
     assert Path(path).read_bytes().startswith(b"RRF2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_serve_answers_this_machine_only_and_ends_cleanly(dataset: Path, number: signal.Signals):
     command = [sys.executable, "-m", "taccorl.cli.main", "view", str(dataset), "--serve=true"]

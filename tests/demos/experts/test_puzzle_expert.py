@@ -89,6 +89,7 @@ def test_exact_hands_need_no_correction(sim):
     assert episode.duration_s < 25
 
 
+@pytest.mark.slow
 def test_human_hands_feel_the_rim_and_one_is_at_the_tray_at_a_time(sim):
     episode = Episode(sim, 1)
     assert episode.outcome.success[0]

@@ -74,6 +74,7 @@ def episode(sim, request) -> Episode:
     return Episode(sim, request.param)
 
 
+@pytest.mark.slow
 def test_it_succeeds_within_twenty_seconds(episode):
     assert episode.outcome.success[0], episode.outcome.failure
     assert episode.duration_s < 20

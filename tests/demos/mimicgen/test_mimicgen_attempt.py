@@ -198,6 +198,7 @@ def test_seeds_are_of_root_task_and_attempt_and_not_those_of_collect():
     assert one[0] != Plan(task="puzzle", seed=0).attempt_seed(3)
 
 
+@pytest.mark.slow
 def test_an_attempt_is_the_same_whatever_ran_before(pool, succeeded):
     again = Attempts(pool, Simulation(Assembly2()), seed=11).run(succeeded.k)
     np.testing.assert_array_equal(again.actions, succeeded.actions)

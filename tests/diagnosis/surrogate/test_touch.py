@@ -135,6 +135,7 @@ def test_every_hidden_effect_changes_what_is_recorded(name):
     np.testing.assert_array_equal(other[:, 2:], 0.0)  # the other arm's pads
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["depth_offset", *(pytest.param(n, marks=pytest.mark.slow) for n in ("taxel_creep", "taxel_ghosting"))]
 )
