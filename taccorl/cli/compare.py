@@ -206,8 +206,9 @@ def _error_cells(s: "Score") -> list:
     from rich.text import Text
 
     from taccorl.diagnosis.comparison import shown
+    from taccorl.diagnosis.search import SearchConfig
 
-    return [shown(s.rmse, s.unit), Text(f"{s.ratio:.3g}", "green" if s.ratio <= 1.25 else "yellow")]
+    return [shown(s.rmse, s.unit), Text(f"{s.ratio:.3g}", "green" if s.ratio <= SearchConfig().stop_at else "yellow")]
 
 
 def _write(

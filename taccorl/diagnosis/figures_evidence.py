@@ -10,6 +10,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from scipy.stats import binomtest
 
 from taccorl.diagnosis.figure_style import AFTER, BEFORE, FLOOR, legend, new_figure, tidy
+from taccorl.diagnosis.search import SearchConfig
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,9 @@ class Step:
     """95 %."""
 
 
-def waterfall(steps: Sequence[Step], origins: Sequence[str], title: str, goal: float = 1.25) -> Figure:
+def waterfall(
+    steps: Sequence[Step], origins: Sequence[str], title: str, goal: float = SearchConfig().stop_at
+) -> Figure:
     """Validation error after each added effect, down to the noise floor.
 
     Args:

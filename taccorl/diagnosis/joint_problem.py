@@ -49,6 +49,8 @@ PAYLOAD_PLACE = tuple(
     for name in ("payload_sin_m", "payload_cos_m")
 )
 """s and c of ``PayloadLever``. Fitted where a fit recording holds a payload whose place is not stated; 50 mm are a choice."""
+OF_RECORDINGS = (EFFORT_SCALE.name, *(f.name for f in PAYLOAD_PLACE))
+"""Always fitted numbers that say something of the recordings; the twin has no place for them."""
 
 
 class JointProblem:

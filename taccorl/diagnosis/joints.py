@@ -15,7 +15,7 @@ from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.noise_floor import SignalFloor
 from taccorl.diagnosis.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.identifiable import Known, absolute_numbers, identifiable_numbers
-from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
+from taccorl.diagnosis.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
 from taccorl.diagnosis.problem import split_rows
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
 from taccorl.errors import TaccorlError
@@ -104,6 +104,11 @@ def diagnose_joint(
     own = dataclasses.replace(measurements, fit=sides[0], validation=sides[1], test=sides[2])
     problem = JointProblem(config, signal, own, gains=gains)
     fit_to, validation = (problem.fit, problem.validation) if problem.validation else split_rows(problem.fit)
+    if not any(np.isfinite(r.measured).any() for r in validation):
+        raise TaccorlError(
+            f"{signal}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so no effect can "
+            "be judged; record a motion that is measured to its end, or mark another one with use: validation"
+        )
     can_tell = identifiability(problem, fit_to, problem.start, problem.present)
     found = diagnose(
         problem,
@@ -151,7 +156,23 @@ def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
         mine = [n for n in known.absolute if n.name.startswith(prefix) and np.isfinite([n.low, n.high]).all()]
         ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in mine}
         effects.append(dataclasses.replace(effect, interval=effect.interval | ends, evidence=evidence))
-    return dataclasses.replace(found, effects=tuple(effects), intervals=found.intervals | known.intervals)
+    remarks = (*found.remarks, *_payload_remarks(found))
+    return dataclasses.replace(
+        found, effects=tuple(effects), intervals=found.intervals | known.intervals, remarks=remarks
+    )
+
+
+def _payload_remarks(found: Diagnosis) -> list[str]:
+    """A payload is elsewhere than the twin has it, and no recording states where."""
+    names = [f.name for f in PAYLOAD_PLACE]
+    ends = [found.intervals[name] for name in names if name in found.base]
+    if not any(low > 0.0 or high < 0.0 for low, high in ends):
+        return []
+    off_mm = 1e3 * float(np.hypot(*(found.base[name] for name in names)))
+    return [
+        f"The payload pulls as if it were {off_mm:.1f} mm off the TCP. No recording states its place: state payload_position_m "
+        "in measurements.yaml, else compare shows an error there that this diagnosis does not."
+    ]
 
 
 def diagnose_joints(
@@ -217,7 +238,10 @@ def refitted(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig
 def set_numbers(
     config: TwinConfig, signal: str, base: Mapping[str, float], intervals: Mapping[str, Sequence[float]]
 ) -> None:
-    """Write fitted gains into one arm of ``config``, and the delay of the speed unless its interval holds 0."""
+    """Write fitted gains into one arm of ``config``, and the delay of the speed unless its interval holds 0.
+
+    Where a payload lies and how efforts are scaled belongs to recordings, not to the twin.
+    """
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
     k = JOINTS.index(joint)

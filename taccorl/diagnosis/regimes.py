@@ -14,11 +14,12 @@ from taccorl.alignment.measurements import Use
 from taccorl.diagnosis.along import variable_unit
 from taccorl.diagnosis.comparison import USES, Trace
 from taccorl.diagnosis.localise import LEAST_SHARE, REGIMES, Motion, bridged, motions_of
+from taccorl.diagnosis.search import SearchConfig
 
 ALL = "all rows"
 GROUPS = ("speed", "direction", "pose")
 """Of ``localise.REGIMES``."""
-AT_FLOOR = 1.25
+AT_FLOOR = SearchConfig().stop_at
 """Noise floors up to which an error is at the floor, as for the search."""
 DISAGREE = 1.3
 """Ratio of two errors that is remarkable."""

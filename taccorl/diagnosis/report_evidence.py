@@ -9,6 +9,7 @@ from taccorl.diagnosis.figure_style import data_uri, png
 from taccorl.diagnosis.figures_evidence import Step, waterfall
 from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.identifiable import TIMING_S, Known
+from taccorl.diagnosis.joint_problem import OF_RECORDINGS
 from taccorl.diagnosis.regimes import ALL, AT_FLOOR, RegimeError, RegimeErrors
 from taccorl.diagnosis.report_html import figure, note, table
 from taccorl.diagnosis.search import Diagnosis, Evidence, Round
@@ -134,7 +135,8 @@ def _numbers(d: Diagnosis, known: Known | None) -> str:
         low, high = d.intervals.get(name, (None, None))
         ends = "" if low is None else f"{low:.4g} … {high:.4g}"
         start = f"{d.start[name]:.4g}" if name in d.start else ""
-        rows.append([html.escape(name), start, f"{value:.4g}{html.escape(units.get(name, ''))}", ends])
+        words = f"{name} (of the recordings, not in the twin)" if name in OF_RECORDINGS else name
+        rows.append([html.escape(words), start, f"{value:.4g}{html.escape(units.get(name, ''))}", ends])
     text = table(("number of the twin", "before", "fitted", "95 %"), rows, numbers=range(1, 4))
     if known is not None and not known.pinned_by and "kp" in d.base:
         text += note(

@@ -13,6 +13,7 @@ from taccorl.diagnosis.localise import WHERE_NOT_WHY, Cell, worst_regime
 from taccorl.diagnosis.report import GENERATOR, Report, cells_of
 from taccorl.diagnosis.report_evidence import diagnosis_section, first_read
 from taccorl.diagnosis.report_html import figure, note, table
+from taccorl.diagnosis.search import SearchConfig
 
 STYLE = """
 :root{color-scheme:light}
@@ -131,7 +132,7 @@ def _score_table(report: Report) -> str:
 
 
 def _errors(s: Score) -> list[str]:
-    grade = "good" if s.ratio <= 1.25 else "bad"
+    grade = "good" if s.ratio <= SearchConfig().stop_at else "bad"
     low, high = (f"{x * shown_unit(s.unit)[0]:.3g}" for x in s.interval)
     return [f"{shown(s.rmse, s.unit)} ({low} … {high})", f'<span class="{grade}">{s.ratio:.3g}</span>']
 

@@ -36,7 +36,7 @@ GAINS_MOVED = 2.0
 """Factor to the twin's gains from which a refit of them is a finding of its own: late positions, a wrong unit of time, or gains
 other than the commanded ones cause it."""
 WORDS: dict[Status, str] = {
-    "nothing_missing": "nothing is missing: the error is at the noise floor",
+    "nothing_missing": "nothing is missing: the error is at the noise floor, or little above it and no effect explains the rest",
     "gains_moved": "at the noise floor without any effect, but only with gains far from the twin's",
     "at_floor": "at the noise floor",
     "something_else": "something else: structure remains that no known effect explains",
@@ -267,7 +267,7 @@ class _Search:
             },
             steps=tuple(steps),
             remarks=tuple(self._remarks(model)),
-            at_bound=model.at_bound,
+            at_bound=tuple(f.name for f in model.frees if f.name in model.at_bound and not _untouched(f, model)),
             trouble=model.trouble,
             evaluations=self.evaluations,
             cpu_s=time.process_time() - began,
@@ -562,6 +562,11 @@ class _Search:
                 f"{', '.join(r.name for r in self.validation)}"
             )
         return list(model.effects)
+
+
+def _untouched(f: Free, model: Fit) -> bool:
+    """Whether a number is at the end of its range because it starts there and nothing moves it: absent, not far off."""
+    return f.start in (f.low, f.high) and abs(f.coordinate(model.values[f.name]) - f.coordinate(f.start)) < 0.01
 
 
 def gain_of(better: Blocks, before: Blocks) -> float:

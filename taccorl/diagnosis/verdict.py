@@ -16,7 +16,7 @@ Kind = Literal[
     "nothing_missing", "effects", "ties", "more", "something_else", "gains_moved", "not_converged", "data_first"
 ]
 Level = Literal["high", "moderate", "low"]
-FLOOR = SearchConfig().stop_at
+FLOOR, LITTLE = SearchConfig().stop_at, SearchConfig().little
 """Noise floors up to which an error counts as at the floor."""
 _UNCERTAIN: tuple[Kind, ...] = ("more", "something_else", "gains_moved", "not_converged", "data_first")
 _MOST = 3  # names or reasons in one sentence
@@ -147,8 +147,14 @@ def _doubts(d: Diagnosis, kind: Kind) -> list[str]:
     test = d.errors["after"].get("test")
     if test is None:
         found.append("no test recording checks it: validation recordings chose the effects")
-    elif test > FLOOR and d.errors["after"]["validation"] <= FLOOR:
+    elif test > FLOOR and d.errors["after"]["validation"] <= LITTLE:
         found.append(f"test recordings, which no choice has seen, keep {test:.2f} noise floors")
+    after = d.errors["after"]
+    if kind == "nothing_missing" and max(after["fit"], after["validation"]) > FLOOR:
+        found.append(
+            f"fit recordings keep {after['fit']:.2f} and validation recordings {after['validation']:.2f} noise floors, and no "
+            "effect explains that"
+        )
     if unjudged(d):
         found.append(unjudged(d))
     if d.at_bound:

@@ -104,7 +104,7 @@ def test_waterfall_falls_from_step_to_step():
     figure = waterfall(steps, [ORIGIN], "error")
     bars = [(p.get_y(), p.get_height()) for p in figure.axes[0].patches if p.get_width() == pytest.approx(0.62)]
     assert bars == [(0.0, 20.0), (4.0, 16.0), (1.0, 3.0)]
-    assert "-80%" in words(figure) and "noise floor (1.0)" in words(figure) and "at the floor: ≤ 1.25" in words(figure)
+    assert "-80%" in words(figure) and "noise floor (1.0)" in words(figure) and "at the floor: ≤ 1.3" in words(figure)
     drawn(figure)
 
 

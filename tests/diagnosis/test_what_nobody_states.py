@@ -12,11 +12,12 @@ from taccorl.alignment.joint_motion import joint_motion
 from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.fit import FINE, fit, moved_by
 from taccorl.diagnosis.joint_problem import JointProblem
-from taccorl.diagnosis.joints import set_numbers
-from taccorl.diagnosis.motions import CHIRP, STIFFER_CHIRP, WIDE_TRIANGLE
+from taccorl.diagnosis.joints import diagnose_joint, mended, set_numbers
+from taccorl.diagnosis.motions import CHIRP, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
 from taccorl.diagnosis.search import diagnose
 from taccorl.diagnosis.surrogate.cases import Case, draw_case
 from taccorl.diagnosis.surrogate.recordings import recordings
+from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.speed_delay import SpeedDelay
 from taccorl.sim.twin import TwinConfig
@@ -65,9 +66,9 @@ def test_a_sampled_loop_with_a_known_weight_is_no_effect_and_its_gains_are_found
     low, high = found.after.intervals()["kp"]
     assert low < case.values()["kp"] < high
     assert high / low < 1.05
-    mended = TwinConfig()
-    set_numbers(mended, case.signal, found.base, found.intervals)
-    (effect,) = mended.effects
+    new = TwinConfig()
+    set_numbers(new, case.signal, found.base, found.intervals)
+    (effect,) = new.effects
     assert isinstance(effect, SpeedDelay)
     assert effect.acts_on() == [case.signal]
     assert effect.delay_s == found.base["speed_delay_s"]
@@ -142,3 +143,45 @@ def test_intervals_widen_by_what_the_other_recordings_would_move():
     assert low < 0.85
     assert high > 1.15
     assert np.ptp(model.intervals()["torque_ff"]) < 0.1
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 1e-3, 2.5e-3])
+def test_with_commanded_gains_the_delay_is_found_from_a_start_of_zeros(delay_s: float):
+    """All numbers start at 0 here: a solver whose first step is as long as its start would not move."""
+    twin = soft()
+    robot = soft()
+    robot.effects = [make_effect("speed_delay", arm="left", joints=["joint5"], delay_s=delay_s)]
+    made = [
+        recorded(robot, motion, k, effort=True) for k, motion in enumerate((CHIRP, CHIRP, VALIDATION[0], VALIDATION[1]))
+    ]
+    measurements = Measurements(tuple(made[:2]), validation=tuple(made[2:]))
+    problem = JointProblem(twin, SIGNAL, measurements)
+    assert problem.commanded
+    found = diagnose(problem, problem.fit, problem.validation, start=problem.start)
+    assert found.names == ()
+    assert found.base["speed_delay_s"] == pytest.approx(delay_s, abs=2e-4)
+    assert "speed_delay_s" not in found.at_bound  # absent is no end of a range that says anything
+
+
+def soft() -> TwinConfig:
+    """Joint 5 with gains that leave room for a late speed."""
+    twin = TwinConfig()
+    set_numbers(twin, SIGNAL, {"kp": 6.0, "kd": 0.6, "torque_ff": 0.0}, {})
+    return twin
+
+
+def test_a_payload_off_its_place_is_said_with_the_way_out_and_is_nothing_of_the_twin():
+    case = draw_case((), 30038, design="pack")
+    found = diagnose_joint(case.twin, case.signal, recordings(case, "pack"), gains="fitted")
+    (remark,) = [r for r in found.diagnosis.remarks if "payload" in r]
+    assert "5.2 mm" in remark
+    assert "payload_position_m" in remark
+    assert mended(case.twin, [found]).effects == case.twin.effects
+
+
+def test_validation_rows_without_a_measurement_are_refused():
+    whole = recorded(NOMINAL, CHIRP, 0)
+    alone = dataclasses.replace(whole, measured=whole.measured.copy())
+    alone.measured[len(alone.measured) // 2 :, alone.column(SIGNAL)] = np.nan
+    with pytest.raises(TaccorlError, match="nothing was measured in the validation rows"):
+        diagnose_joint(NOMINAL, SIGNAL, Measurements((alone,)))
