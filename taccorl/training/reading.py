@@ -4,13 +4,15 @@ LeRobot 0.6.1 makes Python lists of every column of every row that a window or a
 ``_query_hf_dataset``), opens a video anew for every picture where torchcodec finds no FFmpeg (video_utils.py), and gives a
 window to all observations or to none (factory.py, ``resolve_delta_timestamps``). Here rows are read out of the Arrow columns
 that are wanted, videos stay open, and a policy's ``window_delta_indices`` names the features that get a window. What comes out
-is the same, to the bit and the type; tests compare.
+is the same, to the bit and the type; tests compare. With ``--dataset.cache=gpu|host|disk`` whole batches are gathered from
+numbers and decoded frames (``frame_cache``) instead of row by row.
 
 ``TACCORL_NO_PATCH=1`` leaves LeRobot as it is. So does any other version of LeRobot than the one that was compared.
 """
 
 import bisect
 import contextlib
+import dataclasses
 import logging
 import os
 import threading
@@ -25,11 +27,16 @@ import pyarrow as pa
 import torch
 from av.container import InputContainer
 from lerobot import __version__ as lerobot_version
+from lerobot.configs.default import DatasetConfig
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
 
+from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
+from taccorl.training.frame_cache import CacheRequest, Frames, open_frames
 
 COMPARED_VERSION = "0.6.1"
 OPEN_VIDEOS = 16
@@ -63,7 +70,83 @@ def install() -> bool:
         lerobot_dataset.DatasetReader = FastReader
         factory.resolve_delta_timestamps = with_windows(factory.resolve_delta_timestamps)
         factory.StreamingLeRobotDataset = streamed(factory.StreamingLeRobotDataset)
+        factory.make_dataset = with_cache(factory.make_dataset)
+        lerobot_dataset.LeRobotDataset.__getitems__ = whole_batch  # pyright: ignore[reportAttributeAccessIssue]
+        default_collate_fn_map[WholeBatch] = lambda batch, **_: batch[0]
+    add_cache_options()
     return True
+
+
+def add_cache_options() -> None:
+    """``--dataset.cache`` and ``--dataset.cache_store`` among LeRobot's options of a dataset."""
+    if "cache" in {f.name for f in dataclasses.fields(DatasetConfig)}:
+        return
+    # none, disk, host or gpu: decode every frame once, at the policy's resolution, and gather whole batches.
+    for f in dataclasses.fields(DatasetConfig):  # once made, a dataclass has lost its default factories
+        if f.default_factory is not dataclasses.MISSING:
+            setattr(DatasetConfig, f.name, dataclasses.field(default_factory=f.default_factory))
+    DatasetConfig.__annotations__ |= {"cache": str, "cache_store": str}
+    DatasetConfig.cache, DatasetConfig.cache_store = "none", "outputs/store"  # pyright: ignore[reportAttributeAccessIssue]
+    dataclasses.dataclass(DatasetConfig)
+
+
+_requested: CacheRequest | None = None
+"""Of the training that is being made: LeRobot hands its readers nothing of its dataset's options."""
+
+
+def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """LeRobot's ``make_dataset``, whose reader knows what ``--dataset.cache`` asks for."""
+
+    def make_with_cache(cfg: Any) -> Any:
+        global _requested
+        _requested = cache_request(cfg)
+        if _requested is not None and cfg.num_workers:
+            _log.info("--dataset.cache=%s: batches are gathered by the training's own process", _requested.place)
+            cfg.num_workers = 0
+        return make_dataset(cfg)
+
+    return make_with_cache
+
+
+def cache_request(cfg: Any) -> CacheRequest | None:
+    """What a training's options ask for.
+
+    Raises:
+        TaccorlError: no such place, or options that go with no cache.
+    """
+    if getattr(cfg.dataset, "cache", "none") == "none":
+        return None
+    policy = cfg.trainable_config
+    if cfg.dataset.streaming:
+        raise TaccorlError(f"--dataset.cache={cfg.dataset.cache}: not with --dataset.streaming=true; leave one out")
+    if cfg.dataset.image_transforms.enable:
+        raise TaccorlError(
+            f"--dataset.cache={cfg.dataset.cache}: --dataset.image_transforms.enable=true changes pictures one by one on the "
+            "CPU; leave it out, tactile_pi05 changes whole batches (--policy.image_randomization)"
+        )
+    resolution = getattr(policy, "image_resolution", None)
+    return CacheRequest(
+        place=cfg.dataset.cache,
+        resolution=tuple(resolution) if resolution else None,
+        store=Path(cfg.dataset.cache_store),
+        device=str(policy.device),
+    )
+
+
+class WholeBatch(dict):
+    """A batch as LeRobot's loader gives it, already collated."""
+
+    def pin_memory(self) -> "WholeBatch":
+        """What is on the CPU, pinned."""
+        pinned = {k: v.pin_memory() for k, v in self.items() if isinstance(v, Tensor) and v.device.type == "cpu"}
+        return WholeBatch({**self, **pinned})
+
+
+def whole_batch(dataset: Any, rows: list[int]) -> list[Any]:
+    """``LeRobotDataset.__getitems__``: one ``WholeBatch`` where frames are cached, else row by row."""
+    dataset.hf_dataset  # loads it  # noqa: B018
+    batch = dataset.reader.batch(rows) if isinstance(dataset.reader, FastReader) else None
+    return [dataset[row] for row in rows] if batch is None else [batch]
 
 
 def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Callable[[Any, Any], dict[str, list] | None]:
@@ -133,6 +216,14 @@ class Column:
                 start += len(chunk)
         # As LeRobot's own way through Python's numbers makes them.
         self._dtype = np.int64 if pa.types.is_integer(kind) else np.float32
+        self.kind = torch.int64 if pa.types.is_integer(kind) else torch.float32
+
+    def stored(self, rows: list[int]) -> Tensor:
+        """(len(rows), *shape), in as many bytes as the file has them: int16 touch is a quarter of what ``rows`` gives."""
+        pieces = np.concatenate(self._pieces) if self._pieces else np.empty((0, 1))
+        if pieces.dtype.kind == "f" and pieces.itemsize > 4:
+            pieces = pieces.astype(np.float32)
+        return torch.from_numpy(np.ascontiguousarray(pieces[rows])).reshape(len(rows), *self.shape)
 
     def rows(self, rows: list[int]) -> Tensor:
         """(len(rows), *shape)"""
@@ -147,18 +238,22 @@ class FastReader(DatasetReader):
     """LeRobot's reader, where a dataset is numbers and colour videos; anything else goes LeRobot's own way."""
 
     _columns: dict[str, Column] | None = None
+    _gathered: "Gathered | None" = None
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self._cache = _requested
         given = [v for v in (*args, *kwargs.values()) if isinstance(v, Deltas)]
         self._relative_actions = given[0].relative_actions if given else None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k != "_columns"}  # a worker makes its own, of the same files
+        return {
+            k: v for k, v in self.__dict__.items() if k not in ("_columns", "_gathered")
+        }  # a worker makes its own, of the same files
 
     def _build_index_mapping(self) -> None:
         super()._build_index_mapping()
-        self._columns = None
+        self._columns = self._gathered = None
         if self.hf_dataset is not None and IS_SIM in self.hf_dataset.column_names:
             # Which rows the share p of the loss's weights counts: those that are trained on. LeRobot's editing of a dataset
             # loses the statistics of what it does not know.
@@ -172,7 +267,7 @@ class FastReader(DatasetReader):
 
     def _relative_statistics(self, relative_A: np.ndarray) -> dict[str, np.ndarray]:
         """Exact statistics of actions as a policy with relative ones meets them: each step of each row's chunk, up to the end of
-        the episode, less the row's state where that is wanted."""
+        the episode, less the row's state where that is wanted. (A,) each, and (H, A) for ``STEP_STATISTICS``."""
         table: Any = self.hf_dataset
         episode, state, action = (Column(table.data.column(k)) for k in ("episode_index", OBS_STATE, ACTION))
         everything = list(range(len(table)))
@@ -189,9 +284,11 @@ class FastReader(DatasetReader):
             values = np.concatenate(parts)
             found = {"min": values.min(), "max": values.max(), "mean": values.mean(), "std": values.std()}
             found |= {f"q{q:02d}": np.quantile(values, q / 100) for q in (1, 10, 50, 90, 99)}
+            found |= {"step_mean": [part.mean() for part in parts], "step_std": [part.std() for part in parts]}
             for name, value in (found | {"count": len(values)}).items():
                 told.setdefault(name, []).append(value)
-        return {name: np.array(v if name != "count" else v[:1]) for name, v in told.items()}
+        statistics = {name: np.array(v if name != "count" else v[:1]) for name, v in told.items()}
+        return statistics | {name: statistics[name].T for name in STEP_STATISTICS}
 
     def columns(self) -> dict[str, Column]:
         """Feature → its column; empty: a dataset that is left to LeRobot."""
@@ -204,6 +301,29 @@ class FastReader(DatasetReader):
                 with contextlib.suppress(TypeError, pa.ArrowInvalid):
                     self._columns = {key: Column(dataset.data.column(key)) for key in dataset.column_names}
         return self._columns
+
+    def batch(self, rows: list[int]) -> "WholeBatch | None":
+        """The rows of a batch at once, as collating ``get_item`` of each would give them; None: no cache, or not for this
+        dataset.
+
+        Raises:
+            DatasetError: see ``open_frames``.
+        """
+        if self._cache is None:
+            return None
+        if self._gathered is None:
+            columns = self.columns()
+            windows = self.delta_indices or {}
+            if not columns or any(key in windows for key in self._meta.video_keys):
+                _log.warning(
+                    "--dataset.cache=%s: %s has more than numbers and single colour pictures; its rows are read one by one",
+                    self._cache.place,
+                    self.root,
+                )
+                self._cache = None
+                return None
+            self._gathered = Gathered(self, columns, self._cache)
+        return self._gathered.batch(rows)
 
     def get_item(self, idx: int) -> dict:
         columns = self.columns()
@@ -253,6 +373,54 @@ class FastReader(DatasetReader):
                 return super()._query_videos(query_timestamps, ep_idx)
             pictures[key] = picture if self._return_uint8 else picture.to(torch.float32) / 255
         return pictures
+
+
+class Gathered:
+    """A dataset's numbers as tensors beside its cached frames: a batch is a few gathers on one device."""
+
+    def __init__(self, reader: FastReader, columns: dict[str, Column], request: CacheRequest) -> None:
+        """
+        Raises:
+            DatasetError: see ``open_frames``.
+        """
+        meta: Any = reader._meta
+        assert reader.hf_dataset is not None and meta.tasks is not None, "LeRobot loads table and tasks first"
+        everything = list(range(len(reader.hf_dataset)))
+        numbers = {key: column.stored(everything) for key, column in columns.items()}
+        self.frames: Frames = open_frames(
+            request, reader.root, meta.video_keys, meta.total_frames, sum(x.nbytes for x in numbers.values())
+        )
+        device = self.frames.device
+        self.numbers = {key: x.to(device) for key, x in numbers.items()}
+        self.kinds = {key: column.kind for key, column in columns.items()}
+        self.offsets = {key: torch.tensor(d, device=device) for key, d in (reader.delta_indices or {}).items()}
+        episode = numbers["episode_index"].reshape(-1)
+        begins = torch.ones(len(episode), dtype=torch.bool)
+        begins[1:] = episode[1:] != episode[:-1]
+        place = begins.cumsum(0) - 1
+        firsts = torch.nonzero(begins).reshape(-1)
+        self.first = firsts[place].to(device)
+        self.last = (torch.cat([firsts[1:], torch.tensor([len(episode)])]) - 1)[place].to(device)
+        self.tasks = [str(meta.tasks.iloc[k].name) for k in range(len(meta.tasks))]
+        self.task_index = numbers["task_index"].reshape(-1).tolist()
+
+    def batch(self, rows: list[int]) -> WholeBatch:
+        """B rows: key → (B, …), ``task`` a list of B sentences."""
+        rows_B = torch.tensor(rows, device=self.frames.device)
+        found: dict[str, Any] = {}
+        for key, numbers in self.numbers.items():
+            if key not in self.offsets:
+                found[key] = numbers[rows_B].to(self.kinds[key])
+        for key, offsets_W in self.offsets.items():
+            wanted_BW = rows_B[:, None] + offsets_W
+            first_B1, last_B1 = self.first[rows_B][:, None], self.last[rows_B][:, None]
+            found[f"{key}_is_pad"] = (wanted_BW < first_B1) | (wanted_BW > last_B1)
+            if key in self.numbers:
+                within_BW = torch.minimum(torch.maximum(wanted_BW, first_B1), last_B1)
+                found[key] = self.numbers[key][within_BW].to(self.kinds[key])
+        found |= self.frames.rows(found["index"])
+        found["task"] = [self.tasks[self.task_index[row]] for row in rows]
+        return WholeBatch(found)
 
 
 class OpenVideos(threading.local):

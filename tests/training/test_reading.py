@@ -118,7 +118,15 @@ def test_relative_actions_are_normalised_by_their_own_range_over_the_episodes_tr
             ("q01", np.quantile(wanted, 0.01, axis=0)), ("q99", np.quantile(wanted, 0.99, axis=0)),
         ):  # fmt: skip
             np.testing.assert_allclose(found[name], value, atol=1e-6)
-        assert set(found) == set(stock.meta.stats["action"])
+        assert set(found) == {*stock.meta.stats["action"], "step_mean", "step_std"}
+        assert found["step_mean"].shape == found["step_std"].shape == (3, 14)
+        now = np.array([
+            np.where(np.isin(np.arange(14), (6, 13)), row["action"], row["action"] - row["observation.state"])
+            for row in stock.hf_dataset
+            if episodes is None or row["episode_index"] in episodes
+        ])  # fmt: skip
+        np.testing.assert_allclose(found["step_mean"][0], now.mean(0), atol=1e-6)
+        np.testing.assert_allclose(found["step_std"][0], now.std(0), atol=1e-6)
     config.use_relative_actions = False
     meta = load(root, FastReader, monkeypatch, delta_timestamps=resolve(config, stock.meta)).meta
     np.testing.assert_array_equal(meta.stats["action"]["q01"], stock.meta.stats["action"]["q01"])

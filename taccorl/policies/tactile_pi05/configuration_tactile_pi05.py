@@ -162,6 +162,13 @@ class TactilePI05Config(PI05Config):
     """Actions of a chunk that are executed before the policy looks again."""
     num_inference_steps: int = 4
     """K_denoise. Not used by regression, which takes one."""
+    normalize_steps: bool | None = None
+    """Normalise each of the H × A numbers of a chunk of relative actions by its own mean and deviation, after LeRobot's
+    normalisation of all steps together (see ``chunk_steps``). None: the backbone's own, False for full, whose weights know
+    LeRobot's, and True for small and tiny."""
+    average_decay: float | None = None
+    """d: act with an exponential mean of the weights (see ``averaged``). 0: with the last ones. None: the backbone's own, 0.999
+    for small and 0 for full and tiny."""
     optimizer_lr: float = 2.5e-5
     """η_max."""
     optimizer_muon: bool = False
@@ -191,6 +198,13 @@ class TactilePI05Config(PI05Config):
                 raise TaccorlError(
                     f"--policy.{name}={getattr(self, name)}: at least 1; no touch at all: --policy.tactile=false"
                 )
+        if self.normalize_steps and not self.use_relative_actions:
+            raise TaccorlError(
+                "--policy.normalize_steps=true: all steps of absolute actions are alike; it goes with "
+                "--policy.use_relative_actions=true only"
+            )
+        if self.average_decay is not None and not 0 <= self.average_decay < 1:
+            raise TaccorlError(f"--policy.average_decay={self.average_decay}: 0 or more, and below 1")
         if not 0 <= self.contact_threshold < math.inf:
             raise TaccorlError(
                 f"--policy.contact_threshold={self.contact_threshold}: 0 or more, in normalised readings"
@@ -214,6 +228,17 @@ class TactilePI05Config(PI05Config):
     def is_regression(self) -> bool:
         """Whether the chunk is predicted at once."""
         return self.objective == "regression"
+
+    @property
+    def normalizes_steps(self) -> bool:
+        """``normalize_steps`` as it is meant."""
+        wanted = self.backbone != "full" if self.normalize_steps is None else self.normalize_steps
+        return wanted and self.use_relative_actions
+
+    @property
+    def decay_of_average(self) -> float:
+        """``average_decay`` as it is meant."""
+        return (0.999 if self.backbone == "small" else 0.0) if self.average_decay is None else self.average_decay
 
     @property
     def tokenizer_name(self) -> str:

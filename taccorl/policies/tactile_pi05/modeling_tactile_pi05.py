@@ -18,6 +18,8 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_LANGUAGE_ATTENTION_M
 from torch import Tensor
 
 from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.averaged import Averaged
+from taccorl.policies.tactile_pi05.chunk_steps import ChunkSteps
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     RAW_STATE,
     STATE_SINCE_PLAN,
@@ -98,7 +100,11 @@ class TactilePI05Policy(PI05Policy):
             load_base_weights(self, config.base_checkpoint)
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
-        self.model.to(config.device)
+        self.steps = (
+            ChunkSteps.of_statistics(dataset_stats, config, self._num_actions) if config.normalizes_steps else None
+        )
+        self.averaged = Averaged(self.model, config.decay_of_average) if config.decay_of_average else None
+        self.to(config.device)
         changes = config.image_changes()
         self._change_images = changes.build() if changes else None
         self.reset()
@@ -266,16 +272,17 @@ class TactilePI05Policy(PI05Policy):
 
         if self._may_graph(prompt[0].device) and not kwargs:
             sensed = self._state(batch), *self._readings(batch)
-            actions = self._graphed_chunk(images, image_masks, *prompt, noise, *sensed)
-            return actions[:, :, : self._num_actions]
+            return self._finished(self._graphed_chunk(images, image_masks, *prompt, noise, *sensed))
         images = self._tokens(images)
 
         def compute(rows: Any) -> Tensor:
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
             return self.model.sample_actions(*seen, *(x[rows] for x in prompt), noise=noise[rows], **kwargs)
 
+        if self.steps is not None and kwargs.get("prev_chunk_left_over") is not None:
+            kwargs["prev_chunk_left_over"] = self.steps.normalized(kwargs["prev_chunk_left_over"])
         actions, _ = self._by_contact(batch, compute, together=self._rtc_enabled())
-        return actions[:, :, : self._num_actions]
+        return self._finished(actions)
 
     def _may_graph(self, device: torch.device) -> bool:
         # Autocast keeps copies of weights, which a graph would go on using.
@@ -314,7 +321,32 @@ class TactilePI05Policy(PI05Policy):
             self._graph = None  # its memory is training's
         if mode == self.training:
             return self  # LeRobot says so at every step; going through all modules takes longer than touch does
+        if self.averaged is not None:
+            self.averaged.exchange(self.model)
         return super().train(mode)
+
+    def update(self) -> None:
+        """Called by LeRobot after each step of the optimiser."""
+        if self.averaged is not None:
+            self.averaged.update(self.model)
+
+    def _save_pretrained(self, *args: Any, **kwargs: Any) -> None:
+        """With the weights that are trained in their place, whatever the policy is doing: training goes on from them."""
+        was_training = self.training
+        self.train()
+        super()._save_pretrained(*args, **kwargs)
+        self.train(was_training)
+
+    def prepare_action(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, H, 32) of what is learnt: normalised, each step by itself where that is wanted, and filled up."""
+        if self.steps is None:
+            return super().prepare_action(batch)
+        return super().prepare_action({**batch, ACTION: self.steps.normalized(batch[ACTION])})
+
+    def _finished(self, actions_BHA: Tensor) -> Tensor:
+        """The chunk without what fills it up, as LeRobot's normaliser takes it back."""
+        actions_BHA = actions_BHA[:, :, : self._num_actions]
+        return actions_BHA if self.steps is None else self.steps.restored(actions_BHA)
 
     def _remember(self, reading_BK: Tensor) -> Tensor:
         """(B, L, K): the last L readings; before the first there were none, it is repeated, as in datasets."""

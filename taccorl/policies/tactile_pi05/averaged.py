@@ -1,0 +1,47 @@
+"""An exponential mean of a network's weights over training, with which the policy acts.
+
+    m ← m + (1 − d_n) (w − m),    d_n = min(d, (1 + n) / (10 + n))    after optimiser step n
+
+The ramp of d_n forgets the random start (as in TensorFlow's ExponentialMovingAverage). Noise of the last steps averages out; what
+that gives a policy is in docs/learning.md.
+"""
+
+import torch
+from torch import Tensor, nn
+
+
+class Averaged(nn.Module):
+    """The mean of the floating-point parameters of ``network``, in buffers that checkpoints hold.
+
+    While the policy trains, ``network`` has the weights that are trained; while it acts, those are exchanged with the mean.
+    """
+
+    num_updates: Tensor
+
+    def __init__(self, network: nn.Module, decay: float) -> None:
+        super().__init__()
+        self.decay = decay
+        self.register_buffer("num_updates", torch.zeros((), dtype=torch.int64))
+        for name, weight in network.named_parameters():
+            self.register_buffer(_key(name), weight.detach().clone())
+
+    @torch.no_grad()
+    def update(self, network: nn.Module) -> None:
+        """After a step of the optimiser."""
+        self.num_updates += 1
+        n = int(self.num_updates)
+        decay = min(self.decay, (1 + n) / (10 + n))
+        pairs = [(self.get_buffer(_key(name)), weight.detach()) for name, weight in network.named_parameters()]
+        means, weights = zip(*pairs, strict=True)
+        torch._foreach_lerp_(list(means), list(weights), 1 - decay)
+
+    @torch.no_grad()
+    def exchange(self, network: nn.Module) -> None:
+        """Mean and weights change places; nothing is copied."""
+        for name, weight in network.named_parameters():
+            mean = self.get_buffer(_key(name))
+            weight.data, mean.data = mean.data, weight.data
+
+
+def _key(name: str) -> str:
+    return name.replace(".", "/")  # buffers have no dots in their names

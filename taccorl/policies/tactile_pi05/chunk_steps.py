@@ -1,0 +1,73 @@
+"""Each step of a chunk normalised by itself.
+
+LeRobot normalises all steps of a chunk by one range for each number of an action. Of relative actions the first step is
+several times smaller than the last, so errors of the first steps hardly count. Here step h, number a becomes
+
+    z = (x − μ_ha) / σ_ha        with mean μ and deviation σ of the normalised x over the rows that are trained on
+"""
+
+from typing import Any
+
+import torch
+from lerobot.configs import NormalizationMode
+from lerobot.utils.constants import ACTION
+from torch import Tensor, nn
+
+from taccorl.errors import TaccorlError
+
+STEP_STATISTICS = ("step_mean", "step_std")
+"""Of ``ACTION`` in a dataset's statistics, (H, A) each, in the units of actions; ``taccorl.training.reading`` computes them."""
+LEAST_STD = 0.01
+"""Of a normalised number, 2 of which are its range: a number that hardly moves is not blown up."""
+
+
+class ChunkSteps(nn.Module):
+    """μ and σ, (H, A), in a policy's checkpoint. Before a dataset has told them: 0 and 1."""
+
+    mean_HA: Tensor
+    std_HA: Tensor
+
+    def __init__(self, horizon: int, num_actions: int) -> None:
+        super().__init__()
+        self.register_buffer("mean_HA", torch.zeros(horizon, num_actions))
+        self.register_buffer("std_HA", torch.ones(horizon, num_actions))
+
+    @classmethod
+    def of_statistics(cls, statistics: Any, config: Any, num_actions: int) -> "ChunkSteps":
+        """
+        Args:
+            statistics: LeRobot's of a dataset; None, or without those of steps: a checkpoint brings them, or nothing does.
+            config: the policy's.
+
+        Raises:
+            TaccorlError: actions are normalised in a way that is not known here.
+        """
+        steps = cls(config.chunk_size, num_actions)
+        told = (statistics or {}).get(ACTION, {})
+        if any(name not in told for name in STEP_STATISTICS):
+            return steps
+        mean, std = (torch.as_tensor(told[name], dtype=torch.float32) for name in STEP_STATISTICS)
+        mode = config.normalization_mapping.get("ACTION", NormalizationMode.IDENTITY)
+        if mode is NormalizationMode.QUANTILES:
+            low, high = (torch.as_tensor(told[name], dtype=torch.float32) for name in ("q01", "q99"))
+        elif mode is NormalizationMode.MIN_MAX:
+            low, high = (torch.as_tensor(told[name], dtype=torch.float32) for name in ("min", "max"))
+        else:
+            raise TaccorlError(
+                f"--policy.normalize_steps=true: with --policy.normalization_mapping of ACTION {mode.value}; QUANTILES and "
+                "MIN_MAX are known, or leave it out (--policy.normalize_steps=false)"
+            )
+        half = ((high - low) / 2).clamp(min=1e-8)
+        steps.mean_HA.copy_((mean - low) / half - 1)
+        steps.std_HA.copy_((std / half).clamp(min=LEAST_STD))
+        return steps
+
+    def normalized(self, actions_BHA: Tensor) -> Tensor:
+        """x → z of the first steps of a chunk, (B, ≤ H, A)."""
+        steps = actions_BHA.shape[-2]
+        return (actions_BHA - self.mean_HA[:steps]) / self.std_HA[:steps]
+
+    def restored(self, actions_BHA: Tensor) -> Tensor:
+        """z → x."""
+        steps = actions_BHA.shape[-2]
+        return actions_BHA * self.std_HA[:steps] + self.mean_HA[:steps]

@@ -1,0 +1,233 @@
+"""Pictures of a dataset, decoded once: uint8 at the resolution that the policy sees, in the store, on the GPU or in memory.
+
+Decoding a video for every row that is drawn limits training to some hundred rows a second and core. Here each frame is decoded
+once, by the stage ``frames``, into one file a camera that is memory-mapped. Its key is made of the dataset's content, the
+resolution and the stage's version, so that another dataset or resolution is another artefact, and runs share it.
+
+Letters in shapes: N rows of the dataset, B rows of a batch.
+"""
+
+import logging
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import av
+import numpy as np
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies.common.vla_utils import resize_with_pad_torch
+from torch import Tensor
+
+from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.lineage.stage import Stage
+from taccorl.lineage.store import Store
+
+Place = Literal["none", "disk", "host", "gpu"]
+PLACES: tuple[Place, ...] = get_args(Place)
+SHARE_OF_FREE = 0.8
+"""Of the memory that is free, so much may be taken: training wants some, too."""
+_AT_ONCE = 64  # frames that are resized together
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CacheRequest:
+    """Where frames are to be held, and how large."""
+
+    place: Place
+    resolution: tuple[int, int] | None
+    """Rows and columns; None: as the dataset has them."""
+    store: Path
+    device: str
+    """The policy's."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: no such place.
+        """
+        if self.place not in PLACES:
+            raise TaccorlError(f"--dataset.cache={self.place}: {nearest(self.place, PLACES)}")
+
+
+@dataclass(frozen=True)
+class FramesConfig:
+    """Of the stage ``frames``."""
+
+    resolution: tuple[int, int] | None
+
+
+def _write_frames(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
+    meta = LeRobotDatasetMetadata("local/dataset", root=inputs[0])
+    files: dict[tuple[str, Path], list[int]] = {}
+    for key in meta.video_keys:
+        for episode in range(meta.total_episodes):
+            files.setdefault((key, inputs[0] / meta.get_video_file_path(episode, key)), []).append(episode)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    arrays = {key: _empty(out_dir, meta, key, config.resolution) for key in meta.video_keys}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        jobs = [
+            pool.submit(_decode, arrays[key], path, meta, key, episodes, config.resolution)
+            for (key, path), episodes in files.items()
+        ]
+        for job in jobs:
+            job.result()
+    for array in arrays.values():
+        array.flush()
+
+
+FRAMES = Stage(name="frames", fn=_write_frames, version=1)
+
+
+def _file(folder: Path, key: str) -> Path:
+    return folder / f"{key}.npy"
+
+
+def _empty(folder: Path, meta: LeRobotDatasetMetadata, key: str, resolution: tuple[int, int] | None) -> np.memmap:
+    rows, columns = resolution or tuple(meta.features[key]["shape"][:2])
+    shape = (meta.total_frames, 3, rows, columns)
+    return np.lib.format.open_memmap(_file(folder, key), mode="w+", dtype=np.uint8, shape=shape)
+
+
+def _decode(
+    out: np.ndarray,
+    path: Path,
+    meta: LeRobotDatasetMetadata,
+    key: str,
+    episodes: Sequence[int],
+    resolution: tuple[int, int] | None,
+) -> None:
+    """Every frame of ``episodes`` in one file, each into its row of ``out`` (N, 3, rows, columns).
+
+    Raises:
+        DatasetError: fewer or more frames in the file than rows.
+    """
+    rows, times_s = [], []
+    for k in episodes:
+        episode: Any = meta.episodes[k]  # pyright: ignore[reportOptionalSubscript]
+        first, last = int(episode["dataset_from_index"]), int(episode["dataset_to_index"])
+        begin_s = float(episode[f"videos/{key}/from_timestamp"])
+        rows += range(first, last)
+        times_s += [begin_s + t / meta.fps for t in range(last - first)]
+    order = np.argsort(times_s, kind="stable")
+    rows, times_s = np.asarray(rows)[order], np.asarray(times_s)[order]
+    done, waiting = 0, []
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "NONE"
+        step_s = float(stream.time_base or Fraction(0))
+        for frame in container.decode(stream):
+            if done + len(waiting) == len(rows) or frame.pts is None:
+                continue
+            if abs(frame.pts * step_s - times_s[done + len(waiting)]) > 0.5 / meta.fps:
+                continue  # of an episode that the dataset no longer has
+            waiting.append(frame.to_ndarray(format="rgb24"))
+            if len(waiting) == _AT_ONCE:
+                out[rows[done : done + len(waiting)]] = resized(np.stack(waiting), resolution)
+                done, waiting = done + len(waiting), []
+    if waiting:
+        out[rows[done : done + len(waiting)]] = resized(np.stack(waiting), resolution)
+    if done + len(waiting) != len(rows):
+        at = done + len(waiting)
+        raise DatasetError(
+            f"{path}: {at} of its {len(rows)} frames are there, none at {times_s[at]:.3f} s; make the dataset again "
+            "(taccorl check tells more)"
+        )
+
+
+def resized(pictures: np.ndarray, resolution: tuple[int, int] | None) -> np.ndarray:
+    """(B, rows, columns, 3) uint8 → (B, 3, *resolution) uint8, as the policy resizes them, rounded to whole values."""
+    if resolution is None or pictures.shape[1:3] == tuple(resolution):
+        return pictures.transpose(0, 3, 1, 2)
+    small = resize_with_pad_torch(torch.from_numpy(pictures).to(torch.float32) / 255, *resolution)
+    return (small * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 3, 1, 2).numpy()
+
+
+class Frames:
+    """The pictures of a dataset where they are wanted.
+
+    Args:
+        arrays: camera → (N, 3, rows, columns) uint8.
+        numbers_bytes: what the dataset's numbers take beside them.
+
+    What does not fit on the GPU is held in memory, what does not fit there stays on disk; the log says so.
+    """
+
+    def __init__(self, arrays: dict[str, np.ndarray], place: Place, device: str, numbers_bytes: int = 0) -> None:
+        needed = sum(array.nbytes for array in arrays.values()) + numbers_bytes
+        self.place = _fitting(place, needed, device)
+        self.device = torch.device(device if self.place == "gpu" else "cpu")
+        self.tensors: dict[str, Tensor] = {}
+        for key, array in arrays.items():
+            if self.place == "disk":
+                self.tensors[key] = torch.from_numpy(array)
+                continue
+            held = torch.empty(array.shape, dtype=torch.uint8, device=self.device)
+            for first in range(0, len(array), 4096):  # never twice as much in memory
+                held[first : first + 4096] = torch.from_numpy(np.array(array[first : first + 4096]))
+            self.tensors[key] = held
+
+    def rows(self, rows_B: Tensor) -> dict[str, Tensor]:
+        """Camera → (B, 3, rows, columns) uint8 of the dataset's rows."""
+        return {key: frames[rows_B] for key, frames in self.tensors.items()}
+
+
+def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_rows: int, numbers_bytes: int) -> Frames:
+    """Frames of the dataset at ``root``, decoded now if no run did before.
+
+    Raises:
+        DatasetError: damaged videos, or frames of another number than the dataset has rows.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    if cameras:
+        store = Store(request.store)
+        dataset, config = store.dataset(root), FramesConfig(request.resolution)
+        if store.find(FRAMES, config, [dataset]) is None:
+            _log.info("decoding %d frames of %s into %s, once", num_rows * len(cameras), root, store.root)
+        folder = store.run(FRAMES, config, [dataset]).path
+        for key in cameras:
+            arrays[key] = np.load(_file(folder, key), mmap_mode="c")
+            if len(arrays[key]) != num_rows:
+                raise DatasetError(
+                    f"{_file(folder, key)}: {len(arrays[key])} frames, the dataset {root} has {num_rows} rows. Remove {folder}; "
+                    "the next run decodes anew"
+                )
+    return Frames(arrays, request.place, request.device, numbers_bytes)
+
+
+def _fitting(place: Place, needed: int, device: str) -> Place:
+    """``place``, or the next one with room for ``needed`` bytes."""
+    if place == "gpu" and not device.startswith("cuda"):
+        _log.warning("--dataset.cache=gpu: --policy.device=%s is none; frames are held in memory", device)
+        place = "host"
+    if place == "gpu":
+        free = torch.cuda.mem_get_info(device)[0]
+        if needed > SHARE_OF_FREE * free:
+            _log.warning(_too_large("gpu", needed, free, "held in memory"))
+            place = "host"
+    if place == "host":
+        free = _free_memory_bytes()
+        if needed > SHARE_OF_FREE * free:
+            _log.warning(_too_large("host", needed, free, "read from disk"))
+            place = "disk"
+    return place
+
+
+def _too_large(place: str, needed: int, free: int, instead: str) -> str:
+    return (
+        f"--dataset.cache={place}: frames and numbers need {needed / 1e9:.2f} GB, {free / 1e9:.2f} GB are free, of which "
+        f"{SHARE_OF_FREE:.0%} may be taken; they are {instead}. They would fit with pictures of "
+        f"{(SHARE_OF_FREE * free / needed) ** 0.5:.0%} of the side (--policy.image_resolution), or fewer episodes"
+    )
+
+
+def _free_memory_bytes() -> int:
+    for line in Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").exists() else []:
+        if line.startswith("MemAvailable:"):
+            return 1024 * int(line.split()[1])
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")

@@ -1,0 +1,162 @@
+"""Whole batches from cached frames are those of the plain reader; what does not fit or is damaged is said."""
+
+import logging
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import lerobot_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.common.vla_utils import resize_with_pad_torch
+from tiny_dataset import TOUCH, write_tiny
+from torch.utils.data import DataLoader, default_collate
+
+import taccorl.lerobot_plugin  # noqa: F401
+from taccorl.errors import DatasetError, TaccorlError
+from taccorl.training import frame_cache, reading
+from taccorl.training.frame_cache import CacheRequest, Frames
+from taccorl.training.reading import FastReader, WholeBatch, cache_request
+
+WINDOWS = {TOUCH: [k / 30 for k in range(-9, 1)], "action": [k / 30 for k in range(10)]}
+ROWS = [0, 13, 14, 20, 36, 36, 3, 25]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("tiny") / "dataset", rows=(14, 11, 12), sim_episodes=1, cameras=2)
+
+
+def load(root: Path, monkeypatch: pytest.MonkeyPatch, request: CacheRequest | None, **settings) -> LeRobotDataset:
+    monkeypatch.setattr(reading, "_requested", request)
+    monkeypatch.setattr(lerobot_dataset, "DatasetReader", FastReader)
+    return LeRobotDataset("local/tiny", root=root, video_backend="pyav", return_uint8=True, **settings)
+
+
+def request(tmp_path: Path, place="host", resolution=None) -> CacheRequest:
+    return CacheRequest(place=place, resolution=resolution, store=tmp_path / "store", device="cpu")
+
+
+def assert_same(ours: dict, theirs: dict, but: tuple[str, ...] = ()) -> None:
+    assert set(ours) == set(theirs)
+    for key, value in theirs.items():
+        if key in but:
+            continue
+        if isinstance(value, torch.Tensor):
+            assert ours[key].dtype == value.dtype and torch.equal(ours[key], value), key
+        else:
+            assert ours[key] == value
+
+
+@pytest.mark.parametrize("place", ["host", "disk"])
+@pytest.mark.parametrize("windows", [WINDOWS, None])
+@pytest.mark.parametrize("episodes", [None, [0, 2]])
+def test_a_batch_is_the_plain_reader_s_to_the_bit_and_the_type(root, tmp_path, monkeypatch, place, windows, episodes):
+    plain = load(root, monkeypatch, None, delta_timestamps=windows, episodes=episodes)
+    cached = load(root, monkeypatch, request(tmp_path, place), delta_timestamps=windows, episodes=episodes)
+    rows = [row % len(plain) for row in ROWS]
+    (batch,) = cached.__getitems__(rows)
+    assert isinstance(batch, WholeBatch)
+    assert_same(batch, default_collate([plain[row] for row in rows]))
+
+
+def test_smaller_pictures_are_those_that_the_policy_would_make_rounded(root, tmp_path, monkeypatch):
+    plain = load(root, monkeypatch, None)
+    cached = load(root, monkeypatch, request(tmp_path, resolution=(20, 28)))
+    (batch,) = cached.__getitems__(ROWS)
+    expected = default_collate([plain[row] for row in ROWS])
+    cameras = tuple(plain.meta.video_keys)
+    assert_same(batch, expected, but=cameras)
+    for key in cameras:
+        full = expected[key].permute(0, 2, 3, 1).to(torch.float32) / 255
+        small = resize_with_pad_torch(full, 20, 28).permute(0, 3, 1, 2)
+        assert batch[key].shape == (len(ROWS), 3, 20, 28)
+        assert (batch[key] / 255 - small).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_lerobots_loader_gives_whole_batches_in_the_order_that_it_draws(root, tmp_path, monkeypatch):
+    settings = {"batch_size": 8, "sampler": ROWS * 2 + [7], "num_workers": 0, "pin_memory": False}
+    plain = load(root, monkeypatch, None, delta_timestamps=WINDOWS)
+    cached = load(root, monkeypatch, request(tmp_path), delta_timestamps=WINDOWS)
+    ours, theirs = list(DataLoader(cached, **settings)), list(DataLoader(plain, **settings))
+    assert [len(batch["index"]) for batch in ours] == [8, 8, 1]
+    for a, b in zip(ours, theirs, strict=True):
+        assert_same(a, b)
+
+
+def test_another_run_decodes_nothing_and_another_dataset_or_resolution_decodes_its_own(
+    root, tmp_path, monkeypatch, caplog
+):
+    def open_at(root: Path, resolution=None) -> str:
+        caplog.clear()
+        with caplog.at_level(logging.INFO):
+            load(root, monkeypatch, request(tmp_path, resolution=resolution)).__getitems__([0])
+        return caplog.text
+
+    assert "decoding 74 frames" in open_at(root)
+    assert "decoding" not in open_at(root)
+    assert "decoding 74 frames" in open_at(root, (20, 20))
+    other = write_tiny(tmp_path / "other", rows=(14, 11), cameras=2)
+    assert "decoding 50 frames" in open_at(other)
+    moved = shutil.copytree(root, tmp_path / "moved")
+    assert "decoding" not in open_at(moved), "the content counts, not the place"
+
+
+def test_frames_of_another_length_are_refused(root, tmp_path, monkeypatch):
+    load(root, monkeypatch, request(tmp_path)).__getitems__([0])
+    (file,) = (tmp_path / "store" / "frames").glob("*/observation.images.front.npy")
+    short = np.load(file)[:-1]
+    file.chmod(0o644)
+    np.save(file, short)
+    with pytest.raises(DatasetError, match=r"36 frames, the dataset .* has 37 rows. Remove"):
+        load(root, monkeypatch, request(tmp_path)).__getitems__([0])
+
+
+def test_a_video_that_ends_early_is_named_with_the_place(root, tmp_path, monkeypatch):
+    cut = shutil.copytree(root, tmp_path / "cut")
+    for manifest in cut.rglob("*manifest*"):
+        manifest.unlink()
+    front = sorted((cut / "videos" / "observation.images.front").rglob("*.mp4"))[0]
+    other = write_tiny(tmp_path / "other", rows=(9,), cameras=2)
+    shutil.copy(sorted((other / "videos" / "observation.images.front").rglob("*.mp4"))[0], front)
+    with pytest.raises(DatasetError, match=r"mp4: 9 of its 37 frames are there, none at 0\.3"):
+        load(cut, monkeypatch, request(tmp_path)).__getitems__([0])
+
+
+def test_what_does_not_fit_goes_to_the_next_place_and_says_what_would(monkeypatch, caplog):
+    arrays = {"front": np.zeros((10, 3, 100, 100), np.uint8)}
+    monkeypatch.setattr(frame_cache, "_free_memory_bytes", lambda: 200_000)
+    with caplog.at_level(logging.WARNING):
+        frames = Frames(arrays, "host", "cpu", numbers_bytes=100_000)
+    assert frames.place == "disk"
+    # 0.8 · 200 kB of 400 kB: √0.4 = 63 % of the side
+    assert "63%" in caplog.text and "fewer episodes" in caplog.text
+    caplog.clear()
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (300_000, 10**9))
+    assert Frames(arrays, "gpu", "cuda:0").place == "disk"
+    assert "--dataset.cache=gpu" in caplog.text and "--dataset.cache=host" in caplog.text
+    assert Frames(arrays, "gpu", "cpu").place == "disk"
+
+
+def test_options_that_go_with_no_cache_are_refused():
+    def cfg(place="gpu", **changes):
+        values = {
+            "cache": place,
+            "cache_store": "s",
+            "streaming": False,
+            "image_transforms": SimpleNamespace(enable=False),
+        }
+        policy = SimpleNamespace(image_resolution=(96, 96), device="cpu")
+        return SimpleNamespace(dataset=SimpleNamespace(**values | changes), trainable_config=policy, num_workers=2)
+
+    assert cache_request(cfg("none")) is None
+    found = cache_request(cfg())
+    assert found == CacheRequest(place="gpu", resolution=(96, 96), store=Path("s"), device="cpu")
+    with pytest.raises(TaccorlError, match=r"--dataset\.cache=gpuu: .*gpu"):
+        cache_request(cfg("gpuu"))
+    with pytest.raises(TaccorlError, match=r"streaming"):
+        cache_request(cfg(streaming=True))
+    with pytest.raises(TaccorlError, match=r"image_transforms"):
+        cache_request(cfg(image_transforms=SimpleNamespace(enable=True)))
