@@ -1,16 +1,18 @@
 """``python -m pipelines.cotrain [--small] [--task=assembly_2] [--secret=7]``: demonstrations of both domains → policy → scores::
 
-    collect on a surrogate robot ──────┐
-    collect in the twin ──┬────────────┼── merge ── lerobot-train ── lerobot-eval in both
-                          └─ augment ──┘
+    collect on a surrogate robot ── recordings (MCAP) ── ingest ──┐
+    collect in the twin ──┬───────────────────────────────────────┼── merge ── lerobot-train ── lerobot-eval in both
+                          └─ augment ─────────────────────────────┘
 
 There is no robot here. A twin with hidden effects, other cameras and another gain stands in for it; whatever is made from it says
-surrogate, and every score is of a simulation. Everything lands in outputs/cotrain; a run that was stopped goes on where it was.
+surrogate, and every score is of a simulation. Its demonstrations are recorded as the robot's drivers would and ingested, so that
+the real side goes the way of a robot's recordings. Everything lands in outputs/cotrain; a stopped run goes on where it was.
 The paper's numbers want a GPU and π0.5's weights. ``--small`` shows the chain on a CPU in minutes and learns nothing.
 """
 
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -24,6 +26,7 @@ from taccorl.sim.twin_file import save_twin
 from taccorl.training.lerobot_commands import FIRST_SEED, Scoring, Training
 from taccorl.training.surrogate_twin import ORIGIN, draw_surrogate_twin
 
+RECORDING_SPEC = "piper_flexitac_mcap"
 SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")
 SMALL += ("--train=configs/small/tiny.yaml", "--steps=4", "--batch_size=4")
 
@@ -64,6 +67,16 @@ def run(*words: str) -> None:
         raise SystemExit(f"{words[0]} {words[1]} ended with {code}")
 
 
+def record(recordings: Path, *words: str) -> None:
+    """Demonstrations as MCAP files in the folder ``recordings``, once; what an interrupted run left unfinished is made anew."""
+    if recordings.exists():
+        return
+    unfinished = recordings.with_name(f"{recordings.name}.unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    run("taccorl", "collect", "--as_recording=true", *words, f"--out={unfinished}")
+    unfinished.rename(recordings)
+
+
 def main(words: list[str]) -> None:
     chosen = [*(SMALL if "--small" in words else ()), *(word for word in words if word != "--small")]
     try:
@@ -74,12 +87,14 @@ def main(words: list[str]) -> None:
     recipe, name = config.train or Path(f"configs/cotrain/{config.task}.yaml"), f"surrogate_{config.secret}"
     if not recipe.is_file():  # before hours of collecting
         raise SystemExit(f"--train={recipe}: no such file")
-    robot, real, both = (out / part for part in (f"{name}.yaml", name, f"{name}_and_twin"))
+    parts = (f"{name}.yaml", f"{name}_recordings_{config.real}", name, f"{name}_and_twin")
+    robot, recordings, real, both = (out / part for part in parts)
     sources, many = out / "sources", out / "augmented"
     out.mkdir(parents=True, exist_ok=True)
     save_twin(draw_surrogate_twin(config.secret), robot)
     where = ("--seed=1", f"--twin={robot}", f"--origin={ORIGIN}")  # the two domains do not share their scenes
-    run("taccorl", "collect", task, f"--episodes={config.real}", *where, f"--out={real}", store)
+    record(recordings, task, f"--episodes={config.real}", *where, store)
+    run("taccorl", "ingest", str(recordings), f"--spec={RECORDING_SPEC}", f"--out={real}", store)
     run("taccorl", "collect", task, f"--episodes={config.sources}", f"--out={sources}", store)
     run("taccorl", "augment", task, f"--source={sources}", f"--episodes={config.augmented}", f"--out={many}", store)
     run("taccorl", "merge", f"--real={real}", f"--sim={sources}", f"--sim={many}", f"--out={both}", store)

@@ -18,7 +18,7 @@ def read_dataset(root: Path) -> list[Measurement]:
     """Every episode of a dataset as a measurement at the dataset's rate.
 
     Raises:
-        TaccorlError: not a dataset, or one whose numbers have no units.
+        TaccorlError: not a dataset, one whose numbers have no units, or one that does not state its action_time.
     """
     dataset = Dataset(root)
     try:
@@ -32,20 +32,23 @@ def read_dataset(root: Path) -> list[Measurement]:
 
 
 def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...], root: Path, k: int) -> Measurement:
-    """One episode of a dataset.
+    """One episode of a dataset. Row k of the measurement is row k + 1 of the episode (T rows → T − 1).
 
-    Row k of a dataset made from a recording holds the command in force at time k. Row k of one collected in the twin holds
-    the action that was reached, in a straight line, at time k + 1: in force at time k was the action before.
+    The action of row t is reached, in a straight line, at row t + 1 (``DatasetSpec.action_time``): the command in force at
+    row t is the action of row t − 1. Row 0 has none.
+
+    Raises:
+        TaccorlError: too few rows, or the dataset does not state its action_time.
     """
+    episode.spec.require_action_time(episode.name)
     state, action = episode.arrays[STATE].astype(float), episode.executed().astype(float)
-    late = 1 if episode.provenance.get("simulation") else 0
-    target, measured = action[: len(action) - late], state[late:]
+    target, measured = action[:-1], state[1:]
     if len(measured) < 2:
         raise TaccorlError(f"{episode.name}: {len(state)} rows are no measurement")
     time_s = np.arange(len(measured)) / episode.spec.fps
     touch = None
     if TACTILE in episode.arrays:
-        counts = episode.arrays[TACTILE][late:].astype(np.int16)
+        counts = episode.arrays[TACTILE][1:].astype(np.int16)
         baseline = np.asarray(episode.baselines.get(TACTILE, np.zeros(counts.shape[1])))
         touch = Touch(time_s=np.repeat(time_s[:, None], 4, axis=1), counts=counts, baseline=baseline)
     ages = [t.age_max_s for t in episode.timing if t.feature in (STATE, ACTION) and math.isfinite(t.age_max_s)]

@@ -5,8 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.data.episode import Episode
+from taccorl.data.spec import ACTION
 
-STATE, ACTION = "observation.state", "action"
+__all__ = ["ACTION", "STATE"]
+
+STATE = "observation.state"
 
 
 @dataclass(frozen=True)

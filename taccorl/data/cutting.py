@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.data import decode, timing
+from taccorl.data.arms import ACTION
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
 from taccorl.data.recording import Recording, find_sources, opened, release
 from taccorl.data.spec import FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
@@ -290,23 +291,28 @@ class Cutter:
             result.episodes.append(self._episode(name, shown, grid_ns[a:b], matches, slice(a, b)))
 
     def _last_ns(self) -> dict[str, int]:
-        """Channel → time of its last sample; a held one goes on for ever."""
-        channels = [
-            c
-            for key in self.spec.mapped
-            for c in self.spec.features[key].channels
-            if self.spec.features[key].align != "hold"
-        ]
-        return {c: int(self.clocks[c].time_ns[-1]) for c in channels}
+        """Channel → time of the last row that it can fill; a held one goes on for ever."""
+        found: dict[str, int] = {}
+        for key in self.spec.mapped:
+            if self.spec.features[key].align == "hold":
+                continue
+            # Rounded down: rows are 1 / fps apart to a nanosecond.
+            ahead_ns = NS_PER_S // self.spec.target.fps if key == ACTION else 0
+            for c in self.spec.features[key].channels:
+                last_ns = int(self.clocks[c].time_ns[-1]) - ahead_ns
+                found[c] = min(last_ns, found.get(c, last_ns))
+        return found
 
     def _first_usable_ns(self, key: str) -> int:
         mapping, history = self.spec.features[key], self.spec.target.features[key].history
+        fps = self.spec.target.fps
+        ahead_ns = (NS_PER_S + fps // 2) // fps if key == ACTION else 0  # as timing.next_rows rounds row 1
         firsts = []
         for name in mapping.channels:
             time_ns = self.clocks[name].time_ns
             if len(time_ns) < history:
                 raise Unfit(f"{self.spec.channels[name].topic}: {len(time_ns)} samples, a window needs {history}")
-            firsts.append(int(time_ns[history - 1]))
+            firsts.append(int(time_ns[history - 1]) - ahead_ns)
         return max(firsts)
 
     def _report_ends(self, interval: _Interval, start_ns: int, end_ns: int, result: Cut) -> None:
@@ -325,9 +331,11 @@ class Cutter:
 
     def _match(self, key: str, grid_ns: np.ndarray) -> dict[str, timing.Matched]:
         mapping, feature = self.spec.features[key], self.spec.target.features[key]
+        # The action of row t is the last command before row t + 1: the target that is sent from row t on (action_time).
+        due_ns = timing.next_rows(grid_ns, self.spec.target.fps) if key == ACTION else grid_ns
         return {
             name: timing.match(
-                grid_ns,
+                due_ns,
                 self.clocks[name].time_ns,
                 mapping.align,
                 max_age_s=self.spec.channels[name].max_age_s,

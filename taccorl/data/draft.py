@@ -21,6 +21,9 @@ PICTURE_SHAPE = (224, 224, 3)
 """What π0.5 looks at; pictures are letterboxed to it."""
 FPS = 30
 """Rows a second where no camera says what would be natural."""
+ROW_CLOCK_READERS = ("hdf5", "lerobot")
+"""Their files hold rows without times: ``lead_frames`` says which row a command is valid at."""
+ACTION_TIME = "action_time: next_row   # action of row t: the last command sent before row t + 1"
 STALE_PERIODS = 2.4
 """A sample may be late by this many periods before a row counts as stale."""
 
@@ -124,6 +127,9 @@ def _recording(inventory: Inventory, roles: _Roles, path: Path) -> str:
     texts = [t for t in inventory.topics if t.num_messages and t.holds(TEXTS)]
     known = inventory.times_known
     rate = "" if known else f"; rate_hz: the recorder's rows a second, max_age_s: {STALE_PERIODS} / rate_hz"
+    row_clock = inventory.reader in ROW_CLOCK_READERS
+    if row_clock:
+        rate += "; lead_frames of action: 1 if row k is the command reached at row k + 1, 0 if it is in force at row k"
     unused = [t for t in inventory.topics if t not in roles.used and t not in roles.spare and t not in texts]
     lines = [
         *_head(inventory),
@@ -136,7 +142,10 @@ def _recording(inventory: Inventory, roles: _Roles, path: Path) -> str:
         if inventory.reader == "lerobot"
         else "instruction: {from: spec, text: TODO}   # the sentence that the policy reads: pick up the cup",
         f"channels:   # each must be used by a feature below{rate}",
-        *(f"  {roles.names[t.topic]}: {_channel(t, clock, known)}" for t in roles.used),
+        *(
+            f"  {roles.names[t.topic]}: {_channel(t, clock, known, row_clock and t in roles.commands)}"
+            for t in roles.used
+        ),
         *(f"  # {roles.names[t.topic]}: {_channel(t, clock, known)}" for t in roles.spare),
         *(f"  # not used: {' '.join((t.problem or f'{t.topic} ({t.type.name})').split())}" for t in unused),
         "features:   # several channels are joined in the order of the list",
@@ -171,7 +180,7 @@ def _mappings(roles: _Roles) -> list[str]:
     return found + ([line("observation.tactile", roles.pads)] if roles.pads else [])
 
 
-def _channel(t: TopicSummary, clock: str, rate_known: bool) -> str:
+def _channel(t: TopicSummary, clock: str, rate_known: bool, is_row_command: bool = False) -> str:
     parts = [f"topic: {_yaml(t.topic)}"]
     if t.type.name and t.type.name != "no schema" and t.type.shape is None:
         parts.append(f"type: {_yaml(t.type.name)}")
@@ -188,6 +197,8 @@ def _channel(t: TopicSummary, clock: str, rate_known: bool) -> str:
         parts += [f"rate_hz: {rate_hz:g}", f"max_age_s: {max(0.03, round(STALE_PERIODS / rate_hz, 3)):g}"]
     else:
         parts += ["rate_hz: TODO", "max_age_s: TODO"]
+    if is_row_command:
+        parts.append("lead_frames: 1")
     return "{" + ", ".join(parts) + "}"
 
 
@@ -205,6 +216,7 @@ def _dataset(inventory: Inventory, roles: _Roles, path: Path) -> str:
         f"name: {_yaml(re.sub(r'[^A-Za-z0-9_]+', '_', path.stem))}",
         "robot_type: my_robot   # any name, the same for all datasets of this robot",
         f"fps: {fps if known else unknown}",
+        *([ACTION_TIME] if roles.states or roles.commands else []),
         "features:",
     ]
     elements = _elements(roles.states, roles)

@@ -43,7 +43,8 @@ class ChannelTiming:
     longest_gap_s: float
     age_median_s: float
     age_max_s: float
-    """Age of the sample that a row shows: row time − sample time; negative only for interpolate's look-ahead."""
+    """Age of the sample that a row shows: row time − sample time, for ``action`` the next row's time − sample time; negative
+    only for interpolate's look-ahead."""
     duplicates: int = 0
     out_of_order: int = 0
     zero_stamps: int = 0

@@ -44,8 +44,8 @@ MACHINE_FAULTS = {
     errno.EROFS: "the disk is read-only",
 }
 """Faults that no other recording would escape: the whole run stops."""
-RECORDING_STAGE_VERSION = 2
-DATASET_STAGE_VERSION = 2
+RECORDING_STAGE_VERSION = 3
+DATASET_STAGE_VERSION = 3
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Does each arm follow its own command, and how late?
 
-    lag      argmax over k of Σ_t v_action[t] · v_state[t + k], the velocities of all moving joints of one arm
+    lag      argmax over k of Σ_t v_action[t] · v_state[t + k], the velocities of all moving joints of one arm,
+             less the one row after which an action is reached (``DatasetSpec.action_time``)
     swapped  an arm's state lies near the other arm's command, and far from its own
 
 Letters in shapes: T rows, n joints. Velocities are differences of rows: what a policy will see.
@@ -72,7 +73,7 @@ def _correlation_at(v_action: np.ndarray, v_state: np.ndarray, lag: int) -> floa
 
 
 def arm_lags(episode: Episode) -> dict[str, Lag]:
-    """Arm name → lag, for the arms that move enough to tell."""
+    """Arm name → lag of the arm behind its command, for the arms that move enough to tell."""
     if episode.num_rows < LAG_MIN_S * episode.spec.fps:
         return {}
     state, action = episode.arrays.get(STATE), episode.arrays.get(ACTION)
@@ -82,7 +83,8 @@ def arm_lags(episode: Episode) -> dict[str, Lag]:
             continue
         lag = find_lag(action[:, arm.joints], state[:, arm.joints], episode.spec.fps)
         if lag.correlation >= LAG_SURE:
-            lags[arm.name] = lag
+            ahead_s = 1 / episode.spec.fps if episode.spec.action_time == "next_row" else 0.0
+            lags[arm.name] = Lag(lag.lag_s - ahead_s, lag.correlation)
     return lags
 
 

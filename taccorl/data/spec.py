@@ -17,10 +17,12 @@ from typing import Any, Literal
 import numpy as np
 
 from taccorl.data.strict_yaml import Document
-from taccorl.errors import SpecError, nearest
+from taccorl.errors import DatasetError, SpecError, nearest
 
 Align = Literal["hold", "asof", "interpolate", "window"]
+ActionTime = Literal["next_row"]
 SPEC_VERSION = 1
+ACTION = "action"
 UNITS = (
     *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz"),
     *("N", "Nm", "Pa", "kg", "A", "V", "W", "K", "s", "Hz", "1"),
@@ -136,9 +138,30 @@ class DatasetSpec:
     robot_type: str
     fps: int
     features: dict[str, FeatureSpec]
+    action_time: ActionTime | None = None
+    """When the target in ``action`` of row t is reached. ``next_row``: at row t + 1. It is the last command sent before row
+    t + 1, i.e. the target that is sent from row t on and reached in a straight line: what a policy that sees row t outputs.
+    Files of ``data_specs/`` with an ``action`` must state it. None: nobody stated it (other people's datasets, and those
+    that taccorl wrote before it had this key: ingested rows then hold the command in force at row t)."""
     video_codec: Literal["h264", "libsvtav1"] = "h264"
     sensors: dict[str, SensorSpec] = dataclasses.field(default_factory=dict)
     """Filled on loading: feature key → its sensor. Not a key of the file."""
+
+    def require_action_time(self, name: str) -> None:
+        """
+        Args:
+            name: of the dataset or episode, for the message.
+
+        Raises:
+            DatasetError: nobody stated at which row its actions are reached.
+        """
+        if self.action_time is None:
+            raise DatasetError(
+                f"{name}: its meta/taccorl/dataset_spec.json states no action_time, so its action of row t may be the command in "
+                "force at row t (as ingest stored it) or the one reached at row t + 1 (as the twin stored it). Ingest its "
+                "recordings again, or collect or augment it again; of other people's LeRobot datasets: taccorl ingest "
+                "DATASET --spec=…, with reader: lerobot and lead_frames on the channel of action"
+            )
 
     def keys(self, kind: Literal["video", "tactile", "vector", "simulator"]) -> list[str]:
         """Feature keys of one kind; ``sim.*`` are a simulator's own: its state, seeds and labels."""
@@ -175,8 +198,10 @@ class ChannelSpec:
     """Time from the event to its stamp; subtracted."""
     drop_zero_stamp: bool = False
     """Messages stamped 0 (PiPER's joint_ctrl before a first command) are dropped and counted."""
-    lead_frames: int = 0
-    """Index-aligned files only: sample k belongs to row k + lead_frames (cobot_magic's action: 1)."""
+    lead_frames: int | None = None
+    """Files without clocks (HDF5, LeRobot) only: sample k was valid at row k + lead_frames; 0 if not given. The channels of
+    ``action`` must state it: 1 if row k holds the command that is reached at row k + 1 (cobot_magic, ALOHA, LeRobot),
+    0 if it holds the command in force at row k."""
     channel_order: Literal["rgb", "bgr"] = "rgb"
     """Raw HDF5 pictures only."""
 
@@ -328,10 +353,17 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
         raise document.error("fps", f"{spec.fps} is not a rate")
     if not spec.features:
         raise document.error("features", "holds nothing")
+    if (ACTION in spec.features) != (spec.action_time is not None):
+        raise document.error(
+            "action_time",
+            "is missing: write `action_time: next_row`; the action of row t is then the last command sent before row t + 1"
+            if ACTION in spec.features
+            else f"has no effect without a feature {ACTION!r}; remove it",
+        )
     sensors: dict[str, SensorSpec] = {}
     for key, feature in spec.features.items():
         where = f"features/{key}"
-        if not (key == "action" or key.startswith("observation.")):
+        if not (key == ACTION or key.startswith("observation.")):
             raise document.error(where, "LeRobot's policies read `action` and `observation.*` only")
         if feature.sensor is not None:
             sensors[key] = load_sensor_spec(_beside(document, f"{where}/sensor", feature.sensor))

@@ -1,7 +1,8 @@
 """From many clocks to one: which clock a channel keeps, and which of its samples each row of the grid shows.
 
-Pure functions on int64 nanoseconds. No row ever shows the future: ``hold``, ``asof`` and ``window`` use nothing after the
+Pure functions on int64 nanoseconds. No observation shows the future: ``hold``, ``asof`` and ``window`` use nothing after the
 row's time, and ``interpolate`` (for offline study) looks ahead to one next sample, within the channel's max_age_s, and says so.
+``action`` is no observation: its samples are matched with the times of the following rows (``next_rows``).
 A row without a fresh sample is stale; stale rows are never filled or deleted: the episode is split there.
 """
 
@@ -111,6 +112,13 @@ def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
     half = fps // 2
     num_rows = ((end_ns - start_ns + 1) * fps - half - 1) // NS_PER_S + 1
     return start_ns + (np.arange(num_rows, dtype=np.int64) * NS_PER_S + half) // fps
+
+
+def next_rows(grid_ns: np.ndarray, fps: int) -> np.ndarray:
+    """(T,) time of the row after each row of ``make_grid``; the last one is where one more row would be."""
+    if len(grid_ns) == 0:
+        return grid_ns
+    return np.append(grid_ns[1:], grid_ns[0] + (len(grid_ns) * NS_PER_S + fps // 2) // fps)
 
 
 @dataclass(frozen=True)

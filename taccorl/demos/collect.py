@@ -37,6 +37,7 @@ from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
 ATTEMPT_VERSION = 2
+COLLECTION_VERSION = 2
 _MANY = 20  # attempts after which a success rate means something
 _AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long
 
@@ -210,7 +211,7 @@ def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
 
 
 _DEMONSTRATION = Stage("demonstration", _not_yet, ATTEMPT_VERSION)
-_COLLECTION = Stage("collection", _not_yet, manifest=f"{PROVENANCE}/manifest.json")
+_COLLECTION = Stage("collection", _not_yet, COLLECTION_VERSION, manifest=f"{PROVENANCE}/manifest.json")
 REPORT = "collect_report.json"
 
 

@@ -1,7 +1,8 @@
 """One demonstration in the twin as an ``Episode``: what the policy would have seen and done, and the simulator's own state.
 
-A row is the observation before an action, and the action. Pictures are drawn afterwards, row by row, from the stored states:
-only what is kept costs rendering, and a dataset can be rendered again.
+A row is the observation before an action, and the action: the target that is reached at the next row (``action_time: next_row``).
+Pictures are drawn afterwards, row by row, from the stored states: only what is kept costs rendering, and a dataset can be
+rendered again.
 """
 
 import dataclasses

@@ -71,9 +71,18 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
 
 
 def replay_episode(sim: Simulation, episode: Episode) -> Episode:
-    """The twin's version of a measured episode: the same commands, the twin's own joints and touch, no pictures."""
+    """The twin's version of a measured episode: the same commands, the twin's own joints and touch, no pictures.
+
+    The action of row t is reached at row t + 1 (``DatasetSpec.action_time``): in force at row t is the action of row t − 1. No
+    row holds the command in force at row 0; the first action is taken for it, which is exact where an episode begins at rest.
+
+    Raises:
+        TaccorlError: the episode does not state its action_time, or a wrong rate or shape (``replay``).
+    """
+    episode.spec.require_action_time(episode.name)
     state, action = episode.arrays["observation.state"], episode.executed()
-    done = replay(sim, action, episode.spec.fps, state[0])
+    in_force = np.concatenate([action[:1], action[:-1]])
+    done = replay(sim, in_force, episode.spec.fps, state[0])
     arrays = {"observation.state": done.reported.astype(np.float32), "action": action}
     if "observation.tactile" in episode.spec.features:
         arrays["observation.tactile"] = done.tactile

@@ -25,7 +25,7 @@ from taccorl.policies.tactile_pi05.mixture import IS_SIM
 
 IS_SIM_FEATURE = {"dtype": "float32", "shape": (1,), "names": None, "unit": "1", "range": [0, 1]}
 RECORD = PROVENANCE / "cotrain.json"
-VERSION = 1  # of the stage
+VERSION = 2  # of the stage
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
     for d in datasets:
         if IS_SIM in d.info["features"]:
             raise DatasetError(f"{d.root} has {IS_SIM}, it is merged already: give the datasets that it was made of")
+        d.spec.require_action_time(str(d.root))
     for d in datasets[: len(real)]:
         origins = _origins(d)
         is_nameless = not origins and any(key.startswith("sim.") for key in d.info["features"])
@@ -102,8 +103,9 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
         sim: datasets of the twin.
 
     Raises:
-        DatasetError: none given, or they differ in a feature, fps or robot, or are merged already; episodes that say that
-            they come from the twin are given as real.
+        DatasetError: none given, or they differ in a feature, fps or robot, or are merged already; one does not state its
+            action_time, so that its actions may be a row apart from the others'; episodes that say that they come from the
+            twin are given as real.
         InTheWayError: something is at ``out``.
     """
     if out.exists():

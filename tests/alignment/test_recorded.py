@@ -354,7 +354,7 @@ def test_replay_of_the_dataset_gives_the_dataset(dataset, moved):
     assert np.abs(wrong.reported - m.measured[:-1]).max() > 5e-3
 
 
-def test_rows_of_an_ingested_dataset_are_not_shifted_and_tell_their_age():
+def test_rows_of_an_ingested_dataset_are_the_twins_and_tell_their_age():
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     rows = np.linspace(0, 1, 40)[:, None] * np.ones(14)
     timing = ChannelTiming("left_state", "observation.state", "asof", 200.0, 0, 0.005, 0.0025, 0.005)
@@ -362,7 +362,8 @@ def test_rows_of_an_ingested_dataset_are_not_shifted_and_tell_their_age():
         "e", spec, 0, {"observation.state": rows, "action": rows + 1}, lambda: iter(()), (), "", timing=(timing,)
     )
     m = from_episode(episode, signal_names(spec), ("rad",) * 14, Path("d"), 0)
-    np.testing.assert_array_equal(m.target, rows + 1)
+    np.testing.assert_array_equal(m.target, rows[:-1] + 1)  # in force at row k: the action of row k - 1
+    np.testing.assert_array_equal(m.measured, rows[1:])
     assert m.time_error_s == 0.005
     assert "row_times" in {f.check for f in check_measurement(m)}
 

@@ -29,7 +29,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from taccorl.demos.recorder import ORIGIN
 
     folder = tmp_path_factory.mktemp("merge_cli")
-    write_tiny(folder / "foreign", rows=(16,))  # without what taccorl writes down of a dataset
+    write_tiny(folder / "foreign", rows=(16,), with_spec=False)  # without what taccorl writes down of a dataset
     for name, seeds, origin in (("surrogate", (0, 1), "surrogate: made up"), ("twin", (2,), ORIGIN)):
         episodes = [
             dataclasses.replace(tiny_episode(tiny_spec(), 20 + seed, seed), origin=origin, success=True)
@@ -108,8 +108,14 @@ def test_the_command_it_names_next_is_one_that_lerobot_takes(said: Any, monkeypa
     assert config.policy.sim_weight == 1.0 and config.dataset.root == "simulated"  # α that one domain can have
 
 
-def test_a_dataset_that_says_nothing_of_itself_is_merged_too(place: Path, said: Any) -> None:
+def test_a_dataset_that_says_nothing_of_itself_is_merged_once_its_spec_is_written(place: Path, said: Any) -> None:
     code, text = said("merge", "--real=foreign", "--sim=twin", "--out=mixed", "--store=store")
+    assert code == 2 and "foreign: its meta/taccorl/dataset_spec.json states no action_time" in text
+    from tiny_dataset import tiny_spec, write_spec
+
+    shutil.copytree(place / "foreign", place / "described")
+    write_spec(place / "described", tiny_spec())
+    code, text = said("merge", "--real=described", "--sim=twin", "--out=mixed", "--store=store")
     assert code == 0, text
     mixed = Dataset(place / "mixed")
     assert [mixed.episode(k).origin for k in range(2)] == ["", "MuJoCo twin, not a robot"]
@@ -130,7 +136,7 @@ def test_a_dataset_that_says_nothing_of_itself_is_merged_too(place: Path, said: 
         (("--sim=twin", "--sim=twin", "--out=x"), "twin is given twice"),
         (("--real=surrogate", "--sim=twin", "--out=twin/x"), "lie in one another"),
         (("--real=surrogate", "--sim=twin", "--out=mine"), "mine is in the way: it is a folder of 1 entries without"),
-        (("--real=foreign", "--sim=twin", "--out=both"), "both is in the way: it holds cotraining v1"),
+        (("--sim=twin", "--out=both"), "both is in the way: it holds cotraining v2"),
         (("--real=blind", "--sim=twin", "--out=x"), "twin has observation.images.front, blind has not: ingest"),
         (("--rael=surrogate", "--out=x"), "did you mean 'real'?"),
     ],

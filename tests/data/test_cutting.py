@@ -87,6 +87,11 @@ def row_ns(episode: Episode) -> np.ndarray:
     return episode.start_ns + np.array([(2 * k * 10**9 + FPS) // (2 * FPS) for k in range(episode.num_rows)])
 
 
+def next_row_ns(episode: Episode) -> np.ndarray:
+    """(T,) time of the row after each row."""
+    return episode.start_ns + np.array([(2 * k * 10**9 + FPS) // (2 * FPS) for k in range(1, episode.num_rows + 1)])
+
+
 def newest(times_ns: np.ndarray, rows_ns: np.ndarray) -> np.ndarray:
     """(T,) index of the first among the newest samples at or before each row; by plain search."""
     return np.array([int(np.flatnonzero(times_ns == times_ns[times_ns <= t].max())[0]) for t in rows_ns])
@@ -113,7 +118,10 @@ def test_state_and_action_are_the_truth_at_the_newest_samples_time(made: Made) -
     ):
         for arm, columns in (("left", slice(0, 7)), ("right", slice(7, 14))):
             samples = made.sample_ns(topics[arm])
-            shown_s = (samples[newest(samples, rows)] - START_UNIX_NS) * 1e-9
+            due = (
+                rows if key == STATE else next_row_ns(episode)
+            )  # the action of row t: the last command before row t + 1
+            shown_s = (samples[newest(samples, due)] - START_UNIX_NS) * 1e-9
             error = np.abs(episode.arrays[key] - truth(shown_s))[:, columns]
             # CAN counts are 0.001° (half of it: 8.7e-6 rad) and 0.001 mm; float32 at 2.5 rad adds 1.2e-7.
             # The driver's wrong factor, not undone, would leave 5.3e-4 × 2 rad = 1e-3.
@@ -200,8 +208,9 @@ def test_no_row_depends_on_what_comes_after_it(made: Made, tmp_path: Path) -> No
         assert one.start_ns == two.start_ns
         early = int(((row_ns(one) - START_UNIX_NS) * 1e-9 <= change_s).sum())
         for key in (STATE, ACTION, TOUCH, WINDOW):
-            np.testing.assert_array_equal(one.arrays[key][:early], two.arrays[key][:early], err_msg=key)
-            assert (one.arrays[key][early : early + 5] != two.arrays[key][early : early + 5]).any(), key
+            same = early - (key == ACTION)  # an action is what is sent from its row on
+            np.testing.assert_array_equal(one.arrays[key][:same], two.arrays[key][:same], err_msg=key)
+            assert (one.arrays[key][same : same + 5] != two.arrays[key][same : same + 5]).any(), key
         for row, (x, y) in enumerate(zip(one.pictures(), two.pictures(), strict=False)):
             for key in x:
                 assert row >= early or (x[key] == y[key]).all(), (row, key)

@@ -97,7 +97,7 @@ def test_a_robot_with_one_arm_and_one_camera_is_ingested_by_its_drafts(
     episode = dataset.episode(0)
     at_s = (episode.start_ns - START_NS) * 1e-9 + np.arange(episode.num_rows) / 14
     assert episode.num_rows > 50
-    for key, lag in (("observation.state", 0.1), ("action", 0.0)):
+    for key, lag in (("observation.state", 0.1), ("action", -1 / 14)):  # an action is reached at the next row
         expected = 0.3 * np.sin(at_s[:, None] + np.arange(7) - lag)
         # the newest sample may be 10 ms old, and 0.3 rad/s is the fastest
         assert np.abs(episode.arrays[key] - expected).max() < 0.3 * 0.011

@@ -40,6 +40,7 @@ spec_version: 1
 name: small
 robot_type: one_finger
 fps: 30
+action_time: next_row
 video_codec: h264
 features:
   observation.state: {{dtype: float32, shape: [2], names: [a, b], unit: [rad, m], frame: joint, rate_hz: 30, range: [-9, 9]}}

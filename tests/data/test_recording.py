@@ -29,7 +29,7 @@ SENSOR = {
 VECTOR = {"dtype": "float32", "shape": [2], "unit": "rad", "frame": "joint", "rate_hz": 100, "range": [-4, 4]}
 PICTURE = {"dtype": "video", "shape": [8, 8, 3], "unit": "rgb8", "frame": "camera", "rate_hz": 30, "range": [0, 255]}
 DATASET = {
-    "spec_version": 1, "name": "little", "robot_type": "one_arm", "fps": 30,
+    "spec_version": 1, "name": "little", "robot_type": "one_arm", "fps": 30, "action_time": "next_row",
     "features": {
         "observation.state": VECTOR,
         "action": VECTOR,

@@ -52,6 +52,7 @@ DATASET = {
     "name": "little",
     "robot_type": "one_arm",
     "fps": 30,
+    "action_time": "next_row",
     "video_codec": "h264",
     "features": {
         "observation.state": {
@@ -245,7 +246,9 @@ OTHER_WORDS = [
     ("name", "num_changed", "relations"),
     [
         ("pad", 10, "spec_version rows columns wire.rows wire.columns wire.transpose adc_bits baseline.rule scheme"),
-        pytest.param("dataset", 42, "spec_version dtype shape names sensor history", marks=pytest.mark.slow),
+        pytest.param(
+            "dataset", 42, "spec_version action_time dtype shape names sensor history", marks=pytest.mark.slow
+        ),
         pytest.param("recording", 37, "spec_version dataset by from channels align", marks=pytest.mark.slow),
     ],
 )
@@ -324,6 +327,8 @@ def test_counts_must_fit_the_dataset(tmp_path):
     ("path", "value", "place", "reason"),
     [
         (("fps",), 0, "fps", "0 is not a rate"),
+        (("action_time",), REMOVE, "action_time", "is missing: write `action_time: next_row`"),
+        (("action_time",), "same_row", "action_time", "next_row"),
         (("features",), {}, "features", "holds nothing"),
         (("sensors",), {"a": SENSOR}, "sensors", "is not a key of this file; give `sensor:`"),
         (("features", "states"), DATASET["features"]["action"], "features → states", "`action` and `observation.*` only"),
@@ -466,3 +471,10 @@ def _assert_says(error: SpecError, file: Path, place: str, reason: str) -> None:
     keys = [k for k in place.split(" → ") if k and f"{k}:" in file.read_text()]
     if keys and "." not in keys[-1]:
         assert keys[-1] in lines[line - 1], (message, lines[line - 1])
+
+
+def test_action_time_without_an_action_is_refused(tmp_path):
+    features = {"observation.state": DATASET["features"]["observation.state"]}
+    (tmp_path / "pads.yaml").write_text(yaml.safe_dump({**DATASET, "features": features}, sort_keys=False))
+    with pytest.raises(SpecError, match="action_time: has no effect without a feature 'action'; remove it"):
+        load_dataset_spec(tmp_path / "pads.yaml")

@@ -151,7 +151,7 @@ def test_what_is_in_the_way_is_refused_before_the_first_attempt(collected, tmp_p
 def test_another_collection_is_refused_before_the_first_attempt(collected, tmp_path, monkeypatch, other):
     monkeypatch.setattr(Plan, "make", never)
     plan = Plan(**({"task": "assembly_1", "episodes": 1, "images": False, "seed": 5} | other))
-    with pytest.raises(InTheWayError, match="in the way: it holds collection v1, key"):
+    with pytest.raises(InTheWayError, match="in the way: it holds collection v2, key"):
         collect(plan, collected / "a", Store(tmp_path / "store"))
 
 

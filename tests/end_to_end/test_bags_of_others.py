@@ -17,6 +17,7 @@ spec_version: 1
 name: imu_and_pose
 robot_type: somebody_elses
 fps: 20
+action_time: next_row
 features:
   observation.state: {dtype: float32, shape: [3], names: [wx, wy, wz], unit: rad/s, frame: imu, rate_hz: 25, range: [-1000, 1000]}
   action:            {dtype: float32, shape: [3], names: [x, y, z], unit: m, frame: world, rate_hz: 25, range: [-1000, 1000]}

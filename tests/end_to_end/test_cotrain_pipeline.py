@@ -28,6 +28,9 @@ def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(
     both = Dataset(out / "surrogate_7_and_twin")
     origins = [both.episode(k).origin for k in range(both.num_episodes)]
     assert len(origins) == 3 and "surrogate" in origins[0] and origins[1:] == [TWIN, TWIN]
+    assert both.spec.action_time == "next_row"
+    real = Dataset(out / "surrogate_7")
+    assert real.provenance is not None and real.provenance["stage"] == "dataset"  # through recordings and ingest
     is_sim = [both.values(k, ["observation.is_sim"])["observation.is_sim"].mean() for k in range(3)]
     assert is_sim == [0.0, 1.0, 1.0]
     (trained,) = out.glob("policy_*/checkpoints/last/pretrained_model/train_config.json")

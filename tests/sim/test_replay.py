@@ -48,8 +48,8 @@ def test_replay_of_a_twin_s_own_commands_gives_its_own_answer(bench):
 
 
 def test_a_measured_episode_is_replayed_row_by_row(bench):
-    # "Measured" in a twin with friction: its rows hold the state and the command in force at each 1/30 s. The twin without
-    # friction replays it: same rows, same commands, and the residual is what friction does; with friction it is nothing.
+    # "Measured" in a twin with friction: its rows hold the state at each 1/30 s and the target reached 1/30 s later. The twin
+    # without friction replays it: same rows, same commands, and the residual is what friction does; with friction it is nothing.
     def sticky() -> Simulation:
         sim = Simulation(Bench(), TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=1.0)]))
         sim.reset([0])
@@ -59,8 +59,8 @@ def test_a_measured_episode_is_replayed_row_by_row(bench):
     state, action = [], []
     for k in range(45):
         state.append(measured.proprioception()[0].astype(np.float32))
-        action.append(measured.targets[0].astype(np.float32))
         measured.step(measured.targets + 0.01 * np.sin(0.25 * k) * (np.arange(14) % 7 != 6))
+        action.append(measured.targets[0].astype(np.float32))
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     arrays = {"observation.state": np.array(state), "action": np.array(action)}
     episode = Episode("run 1", spec, 0, arrays, lambda: iter(()), (), "sweep", origin="surrogate")

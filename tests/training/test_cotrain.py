@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from tiny_dataset import IS_SIM, TOUCH, tiny_episode, tiny_spec, write_tiny
+from tiny_dataset import IS_SIM, TOUCH, tiny_episode, tiny_spec, write_spec, write_tiny
 
 from taccorl.data.dataset import Dataset
 from taccorl.data.lerobot_format import write_episodes
@@ -13,7 +13,7 @@ from taccorl.data.spec import FeatureSpec
 from taccorl.errors import DatasetError, InTheWayError
 from taccorl.training.cotrain import merge_domains
 
-OWN = {"unit": "1", "frame": "world", "rate_hz": 30, "range": (-np.inf, np.inf)}
+OWN = {"unit": "1", "frame": "world", "rate_hz": 30, "range": (0, 2**62)}
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +30,7 @@ def parts(tmp_path_factory):
         episode, arrays={**shifted, "sim.seed": np.full((21, 1), 5)}, origin="simulated: the twin"
     )
     write_episodes([episode], folder / "twin")
+    write_spec(folder / "twin", twin_spec)
     return write_tiny(folder / "real", rows=(14, 11)), folder / "twin"
 
 
@@ -87,3 +88,18 @@ def test_what_does_not_fit_is_named_with_both_sides(parts, merged, tmp_path):
     with pytest.raises(DatasetError, match=r"real has observation\.images\.front, blind has not: ingest"):
         merge_domains([real], [blind], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_actions_that_may_be_a_row_apart_are_not_merged(parts, tmp_path):
+    real, twin = parts
+    assert Dataset(real).spec.action_time == Dataset(twin).spec.action_time == "next_row"
+    older = write_tiny(tmp_path / "older", rows=(12,), with_spec=False)
+    for spec in (None, dataclasses.replace(tiny_spec(), action_time=None)):
+        if spec is not None:
+            write_spec(older, spec)
+        for real_side, sim_side in (([older], [twin]), ([real], [older]), ([], [older, older])):
+            with pytest.raises(DatasetError, match=r"older: its .* states no action_time.*Ingest its recordings again"):
+                merge_domains(real_side, sim_side, tmp_path / "out")
+    write_spec(older, tiny_spec())
+    merge_domains([real], [older], tmp_path / "out")
+    assert Dataset(tmp_path / "out").spec.action_time == "next_row"

@@ -1,11 +1,13 @@
 """Small LeRobot datasets by LeRobot's own writer: random numbers, pictures that tell their row, touch in its real layout."""
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json
 from taccorl.data.episode import Episode, Pictures
 from taccorl.data.lerobot_format import write_episodes
 from taccorl.data.spec import DatasetSpec, FeatureSpec, data_specs_folder, load_dataset_spec
@@ -58,8 +60,21 @@ def tiny_episode(spec: DatasetSpec, num_rows: int, seed: int, is_sim: float = 0.
     )
 
 
-def write_tiny(root: Path, *, rows: tuple[int, ...] = (24, 18), sim_episodes: int = 0, **spec_changes: int) -> Path:
-    """Episodes of so many rows, the first ``sim_episodes`` of them simulated."""
+def write_tiny(
+    root: Path, *, rows: tuple[int, ...] = (24, 18), sim_episodes: int = 0, with_spec: bool = True, **spec_changes: int
+) -> Path:
+    """Episodes of so many rows, the first ``sim_episodes`` of them simulated.
+
+    Without ``with_spec`` as another program would write them.
+    """
     spec = tiny_spec(is_sim=sim_episodes > 0, **spec_changes)
     write_episodes([tiny_episode(spec, n, k, float(k < sim_episodes)) for k, n in enumerate(rows)], root)
+    if with_spec:
+        write_spec(root, spec)
     return root
+
+
+def write_spec(root: Path, spec: DatasetSpec) -> None:
+    """``meta/taccorl/dataset_spec.json`` of a dataset."""
+    (root / PROVENANCE).mkdir(exist_ok=True)
+    (root / PROVENANCE / "dataset_spec.json").write_text(json.dumps(dataset_spec_to_json(spec)))

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from taccorl.data.recording import Damage, Message, Reader, TopicType, readers
-from taccorl.data.spec import RecordingSpec
+from taccorl.data.spec import ACTION, RecordingSpec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
@@ -25,30 +25,42 @@ BOOKKEEPING = ("/compress_len",)  # ALOHA: bytes of each padded picture; decoder
 
 @dataclass(frozen=True)
 class RowClock:
-    """Times of rows at a fixed rate. Time 0 is the first row for which every channel of the spec has a sample."""
+    """Times of rows at a fixed rate. Time 0 is the first row that every channel of the spec can fill."""
 
     rate_hz: float
     lead_frames: dict[str, int]
     """Topic → its channel's ``lead_frames``."""
+    first_row: int = 0
+    """Row of the file at time 0."""
 
     @classmethod
     def of(cls, rate_hz: float, spec: RecordingSpec | None) -> "RowClock":
         """
         Raises:
-            RecordingError: two channels shift one topic differently.
+            RecordingError: two channels shift one topic differently, or a channel of ``action`` does not state its shift.
         """
         leads: dict[str, int] = {}
+        firsts = [0]
+        commands = spec.features[ACTION].channels if spec and ACTION in spec.features else ()
         for name, channel in spec.channels.items() if spec else ():
-            if leads.setdefault(channel.topic, channel.lead_frames) != channel.lead_frames:
+            if name in commands and channel.lead_frames is None:
                 raise RecordingError(
-                    f"channel {name!r}: lead_frames {channel.lead_frames}, another channel reads {channel.topic} with "
+                    f"channel {name!r} fills {ACTION}: key 'lead_frames' is missing in the recording spec. 1: row k of "
+                    f"{channel.topic} is the command that is reached at row k + 1 (LeRobot, ALOHA, cobot_magic); 0: it is the "
+                    f"command in force at row k"
+                )
+            lead = channel.lead_frames or 0
+            if leads.setdefault(channel.topic, lead) != lead:
+                raise RecordingError(
+                    f"channel {name!r}: lead_frames {lead}, another channel reads {channel.topic} with "
                     f"lead_frames {leads[channel.topic]}: a topic has one"
                 )
-        return cls(rate_hz, leads)
+            firsts.append(lead - 1 if name in commands else lead)  # the action of row t is due at row t + 1
+        return cls(rate_hz, leads, max(firsts))
 
     def time_ns(self, topic: str, k: int) -> int:
         """Time of a topic's sample k, rounded exactly as the dataset's grid rounds its rows."""
-        row = k + self.lead_frames.get(topic, 0) - max(self.lead_frames.values(), default=0)
+        row = k + self.lead_frames.get(topic, 0) - self.first_row
         if self.rate_hz == int(self.rate_hz):
             rate = int(self.rate_hz)
             return (row * NS_PER_S + rate // 2) // rate

@@ -17,10 +17,12 @@ import numpy as np
 from taccorl.data.dataset import BOOKKEEPING, Dataset
 from taccorl.data.readers.hdf5 import RowClock
 from taccorl.data.recording import Message, Reader, Source, TopicType, readers
+from taccorl.data.spec import ACTION
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import DatasetError, RecordingError
 
 TASK = "task"
+_SPEC_FILE = "meta/taccorl/dataset_spec.json"
 REGULAR_S = 1e-3
 """Times stamps may be off k / fps by this (they are float32) and still mean row k."""
 
@@ -93,6 +95,7 @@ class LerobotReader(Reader):
             if known[topic].undecodable:
                 raise RecordingError(f"{self.source.name}: {topic}: {known[topic].undecodable}")
         with _as_recording_errors(), contextlib.ExitStack() as stack:
+            self._check_action_time()
             log_ns = self._times_ns(asked)
             tasks = dict(self.dataset.tasks(self.index))
             self._describe(tasks)
@@ -113,6 +116,28 @@ class LerobotReader(Reader):
                     elif topic in read:
                         value = tasks[k]
                     yield Message(topic, int(log_ns[topic][k]), None, value)
+
+    def _check_action_time(self) -> None:
+        """``lead_frames`` of the command must be what a dataset of ours says of its action."""
+        if self.spec is None or ACTION not in self.spec.features:
+            return
+        lead = 1 if self.dataset.spec.action_time == "next_row" else self._lead_without_action_time()
+        for name in self.spec.features[ACTION].channels:
+            channel = self.spec.channels[name]
+            if lead is not None and channel.topic == ACTION and channel.lead_frames not in (lead, None):
+                meaning = "reached at row k + 1" if lead else "in force at row k"
+                stated = self.dataset.spec.action_time or "is not stated, an older taccorl ingested it"
+                raise RecordingError(
+                    f"{self.source.name}: row k of its {ACTION} is the command {meaning} ({_SPEC_FILE}: action_time {stated}): "
+                    f"channel {name!r} has `lead_frames: {channel.lead_frames}`, it needs {lead}"
+                )
+
+    def _lead_without_action_time(self) -> int | None:
+        """Of a dataset that does not state it: 1 from the twin, 0 from an ingest before the key existed, else unknown."""
+        if not (self.source.path / _SPEC_FILE).is_file():
+            return None
+        provenance = self.dataset.told(self.index).get("provenance") or {}
+        return 1 if provenance.get("simulation") else 0
 
     def _pads(self) -> list[tuple[str, str]]:
         """(feature, pad) of every feature that is pads' newest readings."""

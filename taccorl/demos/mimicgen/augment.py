@@ -45,6 +45,7 @@ from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
 VERSION = 2  # of an attempt
+AUGMENTED_VERSION = 3  # of the dataset
 _ROUND = (
     20  # attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end
 )
@@ -302,7 +303,7 @@ def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
 
 
 _ATTEMPT = Stage("mimicgen", _not_yet, VERSION)
-_AUGMENTED = Stage("augmented", _not_yet, VERSION, manifest=f"{PROVENANCE}/manifest.json")
+_AUGMENTED = Stage("augmented", _not_yet, AUGMENTED_VERSION, manifest=f"{PROVENANCE}/manifest.json")
 
 
 def _build(plan: AugmentPlan, sources: Artefact, k: int, config: dict[str, Any], folder: Path) -> None:

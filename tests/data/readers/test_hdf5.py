@@ -1,5 +1,6 @@
 """HDF5 files as cobot_magic and ALOHA write them, made here so that every number and picture is known."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -85,14 +86,13 @@ def test_an_episode_has_every_row_with_its_state_its_command_and_its_pictures(
     path = write(tmp_path / "episode_0.hdf5", compressed=compressed, rows=rows)
     with opened(Source(path, (path,)), load_recording_spec("cobot_magic_hdf5")) as recording:
         (episode,) = Cutter(recording).cut().episodes
-        # Row 0 has no command (the first is that of row 1): the episode is all the rows from 1 on.
-        assert episode.num_rows == rows - 1
-        expected = np.stack([state(k) for k in range(1, rows)])
-        assert np.array_equal(episode.arrays["observation.state"], expected)
-        assert np.array_equal(episode.arrays["action"], expected)  # the command of a row is that row's own state here
+        # The file pairs a row with the next row's command, as the dataset does: all its rows, as they are.
+        assert episode.num_rows == rows
+        assert np.array_equal(episode.arrays["observation.state"], np.stack([state(k) for k in range(rows)]))
+        assert np.array_equal(episode.arrays["action"], np.stack([state(k + 1) for k in range(rows)]))
         shown = list(episode.pictures())
-        assert len(shown) == rows - 1
-        for row, pictures in enumerate(shown, start=1):
+        assert len(shown) == rows
+        for row, pictures in enumerate(shown):
             for camera, name in enumerate(("front", "left_wrist", "right_wrist")):
                 red, green, blue = pictures[f"observation.images.{name}"][112, 112]  # middle of the letterbox
                 assert abs(int(red) - 4 * row) <= 2
@@ -103,10 +103,40 @@ def test_an_episode_has_every_row_with_its_state_its_command_and_its_pictures(
 def test_sample_k_is_at_the_dataset_grids_own_time_of_row_k(tmp_path: Path) -> None:
     path = write(tmp_path / "episode_0.hdf5")
     recording = load_recording(Source(path, (path,)), load_recording_spec("cobot_magic_hdf5"), tmp_path)
-    # Lead 1: command k is row k + 1. Time 0 is row 1, the first row with everything; 1/30 s = 33 333 333.3 ns.
-    assert list(recording.channels["command"].log_ns[:4]) == [0, 33_333_333, 66_666_667, 100_000_000]
-    assert list(recording.channels["qpos"].log_ns[:4]) == [-33_333_333, 0, 33_333_333, 66_666_667]
+    # Lead 1: command k is reached at row k + 1, and due there as the action of row k; 1/30 s = 33 333 333.3 ns.
+    assert list(recording.channels["command"].log_ns[:3]) == [33_333_333, 66_666_667, 100_000_000]
+    assert list(recording.channels["qpos"].log_ns[:4]) == [0, 33_333_333, 66_666_667, 100_000_000]
     assert recording.channels["qpos"].stamp_ns is None
+
+
+@pytest.mark.parametrize("fps", [30, 60, 7])  # 1/60 s and 1/7 s are rounded up and down to nanoseconds
+def test_commands_in_force_at_their_row_move_by_one_row(tmp_path: Path, fps: int) -> None:
+    path = write(tmp_path / "episode_0.hdf5")
+    rate = (("rate_hz: 30", f"rate_hz: {fps}"), ("max_age_s: 0.05", f"max_age_s: {1.5 / fps}"))
+    folder = tmp_path / "specs"
+    folder.mkdir()
+    for lead, expected_rows in ((1, ROWS), (0, ROWS - 1)):
+        spec = load_recording_spec(spec_with(folder, *rate, ("lead_frames: 1", f"lead_frames: {lead}")))
+        assert spec.contract is not None
+        spec = dataclasses.replace(spec, contract=dataclasses.replace(spec.contract, fps=fps))
+        with opened(Source(path, (path,)), spec) as recording:
+            (episode,) = Cutter(recording).cut().episodes
+            # File: action k = state(k + 1). Lead 0 says that it was in force at row k: then row t's is the file's t + 1.
+            assert episode.num_rows == expected_rows
+            expected = np.stack([state(k + 2 - lead) for k in range(expected_rows)])
+            assert np.array_equal(episode.arrays["action"], expected)
+            assert np.array_equal(
+                episode.arrays["observation.state"], np.stack([state(k) for k in range(expected_rows)])
+            )
+
+
+def test_a_command_without_lead_frames_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "episode_0.hdf5")
+    spec = load_recording_spec(spec_with(tmp_path, (", lead_frames: 1", "")))
+    with pytest.raises(
+        RecordingError, match=r"'command' fills action: key 'lead_frames' is missing.*1: row k of /action"
+    ):
+        load_recording(Source(path, (path,)), spec, tmp_path)
 
 
 def test_topics_are_paths_with_type_and_shape(tmp_path: Path) -> None:
@@ -265,7 +295,7 @@ def test_a_damaged_picture_costs_its_row_only(tmp_path: Path) -> None:
         (episode,) = cutter.cut().episodes
         reds = [int(p["observation.images.front"][112, 112, 0]) // 4 for p in episode.pictures()]
         # 33 ms without a picture is less than max_age_s: row 30 shows the picture of row 29.
-        assert reds == [*range(1, 30), 29, *range(31, ROWS)]
+        assert reds == [*range(30), 29, *range(31, ROWS)]
 
 
 def test_values_of_another_kind_are_refused_when_asked_for(tmp_path: Path) -> None:

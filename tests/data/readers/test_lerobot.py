@@ -1,5 +1,6 @@
 """LeRobot datasets as recordings: one with our features and touch, one of somebody else's with odd features."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -14,7 +15,7 @@ from taccorl.data.cutting import Cutter
 from taccorl.data.dataset import dataset_spec_to_json, episode_record
 from taccorl.data.episode import Episode
 from taccorl.data.recording import find_sources, opened, readers
-from taccorl.data.spec import data_specs_folder, load_dataset_spec, load_recording_spec
+from taccorl.data.spec import RecordingSpec, data_specs_folder, load_dataset_spec, load_recording_spec
 from taccorl.errors import RecordingError
 
 ROWS = (40, 41)
@@ -158,6 +159,43 @@ def test_a_taccorl_dataset_comes_back_row_for_row_through_its_recording_spec(our
                     abs(shown[f"observation.images.{camera}"].mean() - grey(camera, row)) <= 2
                 )  # neighbours differ by 5
         assert row == ROWS[index] - 1
+
+
+def older(ours: Path, copy: Path) -> Path:
+    """The dataset as ingest wrote it before ``action_time``."""
+    shutil.copytree(ours, copy)
+    path = copy / "meta/taccorl/dataset_spec.json"
+    told = json.loads(path.read_text())
+    del told["action_time"]
+    path.write_text(json.dumps(told))
+    return copy
+
+
+def lerobot_spec(lead_frames: int) -> RecordingSpec:
+    spec = load_recording_spec("taccorl_lerobot")
+    command = dataclasses.replace(spec.channels["command"], lead_frames=lead_frames)
+    return dataclasses.replace(spec, channels={**spec.channels, "command": command})
+
+
+def test_an_older_dataset_is_brought_to_the_convention_and_never_read_as_if_it_had_it(
+    ours: Path, tmp_path: Path
+) -> None:
+    _, source = find_sources(older(ours, tmp_path / "older"))[0]
+    with (
+        pytest.raises(RecordingError, match=r"in force at row k .*older taccorl.*`lead_frames: 1`, it needs 0"),
+        opened(source, lerobot_spec(1)),
+    ):
+        pass
+    with opened(source, lerobot_spec(0)) as recording:
+        (episode,) = Cutter(recording).cut().episodes
+        assert episode.num_rows == ROWS[0] - 1  # nothing was in force at the row after the last
+        assert np.array_equal(episode.arrays["observation.state"], made_episode(0).arrays["observation.state"][:-1])
+        assert np.array_equal(episode.arrays["action"], made_episode(0).arrays["action"][1:])
+    with (
+        pytest.raises(RecordingError, match=r"reached at row k \+ 1 .*action_time next_row\).*it needs 1"),
+        opened(find_sources(ours)[0][1], lerobot_spec(0)),
+    ):
+        pass
 
 
 def test_a_pads_topic_is_what_the_pad_had_sent(ours: Path) -> None:
