@@ -85,6 +85,8 @@ def add_cache_options() -> None:
     for f in dataclasses.fields(DatasetConfig):  # once made, a dataclass has lost its default factories
         if f.default_factory is not dataclasses.MISSING:
             setattr(DatasetConfig, f.name, dataclasses.field(default_factory=f.default_factory))
+    for name in ("__init__", "__repr__", "__eq__", "__match_args__"):  # nor does it make again what it has made
+        delattr(DatasetConfig, name)
     DatasetConfig.__annotations__ |= {"cache": str, "cache_store": str}
     DatasetConfig.cache, DatasetConfig.cache_store = "none", "outputs/store"  # pyright: ignore[reportAttributeAccessIssue]
     dataclasses.dataclass(DatasetConfig)
@@ -288,7 +290,7 @@ class FastReader(DatasetReader):
             for name, value in (found | {"count": len(values)}).items():
                 told.setdefault(name, []).append(value)
         statistics = {name: np.array(v if name != "count" else v[:1]) for name, v in told.items()}
-        return statistics | {name: statistics[name].T for name in STEP_STATISTICS}
+        return statistics | {name: np.ascontiguousarray(statistics[name].T) for name in STEP_STATISTICS}
 
     def columns(self) -> dict[str, Column]:
         """Feature → its column; empty: a dataset that is left to LeRobot."""
