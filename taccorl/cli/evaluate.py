@@ -76,7 +76,7 @@ def main(argv: list[str]) -> int:
     """0: scored."""
     config = parse(EvaluateConfig, argv, positional=None)
     _check_places(config)
-    from taccorl.evaluation.episodes import compare
+    from taccorl.evaluation.episodes import ROWS_FILE, compare, write_rows
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored, score
 
     scenes = Scenes(
@@ -102,9 +102,13 @@ def main(argv: list[str]) -> int:
         raise TaccorlError(f"--against={config.against}: is the policy itself; give another one")
     config.out.mkdir(parents=True, exist_ok=True)
     begun_s = time.monotonic()
-    rollouts = [score(scenes, one.load(config.seed), _Progress()) for one in opened]
+    rollouts, rows = [], []
+    for one in opened:
+        rollouts.append(score(scenes, one.load(config.seed), _Progress()))
+        rows.append([rollout.row for rollout in rollouts[-1]])
+        write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
     wall_s = time.monotonic() - begun_s
-    rows = [[rollout.row for rollout in those] for those in rollouts] + ([stored.rows] if stored else [])
+    rows += [stored.rows] if stored else []
     comparisons = compare(rows[0], rows[1]) if len(rows) == 2 else {}
     _write(config, scenes, opened, rows, comparisons, wall_s)
     _print(rows, comparisons)
@@ -255,7 +259,14 @@ def _write_page(
     from taccorl.evaluation.failed_episodes import choose_failures, execute_again
     from taccorl.views.evaluation_page import EvaluationPage, write_page
 
-    failed = [execute_again(scenes, one, images=config.images) for one in choose_failures(rollouts, config.failures)]
+    chosen, images = choose_failures(rollouts, config.failures), config.images
+    try:
+        failed = [execute_again(scenes, one, images=images) for one in chosen]
+    except TaccorlError as error:
+        if not images:
+            raise
+        print(f"note: failures have no pictures: {error}")
+        failed = [execute_again(scenes, one, images=False) for one in chosen]
     page = EvaluationPage(
         rows=[row for own in rows for row in own],
         about=_about(config, scenes, opened),

@@ -38,7 +38,8 @@ class Scenes:
     episode_length: int | None = None
     """Control steps until an episode is cut off; None: the task's own limit."""
     batch_size: int | None = None
-    """Environments at once; None: all episodes in one batch."""
+    """Environments at once; None: all episodes in one batch. A policy that draws noise gets other numbers than in
+    ``lerobot-eval`` in a last batch that is smaller: LeRobot fills it up with scenes that it discards."""
 
     def __post_init__(self) -> None:
         """
@@ -81,7 +82,7 @@ class Scenes:
             num_envs,
             difficulty=self.difficulty,
             twin=self.twin_config(),
-            images="always" if images else "never",
+            images="on_request" if images else "never",
             randomization=self.randomization,
             num_threads=min(num_envs, len(os.sched_getaffinity(0))),
             autoreset=AutoresetMode.DISABLED,
@@ -106,7 +107,9 @@ def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> lis
                 if len(seeds) < size:
                     envs.close()
                     envs = scenes.environments(task, len(seeds), images=actor.needs_images)
-                found += roll_out(envs, actor, seeds, _with_prefix(progress, f"{task}, episodes {first} … "))
+                found += roll_out(
+                    envs, actor, seeds, _with_prefix(progress, f"{task}, seeds {seeds[0]} … {seeds[-1]}: ")
+                )
         finally:
             envs.close()
     return found

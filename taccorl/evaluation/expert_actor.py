@@ -26,6 +26,10 @@ class ExpertActor:
         self._source = ExpertSource()
         self._actions: Iterator[np.ndarray] = iter(())
 
+    def looks_now(self) -> bool:
+        """Never."""
+        return False
+
     def restart(self) -> None:
         """Nothing: its random numbers follow from the scene's seed."""
 

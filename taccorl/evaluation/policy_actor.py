@@ -6,6 +6,7 @@ Rollouts of any kind (evaluation, reinforcement learning) make a policy's batch 
 
 import contextlib
 import json
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -195,6 +196,12 @@ class PolicyActor:
         """Whether a picture is among the policy's inputs; of an unknown policy: yes."""
         features = getattr(self._config, "input_features", None)
         return features is None or any(feature.type is FeatureType.VISUAL for feature in features.values())
+
+    def looks_now(self) -> bool:
+        """Whether a picture is used in this step: not while a policy without a history of observations (``n_obs_steps`` = 1)
+        still has actions of a chunk in LeRobot's ``_action_queue``. Rendering is most of the time of a rollout."""
+        queue = getattr(self.policy, "_action_queue", None)
+        return getattr(self._config, "n_obs_steps", None) != 1 or not isinstance(queue, deque) or not queue
 
     def restart(self) -> None:
         """Put random numbers back to where they were when this was made."""

@@ -43,6 +43,10 @@ class Actor(Protocol):
         """Whether the cameras have to be rendered."""
         ...
 
+    def looks_now(self) -> bool:
+        """Whether ``act`` uses the newest pictures; else it gets those of the last time, and nothing is rendered."""
+        ...
+
     @property
     def max_batch(self) -> int | None:
         """Environments at once; None: any number."""
@@ -105,7 +109,7 @@ def roll_out(
     the actor gives NaN or a target far beyond the limits, or with the category that the actor itself names.
 
     Args:
-        envs: with ``AutoresetMode.DISABLED``.
+        envs: with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
 
     Raises:
         TaccorlError: not one seed for each environment, or actions of another shape than (N, 14).
@@ -116,8 +120,11 @@ def roll_out(
     for one, facts in zip(running, _each(envs.facts(), envs.num_envs), strict=True):
         one.facts = facts
     actor.begin(envs)
+    pictures: Observation = {}
     while True:
-        acted = actor.act(observation)
+        if actor.needs_images and actor.looks_now():
+            pictures = envs.observe(images=True)
+        acted = actor.act({**pictures, **observation})
         actions = shaped(acted.actions, envs.num_envs).astype(np.float32)
         given_up = _bad_actions(actions) | acted.given_up
         for i, end in given_up.items():

@@ -21,12 +21,14 @@ from taccorl.evaluation.episodes import EpisodeRow, summaries
 from taccorl.evaluation.failed_episodes import FailedEpisode
 from taccorl.evaluation.preflight import Check
 from taccorl.evaluation.statistics import PairedComparison
+from taccorl.sim.spaces import IMAGE_SHAPE
 from taccorl.views.episode import save_episode
 
 GENERATOR = "taccorl evaluate"
 _ORIGIN = "Simulated in the MuJoCo twin; no robot was used"
 _JPEG_QUALITY = 88
-_SHRINK = 2  # pictures of 224 pixels are shown at 112: eighteen of them are side by side
+_SHOWN_PX = 176
+"""Side of a picture on the page: six instants fit beside each other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,8 +165,8 @@ def _failure(failed: FailedEpisode, rrd: Path) -> str:
 
 
 def _jpeg_uri(rgb: np.ndarray) -> str:
-    rows, columns = rgb.shape[:2]
-    small = cv2.resize(rgb, (columns // _SHRINK, rows // _SHRINK), interpolation=cv2.INTER_AREA)
+    rows, columns = (n * _SHOWN_PX // IMAGE_SHAPE[0] for n in rgb.shape[:2])
+    small = cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA)
     bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
     blob = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
     return f"data:image/jpeg;base64,{base64.b64encode(blob).decode('ascii')}"

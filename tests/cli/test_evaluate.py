@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from taccorl.cli.main import main
+from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import read_rows
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "evaluation"))
@@ -93,6 +94,18 @@ def test_wrong_words_end_before_any_rollout(words: tuple[str, ...], message: str
 def test_a_folder_that_is_no_checkpoint_is_named(said: Any, tmp_path: Path) -> None:
     code, shown = said("evaluate", "--task=puzzle", f"--policy.path={tmp_path}")
     assert code == 2 and "no config.json there" in shown and not (tmp_path / "outputs").exists()
+
+
+def test_without_opengl_failures_come_without_pictures(
+    said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise TaccorlError("no OpenGL here")
+
+    monkeypatch.setattr("taccorl.sim.simulation.Simulation.render_states", fail)
+    code, shown = said(*EXPERT[:-1], *SHORT, "--failures=1", "--out=scored")
+    assert code == 0 and "note: failures have no pictures: no OpenGL here" in shown
+    assert "timeout after 0.1 s" in (tmp_path / "scored/report.html").read_text()
 
 
 def test_another_twin_is_scored_on_the_same_scenes(said: Any, tmp_path: Path) -> None:

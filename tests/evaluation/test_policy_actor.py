@@ -15,6 +15,7 @@ from taccorl.evaluation.evaluate import Scenes, score
 from taccorl.evaluation.preflight import PolicyFacts, preflight, refuse_differences
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.twin import TwinConfig
+from taccorl.sim.vector_env import TaccorlVectorEnv
 
 STEPS = 7
 SEED = 1000
@@ -161,16 +162,28 @@ def lerobot_rollout(path: Path, task: str, n: int, length: int | None) -> Any:
 
 
 @pytest.mark.slow
-def test_actions_are_those_of_lerobot_eval(checkpoint: Path) -> None:
+def test_actions_are_those_of_lerobot_eval(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Flow matching draws noise: equal actions show equal observations, processors, weights and random numbers."""
     from taccorl.evaluation.policy_actor import open_checkpoint
 
     theirs = lerobot_rollout(checkpoint, "assembly_1", 2, STEPS)
     where = Scenes(tasks=("assembly_1",), episodes=2, seed=SEED, episode_length=STEPS)
     actor = open_checkpoint(checkpoint, "cpu").load(SEED)
-    ours = score(where, actor)
+    rendered: list[int] = []
+    look = TaccorlVectorEnv.observe
+
+    def observe(envs: TaccorlVectorEnv, images: bool = False) -> Any:
+        if images:
+            rendered.append(int(envs.sim.judge.steps[0]))
+        return look(envs, images)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TaccorlVectorEnv, "observe", observe)
+        ours = score(where, actor)
     assert np.array_equal(np.stack([r.actions for r in ours]), theirs["action"].numpy())
     assert [r.row.success for r in ours] == theirs["success"].any(1).tolist()
+    # Pictures were rendered for the two chunks only: n_action_steps is 5, the episode has 7 steps.
+    assert rendered == [0, 5]
     assert np.ptp(theirs["action"].numpy(), axis=1).max() > 1e-3  # it moves
     # A second task of the same run, and a second run, begin with the same random numbers.
     again = score(where, actor)
