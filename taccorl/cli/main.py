@@ -11,6 +11,7 @@ VERBS = {
     "twin": {
         "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them",
         "augment": "a few demonstrations from the twin → many new ones (MimicGen), with a report of yield and coverage",
+        "evaluate": "how good a policy is in the twin: success with its interval, failures, two policies on the same scenes",
         "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
         "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",
         "add-effect": "the twin with one effect more, with the fitted values",
@@ -73,7 +74,7 @@ def _list_verbs() -> int:
         print(group)
         for verb, line in verbs.items():
             print(f"  {verb:12s}{line}")
-    print("\ntraining and scoring are LeRobot's own commands: lerobot-train, lerobot-eval")
+    print("\ntraining is LeRobot's own command: lerobot-train; lerobot-eval scores as taccorl evaluate does")
     return 0
 
 

@@ -15,9 +15,11 @@ from taccorl.sim.vector_env import TaccorlVectorEnv
 
 
 def raw_names(observation: Observation) -> dict[str, Any]:
-    """An observation with pictures, or a batch of them, renamed. Counts become float32, as LeRobot's recorder wants them."""
+    """An observation, or a batch of them, renamed; ``pixels`` only if it has pictures. Counts become float32, as LeRobot's
+    recorder wants them."""
+    pixels = {name: observation[IMAGE_KEYS[name]] for name in CAMERAS if IMAGE_KEYS[name] in observation}
     return {
-        "pixels": {name: observation[IMAGE_KEYS[name]] for name in CAMERAS},
+        **({"pixels": pixels} if pixels else {}),
         "agent_pos": observation[STATE_KEY],
         "tactile": observation[TACTILE_KEY].astype(np.float32),
     }

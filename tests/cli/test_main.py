@@ -13,6 +13,7 @@ import pytest
 
 import taccorl
 from taccorl.cli.check import CheckConfig
+from taccorl.cli.evaluate import EvaluateConfig
 from taccorl.cli.ingest import IngestConfig, InspectConfig
 from taccorl.cli.lineage import ExplainConfig, PruneConfig
 from taccorl.cli.main import VERBS, main
@@ -24,6 +25,7 @@ HELP = {
     ("ingest", "inspect"): InspectConfig,
     ("check",): CheckConfig,
     ("view",): ViewConfig,
+    ("evaluate",): EvaluateConfig,
     ("lineage", "explain"): ExplainConfig,
     ("lineage", "prune"): PruneConfig,
 }

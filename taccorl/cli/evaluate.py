@@ -1,0 +1,280 @@
+"""``taccorl evaluate --policy.path=CHECKPOINT --task=assembly_2 [--episodes=128] [--against=OTHER] [--twin=twin.yaml]``
+
+How good a policy is in the twin: success with its interval, partial credit, failure categories and times, episode by episode, on
+new scenes. The same success in the same scenes as lerobot-eval with the same --seed and batch size.
+
+    --policy.type=expert      the scripted expert instead of a checkpoint, as a reference
+    --against=OTHER           a second checkpoint, expert, or the folder of an earlier evaluation, on the same scenes:
+                              difference of the success rates with its interval, McNemar's exact test
+    --twin=twin.yaml          in another twin
+
+Writes episodes.jsonl (one line an episode), evaluation.json, report.html and failures/*.rrd.
+"""
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from taccorl.cli.parse import parse
+from taccorl.errors import TaccorlError, nearest
+
+if TYPE_CHECKING:
+    from taccorl.evaluation.evaluate import Scenes
+    from taccorl.evaluation.preflight import Check
+    from taccorl.evaluation.rollouts import Actor
+
+EXPERT = "expert"
+
+
+@dataclass(kw_only=True)
+class PolicyChoice:
+    """Which policy."""
+
+    path: Path | None = None
+    """A checkpoint's folder pretrained_model."""
+    type: str | None = None
+    """expert: the task's scripted expert, which needs no checkpoint."""
+    device: str | None = None
+    """cpu, cuda, …; as in the checkpoint if not given."""
+
+
+@dataclass(kw_only=True)
+class EvaluateConfig:
+    """Scores of a policy in the twin."""
+
+    policy: PolicyChoice = field(default_factory=PolicyChoice)
+    """--policy.path=CHECKPOINT or --policy.type=expert."""
+    task: list[str] = field(default_factory=list)
+    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's; once for each."""
+    against: str | None = None
+    """A checkpoint, expert, or an earlier evaluation's folder, to compare with on the same scenes."""
+    episodes: int = 128
+    """Scenes of each task; the paper's number."""
+    seed: int = 1000
+    """Scene seed of the first episode, then one more each; lerobot-eval's default."""
+    out: Path = Path("outputs/evaluation")
+    """Folder of the results. It must not exist, or be empty."""
+    difficulty: str = "train"
+    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    twin: Path | None = None
+    """A twin.yaml; the nominal twin if not given."""
+    randomization: float = 1.0
+    """Share of the paper's reset ranges, 0 … 1; 0: the nominal scene."""
+    episode_length: int | None = None
+    """Control steps until an episode is cut off; the task's own limit if not given."""
+    batch_size: int | None = None
+    """Environments at once; all episodes of a task if not given."""
+    failures: int = 4
+    """Failed episodes with pictures and a Rerun file; 0: none."""
+    images: bool = True
+    """Render the cameras for these (needs OpenGL). A policy with cameras needs OpenGL anyway."""
+
+
+def main(argv: list[str]) -> int:
+    """0: scored."""
+    config = parse(EvaluateConfig, argv, positional=None)
+    _check_places(config)
+    from taccorl.evaluation.episodes import ROWS_FILE, compare, write_rows
+    from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored, score
+
+    scenes = Scenes(
+        tasks=tuple(config.task),
+        episodes=config.episodes,
+        seed=config.seed,
+        difficulty=config.difficulty,
+        twin=config.twin,
+        randomization=config.randomization,
+        episode_length=config.episode_length,
+        batch_size=config.batch_size,
+    )
+    scenes.twin_config()  # read it before anything is loaded
+    against = Path(config.against) if config.against else None
+    stored = read_stored(against, scenes) if against is not None and is_stored(against) else None
+    opened = [_open(config.policy, scenes)]
+    if against is not None and stored is None:
+        choice = PolicyChoice(type=EXPERT) if str(against) == EXPERT else PolicyChoice(path=against)
+        choice.device = config.policy.device
+        opened.append(_open(choice, scenes))
+    names = [one.name for one in opened] + ([stored.policy] if stored else [])
+    if len(set(names)) < len(names):
+        raise TaccorlError(f"--against={config.against}: is the policy itself; give another one")
+    config.out.mkdir(parents=True, exist_ok=True)
+    begun_s = time.monotonic()
+    rollouts, rows = [], []
+    for one in opened:
+        rollouts.append(score(scenes, one.load(config.seed), _Progress()))
+        rows.append([rollout.row for rollout in rollouts[-1]])
+        write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
+    wall_s = time.monotonic() - begun_s
+    rows += [stored.rows] if stored else []
+    comparisons = compare(rows[0], rows[1]) if len(rows) == 2 else {}
+    _write(config, scenes, opened, rows, comparisons, wall_s)
+    _print(rows, comparisons)
+    _write_page(config, scenes, opened, rows, comparisons, rollouts[0])
+    return 0
+
+
+@dataclass
+class _Opened:
+    """A policy whose weights are not loaded yet."""
+
+    name: str
+    digest: str
+    checks: "list[Check]"
+    checkpoint: Any = None
+
+    def load(self, seed: int) -> "Actor":
+        if self.checkpoint is not None:
+            return self.checkpoint.load(seed)
+        from taccorl.evaluation.expert_actor import ExpertActor
+
+        return ExpertActor()
+
+
+def _open(choice: PolicyChoice, scenes: "Scenes") -> _Opened:
+    """Both sides are printed, and a difference ends the command here.
+
+    Raises:
+        TaccorlError: neither or both ways to name a policy, a checkpoint that cannot be used or does not fit.
+    """
+    if (choice.path is None) == (choice.type is None):
+        raise TaccorlError("give --policy.path=CHECKPOINT or --policy.type=expert, one of them")
+    if choice.path is None:
+        if choice.type != EXPERT:
+            known = nearest(str(choice.type), [EXPERT])
+            raise TaccorlError(f"--policy.type={choice.type}: {known}; a checkpoint is --policy.path=…")
+        return _Opened(EXPERT, "the scripted expert, which sees the simulator's poses", [])
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
+    from taccorl.cli.tables import console
+    from taccorl.evaluation.policy_actor import open_checkpoint
+    from taccorl.evaluation.preflight import preflight, refuse_differences
+
+    register_third_party_plugins()
+    checkpoint = open_checkpoint(choice.path, choice.device)
+    checks = preflight(checkpoint.facts(), scenes.twin_config())
+    console().print(_preflight_table(str(choice.path), checks))
+    refuse_differences(checks, str(choice.path))
+    return _Opened(str(choice.path), checkpoint.digest, checks, checkpoint)
+
+
+def _preflight_table(policy: str, checks: "list[Check]") -> Any:
+    from rich.table import Table
+    from rich.text import Text
+
+    found = Table(box=None, pad_edge=False, title=Text(f"preflight of {policy}"), title_justify="left")
+    for column in ("", "checkpoint", "environment", ""):
+        found.add_column(column, overflow="fold")
+    for c in checks:
+        found.add_row(
+            c.what, c.policy, c.environment, Text(c.verdict, {"differs": "red", "same": "green"}.get(c.verdict, "dim"))
+        )
+    return found
+
+
+def _check_places(config: EvaluateConfig) -> None:
+    """
+    Raises:
+        TaccorlError: something lies at ``out``.
+    """
+    if config.out.exists() and not (config.out.is_dir() and not any(config.out.iterdir())):
+        raise TaccorlError(
+            f"--out={config.out}: holds files already; nothing was touched: give another folder, or move it away"
+        )
+    if config.failures < 0:
+        raise TaccorlError(f"--failures={config.failures}: at least 0")
+
+
+class _Progress:
+    """A line on stderr every ten seconds."""
+
+    def __init__(self) -> None:
+        self._last_s = time.monotonic()
+
+    def __call__(self, text: str) -> None:
+        import sys
+
+        now_s = time.monotonic()
+        if now_s - self._last_s > 10:
+            self._last_s = now_s
+            print(text, file=sys.stderr, flush=True)
+
+
+def _print(rows: list, comparisons: dict) -> None:
+    from taccorl.evaluation.episodes import summaries
+
+    for summary in summaries(row for own in rows for row in own):
+        print(f"{summary.policy}, {summary.task}: {summary}")
+    for task, comparison in comparisons.items():
+        print(f"{task}, {rows[0][0].policy} against {rows[1][0].policy}: {comparison}")
+
+
+def _write(
+    config: EvaluateConfig, scenes: "Scenes", opened: list[_Opened], rows: list, comparisons: dict, wall_s: float
+) -> None:
+    import dataclasses
+
+    from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, summaries, write_rows
+    from taccorl.evaluation.evaluate import scenes_to_json
+
+    every = [row for own in rows for row in own]
+    write_rows(every, config.out / ROWS_FILE)
+    summary = {
+        "policies": [{"name": one.name, "digest": one.digest} for one in opened],
+        "scenes": scenes_to_json(scenes),
+        "about": _about(config, scenes, opened),
+        "wall_s": wall_s,
+        "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(every)],
+        "comparisons": {task: c.to_json() for task, c in comparisons.items()},
+        "preflight": {one.name: [dataclasses.asdict(c) for c in one.checks] for one in opened},
+    }
+    (config.out / SUMMARY_FILE).write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[_Opened]) -> dict[str, str]:
+    import mujoco
+
+    import taccorl
+    from taccorl.evaluation.evaluate import scenes_to_json
+    from taccorl.lineage.digest import digest_bytes
+    from taccorl.sim.twin_file import twin_text
+
+    digests = {f"digest of {one.name}": one.digest for one in opened}
+    return {
+        **digests,
+        **{name: str(value) for name, value in scenes_to_json(scenes).items()},
+        "digest of the twin": digest_bytes(twin_text(scenes.twin_config()).encode()),
+        "against": str(config.against),
+        "taccorl": taccorl.__version__,
+        "mujoco": mujoco.__version__,
+    }
+
+
+def _write_page(
+    config: EvaluateConfig, scenes: "Scenes", opened: list[_Opened], rows: list, comparisons: dict, rollouts: list
+) -> None:
+    from taccorl.evaluation.failed_episodes import choose_failures, execute_again
+    from taccorl.views.evaluation_page import EvaluationPage, write_page
+
+    chosen, images = choose_failures(rollouts, config.failures), config.images
+    try:
+        failed = [execute_again(scenes, one, images=images) for one in chosen]
+    except TaccorlError as error:
+        if not images:
+            raise
+        print(f"note: failures have no pictures: {error}")
+        failed = [execute_again(scenes, one, images=False) for one in chosen]
+    page = EvaluationPage(
+        rows=[row for own in rows for row in own],
+        about=_about(config, scenes, opened),
+        comparisons=comparisons,
+        preflight={one.name: one.checks for one in opened if one.checks},
+        failures=failed,
+    )
+    written = write_page(page, config.out)
+    print(
+        f"wrote {config.out}: episodes.jsonl, evaluation.json, {', '.join(str(p.relative_to(config.out)) for p in written)}"
+    )

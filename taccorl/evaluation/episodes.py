@@ -1,0 +1,163 @@
+"""What became of every episode of an evaluation, as rows, and their summaries. One line of JSON is one episode."""
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.statistics import PairedComparison, wilson_interval
+
+ROWS_FILE, SUMMARY_FILE = "episodes.jsonl", "evaluation.json"
+SUCCESS = "success"
+BAD_ACTION = "bad_action"
+"""Category of an episode whose policy gave NaN, or a target far beyond the limits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeRow:
+    """One episode of one policy."""
+
+    policy: str
+    """As it was given: the checkpoint's folder, or ``expert``."""
+    task: str
+    seed: int
+    """Scene seed: ``reset(seed=[seed])`` of an environment brings the scene back."""
+    outcome: str
+    """``success``; the task's own failure category, ``timeout`` or ``diverged``; ``bad_action``; of an expert also
+    ``unreachable`` and ``unfinished``."""
+    partial: int
+    """Goals in place at the end, of ``max_partial``."""
+    max_partial: int
+    steps: int
+    """Control steps until the end."""
+    time_s: float
+    """The same in simulated seconds."""
+    subtask_end_s: dict[str, dict[str, float | None]]
+    """Arm → subtask → simulated time at which it ended [s]; None: it did not."""
+    clipped_steps: int
+    """Control steps with a target beyond the limits."""
+    measures: dict[str, float] = field(default_factory=dict)
+    """Of the task, at the end; names have units."""
+    reason: str = ""
+    """Of ``bad_action`` and ``unreachable``: which joint, which pose."""
+
+    @property
+    def success(self) -> bool:
+        """Whether the task was completed."""
+        return self.outcome == SUCCESS
+
+    @property
+    def partial_credit(self) -> float:
+        """0 … 1: 1 for a success, else the share of goals in place at the end."""
+        return 1.0 if self.success else self.partial / self.max_partial
+
+    def to_json(self) -> dict[str, Any]:
+        """All fields, and ``success`` and ``partial_credit``."""
+        return asdict(self) | {"success": self.success, "partial_credit": self.partial_credit}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary:
+    """Of the episodes of one policy in one task."""
+
+    policy: str
+    task: str
+    n: int
+    successes: int
+    interval_95: tuple[float, float]
+    """Wilson's, of the success rate."""
+    partial_credit: float
+    """Mean of all episodes, 0 … 1."""
+    failures: dict[str, int]
+    """Category → episodes, the most frequent first."""
+    median_success_s: float | None
+    """Simulated seconds to success; None: no success."""
+
+    @classmethod
+    def of(cls, rows: Sequence[EpisodeRow]) -> "Summary":
+        """Of rows (≥ 1) that have policy and task in common."""
+        (policy, task), *others = {(row.policy, row.task) for row in rows}
+        assert not others, "rows of one policy and one task"
+        good = [row.time_s for row in rows if row.success]
+        return cls(
+            policy=policy,
+            task=task,
+            n=len(rows),
+            successes=len(good),
+            interval_95=wilson_interval(len(good), len(rows)),
+            partial_credit=fmean(row.partial_credit for row in rows),
+            failures=dict(Counter(row.outcome for row in rows if not row.success).most_common()),
+            median_success_s=median(good) if good else None,
+        )
+
+    @property
+    def rate(self) -> float:
+        """Success rate, 0 … 1."""
+        return self.successes / self.n
+
+    def __str__(self) -> str:
+        low, high = (100 * end for end in self.interval_95)
+        time = "" if self.median_success_s is None else f", median time to success {self.median_success_s:.1f} s"
+        failures = ", ".join(f"{category} {count}" for category, count in self.failures.items()) or "none"
+        return (
+            f"{self.successes} of {self.n} episodes succeeded: {100 * self.rate:.1f} % (95 %: {low:.1f} … {high:.1f}), "
+            f"partial credit {self.partial_credit:.2f}{time}; failures: {failures}"
+        )
+
+
+def summaries(rows: Iterable[EpisodeRow]) -> list[Summary]:
+    """One for each policy and task, in the order of the rows."""
+    groups: dict[tuple[str, str], list[EpisodeRow]] = {}
+    for row in rows:
+        groups.setdefault((row.policy, row.task), []).append(row)
+    return [Summary.of(group) for group in groups.values()]
+
+
+def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[str, PairedComparison]:
+    """Task → comparison of two policies, paired by scene seed.
+
+    Raises:
+        TaccorlError: they were not scored on the same tasks and seeds.
+    """
+    one, other = ({(row.task, row.seed): row.success for row in rows} for rows in (first, second))
+    if one.keys() != other.keys() or len(one) != len(first) or len(other) != len(second):
+        missing = sorted(one.keys() ^ other.keys())[:3]
+        raise TaccorlError(
+            f"paired comparison: {len(first)} and {len(second)} episodes are not of the same scenes"
+            + (
+                f"; only one of the two has {', '.join(f'{task} seed {seed}' for task, seed in missing)}"
+                if missing
+                else ""
+            )
+        )
+    found = {}
+    for task in dict.fromkeys(row.task for row in first):
+        keys = [key for key in one if key[0] == task]
+        found[task] = PairedComparison.of([one[key] for key in keys], [other[key] for key in keys])
+    return found
+
+
+def write_rows(rows: Iterable[EpisodeRow], path: Path) -> None:
+    """One line of JSON for each."""
+    lines = [json.dumps(row.to_json(), ensure_ascii=False) for row in rows]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_rows(path: Path) -> list[EpisodeRow]:
+    """What ``write_rows`` wrote.
+
+    Raises:
+        TaccorlError: a line that is not a row.
+    """
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            values = json.loads(line)
+            rows.append(EpisodeRow(**{k: v for k, v in values.items() if k not in ("success", "partial_credit")}))
+        except (ValueError, TypeError, AttributeError) as error:
+            raise TaccorlError(f"{path}, line {number}: is not an episode of taccorl evaluate: {error}") from error
+    return rows

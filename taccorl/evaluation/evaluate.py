@@ -1,0 +1,162 @@
+"""Policies × tasks × scene seeds → rows; a stored evaluation of the same scenes as the other side of a comparison."""
+
+import dataclasses
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gymnasium.vector import AutoresetMode
+
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, EpisodeRow, read_rows
+from taccorl.evaluation.rollouts import Actor, Progress, Rollout, roll_out
+from taccorl.sim.tasks import tasks
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import load_twin
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+PAPER_EPISODES = 128
+"""The paper scores every policy on so many scenes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenes:
+    """On what policies are scored."""
+
+    tasks: tuple[str, ...]
+    episodes: int = PAPER_EPISODES
+    """Of each task."""
+    seed: int
+    """Scene seed of the first episode; the next one has the next, as in ``lerobot-eval``."""
+    difficulty: str = "train"
+    twin: Path | None = None
+    """A twin.yaml; None: the nominal twin."""
+    randomization: float = 1.0
+    """Share of the task's reset ranges, 0 … 1."""
+    episode_length: int | None = None
+    """Control steps until an episode is cut off; None: the task's own limit."""
+    batch_size: int | None = None
+    """Environments at once; None: all episodes in one batch. A policy that draws noise gets other numbers than in
+    ``lerobot-eval`` in a last batch that is smaller: LeRobot fills it up with scenes that it discards."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: no task, an unknown one (the nearest name is given), a number below its range.
+        """
+        if not self.tasks:
+            raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
+        for task in self.tasks:
+            tasks.get(task)(self.difficulty)
+        if len(set(self.tasks)) < len(self.tasks):
+            raise TaccorlError(f"--task: {', '.join(self.tasks)}: each task once")
+        for name, least in (("episodes", 1), ("seed", 0), ("episode_length", 1), ("batch_size", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise TaccorlError(f"--{name}={value}: at least {least}")
+        if not 0 <= self.randomization <= 1:
+            raise TaccorlError(f"--randomization={self.randomization:g}: a share of the task's reset ranges, 0 … 1")
+
+    @property
+    def seeds(self) -> range:
+        """Scene seeds of each task."""
+        return range(self.seed, self.seed + self.episodes)
+
+    def twin_config(self) -> TwinConfig:
+        """
+        Raises:
+            TaccorlError: the twin's file cannot be read.
+        """
+        return load_twin(self.twin) if self.twin else TwinConfig()
+
+    def environments(self, task: str, num_envs: int, *, images: bool) -> TaccorlVectorEnv:
+        """That stand still once their episode is over.
+
+        Raises:
+            TaccorlError: as ``TaccorlVectorEnv``.
+        """
+        return TaccorlVectorEnv(
+            task,
+            num_envs,
+            difficulty=self.difficulty,
+            twin=self.twin_config(),
+            images="on_request" if images else "never",
+            randomization=self.randomization,
+            num_threads=min(num_envs, len(os.sched_getaffinity(0))),
+            autoreset=AutoresetMode.DISABLED,
+            max_episode_steps=self.episode_length,
+        )
+
+
+def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> list[Rollout]:
+    """All episodes of one policy, task by task, in the order of their seeds.
+
+    Raises:
+        TaccorlError: as ``roll_out`` and ``TaccorlVectorEnv``.
+    """
+    found: list[Rollout] = []
+    for task in scenes.tasks:
+        actor.restart()
+        size = min(scenes.batch_size or scenes.episodes, actor.max_batch or scenes.episodes, scenes.episodes)
+        envs = scenes.environments(task, size, images=actor.needs_images)
+        try:
+            for first in range(0, scenes.episodes, size):
+                seeds = scenes.seeds[first : first + size]
+                if len(seeds) < size:
+                    envs.close()
+                    envs = scenes.environments(task, len(seeds), images=actor.needs_images)
+                found += roll_out(
+                    envs, actor, seeds, _with_prefix(progress, f"{task}, seeds {seeds[0]} … {seeds[-1]}: ")
+                )
+        finally:
+            envs.close()
+    return found
+
+
+def _with_prefix(progress: Progress | None, prefix: str) -> Progress | None:
+    return None if progress is None else lambda text: progress(f"{prefix}{text}")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An earlier evaluation."""
+
+    policy: str
+    """Name of its first policy, and the folder."""
+    rows: list[EpisodeRow]
+    """Of that policy."""
+
+
+def is_stored(path: Path) -> bool:
+    """Whether ``taccorl evaluate`` wrote that folder."""
+    return (path / SUMMARY_FILE).is_file() and (path / ROWS_FILE).is_file()
+
+
+def read_stored(folder: Path, scenes: Scenes) -> Stored:
+    """Rows of the first policy of an earlier evaluation, for a comparison on ``scenes``.
+
+    The twin may be another: then twins are compared, not only policies.
+
+    Raises:
+        TaccorlError: it was scored on other tasks, seeds, difficulty, randomisation or episode length.
+    """
+    summary = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+    policy, its = summary["policies"][0]["name"], summary["scenes"]
+    ours = scenes_to_json(scenes)
+    differing = [
+        f"{name} {its[name]} there, {ours[name]} here"
+        for name in ("tasks", "episodes", "seed", "difficulty", "randomization", "episode_length")
+        if its[name] != ours[name]
+    ]
+    if differing:
+        raise TaccorlError(f"--against={folder}: was scored on other scenes: {'; '.join(differing)}")
+    name = f"{policy} ({folder})"
+    rows = [dataclasses.replace(row, policy=name) for row in read_rows(folder / ROWS_FILE) if row.policy == policy]
+    return Stored(name, rows)
+
+
+def scenes_to_json(scenes: Scenes) -> dict[str, Any]:
+    """All fields."""
+    return dataclasses.asdict(scenes) | {"tasks": list(scenes.tasks), "twin": str(scenes.twin) if scenes.twin else None}

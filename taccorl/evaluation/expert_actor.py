@@ -1,0 +1,51 @@
+"""The scripted expert of a task as an actor: a reference that sees the simulator's true poses."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from taccorl.demos.collect import ExpertSource
+from taccorl.errors import UnreachableError
+from taccorl.evaluation.rollouts import Acted
+from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.spaces import Observation
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+EXPERT = "expert"
+
+
+class ExpertActor:
+    """As ``taccorl collect`` runs it, with the same random numbers in the same scene (see ``rollouts.Actor``)."""
+
+    name = EXPERT
+    needs_images = False
+    max_batch: int | None = 1
+    """An expert drives one simulation."""
+
+    def __init__(self) -> None:
+        self._source = ExpertSource()
+        self._actions: Iterator[np.ndarray] = iter(())
+
+    def looks_now(self) -> bool:
+        """Never."""
+        return False
+
+    def restart(self) -> None:
+        """Nothing: its random numbers follow from the scene's seed."""
+
+    def begin(self, envs: TaccorlVectorEnv) -> None:
+        """
+        Raises:
+            TaccorlError: more than one environment, or a task without an expert.
+        """
+        self._actions = self._source.actions(envs.sim, np.random.default_rng([int(envs.sim.seeds[0]), 1]))
+
+    def act(self, observation: Observation) -> Acted:
+        """Gives up as ``unreachable`` at a pose that no joint angles reach, as ``unfinished`` at the end of its script."""
+        nothing = np.zeros((1, len(ACTION_NAMES)), dtype=np.float32)
+        try:
+            return Acted(np.asarray(next(self._actions), dtype=np.float32)[None])
+        except UnreachableError as error:
+            return Acted(nothing, {0: ("unreachable", str(error))})
+        except StopIteration:
+            return Acted(nothing, {0: ("unfinished", "the script ended without success")})

@@ -1,0 +1,83 @@
+"""Failed episodes executed again from their actions: pictures at a few instants, and an ``Episode`` for Rerun."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.data.episode import Episode
+from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.evaluate import Scenes
+from taccorl.evaluation.rollouts import Rollout
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.spaces import CAMERAS
+from taccorl.sim.tasks import tasks
+
+NUM_INSTANTS = 6
+
+
+@dataclass(frozen=True)
+class FailedEpisode:
+    """One failure, executed again."""
+
+    rollout: Rollout
+    episode: Episode
+    pictures: np.ndarray | None
+    """(cameras × rows, instants × columns, 3) uint8: a row a camera, instants from first to last; None: not rendered."""
+    instants_s: tuple[float, ...]
+    """Of the pictures' columns."""
+
+
+def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
+    """At most ``num`` failures with at least one action: one of each category in turn, in the order of the rows."""
+    by_category: dict[tuple[str, str], list[Rollout]] = {}
+    for rollout in rollouts:
+        if not rollout.row.success and len(rollout.actions):
+            by_category.setdefault((rollout.row.task, rollout.row.outcome), []).append(rollout)
+    chosen: list[Rollout] = []
+    for turn in range(max((len(those) for those in by_category.values()), default=0)):
+        chosen += [those[turn] for those in by_category.values() if turn < len(those)]
+    return chosen[:num]
+
+
+def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEpisode:
+    """The same scene, actions and touch, bit for bit.
+
+    Args:
+        images: render the cameras (needs OpenGL).
+
+    Raises:
+        TaccorlError: the end is another than the row's: the scenes are not those of the rollout.
+    """
+    row = rollout.row
+    sim = Simulation(tasks.get(row.task)(scenes.difficulty), scenes.twin_config(), scale=scenes.randomization)
+    if scenes.episode_length is not None:
+        sim.judge.limit_steps = scenes.episode_length
+    sim.reset([row.seed])
+    recorder = EpisodeRecorder(
+        sim, with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=images)
+    )
+    for action in rollout.actions:
+        recorder.sensor_rng = np.random.default_rng((row.seed, len(recorder.rows)))  # as the environment's pads
+        recorder.step(action)
+    outcome = sim.judge.outcome
+    end = "success" if outcome.success[0] else str(outcome.failure[0])
+    if end not in ("", row.outcome) or int(outcome.partial[0]) != row.partial:
+        raise TaccorlError(
+            f"{row.task} seed {row.seed}: executed again it ends as {end or 'running'}, not {row.outcome}"
+        )
+    name = f"{row.task} seed {row.seed}, {row.outcome}{': ' + row.reason if row.reason else ''}"
+    simulation = {"policy": row.policy, "task": row.task, "seed": row.seed, "twin": str(scenes.twin or "nominal")}
+    episode = dataclasses.replace(recorder.episode(name, simulation), origin=f"{ORIGIN}; actions of {row.policy}")
+    instants = np.unique(np.linspace(0, len(recorder.rows) - 1, NUM_INSTANTS).round().astype(int))
+    pictures = None
+    if images:
+        columns = [
+            np.concatenate([views[camera] for camera in CAMERAS])
+            for views in sim.render_states(episode.arrays["sim.state"][instants], CAMERAS)
+        ]
+        pictures = np.concatenate(columns, axis=1)
+    return FailedEpisode(rollout, episode, pictures, tuple(instants / episode.spec.fps))

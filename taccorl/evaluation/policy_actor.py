@@ -1,0 +1,221 @@
+"""A LeRobot checkpoint as an actor: the policy with its own pre- and post-processors, as ``lerobot-eval`` runs them.
+
+Rollouts of any kind (evaluation, reinforcement learning) make a policy's batch with ``policy_batch`` and its actions with
+``policy_actions``, so that a policy never sees two kinds of input. Letters in shapes: N environments.
+"""
+
+import contextlib
+import json
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.envs import preprocess_observation
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
+from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
+
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.preflight import PolicyFacts
+from taccorl.evaluation.rollouts import Acted
+from taccorl.lineage.digest import digest_file, digest_files
+from taccorl.sim.lerobot_env import raw_names
+from taccorl.sim.spaces import STATE_KEY, Observation
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+Processor = Callable[[Any], Any]
+
+
+def policy_batch(
+    preprocessor: Processor, observation: Observation, instructions: Sequence[str]
+) -> dict[str, torch.Tensor | Any]:
+    """Input of a policy: LeRobot's conversion of an environment's observation, then the policy's own preprocessor.
+
+    Args:
+        observation: of N environments, in the units and types of ``observation_space``; pictures may be absent.
+        instructions: (N,) sentences.
+    """
+    batch: dict[str, Any] = preprocess_observation(raw_names(observation))
+    batch["task"] = list(instructions)
+    return preprocessor(batch)
+
+
+def policy_actions(
+    policy: Any,
+    preprocessor: Processor,
+    postprocessor: Processor,
+    observation: Observation,
+    instructions: Sequence[str],
+) -> np.ndarray:
+    """(N, 14) float32 targets [rad, m] of the next control step.
+
+    Args:
+        policy: LeRobot's ``PreTrainedPolicy``, or anything with ``select_action``.
+        observation, instructions: as in ``policy_batch``.
+    """
+    batch = policy_batch(preprocessor, observation, instructions)
+    with torch.inference_mode():
+        action = policy.select_action(batch)
+    return postprocessor(action).to("cpu").numpy().astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint's configuration and processors; weights are not read yet."""
+
+    path: Path
+    config: PreTrainedConfig
+    preprocessor: Any
+    postprocessor: Any
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the folder's files."""
+        files = sorted(p for p in self.path.iterdir() if p.is_file() and not p.name.startswith("."))
+        return digest_files({p.name: digest_file(p) for p in files})
+
+    @property
+    def training_dataset(self) -> dict[str, Any] | None:
+        """``meta/info.json`` of the dataset that it was trained on, as ``train_config.json`` names it; None: not there."""
+        try:
+            dataset = json.loads((self.path / "train_config.json").read_text(encoding="utf-8"))["dataset"]
+            return json.loads((Path(dataset["root"]) / "meta" / "info.json").read_text(encoding="utf-8"))
+        except (OSError, KeyError, TypeError, ValueError):
+            return None
+
+    def facts(self) -> PolicyFacts:
+        """For the preflight: from the configuration, the processors' statistics and, where it is there, the training dataset."""
+        config: Any = self.config
+        dataset = self.training_dataset or {}
+        names = getattr(config, "action_feature_names", None) or dataset.get("features", {}).get("action", {}).get(
+            "names"
+        )
+        touch = getattr(config, "tactile_format", None)
+        statistics, missing = _statistics([*self.preprocessor.steps, *self.postprocessor.steps])
+        action = (config.output_features or {}).get("action")
+        return PolicyFacts(
+            inputs={key: tuple(feature.shape) for key, feature in (config.input_features or {}).items()},
+            action_shape=tuple(action.shape) if action else None,
+            fps=getattr(config, "fps", None) or dataset.get("fps"),
+            robot_type=dataset.get("robot_type"),
+            action_names=tuple(names) if isinstance(names, list) else None,
+            touch_gain_per_count=touch.gain_per_count if touch else None,
+            touch_layout=touch.layout if touch else None,
+            ranges={key: statistics[key] for key in ("action", STATE_KEY) if key in statistics},
+            unnormalised=missing,
+        )
+
+    def load(self, seed: int) -> "PolicyActor":
+        """With its weights. Random numbers start from ``seed`` before the policy is made, as in ``lerobot-eval --seed``.
+
+        Raises:
+            TaccorlError: weights are missing or not this policy's.
+        """
+        torch.backends.cudnn.benchmark = True  # this and the next line: as lerobot-eval, for the same numbers
+        torch.backends.cuda.matmul.allow_tf32 = True
+        set_seed(seed)
+        try:
+            policy = get_policy_class(self.config.type).from_pretrained(str(self.path), config=self.config)
+        except (OSError, RuntimeError, KeyError) as error:
+            raise TaccorlError(f"{self.path}: weights cannot be read: {' '.join(str(error).split())}") from error
+        return PolicyActor(str(self.path), policy.eval(), self.preprocessor, self.postprocessor)
+
+
+def _statistics(steps: Sequence[Any]) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], tuple[str, ...]]:
+    """Feature → (low, high) of its data, and features that lack the statistics by which they are to be normalised."""
+    ranges: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    missing: list[str] = []
+    for step in steps:
+        if not isinstance(step, NormalizerProcessorStep | UnnormalizerProcessorStep):
+            continue
+        statistics = {key: {k: np.asarray(v) for k, v in own.items()} for key, own in (step.stats or {}).items()}
+        for low, high in (("q01", "q99"), ("min", "max")):  # the second counts: limits, where they are known
+            ranges |= {key: (own[low], own[high]) for key, own in statistics.items() if low in own and high in own}
+        for key, feature in step.features.items():
+            mode = step.norm_map.get(feature.type, NormalizationMode.IDENTITY)
+            if mode is not NormalizationMode.IDENTITY and key not in statistics:
+                missing.append(key)
+    return ranges, tuple(dict.fromkeys(missing))
+
+
+def open_checkpoint(path: Path, device: str | None = None) -> Checkpoint:
+    """A folder that LeRobot's ``save_pretrained`` or ``lerobot-train`` wrote.
+
+    Args:
+        device: cpu, cuda, …; None: as in the checkpoint, or what this machine has.
+
+    Raises:
+        TaccorlError: no such folder, none of a policy, a type that is not installed, an adapter (PEFT).
+    """
+    if not (path / "config.json").is_file():
+        near = next(iter(sorted(path.glob("**/pretrained_model/config.json"))), None) if path.is_dir() else None
+        hint = f"; did you mean {near.parent}?" if near else "; give the folder pretrained_model of a checkpoint"
+        raise TaccorlError(f"--policy.path={path}: no config.json there{hint}")
+    try:
+        overrides = [] if device is None else [f"--device={device}"]
+        config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+        config.pretrained_path = path
+    except Exception as error:  # draccus and LeRobot raise many kinds; all mean that the file cannot be used
+        raise TaccorlError(
+            f"--policy.path={path}: config.json cannot be used: {' '.join(str(error).split())}"
+        ) from error
+    if config.use_peft:
+        raise TaccorlError(f"--policy.path={path}: is an adapter (PEFT); merge it into its base policy and save that")
+    if not (path / "policy_preprocessor.json").is_file():
+        raise TaccorlError(
+            f"--policy.path={path}: has no policy_preprocessor.json; save the policy with its processors"
+        )
+    overridden = {"device_processor": {"device": str(config.device)}}
+    before, after = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=overridden)
+    return Checkpoint(path, config, before, after)
+
+
+class PolicyActor:
+    """A policy and its processors (see ``rollouts.Actor``). Made after seeding; ``restart`` returns to that state."""
+
+    max_batch: int | None = None
+
+    def __init__(self, name: str, policy: Any, preprocessor: Processor, postprocessor: Processor) -> None:
+        """
+        Args:
+            policy: LeRobot's ``PreTrainedPolicy``, in evaluation mode.
+        """
+        self.name, self.policy = name, policy
+        self._preprocessor, self._postprocessor = preprocessor, postprocessor
+        self._config = getattr(policy, "config", None)
+        self._random_state = get_rng_state()
+        self._instructions: list[str] = []
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether a picture is among the policy's inputs; of an unknown policy: yes."""
+        features = getattr(self._config, "input_features", None)
+        return features is None or any(feature.type is FeatureType.VISUAL for feature in features.values())
+
+    def looks_now(self) -> bool:
+        """Whether a picture is used in this step: not while a policy without a history of observations (``n_obs_steps`` = 1)
+        still has actions of a chunk in LeRobot's ``_action_queue``. Rendering is most of the time of a rollout."""
+        queue = getattr(self.policy, "_action_queue", None)
+        return getattr(self._config, "n_obs_steps", None) != 1 or not isinstance(queue, deque) or not queue
+
+    def restart(self) -> None:
+        """Put random numbers back to where they were when this was made."""
+        set_rng_state(self._random_state)
+
+    def begin(self, envs: TaccorlVectorEnv) -> None:
+        """Forget the last episode."""
+        self.policy.reset()
+        self._instructions = [envs.task_description] * envs.num_envs
+
+    def act(self, observation: Observation) -> Acted:
+        """As ``policy_actions``, in mixed precision where the checkpoint wants it."""
+        amp = bool(getattr(self._config, "use_amp", False))
+        with torch.autocast(torch.device(self._config.device).type) if amp else contextlib.nullcontext():  # pyright: ignore[reportOptionalMemberAccess]
+            return Acted(
+                policy_actions(self.policy, self._preprocessor, self._postprocessor, observation, self._instructions)
+            )

@@ -1,0 +1,155 @@
+"""A checkpoint beside the environment, before any rollout: cameras, state, touch, action, rate, normalisation, robot.
+
+Free of torch: a checkpoint's side comes as ``PolicyFacts``.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, check_actions
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, IMAGE_SHAPE, STATE_KEY, TACTILE_KEY
+from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+
+NOT_STATED = "not stated"
+Verdict = Literal["same", "differs", "not stated"]
+_IMAGES = "observation.images."
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyFacts:
+    """What a checkpoint says of its inputs and outputs. None: it does not say."""
+
+    inputs: dict[str, tuple[int, ...]]
+    """LeRobot key → shape; pictures (3, rows, columns)."""
+    action_shape: tuple[int, ...] | None
+    fps: float | None = None
+    robot_type: str | None = None
+    action_names: tuple[str, ...] | None = None
+    touch_gain_per_count: float | None = None
+    """Normalised reading = counts × gain."""
+    touch_layout: tuple[int, ...] | None = None
+    """Pads, rows, columns."""
+    ranges: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """``action`` and ``observation.state`` → (low, high), each (14,): limits of the data by which they are normalised."""
+    unnormalised: tuple[str, ...] = ()
+    """Features that are to be normalised, but the checkpoint has no statistics of them."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the preflight."""
+
+    what: str
+    policy: str
+    environment: str
+    verdict: Verdict
+
+
+def preflight(policy: PolicyFacts, twin: TwinConfig) -> list[Check]:
+    """Both sides, line by line."""
+    return [
+        _cameras(policy, twin),
+        _same("state", _shape(policy.inputs.get(STATE_KEY)), _shape(ACTION_LOW.shape), optional=True),
+        *_touch(policy),
+        *_other_inputs(policy),
+        _same("action", _shape(policy.action_shape), _shape(ACTION_LOW.shape)),
+        *_names(policy),
+        _same("rate", NOT_STATED if policy.fps is None else f"{policy.fps:g} Hz", f"{CONTROL_HZ} Hz"),
+        *(_normalisation(policy, key) for key in ("action", STATE_KEY) if key in policy.ranges),
+        *_statistics(policy),
+    ]
+
+
+def refuse_differences(checks: Sequence[Check], policy: str) -> None:
+    """
+    Raises:
+        TaccorlError: a line of the preflight differs; names each with both sides.
+    """
+    wrong = [c for c in checks if c.verdict == "differs"]
+    if wrong:
+        lines = "; ".join(f"{c.what}: {c.policy} in the checkpoint, {c.environment} in the environment" for c in wrong)
+        raise TaccorlError(f"{policy} does not fit the environment: {lines}. Nothing was run")
+
+
+def _same(what: str, policy: str, environment: str, *, optional: bool = False) -> Check:
+    """``optional``: the policy may do without."""
+    if policy == NOT_STATED:
+        return Check(what, "not used" if optional else policy, environment, "same" if optional else NOT_STATED)
+    return Check(what, policy, environment, "same" if policy == environment else "differs")
+
+
+def _shape(shape: tuple[int, ...] | None) -> str:
+    return NOT_STATED if shape is None else " × ".join(map(str, shape))
+
+
+def _cameras(policy: PolicyFacts, twin: TwinConfig) -> Check:
+    """A camera that the policy does not use is no difference."""
+    shapes = {k.removeprefix(_IMAGES): s for k, s in policy.inputs.items() if k.startswith(_IMAGES)}
+    there = [camera.name for camera in twin.cameras if camera.name in CAMERAS]
+    rows, columns, _ = IMAGE_SHAPE
+    wanted = dict.fromkeys(there, (3, rows, columns))
+    fits = all(wanted.get(name) == shape for name, shape in shapes.items())
+
+    def listed(sizes: Mapping[str, tuple[int, ...]]) -> str:
+        return ", ".join(f"{name} {s[-2]}×{s[-1]}" for name, s in sizes.items()) or "none"
+
+    return Check("cameras", listed(shapes), listed(wanted), "same" if fits else "differs")
+
+
+def _touch(policy: PolicyFacts) -> list[Check]:
+    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
+    feature, sensor = spec.features[TACTILE_KEY], spec.sensors[TACTILE_KEY]
+    layout = (len(feature.pads), sensor.rows, sensor.columns)
+    checks = [_same("touch", _shape(policy.inputs.get(TACTILE_KEY)), _shape(feature.shape), optional=True)]
+    if TACTILE_KEY in policy.inputs and policy.touch_layout is not None:
+        checks.append(_same("touch layout", _shape(policy.touch_layout), _shape(layout)))
+    if TACTILE_KEY in policy.inputs and policy.touch_gain_per_count is not None:
+        gains = (policy.touch_gain_per_count, sensor.gain_per_count)
+        same = bool(np.isclose(*gains, rtol=1e-6))
+        words = [f"counts × {gain:.6g}" for gain in gains]
+        checks.append(Check("touch gain", words[0], words[1], "same" if same else "differs"))
+    return checks
+
+
+def _other_inputs(policy: PolicyFacts) -> list[Check]:
+    known = {STATE_KEY, TACTILE_KEY, *IMAGE_KEYS.values()}
+    others = [k for k in policy.inputs if k not in known and not k.startswith(_IMAGES)]
+    return [Check("other inputs", ", ".join(others), "none", "differs")] if others else []
+
+
+def _names(policy: PolicyFacts) -> list[Check]:
+    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
+    names = tuple(spec.features["action"].names or ())
+    checks = [_same("robot", policy.robot_type or NOT_STATED, spec.robot_type)]
+    if policy.action_names is not None:
+        same = policy.action_names == names
+        words = [", ".join(those) for those in (policy.action_names, names)]
+        words = ["as the environment", f"{names[0]} … {names[-1]}"] if same else words
+        checks.append(Check("action names", words[0], words[1], "same" if same else "differs"))
+    return checks
+
+
+def _normalisation(policy: PolicyFacts, key: str) -> Check:
+    """Statistics in degrees or millimetres lie far beyond the limits in rad and m."""
+    low, high = policy.ranges[key]
+    there = f"{ACTION_LOW.min():.3g} … {ACTION_HIGH.max():.3g} rad, grippers to {ACTION_HIGH[6]:.3g} m"
+    here = f"{low.min():.3g} … {high.max():.3g}"
+    fits = low.shape == high.shape == ACTION_LOW.shape
+    if fits:
+        try:
+            check_actions(np.stack([low, high]).astype(float))
+        except TaccorlError:
+            fits = False
+    return Check(f"range of {key}", here, there, "same" if fits else "differs")
+
+
+def _statistics(policy: PolicyFacts) -> list[Check]:
+    if not policy.unnormalised:
+        return []
+    missing = f"no statistics of {', '.join(policy.unnormalised)}"
+    return [Check("normalisation", missing, "needs statistics", "differs")]

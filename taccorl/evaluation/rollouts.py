@@ -1,0 +1,194 @@
+"""One batch of episodes: any actor in ``TaccorlVectorEnv``, each episode to its own end.
+
+Letters in shapes: N environments, T control steps of an episode.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.episodes import BAD_ACTION, SUCCESS, EpisodeRow
+from taccorl.sim.actions import ACTION_NAMES, check_actions
+from taccorl.sim.robot import ARMS
+from taccorl.sim.spaces import STATE_KEY, Observation
+from taccorl.sim.twin import CONTROL_HZ
+from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Acted:
+    """What an actor does in one control step."""
+
+    actions: np.ndarray
+    """(N, 14) targets [rad, m]."""
+    given_up: dict[int, tuple[str, str]] = field(default_factory=dict)
+    """Environment → (category, reason): it has no action there, and the episode ends."""
+
+
+class Actor(Protocol):
+    """A policy or an expert, as rollouts use it."""
+
+    @property
+    def name(self) -> str:
+        """Label in rows."""
+        ...
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether the cameras have to be rendered."""
+        ...
+
+    def looks_now(self) -> bool:
+        """Whether ``act`` uses the newest pictures; else it gets those of the last time, and nothing is rendered."""
+        ...
+
+    @property
+    def max_batch(self) -> int | None:
+        """Environments at once; None: any number."""
+        ...
+
+    def restart(self) -> None:
+        """Before the first batch of a task: the state of its random numbers is that of a fresh evaluation."""
+        ...
+
+    def begin(self, envs: TaccorlVectorEnv) -> None:
+        """All environments were reset."""
+        ...
+
+    def act(self, observation: Observation) -> Acted:
+        """The next action of each environment; of those that are over, anything."""
+        ...
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One episode."""
+
+    row: EpisodeRow
+    actions: np.ndarray
+    """(T, 14) float32, as they were given."""
+
+
+class _Running:
+    """Bookkeeping of one environment's episode."""
+
+    def __init__(self, subtasks: Mapping[str, Sequence[str]]) -> None:
+        self.actions: list[np.ndarray] = []
+        self.clipped_steps = 0
+        self.subtask_end_s: dict[str, dict[str, float | None]] = {
+            arm: dict.fromkeys(names) for arm, names in subtasks.items()
+        }
+        self.end: tuple[str, str] | None = None
+        """Outcome and reason."""
+        self.facts: dict[str, Any] = {}
+
+    def stepped(self, action: np.ndarray, facts: dict[str, Any]) -> None:
+        self.actions.append(action)
+        self.facts = facts
+        self.clipped_steps += bool(facts["clipped"])
+        now_s = facts["steps"] / CONTROL_HZ
+        for arm, done in zip(ARMS, facts["subtask"], strict=True):
+            for name in list(self.subtask_end_s[arm])[: int(done)]:
+                if self.subtask_end_s[arm][name] is None:
+                    self.subtask_end_s[arm][name] = now_s
+        if facts["is_success"] or facts["failure"]:
+            self.end = (SUCCESS if facts["is_success"] else str(facts["failure"]), "")
+
+
+def roll_out(
+    envs: TaccorlVectorEnv, actor: Actor, seeds: Sequence[int], progress: Progress | None = None
+) -> list[Rollout]:
+    """One episode in each of the N environments, in the scenes ``seeds``, in their order.
+
+    An episode ends alone: by success, failure, time limit or divergence as the environment judges, as ``bad_action`` where
+    the actor gives NaN or a target far beyond the limits, or with the category that the actor itself names.
+
+    Args:
+        envs: with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
+
+    Raises:
+        TaccorlError: not one seed for each environment, or actions of another shape than (N, 14).
+    """
+    observation, _ = envs.reset(seed=[int(seed) for seed in seeds])
+    subtasks = {arm: [s.name for s in own] for arm, own in envs.sim.task.subtasks().items()}
+    running = [_Running(subtasks) for _ in range(envs.num_envs)]
+    for one, facts in zip(running, _each(envs.facts(), envs.num_envs), strict=True):
+        one.facts = facts
+    actor.begin(envs)
+    pictures: Observation = {}
+    while True:
+        if actor.needs_images and actor.looks_now():
+            pictures = envs.observe(images=True)
+        acted = actor.act({**pictures, **observation})
+        actions = shaped(acted.actions, envs.num_envs).astype(np.float32)
+        given_up = _bad_actions(actions) | acted.given_up
+        for i, end in given_up.items():
+            running[i].end = running[i].end or end
+        over = np.array([one.end is not None for one in running])
+        if over.all():
+            break
+        # The environment checks all rows, and may still move one that ended here: it is held where it is.
+        actions[over] = observation[STATE_KEY][over]
+        observation, *_ = envs.step(actions)
+        facts = _each(envs.facts(), envs.num_envs)
+        for i in np.flatnonzero(~over):
+            running[i].stepped(actions[i].copy(), facts[i])
+        over = np.array([one.end is not None for one in running])
+        if progress is not None:
+            successes = sum(one.end is not None and one.end[0] == SUCCESS for one in running)
+            steps = max(len(one.actions) for one in running)
+            progress(
+                f"step {steps} of {envs.sim.judge.limit_steps}: {over.sum()} of {len(over)} over, {successes} succeeded"
+            )
+        if over.all():
+            break
+    return [_rollout(envs, actor, int(seed), one) for seed, one in zip(seeds, running, strict=True)]
+
+
+def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, one: _Running) -> Rollout:
+    assert one.end is not None
+    outcome, reason = one.end
+    row = EpisodeRow(
+        policy=actor.name,
+        task=envs.task,
+        seed=seed,
+        outcome=outcome,
+        partial=int(one.facts["partial"]),
+        max_partial=envs.sim.task.max_partial,
+        steps=len(one.actions),
+        time_s=len(one.actions) / CONTROL_HZ,
+        subtask_end_s=one.subtask_end_s,
+        clipped_steps=one.clipped_steps,
+        # A diverged simulation has no measures: JSON knows no NaN.
+        measures={k: float(v) for k, v in one.facts["measures"].items() if np.isfinite(v)},
+        reason=reason,
+    )
+    actions = np.array(one.actions, dtype=np.float32).reshape(-1, len(ACTION_NAMES))
+    return Rollout(row, actions)
+
+
+def _bad_actions(actions: np.ndarray) -> dict[int, tuple[str, str]]:
+    """Environment → (``bad_action``, which joint), of targets (N, 14) that the environment would refuse."""
+    found: dict[int, tuple[str, str]] = {}
+    for i, action in enumerate(actions.astype(float)):
+        try:
+            check_actions(action[None])
+        except TaccorlError as error:
+            found[i] = (BAD_ACTION, str(error).replace("of simulation 0 ", ""))
+    return found
+
+
+def _each(facts: dict[str, Any], n: int) -> list[dict[str, Any]]:
+    """The facts of each environment."""
+    return [
+        {
+            k: {name: v[i] for name, v in values.items()} if isinstance(values, dict) else values[i]
+            for k, values in facts.items()
+        }
+        for i in range(n)
+    ]

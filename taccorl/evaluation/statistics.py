@@ -1,0 +1,147 @@
+"""Statistics of success and failure: Wilson's interval, McNemar's exact test, and the difference of two paired shares.
+
+Letters: n episodes; a both succeed, b only the first, c only the second, d neither (n = a + b + c + d).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+from scipy.stats import binomtest
+
+from taccorl.errors import TaccorlError
+
+CONFIDENCE = 0.95
+
+
+def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Wilson's score interval of a share, without continuity correction: (low, high) in 0 … 1.
+
+    (p + z²/2n ± z √(p q / n + z²/4n²)) / (1 + z²/n), with p = successes / n and q = 1 − p. (0, 1) if n is 0.
+
+    Raises:
+        TaccorlError: not 0 ≤ successes ≤ n.
+    """
+    if not 0 <= successes <= n:
+        raise TaccorlError(f"Wilson's interval: {successes} successes of {n} episodes")
+    if n == 0:
+        return 0.0, 1.0
+    z, p = _z(confidence), successes / n
+    middle, scale = p + z**2 / (2 * n), 1 + z**2 / n
+    half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    # At p = 0 and p = 1 one end is exact; rounding would leave 1e-17 there.
+    return (middle - half) / scale if successes else 0.0, (middle + half) / scale if successes < n else 1.0
+
+
+def mcnemar_exact(only_first: int, only_second: int) -> float:
+    """Two-sided p-value of McNemar's exact test: is b of b + c a fair coin? 1 if the two never disagree.
+
+    Raises:
+        TaccorlError: a negative count.
+    """
+    if min(only_first, only_second) < 0:
+        raise TaccorlError(f"McNemar's test: counts {only_first} and {only_second}; give numbers ≥ 0")
+    disagree = only_first + only_second
+    return float(binomtest(only_first, disagree, 0.5).pvalue) if disagree else 1.0
+
+
+def paired_difference_interval(
+    both: int, only_first: int, only_second: int, neither: int, confidence: float = CONFIDENCE
+) -> tuple[float, float]:
+    """Interval of p₁ − p₂ from paired outcomes, in −1 … 1: Newcombe's method 10 (Statist. Med. 17, 2635–2650, 1998).
+
+    Wilson's intervals (l₁, u₁), (l₂, u₂) of both shares, combined with the correlation φ of the pairs:
+    p₁ − p₂ − √((p₁ − l₁)² − 2 φ (p₁ − l₁)(u₂ − p₂) + (u₂ − p₂)²), and likewise above. φ = (ad − bc) / √(product of the
+    four margins), with ad − bc reduced by n / 2, to 0 at the least, where it is positive; 0 if a margin is empty.
+
+    Raises:
+        TaccorlError: a negative count, or no pair at all.
+    """
+    a, b, c, d = both, only_first, only_second, neither
+    n = a + b + c + d
+    if min(a, b, c, d) < 0 or n == 0:
+        raise TaccorlError(f"paired difference: counts {a}, {b}, {c}, {d}; give numbers ≥ 0, one of them > 0")
+    p1, p2 = (a + b) / n, (a + c) / n
+    (l1, u1), (l2, u2) = wilson_interval(a + b, n, confidence), wilson_interval(a + c, n, confidence)
+    margins = (a + b) * (c + d) * (a + c) * (b + d)
+    numerator = a * d - b * c
+    if numerator > 0:
+        numerator = max(numerator - n / 2, 0)
+    phi = numerator / math.sqrt(margins) if margins else 0.0
+
+    def distance(first: float, second: float) -> float:
+        return math.sqrt(max(first**2 - 2 * phi * first * second + second**2, 0.0))
+
+    return p1 - p2 - distance(p1 - l1, u2 - p2), p1 - p2 + distance(u1 - p1, p2 - l2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedComparison:
+    """Two policies on the same scenes."""
+
+    both: int
+    only_first: int
+    only_second: int
+    neither: int
+
+    @classmethod
+    def of(cls, first: Sequence[bool], second: Sequence[bool]) -> "PairedComparison":
+        """Of the successes (n,) of both, scene by scene.
+
+        Raises:
+            TaccorlError: not one pair a scene.
+        """
+        if len(first) != len(second):
+            raise TaccorlError(f"paired comparison: {len(first)} and {len(second)} episodes; give one pair a scene")
+        pairs = [(bool(x), bool(y)) for x, y in zip(first, second, strict=True)]
+        count = pairs.count
+        return cls(
+            both=count((True, True)),
+            only_first=count((True, False)),
+            only_second=count((False, True)),
+            neither=count((False, False)),
+        )
+
+    @property
+    def n(self) -> int:
+        """Scenes."""
+        return self.both + self.only_first + self.only_second + self.neither
+
+    @property
+    def difference(self) -> float:
+        """p₁ − p₂, −1 … 1."""
+        return (self.only_first - self.only_second) / self.n
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % of ``difference``, as ``paired_difference_interval``."""
+        return paired_difference_interval(self.both, self.only_first, self.only_second, self.neither)
+
+    @property
+    def p_value(self) -> float:
+        """As ``mcnemar_exact``."""
+        return mcnemar_exact(self.only_first, self.only_second)
+
+    def to_json(self) -> dict[str, int | float | list[float]]:
+        """Counts, difference, its interval, p-value."""
+        counts = {name: getattr(self, name) for name in ("both", "only_first", "only_second", "neither")}
+        return {
+            "n": self.n,
+            **counts,
+            "difference": self.difference,
+            "difference_interval_95": list(self.interval),
+            "mcnemar_exact_p": self.p_value,
+        }
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return (
+            f"difference {100 * self.difference:+.1f} percentage points (95 %: {100 * low:+.1f} … {100 * high:+.1f}); "
+            f"of {self.n} scenes {self.both} both, {self.only_first} only the first, {self.only_second} only the second, "
+            f"{self.neither} neither; McNemar's exact test p = {self.p_value:.3g}"
+        )
+
+
+def _z(confidence: float) -> float:
+    return NormalDist().inv_cdf(0.5 + confidence / 2)

@@ -1,0 +1,200 @@
+"""The page of ``taccorl evaluate``: success with intervals, paired comparison, failures with pictures and Rerun files.
+
+HTML with its pictures inside; the Rerun files lie beside it.
+"""
+
+import base64
+import html
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import taccorl
+from taccorl.diagnosis.report_html import figure, note, table
+from taccorl.diagnosis.report_page import STYLE
+from taccorl.evaluation.episodes import EpisodeRow, summaries
+from taccorl.evaluation.failed_episodes import FailedEpisode
+from taccorl.evaluation.preflight import Check
+from taccorl.evaluation.statistics import PairedComparison
+from taccorl.sim.spaces import IMAGE_SHAPE
+from taccorl.views.episode import save_episode
+
+GENERATOR = "taccorl evaluate"
+_ORIGIN = "Simulated in the MuJoCo twin; no robot was used"
+_JPEG_QUALITY = 88
+_SHOWN_PX = 176
+"""Side of a picture on the page: six instants fit beside each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationPage:
+    """What the page shows."""
+
+    rows: Sequence[EpisodeRow]
+    about: dict[str, str]
+    """Resolved settings, versions, digests."""
+    comparisons: dict[str, PairedComparison] = field(default_factory=dict)
+    """Task → the first policy against the second, on the same scenes."""
+    preflight: dict[str, Sequence[Check]] = field(default_factory=dict)
+    """Policy → both sides."""
+    failures: Sequence[FailedEpisode] = ()
+
+
+def write_page(page: EvaluationPage, folder: Path) -> list[Path]:
+    """``report.html`` and ``failures/*.rrd`` in ``folder``; returns all files that were written, the page first.
+
+    Raises:
+        OutputError: the disk is full, or a file of another program is in the way.
+    """
+    files = []
+    for failed in page.failures:
+        row = failed.rollout.row
+        rrd = folder / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd"
+        rrd.parent.mkdir(exist_ok=True)
+        save_episode(failed.episode, rrd, native=True)
+        files.append(rrd)
+    report = folder / "report.html"
+    report.write_text(_html(page, files), encoding="utf-8")
+    return [report, *files]
+
+
+def _html(page: EvaluationPage, rrds: Sequence[Path]) -> str:
+    names = list(dict.fromkeys(row.policy for row in page.rows))
+    title = f"Evaluation of {names[0]}" + (f" against {names[1]}" if len(names) > 1 else "")
+    parts = [
+        f"<h1>{html.escape(title)}</h1>",
+        f'<p class="data">{_ORIGIN}</p>',
+        _scores(page.rows),
+        *_comparisons(page.comparisons, names),
+        "<h2>Failures</h2>",
+        _categories(page.rows),
+        *(_failure(failed, rrd) for failed, rrd in zip(page.failures, rrds, strict=True)),
+        *_preflight(page.preflight),
+        "<h2>Episodes</h2>",
+        f"<details><summary>all {len(page.rows)} episodes</summary>{_episodes(page.rows)}</details>",
+        "<h2>Settings</h2>",
+        table((), [[html.escape(name), html.escape(value)] for name, value in page.about.items()]),
+    ]
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="generator" content="{GENERATOR}, taccorl {taccorl.__version__}">'
+        f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
+        f"<style>{STYLE}</style></head><body><main>{chr(10).join(parts)}</main></body></html>\n"
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _scores(rows: Sequence[EpisodeRow]) -> str:
+    heads = (
+        "policy",
+        "task",
+        "episodes",
+        "successes",
+        "success rate (95 %)",
+        "partial credit",
+        "median time to success",
+    )
+    lines = []
+    for s in summaries(rows):
+        low, high = s.interval_95
+        time = "–" if s.median_success_s is None else f"{s.median_success_s:.1f} s"
+        rate = f"{_percent(s.rate)} ({100 * low:.1f} … {100 * high:.1f})"
+        cells = [
+            html.escape(s.policy),
+            html.escape(s.task),
+            str(s.n),
+            str(s.successes),
+            rate,
+            f"{s.partial_credit:.2f}",
+            time,
+        ]
+        lines.append(cells)
+    return table(heads, lines, numbers=range(2, 7)) + note(
+        "95 %: Wilson's interval. Partial credit: 1 for a success, else the share of the task's goals in place at the end; "
+        "mean of all episodes. Times are simulated."
+    )
+
+
+def _comparisons(comparisons: dict[str, PairedComparison], names: Sequence[str]) -> list[str]:
+    if not comparisons:
+        return []
+    heads = ("task", "scenes", "both", f"only {names[0]}", f"only {names[1]}", "neither", "difference (95 %)", "p")
+    lines = []
+    for task, c in comparisons.items():
+        low, high = c.interval
+        difference = f"{100 * c.difference:+.1f} points ({100 * low:+.1f} … {100 * high:+.1f})"
+        counts = [str(k) for k in (c.n, c.both, c.only_first, c.only_second, c.neither)]
+        lines.append([html.escape(task), *counts, difference, f"{c.p_value:.3g}"])
+    words = "Same scenes for both. Difference of the success rates with Newcombe's paired interval; p: McNemar's exact test."
+    return ["<h2>Paired comparison</h2>", table(heads, lines, numbers=range(1, 8)), note(words)]
+
+
+def _categories(rows: Sequence[EpisodeRow]) -> str:
+    lines = [
+        [html.escape(s.policy), html.escape(s.task), html.escape(category), str(count), _percent(count / s.n)]
+        for s in summaries(rows)
+        for category, count in s.failures.items()
+    ]
+    if not lines:
+        return note("None.")
+    return table(("policy", "task", "category", "episodes", "share of all"), lines, numbers=(3, 4))
+
+
+def _failure(failed: FailedEpisode, rrd: Path) -> str:
+    row = failed.rollout.row
+    link = f"{rrd.parent.name}/{rrd.name}"
+    command = shlex.join([str(Path(sys.executable).with_name("rerun")), str(rrd)])
+    title = f"{row.task}, seed {row.seed}: {row.outcome} after {row.time_s:.1f} s"
+    parts = [f"<h3>{html.escape(title)}</h3>"]
+    if row.reason:
+        parts.append(note(row.reason))
+    if failed.pictures is not None:
+        times = ", ".join(f"{t:.1f}" for t in failed.instants_s)
+        parts.append(figure(_jpeg_uri(failed.pictures), f"front, left wrist, right wrist at {times} s"))
+    parts.append(f'<p class="note"><a href="{html.escape(link)}">{html.escape(link)}</a>: '
+                 f"<code>{html.escape(command)}</code></p>")  # fmt: skip
+    return "".join(parts)
+
+
+def _jpeg_uri(rgb: np.ndarray) -> str:
+    rows, columns = (n * _SHOWN_PX // IMAGE_SHAPE[0] for n in rgb.shape[:2])
+    small = cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA)
+    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+    blob = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(blob).decode('ascii')}"
+
+
+def _preflight(preflight: dict[str, Sequence[Check]]) -> list[str]:
+    parts = ["<h2>Checkpoint and environment</h2>"] if preflight else []
+    for policy, checks in preflight.items():
+        lines = [[html.escape(w) for w in (c.what, c.policy, c.environment, c.verdict)] for c in checks]
+        parts.append(table(("", policy, "environment", ""), lines))
+    return parts
+
+
+def _episodes(rows: Sequence[EpisodeRow]) -> str:
+    heads = ("policy", "task", "seed", "outcome", "time [s]", "partial", "subtasks done", "clipped steps", "reason")
+    lines = []
+    for row in rows:
+        ends = [end for own in row.subtask_end_s.values() for end in own.values()]
+        done = f"{sum(end is not None for end in ends)} of {len(ends)}"
+        numbers = [f"{row.time_s:.2f}", f"{row.partial} of {row.max_partial}", done, str(row.clipped_steps)]
+        lines.append(
+            [
+                html.escape(row.policy),
+                html.escape(row.task),
+                str(row.seed),
+                row.outcome,
+                *numbers,
+                html.escape(row.reason),
+            ]
+        )
+    return table(heads, lines, numbers=(2, 4, 5, 6, 7))

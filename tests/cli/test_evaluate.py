@@ -1,0 +1,142 @@
+"""``taccorl evaluate`` as a user types it."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taccorl.cli.main import main
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.episodes import read_rows
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "evaluation"))
+
+EXPERT = ("evaluate", "--policy.type=expert", "--task=assembly_1", "--images=false")
+SHORT = ("--episodes=2", "--episode_length=4")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from tiny_checkpoint import write_checkpoint
+
+    return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
+
+
+@pytest.fixture
+def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs the verb in an empty folder; (exit code, all that was printed)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: Any) -> tuple[int, str]:
+        code = main(list(map(str, words)))
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, shown.out + shown.err
+
+    return run
+
+
+def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: Path) -> None:
+    code, shown = said(*EXPERT, *SHORT, "--failures=1", "--out=scored")
+    assert code == 0
+    assert "expert, assembly_1: 0 of 2 episodes succeeded: 0.0 % (95 %: 0.0 … 65.8)" in shown
+    assert "failures: timeout 2" in shown
+    rows = read_rows(tmp_path / "scored/episodes.jsonl")
+    assert [(r.seed, r.outcome, r.steps) for r in rows] == [(1000, "timeout", 4), (1001, "timeout", 4)]
+    summary = json.loads((tmp_path / "scored/evaluation.json").read_text())
+    assert summary["scores"][0]["failures"] == {"timeout": 2} and summary["scenes"]["episode_length"] == 4
+    assert summary["about"]["mujoco"] and len(summary["about"]["digest of the twin"]) == 64
+    page = (tmp_path / "scored/report.html").read_text()
+    link = "failures/assembly_1_seed_1000_timeout.rrd"
+    assert f'href="{link}"' in page and (tmp_path / "scored" / link).read_bytes()[:4] == b"RRF2"
+    assert (
+        "Simulated in the MuJoCo twin; no robot was used" in page
+        and "assembly_1, seed 1000: timeout after 0.1 s" in page
+    )
+
+    # Nothing of it is overwritten, and it can be the other side of a comparison.
+    before = (tmp_path / "scored/episodes.jsonl").read_bytes()
+    code, shown = said(*EXPERT, *SHORT, "--out=scored")
+    assert code == 2 and "--out=scored: holds files already; nothing was touched" in shown
+    assert (tmp_path / "scored/episodes.jsonl").read_bytes() == before
+    code, shown = said(*EXPERT, *SHORT, "--failures=0", "--against=scored", "--out=again")
+    assert code == 0 and "assembly_1, expert against expert (scored): difference +0.0 percentage points" in shown
+    assert "of 2 scenes 0 both, 0 only the first, 0 only the second, 2 neither; McNemar's exact test p = 1" in shown
+    again = read_rows(tmp_path / "again/episodes.jsonl")
+    assert again[:2] == rows and {r.policy for r in again[2:]} == {
+        "expert (scored)"
+    }  # the same seeds give the same rows
+    code, shown = said(*EXPERT, *SHORT, "--seed=7", "--against=scored", "--out=other")
+    assert code == 2 and "was scored on other scenes: seed 1000 there, 7 here" in shown and not Path("other").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--task=assembly1", "--policy.type=expert"), "did you mean 'assembly_1'"),
+        (("--policy.type=expert",), "missing --task="),
+        (("--task=puzzle",), "give --policy.path=CHECKPOINT or --policy.type=expert, one of them"),
+        (("--task=puzzle", "--policy.type=expert", "--policy.path=x"), "one of them"),
+        (("--task=puzzle", "--policy.type=exprt"), "--policy.type=exprt: did you mean 'expert'?"),
+        (("--task=puzzle", "--policy.type=expert", "--against=expert"), "is the policy itself"),
+        (("--task=puzzle", "--policy.type=expert", "--twin=none.yaml"), "none.yaml"),
+        (("--task=puzzle", "--policy.type=expert", "--failures=-1"), "--failures=-1"),
+    ],
+)
+def test_wrong_words_end_before_any_rollout(words: tuple[str, ...], message: str, said: Any, tmp_path: Path) -> None:
+    code, shown = said("evaluate", *words, "--out=scored")
+    assert code == 2 and message in shown and not (tmp_path / "scored").exists()
+
+
+@pytest.mark.slow
+def test_a_folder_that_is_no_checkpoint_is_named(said: Any, tmp_path: Path) -> None:
+    code, shown = said("evaluate", "--task=puzzle", f"--policy.path={tmp_path}")
+    assert code == 2 and "no config.json there" in shown and not (tmp_path / "outputs").exists()
+
+
+def test_without_opengl_failures_come_without_pictures(
+    said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise TaccorlError("no OpenGL here")
+
+    monkeypatch.setattr("taccorl.sim.simulation.Simulation.render_states", fail)
+    code, shown = said(*EXPERT[:-1], *SHORT, "--failures=1", "--out=scored")
+    assert code == 0 and "note: failures have no pictures: no OpenGL here" in shown
+    assert "timeout after 0.1 s" in (tmp_path / "scored/report.html").read_text()
+
+
+def test_another_twin_is_scored_on_the_same_scenes(said: Any, tmp_path: Path) -> None:
+    (tmp_path / "weak.yaml").write_text("controller: {kp_nm_per_rad: [200.0, 200.0, 200.0, 100.0, 50.0, 50.0]}\n")
+    assert said(*EXPERT, *SHORT, "--failures=0", "--out=nominal")[0] == 0
+    code, shown = said(*EXPERT, *SHORT, "--failures=0", "--twin=weak.yaml", "--against=nominal", "--out=weak")
+    assert code == 0 and "expert against expert (nominal)" in shown
+    weak, nominal = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("weak", "nominal"))
+    assert weak["scenes"]["twin"] == "weak.yaml" and nominal["scenes"]["twin"] is None
+    assert weak["about"]["digest of the twin"] != nominal["about"]["digest of the twin"]
+
+
+@pytest.mark.slow
+def test_a_checkpoint_is_preflighted_scored_and_shown(said: Any, checkpoint: Path, tmp_path: Path) -> None:
+    code, shown = said(
+        *("evaluate", f"--policy.path={checkpoint}", "--policy.device=cpu", "--task=assembly_1", "--against=expert"),
+        *(*SHORT, "--failures=1", "--out=scored"),
+    )
+    assert code == 0 and "preflight of" in shown
+    assert shown.index("cameras") < shown.index("0 of 2 episodes succeeded")
+    page = (tmp_path / "scored/report.html").read_text()
+    assert "data:image/jpeg;base64," in page and "Paired comparison" in page and "Checkpoint and environment" in page
+    summary = json.loads((tmp_path / "scored/evaluation.json").read_text())
+    assert [p["name"] for p in summary["policies"]] == [str(checkpoint), "expert"]
+    assert len(summary["policies"][0]["digest"]) == 64 and summary["comparisons"]["assembly_1"]["n"] == 2
+
+    config = json.loads((checkpoint / "config.json").read_text())
+    (checkpoint / "config.json").write_text(json.dumps({**config, "fps": 50}))
+    try:
+        code, shown = said("evaluate", f"--policy.path={checkpoint}", "--task=assembly_1", "--out=fast")
+    finally:
+        (checkpoint / "config.json").write_text(json.dumps(config))
+    assert code == 2 and "rate: 50 Hz in the checkpoint, 30 Hz in the environment. Nothing was run" in shown
+    assert "preflight of" in shown and not (tmp_path / "fast").exists()

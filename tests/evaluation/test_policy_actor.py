@@ -1,0 +1,228 @@
+"""A checkpoint's own processors, the same numbers as lerobot-eval's rollout, and the preflight of what does not fit."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_checkpoint import write_checkpoint
+
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.evaluate import Scenes, score
+from taccorl.evaluation.preflight import PolicyFacts, preflight, refuse_differences
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+STEPS = 7
+SEED = 1000
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
+
+
+def facts(**changes: Any) -> PolicyFacts:
+    """Of a policy that fits."""
+    inputs = {"observation.state": (14,), "observation.tactile": (1536,), "observation.images.front": (3, 224, 224)}
+    fitting = PolicyFacts(
+        inputs=inputs,
+        action_shape=(14,),
+        fps=30,
+        robot_type="bi_piper_flexitac",
+        touch_gain_per_count=1 / 75,
+        touch_layout=(4, 32, 12),
+        ranges={"action": (ACTION_LOW, ACTION_HIGH)},
+    )
+    return dataclasses.replace(fitting, **changes)
+
+
+def test_a_policy_that_fits_passes() -> None:
+    checks = preflight(facts(), TwinConfig())
+    assert {c.verdict for c in checks} == {"same"}
+    refuse_differences(checks, "policy")
+    assert {c.what for c in checks} >= {"cameras", "state", "touch", "touch gain", "action", "robot", "rate"}
+
+
+def test_what_a_checkpoint_does_not_state_is_no_difference() -> None:
+    checks = preflight(PolicyFacts(inputs={}, action_shape=(14,)), TwinConfig())
+    refuse_differences(checks, "policy")
+    assert {c.what for c in checks if c.verdict == "not stated"} == {"robot", "rate"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"inputs": {"observation.images.top": (3, 224, 224)}},
+            "cameras: top 224×224 in the checkpoint, front 224×224",
+        ),
+        ({"inputs": {"observation.images.front": (3, 96, 96)}}, "cameras: front 96×96"),
+        ({"inputs": {"observation.state": (7,)}}, "state: 7 in the checkpoint, 14 in the environment"),
+        ({"inputs": {"observation.tactile": (768,)}}, "touch: 768 in the checkpoint, 1536"),
+        ({"inputs": {"observation.force": (6,)}}, "other inputs: observation.force"),
+        ({"action_shape": (7,)}, "action: 7 in the checkpoint, 14"),
+        ({"fps": 50}, "rate: 50 Hz in the checkpoint, 30 Hz in the environment"),
+        ({"robot_type": "aloha"}, "robot: aloha in the checkpoint, bi_piper_flexitac"),
+        ({"action_names": tuple("abcdefghijklmn")}, "action names: a, b, c"),
+        ({"touch_gain_per_count": 1 / 255}, "touch gain: counts × 0.00392157 in the checkpoint, counts × 0.0133333"),
+        ({"touch_layout": (2, 16, 16)}, "touch layout: 2 × 16 × 16 in the checkpoint, 4 × 32 × 12"),
+        ({"ranges": {"action": (np.degrees(ACTION_LOW), np.degrees(ACTION_HIGH))}}, "range of action: -170 … 180 in"),
+        ({"unnormalised": ("action",)}, "normalisation: no statistics of action"),
+    ],
+)
+def test_each_difference_is_named_with_both_sides(changes: dict, words: str) -> None:
+    checks = preflight(facts(**changes), TwinConfig())
+    with pytest.raises(TaccorlError, match="policy does not fit the environment") as error:
+        refuse_differences(checks, "policy")
+    assert words in str(error.value) and str(error.value).endswith("Nothing was run")
+
+
+def test_a_twin_without_the_camera_does_not_fit() -> None:
+    blind = dataclasses.replace(TwinConfig(), cameras=[c for c in TwinConfig().cameras if c.name != "front"])
+    with pytest.raises(TaccorlError, match="cameras: front 224×224 in the checkpoint, left_wrist 224×224"):
+        refuse_differences(preflight(facts(), blind), "policy")
+
+
+def test_a_checkpoint_states_its_facts(checkpoint: Path) -> None:
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    opened = open_checkpoint(checkpoint, "cpu")
+    found = opened.facts()
+    assert found.inputs["observation.images.front"] == (3, 224, 224) and found.action_shape == (14,) and found.fps == 30
+    assert found.touch_layout == (4, 32, 12) and found.touch_gain_per_count == pytest.approx(1 / 75)
+    low, high = found.ranges["action"]
+    assert high - low == pytest.approx(np.full(14, 0.1), abs=1e-5) and found.unnormalised == ()
+    refuse_differences(preflight(found, TwinConfig()), "policy")
+    assert len(opened.digest) == 64 and opened.digest == open_checkpoint(checkpoint, "cpu").digest
+
+
+def test_statistics_that_are_missing_are_found(checkpoint: Path, tmp_path: Path) -> None:
+    from lerobot.policies.factory import make_pre_post_processors
+
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    bare = shutil.copytree(checkpoint, tmp_path / "bare")
+    for processor in make_pre_post_processors(open_checkpoint(checkpoint, "cpu").config):
+        processor.save_pretrained(bare)
+    found = open_checkpoint(bare, "cpu").facts()
+    assert set(found.unnormalised) == {"observation.state", "action"}
+
+
+def test_folders_that_are_no_checkpoint_are_refused(checkpoint: Path, tmp_path: Path) -> None:
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    with pytest.raises(TaccorlError, match=r"no config\.json there; give the folder pretrained_model"):
+        open_checkpoint(tmp_path)
+    with pytest.raises(TaccorlError, match=f"did you mean {checkpoint}"):
+        open_checkpoint(checkpoint.parent)
+    other = shutil.copytree(checkpoint, tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    (other / "config.json").write_text(json.dumps({**config, "type": "no_such_policy"}))
+    with pytest.raises(TaccorlError, match="Policy type 'no_such_policy'"):
+        open_checkpoint(other)
+    weightless = shutil.copytree(checkpoint, tmp_path / "weightless")
+    (weightless / "model.safetensors").unlink()
+    with pytest.raises(TaccorlError, match="weightless"):
+        open_checkpoint(weightless, "cpu").load(SEED)
+    (weightless / "policy_preprocessor.json").unlink()
+    with pytest.raises(TaccorlError, match=r"has no policy_preprocessor\.json"):
+        open_checkpoint(weightless, "cpu")
+
+
+def lerobot_rollout(path: Path, task: str, n: int, length: int | None) -> Any:
+    """LeRobot's own evaluation in its own order: seed, environments, policy, processors, rollout."""
+    import torch
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.envs import make_env, make_env_pre_post_processors
+    from lerobot.policies import make_policy, make_pre_post_processors
+    from lerobot.scripts.lerobot_eval import rollout
+    from lerobot.utils.random_utils import set_seed
+
+    from taccorl.lerobot_plugin.env import TaccorlEnvConfig
+
+    set_seed(SEED)
+    env_config = TaccorlEnvConfig(task=task, episode_length=length)
+    envs = make_env(env_config, n_envs=n)["taccorl"][0]
+    config = PreTrainedConfig.from_pretrained(path, cli_overrides=["--device=cpu"])
+    config.pretrained_path = path
+    policy = make_policy(config, env_cfg=env_config).eval()
+    before, after = make_pre_post_processors(
+        config, pretrained_path=str(path), preprocessor_overrides={"device_processor": {"device": "cpu"}}
+    )
+    env_before, env_after = make_env_pre_post_processors(env_config, config)
+    with torch.no_grad():
+        done = rollout(envs, policy, env_before, env_after, before, after, seeds=list(range(SEED, SEED + n)))
+    envs.close()
+    return done
+
+
+@pytest.mark.slow
+def test_actions_are_those_of_lerobot_eval(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flow matching draws noise: equal actions show equal observations, processors, weights and random numbers."""
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    theirs = lerobot_rollout(checkpoint, "assembly_1", 2, STEPS)
+    where = Scenes(tasks=("assembly_1",), episodes=2, seed=SEED, episode_length=STEPS)
+    actor = open_checkpoint(checkpoint, "cpu").load(SEED)
+    rendered: list[int] = []
+    look = TaccorlVectorEnv.observe
+
+    def observe(envs: TaccorlVectorEnv, images: bool = False) -> Any:
+        if images:
+            rendered.append(int(envs.sim.judge.steps[0]))
+        return look(envs, images)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TaccorlVectorEnv, "observe", observe)
+        ours = score(where, actor)
+    assert np.array_equal(np.stack([r.actions for r in ours]), theirs["action"].numpy())
+    assert [r.row.success for r in ours] == theirs["success"].any(1).tolist()
+    # Pictures were rendered for the two chunks only: n_action_steps is 5, the episode has 7 steps.
+    assert rendered == [0, 5]
+    assert np.ptp(theirs["action"].numpy(), axis=1).max() > 1e-3  # it moves
+    # A second task of the same run, and a second run, begin with the same random numbers.
+    again = score(where, actor)
+    assert all(np.array_equal(a.actions, b.actions) for a, b in zip(ours, again, strict=True))
+
+
+@pytest.mark.slow
+def test_success_per_seed_is_that_of_lerobot_eval() -> None:
+    """A stand-in that repeats one expert episode: it succeeds in that episode's scene and fails in the next one."""
+    import torch
+    from lerobot.scripts.lerobot_eval import rollout
+
+    from taccorl.evaluation.expert_actor import ExpertActor
+    from taccorl.evaluation.policy_actor import PolicyActor
+    from taccorl.lerobot_plugin.env import TaccorlEnvConfig
+
+    (expert,) = score(Scenes(tasks=("assembly_1",), episodes=1, seed=0), ExpertActor())
+    assert expert.row.success
+
+    class Repeats(torch.nn.Module):
+        def reset(self) -> None:
+            self.step = 0
+
+        def select_action(self, batch: dict) -> torch.Tensor:
+            action = torch.from_numpy(expert.actions[min(self.step, len(expert.actions) - 1)])
+            self.step += 1
+            return action.repeat(len(batch["observation.state"]), 1)
+
+    length = len(expert.actions) + 5
+
+    def unchanged(batch: Any) -> Any:
+        return batch
+
+    config = TaccorlEnvConfig(task="assembly_1", episode_length=length)
+    envs = config.create_envs(2)["taccorl"][0]
+    theirs: Any = rollout(envs, Repeats(), *config.get_env_processors(), unchanged, unchanged, seeds=[0, 1])  # pyright: ignore[reportArgumentType]
+    envs.close()
+    actor = PolicyActor("repeats", Repeats(), unchanged, unchanged)
+
+    ours = score(Scenes(tasks=("assembly_1",), episodes=2, seed=0, episode_length=length), actor)
+    assert [r.row.success for r in ours] == theirs["success"].any(1).tolist() == [True, False]
+    assert [r.row.steps for r in ours] == (theirs["done"].int().argmax(1) + 1).tolist()

@@ -1,0 +1,213 @@
+"""One batch of episodes with stand-in actors whose ends are known beforehand."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taccorl.errors import TaccorlError, UnreachableError
+from taccorl.evaluation.evaluate import Scenes, score
+from taccorl.evaluation.expert_actor import ExpertActor
+from taccorl.evaluation.failed_episodes import choose_failures, execute_again
+from taccorl.evaluation.rollouts import Acted, Rollout
+from taccorl.sim.spaces import STATE_KEY, Observation
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+STEPS = 6
+
+
+class StandIn:
+    """Holds still, but for what ``change(step, actions, envs)`` does to its actions."""
+
+    name, needs_images, max_batch = "stand-in", False, None
+
+    def __init__(self, change: Callable[[int, np.ndarray, TaccorlVectorEnv], None] | None = None) -> None:
+        self.change, self.step, self.restarts = change, 0, 0
+
+    def looks_now(self) -> bool:
+        return True
+
+    def restart(self) -> None:
+        self.restarts += 1
+
+    def begin(self, envs: TaccorlVectorEnv) -> None:
+        self.envs, self.step = envs, 0
+
+    def act(self, observation: Observation) -> Acted:
+        actions = observation[STATE_KEY].copy()
+        if self.change:
+            self.change(self.step, actions, self.envs)
+        self.step += 1
+        return Acted(actions)
+
+
+def scenes(task: str = "assembly_1", **changes: object) -> Scenes:
+    values: dict = {"tasks": (task,), "episodes": 3, "seed": 7, "episode_length": STEPS}
+    return Scenes(**{**values, **changes})
+
+
+def same(one: list[Rollout], other: list[Rollout]) -> bool:
+    return [r.row for r in one] == [r.row for r in other] and all(
+        np.array_equal(a.actions, b.actions) for a, b in zip(one, other, strict=True)
+    )
+
+
+def test_who_holds_still_runs_out_of_time() -> None:
+    rows = [r.row for r in score(scenes(), StandIn())]
+    assert [row.seed for row in rows] == [7, 8, 9]
+    assert [row.outcome for row in rows] == ["timeout"] * 3
+    assert all(row.steps == STEPS and row.time_s == pytest.approx(STEPS / 30) for row in rows)
+    assert all(end is None for row in rows for own in row.subtask_end_s.values() for end in own.values())
+    assert rows[0].subtask_end_s.keys() == {"left", "right"} and all(
+        len(v) == 2 for v in rows[0].subtask_end_s.values()
+    )
+
+
+def test_a_bad_action_and_a_divergence_end_their_own_episode() -> None:
+    def break_two(step: int, actions: np.ndarray, envs: TaccorlVectorEnv) -> None:
+        if step >= 2:
+            actions[0, 3] = np.nan  # and goes on with it after the end
+        if step >= 4:
+            actions[3, 1] = 90.0  # degrees
+        if step == 3:
+            envs.sim.arrays["qvel"][1, 20] = np.nan
+
+    healthy, broken = (score(scenes(episodes=4), StandIn(change)) for change in (None, break_two))
+    rows = [r.row for r in broken]
+    assert [row.outcome for row in rows] == ["bad_action", "diverged", "timeout", "bad_action"]
+    assert [row.steps for row in rows] == [2, 4, STEPS, 4]
+    assert rows[0].reason.startswith("action: left_joint4 is nan") and "left_joint2 is 90" in rows[3].reason
+    assert rows[1].reason == ""
+    assert same(broken[2:3], healthy[2:3])
+    assert np.isfinite(list(rows[1].measures.values())).all()
+
+
+def test_the_same_seeds_twice_give_the_same_rows_in_any_batch() -> None:
+    def wander(step: int, actions: np.ndarray, envs: TaccorlVectorEnv) -> None:
+        actions += 0.01 * np.sin(step + envs.sim.seeds[:, None])
+
+    once = score(scenes(), StandIn(wander))
+    assert same(once, score(scenes(), StandIn(wander)))
+    assert same(once, score(scenes(batch_size=2), StandIn(wander)))  # batches of two and one
+    assert not same(once, score(scenes(seed=8), StandIn(wander)))
+
+
+def test_another_twin_moves_otherwise_in_the_same_scenes(tmp_path: Path) -> None:
+    (tmp_path / "weak.yaml").write_text("controller: {kp_nm_per_rad: [200.0, 200.0, 200.0, 100.0, 50.0, 50.0]}\n")
+    nominal, weak = (score(scenes(twin=twin), StandIn()) for twin in (None, tmp_path / "weak.yaml"))
+    assert [r.row.seed for r in nominal] == [r.row.seed for r in weak]
+    assert np.array_equal(nominal[0].actions[0], weak[0].actions[0])  # the first observation is of the reset
+    assert not np.array_equal(nominal[0].actions[-1], weak[0].actions[-1])
+
+
+def test_a_target_beyond_the_limits_is_clipped_and_counted() -> None:
+    def reach(step: int, actions: np.ndarray, envs: TaccorlVectorEnv) -> None:
+        actions[:, 6] = 0.2 if step < 2 else 0.05
+
+    assert [r.row.clipped_steps for r in score(scenes(), StandIn(reach))] == [2, 2, 2]
+
+
+def test_actions_of_another_shape_are_refused() -> None:
+    class Short(StandIn):
+        def act(self, observation: Observation) -> Acted:
+            return Acted(observation[STATE_KEY][:, :7])
+
+    with pytest.raises(TaccorlError, match=r"shape \(3, 7\), wanted is \(3, 14\)"):
+        score(scenes(), Short())
+
+
+def test_random_numbers_begin_anew_for_each_task() -> None:
+    actor = StandIn()
+    rows = [r.row for r in score(scenes(tasks=("assembly_1", "puzzle"), episodes=1), actor)]
+    assert actor.restarts == 2 and [row.task for row in rows] == ["assembly_1", "puzzle"]
+    assert [row.max_partial for row in rows] == [1, 3]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"tasks": ("assembly1",)}, "did you mean 'assembly_1'"),
+        ({"tasks": ()}, "missing --task=, one of assembly_1"),
+        ({"tasks": ("puzzle", "puzzle")}, "each task once"),
+        ({"difficulty": "trian"}, "did you mean 'train'"),
+        ({"episodes": 0}, "--episodes=0: at least 1"),
+        ({"seed": -1}, "--seed=-1"),
+        ({"randomization": 2.0}, "--randomization=2"),
+    ],
+)
+def test_scenes_that_cannot_be_are_refused(changes: dict, words: str) -> None:
+    with pytest.raises(TaccorlError, match=words):
+        scenes(**changes)
+
+
+@pytest.mark.parametrize(
+    ("way_out", "outcome", "reason"),
+    [("end", "unfinished", "the script ended without success"), ("pose", "unreachable", "left: 0.9 m away")],
+)
+def test_an_expert_that_cannot_go_on_ends_its_episode(way_out: str, outcome: str, reason: str) -> None:
+    class Short(ExpertActor):
+        def begin(self, envs: TaccorlVectorEnv) -> None:
+            self._actions = self._two_steps(envs)
+
+        def _two_steps(self, envs: TaccorlVectorEnv) -> Iterator[np.ndarray]:
+            for _ in range(2):
+                yield envs.observe()[STATE_KEY][0]
+            if way_out == "pose":
+                raise UnreachableError(reason)
+
+    first, second = (r.row for r in score(scenes(episodes=2), Short()))
+    assert (first.outcome, first.reason, first.steps) == (outcome, reason, 2)
+    assert second.outcome == outcome and second.seed == 8
+
+
+def test_failures_are_chosen_from_all_categories() -> None:
+    (base,) = score(scenes(episodes=1), StandIn())
+    ends = ["timeout", "timeout", "success", "dropped", "timeout", "dropped"]
+    all_of_them = [
+        dataclasses.replace(base, row=dataclasses.replace(base.row, seed=k, outcome=end)) for k, end in enumerate(ends)
+    ]
+    assert [r.row.seed for r in choose_failures(all_of_them, 3)] == [0, 3, 1]
+    assert [r.row.seed for r in choose_failures(all_of_them, 9)] == [0, 3, 1, 5, 4]
+    assert choose_failures(all_of_them, 0) == []
+    without = dataclasses.replace(base, actions=base.actions[:0])
+    assert choose_failures([without], 3) == []
+
+
+def test_a_failure_is_executed_again_bit_for_bit() -> None:
+    seen: list[Observation] = []
+
+    class Watching(StandIn):
+        def act(self, observation: Observation) -> Acted:
+            seen.append(observation)
+            return Acted((observation[STATE_KEY] + 0.01).astype(np.float32))
+
+    where = scenes(episodes=2)
+    rollouts = score(where, Watching())
+    again = execute_again(where, rollouts[1], images=False)
+    for key in (STATE_KEY, "observation.tactile"):
+        assert np.array_equal(again.episode.arrays[key], np.stack([o[key][1] for o in seen[:STEPS]]))
+    assert again.episode.name == "assembly_1 seed 8, timeout" and again.pictures is None
+    wrong = dataclasses.replace(rollouts[1], row=dataclasses.replace(rollouts[1].row, outcome="dropped"))
+    with pytest.raises(TaccorlError, match="ends as timeout, not dropped"):
+        execute_again(where, wrong, images=False)
+
+
+@pytest.mark.slow
+def test_the_expert_succeeds_where_it_is_known_to() -> None:
+    from taccorl.data.spec import find_spec, load_dataset_spec
+    from taccorl.demos.collect import ExpertSource, Plan, attempt
+    from taccorl.demos.recorder import with_simulator
+
+    plan = Plan(task="assembly_1", images=False, source=ExpertSource())
+    sim = plan.make()
+    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    collected = attempt(plan, sim, spec, 0)
+    assert collected.outcome == "success"
+    where = scenes(episodes=1, seed=plan.attempt_seed(0), episode_length=None)
+    (found,) = score(where, ExpertActor())
+    assert found.row.success and found.row.partial_credit == 1.0
+    assert np.array_equal(found.actions, np.stack([row["action"] for row in collected.rows]))
+    ends = [end for own in found.row.subtask_end_s.values() for end in own.values()]
+    assert all(end is not None and 0 < end <= found.row.time_s for end in ends)

@@ -1,0 +1,35 @@
+"""A checkpoint of tactile_pi05 at its smallest, as lerobot-train leaves one: random weights, statistics near the home pose."""
+
+import sys
+from pathlib import Path
+
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.sim.spaces import IMAGE_KEYS
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "policies"))
+
+
+def write_checkpoint(folder: Path) -> Path:
+    """``folder/pretrained_model`` with weights, configuration and both processors; returns it."""
+    import torch
+    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot.policies.factory import make_pre_post_processors
+    from tiny_policies import tiny_policy
+
+    import taccorl.lerobot_plugin  # noqa: F401
+
+    inputs = {
+        "observation.state": PolicyFeature(FeatureType.STATE, (14,)),
+        "observation.tactile": PolicyFeature(FeatureType.STATE, (1536,)),
+        **{key: PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for key in IMAGE_KEYS.values()},
+    }
+    policy = tiny_policy(fps=30, discrete_state_input=None, input_features=inputs)
+    middle = torch.tensor((ACTION_LOW + ACTION_HIGH) / 2, dtype=torch.float32)
+    statistics = {
+        name: {"q01": middle - 0.05, "q99": middle + 0.05, "min": middle - 0.05, "max": middle + 0.05}
+        for name in ("action", "observation.state")
+    }
+    policy.save_pretrained(folder / "pretrained_model")
+    for processor in make_pre_post_processors(policy.config, dataset_stats=statistics):
+        processor.save_pretrained(folder / "pretrained_model")
+    return folder / "pretrained_model"
