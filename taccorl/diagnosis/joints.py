@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -168,7 +169,7 @@ def _payload_remarks(found: Diagnosis) -> list[str]:
     ends = [found.intervals[name] for name in names if name in found.base]
     if not any(low > 0.0 or high < 0.0 for low, high in ends):
         return []
-    off_mm = 1e3 * float(np.hypot(*(found.base[name] for name in names)))
+    off_mm = 1e3 * math.hypot(*(float(found.base[name]) for name in names))
     return [
         f"The payload pulls as if it were {off_mm:.1f} mm off the TCP. No recording states its place: state payload_position_m "
         "in measurements.yaml, else compare shows an error there that this diagnosis does not."

@@ -32,7 +32,9 @@ def test_the_paper_s_loss_by_hand() -> None:
     assert paper_loss(reported, np.array([0.0, np.nan, 1.0])) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("signal", TRUTH)
+@pytest.mark.parametrize(
+    "signal", [pytest.param(s, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, s in enumerate(TRUTH)]
+)
 def test_the_paper_s_gains_are_found_from_its_sweep(signal: str) -> None:
     validation = motion_of(signal, 1, high_hz=1.0)
     fit = identify_controller([motion_of(signal)], JointModel(REFERENCE_TWIN, signal), validation=[validation])

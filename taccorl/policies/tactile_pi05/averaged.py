@@ -31,9 +31,9 @@ class Averaged(nn.Module):
         self.num_updates += 1
         n = int(self.num_updates)
         decay = min(self.decay, (1 + n) / (10 + n))
-        pairs = [(self.get_buffer(_key(name)), weight.detach()) for name, weight in network.named_parameters()]
-        means, weights = zip(*pairs, strict=True)
-        torch._foreach_lerp_(list(means), list(weights), 1 - decay)
+        means = [self.get_buffer(_key(name)) for name, _ in network.named_parameters()]
+        weights = [weight.detach() for weight in network.parameters()]
+        torch._foreach_lerp_(means, weights, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
     @torch.no_grad()
     def exchange(self, network: nn.Module) -> None:

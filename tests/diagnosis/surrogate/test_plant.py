@@ -206,7 +206,7 @@ def test_with_a_spring_in_the_gear_motor_and_link_are_two_masses():
     assert np.abs(geared(step) - motor).max() > 1e-3
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (k % 4 > 0)) for k, n in enumerate(KINDS)])
 def test_every_hidden_effect_changes_what_is_reported(name):
     k = KINDS[name]
     number = 5 if 5 in k.joints else k.joints[-1]  # a joint with weight
