@@ -185,3 +185,13 @@ def test_validation_rows_without_a_measurement_are_refused():
     alone.measured[len(alone.measured) // 2 :, alone.column(SIGNAL)] = np.nan
     with pytest.raises(TaccorlError, match="nothing was measured in the validation rows"):
         diagnose_joint(NOMINAL, SIGNAL, Measurements((alone,)))
+
+
+@pytest.mark.slow
+def test_dry_friction_and_a_late_command_are_found_together():
+    """As in the pairs of docs/diagnosis.md."""
+    case = draw_case(("coulomb_friction", "command_delay"), 51000, design="pack", sampled=True, coloured=True)
+    problem = problem_of(case, effort=True, design="pack")
+    found = diagnose(problem, problem.fit, problem.validation, problem.test, start=problem.start)
+    assert {"coulomb_friction", "command_delay"} <= {*found.names}
+    assert found.errors["after"]["validation"] < 1.3 < found.errors["fitted"]["validation"]
