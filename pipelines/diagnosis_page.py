@@ -48,8 +48,8 @@ has a row of its own. Pads are judged by all their taxels, each a channel.
 
 Two rows are not reached. **Lost commands**: of those that changed the motion by at least 0.6 noise floors all were said (19 of
 19); the others lost 1 to 6 % of commands in motion so slow that the loss is below the noise. **CPU of packs**: seven recordings
-of a pack cost seven times one, and the search needs about 2000 simulations of each; what was tried (fewer candidates refitted
-to the end, no search where nothing is missing) halved the median over all cases but not the slow tenth.
+of a pack cost seven times one, and the search needs about 2000 simulations of each; refitting fewer candidates to the end did
+not bring the slow tenth down.
 
 *Material*: the validation error, gains refitted, is at least {MATERIAL:g} noise floors; below that there is nothing to find.
 *Exact*: the hidden effect is the one that was added first; of two, both are found. *Named*: it is that, or named with it as a
