@@ -134,7 +134,7 @@ class _Opened:
 
 
 def _open(choice: PolicyChoice, scenes: "Scenes") -> _Opened:
-    """Both sides are printed, and a difference ends the command here.
+    """Print what the checkpoint and the environment state, and end the command if they differ.
 
     Raises:
         TaccorlError: neither or both ways to name a policy, a checkpoint that cannot be used or does not fit.

@@ -23,11 +23,11 @@ PAPER_EPISODES = 128
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes:
-    """On what policies are scored."""
+    """Tasks, scenes and twin on which policies are scored."""
 
     tasks: tuple[str, ...]
     episodes: int = PAPER_EPISODES
-    """Of each task."""
+    """Number of scenes of each task."""
     seed: int
     """Scene seed of the first episode; the next one has the next, as in ``lerobot-eval``."""
     difficulty: str = "train"
@@ -121,7 +121,7 @@ def _with_prefix(progress: Progress | None, prefix: str) -> Progress | None:
 
 @dataclass(frozen=True)
 class Stored:
-    """An earlier evaluation."""
+    """The episodes of an earlier evaluation, as its folder holds them."""
 
     policy: str
     """Name of its first policy, and the folder."""

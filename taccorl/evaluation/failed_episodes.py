@@ -44,7 +44,7 @@ def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
 
 
 def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEpisode:
-    """The same scene, actions and touch, bit for bit.
+    """Run a failed episode again: the same scene, actions and touch, bit for bit.
 
     Args:
         images: render the cameras (needs OpenGL).

@@ -135,7 +135,7 @@ def _names(policy: PolicyFacts) -> list[Check]:
 
 
 def _normalisation(policy: PolicyFacts, key: str) -> Check:
-    """Statistics in degrees or millimetres lie far beyond the limits in rad and m."""
+    """Compare the data limits of the checkpoint with the joint limits [rad] and openings [m]: other units lie far beyond them."""
     low, high = policy.ranges[key]
     there = f"{ACTION_LOW.min():.3g} … {ACTION_HIGH.max():.3g} rad, grippers to {ACTION_HIGH[6]:.3g} m"
     here = f"{low.min():.3g} … {high.max():.3g}"

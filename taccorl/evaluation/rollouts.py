@@ -40,7 +40,7 @@ class Actor(Protocol):
 
     @property
     def needs_images(self) -> bool:
-        """Whether the cameras have to be rendered."""
+        """Whether the actor uses camera pictures at all; if not, nothing is rendered."""
         ...
 
     def looks_now(self) -> bool:

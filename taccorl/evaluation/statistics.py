@@ -35,7 +35,7 @@ def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> t
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
-    """Two-sided p-value of McNemar's exact test: is b of b + c a fair coin? 1 if the two never disagree.
+    """Two-sided p-value of McNemar's exact test: b of b + c under a binomial of 1/2. It is 1 if the two policies never disagree.
 
     Raises:
         TaccorlError: a negative count.

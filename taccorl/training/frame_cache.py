@@ -44,7 +44,7 @@ class CacheRequest:
     """Rows and columns; None: as the dataset has them."""
     store: Path
     device: str
-    """The policy's."""
+    """Torch device of the policy: ``cpu``, ``cuda`` or ``cuda:0``."""
 
     def __post_init__(self) -> None:
         """

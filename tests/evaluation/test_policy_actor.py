@@ -27,7 +27,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def facts(**changes: Any) -> PolicyFacts:
-    """Of a policy that fits."""
+    """What a checkpoint states that fits the environment."""
     inputs = {"observation.state": (14,), "observation.tactile": (1536,), "observation.images.front": (3, 224, 224)}
     fitting = PolicyFacts(
         inputs=inputs,

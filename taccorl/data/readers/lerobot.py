@@ -133,7 +133,8 @@ class LerobotReader(Reader):
                 )
 
     def _lead_without_action_time(self) -> int | None:
-        """Of a dataset that does not state it: 1 from the twin, 0 from an ingest before the key existed, else unknown."""
+        """Rows by which actions lead states where ``action_time`` is missing: 1 if the twin made the dataset, 0 if ingest did,
+        else None."""
         if not (self.source.path / _SPEC_FILE).is_file():
             return None
         provenance = self.dataset.told(self.index).get("provenance") or {}

@@ -37,7 +37,7 @@ class Averaged(nn.Module):
 
     @torch.no_grad()
     def exchange(self, network: nn.Module) -> None:
-        """Mean and weights change places; nothing is copied."""
+        """Swap the weights of ``network`` with their mean. Only references are swapped, no numbers are copied."""
         for name, weight in network.named_parameters():
             mean = self.get_buffer(_key(name))
             weight.data, mean.data = mean.data, weight.data
