@@ -28,7 +28,7 @@ from taccorl.training.surrogate_twin import ORIGIN, draw_surrogate_twin
 
 RECORDING_SPEC = "piper_flexitac_mcap"
 SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")
-SMALL += ("--train=configs/small/tiny.yaml", "--steps=4", "--batch_size=4")
+SMALL += ("--train=configs/learn/tiny.yaml", "--steps=4", "--batch_size=4")
 
 
 @dataclass(kw_only=True)

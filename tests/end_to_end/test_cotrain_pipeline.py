@@ -36,7 +36,7 @@ def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(
     (trained,) = out.glob("policy_*/checkpoints/last/pretrained_model/train_config.json")
     config = json.loads(trained.read_text())
     assert config["steps"] == 4 and config["policy"]["sim_weight"] == 0.5
-    of_tiny_yaml = {"optimizer_muon": True, "image_randomization": False}
+    of_tiny_yaml = {"chunk_size": 16, "image_randomization": False}
     assert of_tiny_yaml.items() <= config["policy"].items()
     assert "surrogate" in config["dataset"]["repo_id"]
 

@@ -13,7 +13,6 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, load_optimizer_state, save_optimizer_state
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
-from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from safetensors.torch import save_file
 from tiny_policies import (
     FORMAT,
@@ -29,11 +28,10 @@ from tiny_policies import (
 )
 
 from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.cameras import CameraEncoder, Residual
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
 from taccorl.policies.tactile_pi05.encoder import StateToken
-from taccorl.policies.tactile_pi05.keypoints import KeypointCamera
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
-from taccorl.policies.tactile_pi05.muon import MuonAdamW, orthogonal
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import TactileReadingStep
 from taccorl.policies.tactile_pi05.tokenizer import ByteTokenizer, PromptTokenizerStep, WordTokenizer
 from taccorl.policies.tactile_pi05.weights import load_base_weights
@@ -296,37 +294,44 @@ def test_a_token_of_the_state_is_the_waves_of_each_joint_and_no_joint_is_beyond_
     assert torch.equal(token(torch.tensor([[0.3, 2e8]])), token(torch.tensor([[0.3, 4.0]])))
 
 
-def test_a_key_point_is_where_its_map_is_high():
-    camera = KeypointCamera(2, 3, 8)
-    assert camera.maps(torch.rand(1, 3, 112, 112)).shape == (1, 2, 28, 28)
-    camera.maps = torch.nn.Conv2d(3, 2, 1)  # the first map: red; the second: blue
-    torch.nn.init.zeros_(camera.maps.bias)
-    with torch.no_grad():
-        camera.maps.weight.copy_(40 * torch.tensor([[1.0, 0, 0], [0, 0, 1]])[:, :, None, None])
-    image = torch.zeros(2, 3, 5, 9)
-    image[0, 0, 1, 6] = 1  # of 9 columns −1 … 1 the seventh: 0.5; of 5 rows the second: −0.5
-    image[0, 2, 4, 0] = 1
-    image[1, 0, 0, [2, 8]] = 1  # two alike: between them, at column 5, 0.25
-    points = camera.points(image)  # x of red and blue, y of red and blue; blue of the second is nowhere, so the middle
+def test_a_point_is_where_its_map_is_high():
+    camera = CameraEncoder((16, 32), 2, 3, 8)
+    assert camera.maps(camera.features(torch.rand(1, 3, 112, 112))).shape == (1, 2, 28, 28)
+    maps = torch.zeros(2, 2, 5, 9)  # of two pictures; sharpness 3: 40 · 3 is all of a softmax
+    maps[0, 0, 1, 6] = 40  # of 9 columns −1 … 1 the seventh: 0.5; of 5 rows the second: −0.5
+    maps[0, 1, 4, 0] = 40
+    maps[1, 0, 0, [2, 8]] = 40  # two alike: between them, at column 5, 0.25
+    points = camera.points(maps)  # x of both maps, then y; the second of the second picture is flat, so the middle
     torch.testing.assert_close(points, torch.tensor([[0.5, -1.0, -0.5, 1.0], [0.25, 0.0, -1.0, 0.0]]))
 
     # A softmax that is not all in one place: of 9 columns one weighs e^(3 · 0.5 · 2) = e³, the rest 1 each.
     torch.nn.init.constant_(camera.sharpness, 0.5)
-    with torch.no_grad():
-        camera.maps.weight *= 2 / 40
-    soft = torch.zeros(1, 3, 1, 9)
-    soft[0, 0, 0, 8] = 1
+    soft = torch.zeros(1, 2, 1, 9)
+    soft[0, 0, 0, 8] = 2
     weight = math.exp(3) / (math.exp(3) + 8)
     places = [-1 + column / 4 for column in range(9)]
     assert camera.points(soft)[0, 0].item() == pytest.approx(weight + (1 - weight) * sum(places[:8]) / 8, rel=1e-5)
-    torch.nn.init.ones_(camera.sharpness)
-    with torch.no_grad():
-        camera.maps.weight *= 40 / 2
 
-    waves = [math.pi * 2**k * p for p in (0.5, -1.0, -0.5, 1.0) for k in range(3)]
-    told = torch.tensor([[0.5, -1.0, -0.5, 1.0, *map(math.sin, waves), *map(math.cos, waves)]])
+
+def test_tokens_of_a_picture_are_made_of_its_points_their_waves_and_its_mean():
+    torch.manual_seed(0)
+    camera, image = CameraEncoder((16, 32, 32), 2, 3, 8), torch.rand(1, 3, 56, 56)
+    features = camera.features(image)
+    assert features.shape == (1, 32, 7, 7)  # a quarter, and the second block halves it
+    points = camera.points(camera.maps(features))
+    waves = [math.pi * 2**k * p for p in points[0].tolist() for k in range(3)]
+    told = torch.tensor([[*points[0].tolist(), *map(math.sin, waves), *map(math.cos, waves)]])
+    told = torch.cat([told, features.mean((2, 3))], dim=1)
     expected = camera.out(torch.nn.functional.gelu(camera.hidden(told)))
-    torch.testing.assert_close(camera(image[:1]), expected.view(1, 3, 8))
+    torch.testing.assert_close(camera(image), expected.view(1, 3, 8))
+
+
+def test_a_block_of_a_camera_is_the_identity_beside_two_convolutions():
+    block, x = Residual(16, 16, 1), torch.randn(2, 16, 5, 5)
+    torch.nn.init.zeros_(block.body[4].weight)
+    torch.nn.init.zeros_(block.body[4].bias)
+    torch.testing.assert_close(block(x), x.clamp(min=0))
+    assert Residual(16, 32, 2)(x).shape == (2, 32, 3, 3)
 
 
 def test_each_camera_has_key_points_of_its_own_and_none_may_be_missing():
@@ -350,11 +355,11 @@ def test_each_camera_has_key_points_of_its_own_and_none_may_be_missing():
     assert torch.equal(chunk(more, batch), seen)
 
 
-def test_a_tiny_that_saw_with_patches_is_told_apart(tmp_path):
+def test_a_tiny_of_other_layers_is_told_apart(tmp_path):
     with sees_with("patches"):
         tiny_policy().save_pretrained(tmp_path)
     with pytest.raises(
-        TaccorlError, match=r"it saw with patches, before tiny had key points: train anew\. Nothing was loaded"
+        TaccorlError, match=r"an earlier taccorl's tiny had other layers .* train anew\. Nothing was loaded"
     ):
         TactilePI05Policy.from_pretrained(tmp_path)
 
@@ -363,10 +368,7 @@ def test_a_tiny_that_saw_with_patches_is_told_apart(tmp_path):
     ("changes", "said"),
     [
         ({"backbone": "tiny", "image_resolution": (56, 84)}, "tiny takes squares, such as"),
-        (
-            {"backbone": "small", "image_resolution": (56, 56)},
-            "small takes squares of a multiple of 16 pixels, such as",
-        ),
+        ({"backbone": "small", "image_resolution": (96, 112)}, "small takes squares, such as"),
     ],
 )
 def test_pictures_of_a_size_that_it_does_not_take_are_refused(changes, said):
@@ -420,59 +422,10 @@ def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
         load_base_weights(policy, str(tmp_path))
 
 
-def test_regression_predicts_one_chunk_and_its_loss_is_that_chunks_error():
-    policy, batch = tiny_policy(objective="regression"), batch_of(True, False, True)
-    predicted = chunk(policy, batch, seed=1)
-    assert torch.equal(predicted, chunk(policy, batch, seed=2))  # no draw
-    # … and one step, out of zeros, whatever the caller says
-    assert torch.equal(predicted, policy.predict_action_chunk(batch, num_steps=7, noise=torch.ones(3, 10, 32)))
-    errors, scale = batch["action"] - predicted, 0.02
-    wanted = ((errors**2 + scale**2).sqrt() - scale).mean(dim=(1, 2))
-    torch.testing.assert_close(losses(policy, batch, seed=3), wanted, rtol=1e-5, atol=1e-6)
-    # Far off it is the absolute error less the scale, near by the square over twice the scale; at 0 its gradient is finite.
-    near, far = predicted + 1e-4, predicted + 3.0
-    assert losses(policy, {**batch, "action": far}).tolist() == pytest.approx([2.98] * 3, rel=1e-3)
-    assert losses(policy, {**batch, "action": near}).tolist() == pytest.approx([1e-8 / 0.04] * 3, rel=0.05)
-    policy.forward({**batch, "action": predicted})[0].backward()
-    gradients = [p.grad for p in policy.model.action_out_proj.parameters()]
-    assert all(gradient is not None and torch.isfinite(gradient).all() for gradient in gradients)
-
-
-def test_a_regressed_chunk_in_real_time_begins_where_the_last_one_goes_on():
-    policy, batch = tiny_policy(objective="regression"), batch_of(True, False)
-    free = chunk(policy, batch)
-    policy.config.rtc_config = RTCConfig(execution_horizon=8)  # as LeRobot's rollout does it, with its weight of 10
-    policy.init_rtc_processor()
-    assert policy.config.rtc_config.max_guidance_weight == 10
-    led = policy.predict_action_chunk(batch, prev_chunk_left_over=free + 0.1, inference_delay=2)
-    share = ((led - free) / 0.1).mean(dim=(0, 2))
-    # LINEAR: what is on its way is kept; then the last chunk weighs 6/7, 5/7, …; behind the horizon not at all.
-    wanted = [1, 1, *(k / 7 for k in range(6, 0, -1)), 0, 0]
-    assert share.tolist() == pytest.approx(wanted, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_regression_is_learnt_in_a_few_steps_and_kept_in_a_checkpoint(tmp_path):
-    policy = tiny_policy(objective="regression", image_randomization=False, image_noise_std=0.0)
-    batch, optimizer = batch_of(True, False), torch.optim.AdamW(policy.parameters(), lr=3e-3)
-    first = losses(policy, batch).mean()
-    for _ in range(80):
-        policy.train().forward(batch)[0].backward()
-        optimizer.step()
-        optimizer.zero_grad()
-    policy.eval()
-    assert losses(policy, batch).mean() < 0.2 * first
-    assert (chunk(policy, batch) - batch["action"]).abs().mean() < 0.2 * batch["action"].abs().mean()
-    policy.save_pretrained(tmp_path)
-    again = TactilePI05Policy.from_pretrained(tmp_path)
-    assert again.config.is_regression and torch.equal(chunk(again, batch), chunk(policy, batch))
-
-
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
         ({"backbone": "tny"}, "--policy.backbone=tny: did you mean 'tiny'"),
-        ({"objective": "regresion"}, "--policy.objective=regresion: did you mean 'regression'"),
         ({"base_checkpoint": "lerobot/pi05_base"}, "fit --policy.backbone=full only, not tiny"),
         ({"tactile_history": 0}, "--policy.tactile_history=0: at least 1"),
         ({"contact_threshold": float("nan")}, "--policy.contact_threshold=nan"),
@@ -483,8 +436,7 @@ def test_settings_out_of_range_are_refused(setting, said):
         tiny_config(**setting)
 
 
-@pytest.mark.parametrize("optimizer_muon", [False, True])
-def test_two_steps_stop_resume_are_the_numbers_of_four_steps(optimizer_muon, tmp_path):
+def test_two_steps_stop_resume_are_the_numbers_of_four_steps(tmp_path):
     def train(policy: TactilePI05Policy, optimizer: torch.optim.Optimizer, steps: range) -> list[float]:
         losses = []
         policy.train()
@@ -497,7 +449,7 @@ def test_two_steps_stop_resume_are_the_numbers_of_four_steps(optimizer_muon, tmp
         return losses
 
     torch.manual_seed(0)
-    policy = TactilePI05Policy(tiny_config(optimizer_muon=optimizer_muon))
+    policy = TactilePI05Policy(tiny_config())
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     train(policy, optimizer, range(2))
     policy.save_pretrained(tmp_path)
@@ -531,101 +483,6 @@ def test_the_optimizer_is_lerobots_adamw_and_its_files_are_read_again(tmp_path):
     assert again.state_dict()["param_groups"] == optimizer.state_dict()["param_groups"]
     state, stored = again.state_dict()["state"][0], optimizer.state_dict()["state"][0]
     assert state.keys() == stored.keys() and all(torch.equal(state[k], v) for k, v in stored.items())
-
-
-def test_muon_moves_matrices_as_torchs_does_and_adamw_moves_the_rest(tmp_path):
-    """Theirs computes in bfloat16, with 8 bits: directions differ by less than 1 in 64 of a step."""
-    torch.manual_seed(0)
-    shapes = ((24, 8), (8, 24), (8, 24), (16, 16))
-    ours, theirs = ([torch.nn.Parameter(x.clone()) for x in start] for start in 2 * [[torch.randn(s) for s in shapes]])
-    bias, their_bias = (torch.nn.Parameter(torch.linspace(-1, 1, 8)) for _ in range(2))
-    idle = torch.nn.Parameter(torch.ones(3, 3))  # never has a gradient
-    kind = {"lr": 1e-2, "weight_decay": 0.1}
-    groups = [{"params": [bias]}, {"params": [*ours, idle], "by_muon": True}]
-    optimizer = dataclasses.replace(tiny_config().get_optimizer_preset(), **kind).build(groups)
-    assert isinstance(optimizer, MuonAdamW)
-    muon = torch.optim.Muon(theirs, adjust_lr_fn="match_rms_adamw", **kind)
-    adamw = dataclasses.replace(tiny_config().get_optimizer_preset(), **kind).build([their_bias])
-    for _ in range(3):
-        for p, q in zip([*ours, bias], [*theirs, their_bias], strict=True):
-            p.grad = torch.randn(p.shape)
-            q.grad = p.grad.clone()
-        before = [p.detach().clone() for p in ours]
-        for each in (optimizer, muon, adamw):
-            each.step()
-        assert all(torch.equal(p.grad, q.grad) for p, q in zip(ours, theirs, strict=True))
-    for p, q, old in zip(ours, theirs, before, strict=True):
-        assert (p - q).norm() < (p - old).norm() / 20
-        step = (p - old * (1 - 1e-2 * 0.1)) / (1e-2 * 0.2 * math.sqrt(max(p.shape)))
-        values = torch.linalg.svdvals(step.detach())
-        assert values.min() > 0.6 and values.max() < 1.25  # nearly orthogonal, whatever the gradient's size
-    assert torch.equal(bias, their_bias) and torch.equal(idle, torch.ones(3, 3))
-
-    save_optimizer_state(optimizer, tmp_path)
-    empty = [torch.nn.Parameter(torch.zeros_like(p)) for p in (bias, *ours, idle)]
-    fresh = [{"params": empty[:1]}, {"params": empty[1:], "by_muon": True}]
-    again = load_optimizer_state(tiny_config().get_optimizer_preset().build(fresh), tmp_path)
-    stored, kept = again.state_dict(), optimizer.state_dict()
-    assert stored["param_groups"] == kept["param_groups"] and stored["state"].keys() == kept["state"].keys()
-    for i, state in kept["state"].items():
-        assert all(torch.equal(stored["state"][i][k], v) for k, v in state.items())
-
-
-def test_muon_takes_a_closure_and_leaves_bfloat16_weights_where_decay_takes_them():
-    weight = torch.nn.Parameter(torch.ones(4, 4, dtype=torch.bfloat16))
-    optimizer = MuonAdamW([{"params": [weight], "by_muon": True}], lr=0.5, weight_decay=0.01)
-
-    def closure() -> float:
-        weight.grad = torch.zeros_like(weight)
-        return 3.5
-
-    for _ in range(2):
-        assert optimizer.step(closure) == 3.5
-    # 1 − 0.5 · 0.01 = 0.995, in bfloat16 0.996; of that 0.991, in bfloat16 0.992
-    assert weight.tolist() == 4 * [4 * [0.9921875]]
-
-
-def test_muon_leaves_out_a_step_whose_gradients_overflowed():
-    weight, bias = torch.nn.Parameter(torch.ones(3, 3)), torch.nn.Parameter(torch.ones(3))
-    optimizer = MuonAdamW([{"params": [bias]}, {"params": [weight], "by_muon": True}], lr=0.1, fused=True)
-    scaler = torch.amp.GradScaler("cpu")
-    for factor, moves in ((math.inf, False), (1.0, True)):
-        scaler.scale(factor * ((weight * torch.arange(9.0).view(3, 3)).sum() + bias.sum())).backward()
-        scaler.step(optimizer)
-        scaler.update()
-        optimizer.zero_grad()
-        for p in (weight, bias):
-            assert p.isfinite().all() and torch.equal(p, torch.ones_like(p)) is not moves
-
-
-def test_directions_of_muon_are_the_nearest_orthogonal_matrices():
-    torch.manual_seed(0)
-    for shape in ((3, 6, 20), (3, 20, 6)):
-        matrices = torch.randn(shape)
-        left, _, right = torch.linalg.svd(matrices, full_matrices=False)
-        nearest, found = left @ right, orthogonal(1e-3 * matrices)  # of any size
-        assert found.shape == shape
-        # same singular vectors: what differs from the nearest one is along them only
-        along = left.mT @ found @ right.mT
-        off = along - torch.diag_embed(along.diagonal(dim1=1, dim2=2))
-        assert off.abs().max() < 1e-3 and (found - nearest).abs().max() < 0.35
-
-
-@pytest.mark.parametrize("vision", ["keypoints", "patches"])
-def test_with_muon_hidden_matrices_are_a_group_and_everything_is_in_one(vision):
-    with sees_with(vision):
-        policy = tiny_policy(optimizer_muon=True)
-    rest, hidden = policy.get_optim_params()
-    names = {p: name for name, p in policy.named_parameters()}
-    assert hidden["by_muon"] and "by_muon" not in rest
-    assert sorted(names[p] for p in rest["params"] + hidden["params"]) == sorted(names.values())
-    told = {names[p].split("layers.")[1] for p in hidden["params"]}
-    parts = ("self_attn.q_proj", "self_attn.k_proj", "self_attn.v_proj", "self_attn.o_proj")
-    parts += ("mlp.gate_proj", "mlp.up_proj", "mlp.down_proj")
-    assert told == {f"{layer}.{part}.weight" for layer in range(3) for part in parts}
-    assert len(hidden["params"]) == 2 * 3 * 7  # of the language model and of the expert
-    policy.config.optimizer_muon = False
-    assert len(list(policy.get_optim_params())) == len(names)
 
 
 def test_every_backbone_that_can_be_named_has_a_size():

@@ -31,7 +31,7 @@ COMMON: dict[str, Any] = {
 
 @contextmanager
 def sees_with(vision: str) -> Iterator[None]:
-    """tiny with "keypoints", as it is, or with "patches", as the larger ones are."""
+    """tiny with "cameras", as it is, or with "patches", as the larger ones are."""
     with pytest.MonkeyPatch.context() as patch:
         if vision == "patches":
             patches = Patches(px=28, width=64, depth=2, heads=4, mlp=128)
@@ -70,7 +70,7 @@ def plain_pi05(weights_of: TactilePI05Policy, monkeypatch: pytest.MonkeyPatch) -
     widths = {"gemma_2b": size.text_width, "gemma_300m": size.expert_width}
 
     def backbone(*_: Any, precision: Any, image_size: int, use_adarms: Any, **frozen: bool) -> SmallBackbone:
-        return SmallBackbone(size, precision=precision, image_px=image_size, num_cameras=len(CAMERAS), **frozen)
+        return SmallBackbone(size, image_px=image_size, num_cameras=len(CAMERAS), **frozen)
 
     monkeypatch.setattr(pi05, "get_gemma_config", lambda variant: SimpleNamespace(width=widths[variant]))
     monkeypatch.setattr(pi05, "PaliGemmaWithExpertModel", backbone)

@@ -1,6 +1,6 @@
 """An exponential mean of a network's weights over training, with which the policy acts.
 
-    m ← m + (1 − d_n) (w − m),    d_n = min(d, (1 + n) / (10 + n))    after optimiser step n
+    m ← d_n m + (1 − d_n) w,    d_n = min(d, (1 + n) / (10 + n))    after optimiser step n
 
 The ramp of d_n forgets the random start (as in TensorFlow's ExponentialMovingAverage). Noise of the last steps averages out; what
 that gives a policy is in docs/learning.md.
@@ -29,11 +29,13 @@ class Averaged(nn.Module):
     def update(self, network: nn.Module) -> None:
         """After a step of the optimiser."""
         self.num_updates += 1
-        n = int(self.num_updates)
-        decay = min(self.decay, (1 + n) / (10 + n))
+        # A tensor, so that nothing is read back from a GPU.
+        decay = ((1 + self.num_updates) / (10 + self.num_updates)).clamp(max=self.decay)
         means = [self.get_buffer(_key(name)) for name, _ in network.named_parameters()]
         weights = [weight.detach() for weight in network.parameters()]
-        torch._foreach_lerp_(means, weights, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
+        torch._foreach_mul_(means, decay)  # pyright: ignore[reportPrivateImportUsage]
+        shares = torch._foreach_mul(weights, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
+        torch._foreach_add_(means, shares)  # pyright: ignore[reportPrivateImportUsage]
 
     @torch.no_grad()
     def exchange(self, network: nn.Module) -> None:

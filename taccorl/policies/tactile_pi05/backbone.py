@@ -18,8 +18,8 @@ from lerobot.policies.pi05.modeling_pi05 import (
 )
 from torch import Tensor, nn
 
-from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
-from taccorl.policies.tactile_pi05.keypoints import KeypointTower
+from taccorl.policies.tactile_pi05.cameras import CameraTower, encode_pictures
+from taccorl.policies.tactile_pi05.compiled import Compiled, CompiledBackbone
 from taccorl.policies.tactile_pi05.tokenizer import write_number_embeddings
 
 _HEADS, _KV_HEADS = 8, 1
@@ -37,9 +37,10 @@ class Patches:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Keypoints:
-    """A ``KeypointTower``. Numbers are of each camera."""
+class Cameras:
+    """A ``CameraTower``. Numbers are of each camera."""
 
+    channels: tuple[int, ...]
     points: int
     tokens: int
 
@@ -54,20 +55,20 @@ class Size:
     text_mlp: int
     expert_width: int
     expert_mlp: int
-    vision: Patches | Keypoints
+    vision: Patches | Cameras
     vocabulary: int
 
 
 SIZES = {
-    # 30 M, for one GPU from scratch: 196 tokens a camera
+    # 11.7 M with three cameras, for one GPU
     "small": Size(
-        depth=7, head_width=48, text_width=384, text_mlp=1536, expert_width=256, expert_mlp=1024,
-        vision=Patches(px=16, width=256, depth=6, heads=4, mlp=1024), vocabulary=520,
+        depth=4, head_width=32, text_width=256, text_mlp=512, expert_width=256, expert_mlp=512,
+        vision=Cameras(channels=(32, 64, 128, 128), points=48, tokens=6), vocabulary=520,
     ),
-    # 1.6 M with three cameras, for a CPU: 4 tokens a camera
+    # 1.1 M with three cameras, for a CPU: tests and demonstrations
     "tiny": Size(
         depth=3, head_width=16, text_width=96, text_mlp=192, expert_width=64, expert_mlp=128,
-        vision=Keypoints(points=32, tokens=4), vocabulary=520,
+        vision=Cameras(channels=(16, 32), points=32, tokens=4), vocabulary=520,
     ),
 }  # fmt: skip
 
@@ -93,13 +94,16 @@ class FullBackbone(CompiledBackbone):
 
 
 class SmallBackbone(CompiledBackbone):
-    """LeRobot's PaliGemma with its action expert, in another size and without language heads."""
+    """LeRobot's PaliGemma with its action expert, in another size and without language heads.
+
+    Its weights are float32 whatever ``--policy.dtype`` says: with bfloat16, LeRobot's trainer computes in it (autocast), and
+    small changes of weights are not lost.
+    """
 
     def __init__(
         self,
         size: Size,
         *,
-        precision: Any,
         image_px: int,
         num_cameras: int,
         freeze_vision_encoder: bool,
@@ -158,19 +162,23 @@ class SmallBackbone(CompiledBackbone):
         expert.embed_tokens = None
         model: Any = self.paligemma.model
         write_number_embeddings(model.language_model.embed_tokens.weight)
-        if isinstance(size.vision, Keypoints):
+        if isinstance(size.vision, Cameras):
             self.tells_cameras_apart = True
-            model.vision_tower = KeypointTower(num_cameras, size.vision.points, size.vision.tokens, size.text_width)
+            seen = size.vision
+            model.vision_tower = CameraTower(num_cameras, seen.channels, seen.points, seen.tokens, size.text_width)
             model.multi_modal_projector = None
         without_language_heads(self)
-        self.to_bfloat16_for_selected_params(precision)
         self._set_requires_grad()
 
     def embed_images(self, images: list[Tensor]) -> list[Tensor]:
         if not self.tells_cameras_apart:
             return super().embed_images(images)
         tower: Any = self.paligemma.model.vision_tower
-        return [tokens.to(images[0].dtype) for tokens in tower([image.to(torch.float32) for image in images])]
+        encode = _compiled_pictures if self.fuses(images[0].device) else encode_pictures
+        return [tokens.to(images[0].dtype) for tokens in tower([image.to(torch.float32) for image in images], encode)]
+
+
+_compiled_pictures = Compiled(encode_pictures)
 
 
 def without_language_heads(backbone: PaliGemmaWithExpertModel) -> None:

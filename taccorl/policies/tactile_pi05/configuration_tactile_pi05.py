@@ -15,15 +15,15 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
+from taccorl.policies.tactile_pi05.hand_poses import NUM_HAND_POSES
 from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
-from taccorl.policies.tactile_pi05.muon import BY_MUON, MuonAdamW
+from taccorl.sim.actions import ACTION_NAMES
 
 TACTILE = "observation.tactile"
 RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
 STATE_SINCE_PLAN = "state_since_plan"  # of an action tensor: how far that has moved since its chunk was predicted
 _PALIGEMMA = "google/paligemma-3b-pt-224"
 _BACKBONES = ("full", "small", "tiny")
-_OBJECTIVES = ("flow_matching", "regression")
 
 
 @LRSchedulerConfig.register_subclass("warmup_then_cosine")
@@ -46,16 +46,12 @@ class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
 @OptimizerConfig.register_subclass("fused_adamw")
 @dataclass
 class FusedAdamW(AdamWConfig):
-    """LeRobot's AdamW; on a GPU PyTorch's fused kernel, half the time, and bfloat16 weights are rounded once a step.
-
-    Parameter groups that are marked so are moved by Muon (see ``muon``).
-    """
+    """LeRobot's AdamW; on a GPU PyTorch's fused kernel, half the time, and bfloat16 weights are rounded once a step."""
 
     def build(self, params: OptimizerParams) -> AdamW:
         groups: Any = super().build(params).param_groups
         fused = all(p.is_cuda for group in groups for p in group["params"])
-        optimizer = MuonAdamW if any(group.get(BY_MUON) for group in groups) else AdamW
-        return optimizer([{**group, "fused": fused} for group in groups], fused=fused)
+        return AdamW([{**group, "fused": fused} for group in groups], fused=fused)
 
 
 @dataclass(frozen=True)
@@ -110,7 +106,8 @@ class TactilePI05Config(PI05Config):
     """π0.5 with touch. Fields that are not here are those of LeRobot's pi05."""
 
     backbone: str = "full"
-    """full: π0.5's own size (3.4 billion parameters); small (30 million) and tiny (1.6 million): from scratch, same code."""
+    """full: π0.5's own size (3.4 billion parameters). From scratch, of the same code: small (11.7 million), for one GPU;
+    tiny (1.1 million), for tests and demonstrations on a CPU."""
     base_checkpoint: str | None = None
     """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: at random."""
     tokenizer: str | None = None
@@ -118,6 +115,9 @@ class TactilePI05Config(PI05Config):
     discrete_state_input: bool | None = None
     """True: the state is part of the prompt, 256 steps over each joint's range, as in π0.5. False: a token beside the actions, as
     in π0, exact. None: the backbone's own, True for full and False for small and tiny."""
+    hand_poses: bool | None = None
+    """Tell the state's token where both hands are, too (see ``hand_poses``). None: True where the state is a token and the
+    names of the actions are those of the two arms whose geometry is known."""
     tactile: bool = True
     """False: vision only. The same policy without touch: with flow matching, LeRobot's pi05."""
     tactile_history: int = 10
@@ -150,18 +150,12 @@ class TactilePI05Config(PI05Config):
     compile_model: bool = True
     """On a GPU, train with compiled layers (see ``compiled``; ``compile_mode`` is not used). False: LeRobot's own forward."""
 
-    objective: str = "flow_matching"
-    """How chunks are learnt and made; a checkpoint is of the one that it was trained with. flow_matching, π0.5's: drawn out of
-    noise in ``num_inference_steps`` steps. regression: predicted in one step, trained by a smooth absolute error (as L1
-    regression in OpenVLA-OFT, arXiv:2502.19645). The same observation always gives the same chunk; where demonstrations do
-    different things in the same situation, that may lie between them. What a tiny policy gains: configs/small/tiny.yaml."""
-
     chunk_size: int = 10
     """H: actions that are predicted."""
     n_action_steps: int = 10
     """Actions of a chunk that are executed before the policy looks again."""
     num_inference_steps: int = 4
-    """K_denoise. Not used by regression, which takes one."""
+    """K_denoise."""
     normalize_steps: bool | None = None
     """Normalise each of the H × A numbers of a chunk of relative actions by its own mean and deviation, after LeRobot's
     normalisation of all steps together (see ``chunk_steps``). None: the backbone's own, False for full, whose weights know
@@ -171,8 +165,6 @@ class TactilePI05Config(PI05Config):
     for small and 0 for full and tiny."""
     optimizer_lr: float = 2.5e-5
     """η_max."""
-    optimizer_muon: bool = False
-    """Move the matrices of the language model's and the expert's layers by Muon (see ``muon``). For training from scratch."""
     scheduler_warmup_steps: int = 100
     """T_warm."""
     scheduler_decay_lr: float = 5e-6
@@ -186,8 +178,6 @@ class TactilePI05Config(PI05Config):
         super().__post_init__()
         if self.backbone not in _BACKBONES:
             raise TaccorlError(f"--policy.backbone={self.backbone}: {nearest(self.backbone, _BACKBONES)}")
-        if self.objective not in _OBJECTIVES:
-            raise TaccorlError(f"--policy.objective={self.objective}: {nearest(self.objective, _OBJECTIVES)}")
         if self.base_checkpoint and self.backbone != "full":
             raise TaccorlError(
                 f"--policy.base_checkpoint={self.base_checkpoint}: π0.5's weights fit --policy.backbone=full only, not "
@@ -202,6 +192,11 @@ class TactilePI05Config(PI05Config):
             raise TaccorlError(
                 "--policy.normalize_steps=true: all steps of absolute actions are alike; it goes with "
                 "--policy.use_relative_actions=true only"
+            )
+        if self.hand_poses and self.has_discrete_state:
+            raise TaccorlError(
+                "--policy.hand_poses=true: the poses are part of the state's token; --policy.discrete_state_input=true puts the "
+                "state into the prompt"
             )
         if self.average_decay is not None and not 0 <= self.average_decay < 1:
             raise TaccorlError(f"--policy.average_decay={self.average_decay}: 0 or more, and below 1")
@@ -225,11 +220,6 @@ class TactilePI05Config(PI05Config):
         return ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
 
     @property
-    def is_regression(self) -> bool:
-        """Whether the chunk is predicted at once."""
-        return self.objective == "regression"
-
-    @property
     def normalizes_steps(self) -> bool:
         """``normalize_steps`` as it is meant."""
         wanted = self.backbone != "full" if self.normalize_steps is None else self.normalize_steps
@@ -251,10 +241,17 @@ class TactilePI05Config(PI05Config):
         return self.backbone == "full" if self.discrete_state_input is None else self.discrete_state_input
 
     @property
+    def knows_hands(self) -> bool:
+        """``hand_poses`` as it is meant."""
+        if self.hand_poses is None:
+            return not self.has_discrete_state and tuple(self.action_feature_names or ()) == ACTION_NAMES
+        return self.hand_poses
+
+    @property
     def state_dim(self) -> int:
-        """S: numbers of the robot's state."""
+        """S: numbers that the state's token is made of: the robot's state and, where it is told, its hands' poses."""
         assert self.input_features is not None, "the policy's __init__ has made sure of features"
-        return self.input_features[OBS_STATE].shape[0]
+        return self.input_features[OBS_STATE].shape[0] + NUM_HAND_POSES * self.knows_hands
 
     @property
     def window_delta_indices(self) -> dict[str, list[int]]:

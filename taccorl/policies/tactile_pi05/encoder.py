@@ -101,8 +101,8 @@ class StateToken(nn.Module):
 
     def __init__(self, state_dim: int, width: int) -> None:
         super().__init__()
-        self.hidden = nn.Linear(state_dim * (1 + 2 * self._OCTAVES), 4 * width)
-        self.out = nn.Linear(4 * width, width)
+        self.hidden = nn.Linear(state_dim * (1 + 2 * self._OCTAVES), 2 * width)
+        self.out = nn.Linear(2 * width, width)
 
     def forward(self, state_BS: Tensor) -> Tensor:
         """(B, S), −1 … 1 where most rows are → (B, 1, width)."""

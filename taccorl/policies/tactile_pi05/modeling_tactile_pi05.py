@@ -5,7 +5,6 @@ CPU also beside rows with contact (``_by_contact``). Where a GPU computes by oth
 training, ``graphed`` for a chunk), it is so up to rounding.
 """
 
-import dataclasses
 import logging
 from collections import deque
 from collections.abc import Callable
@@ -28,17 +27,14 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
 )
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
+from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
-from taccorl.policies.tactile_pi05.muon import BY_MUON
 from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
 from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkpoint
 
 # B batch, S state, L history, K taxels, P pads, R rows, C columns, H horizon, A action
 ACTION_IS_PAD = "action_is_pad"
 _EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"  # of LeRobot's --policy.empty_cameras
-REGRESSION_SCALE = 0.02
-"""s, in normalised actions, 2 of which are an action's range. Smaller errors count by their square, larger ones as they are."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -166,11 +162,9 @@ class TactilePI05Policy(PI05Policy):
         return loss, said
 
     def action_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
-        """(B, H, 32) losses by ``config.objective``, and (B,) contact (None: vision only).
+        """(B, H, 32) squared errors of the velocity at a random time, and (B,) contact (None: vision only).
 
-        Flow matching: squared errors of the velocity at a random time. Draws noise and time from torch's generator as LeRobot's
-        pi05 does; in training, first what changes the images. Regression: √(e² + s²) − s of the chunk's errors e, in normalised
-        actions, with s = ``REGRESSION_SCALE``: absolute errors, that are smooth at 0 (pseudo-Huber, over s).
+        Draws noise and time from torch's generator as LeRobot's pi05 does; in training, first what changes the images.
         """
         if self.training and self._change_images is not None:
             batch = {**batch, **{k: self._change_images(batch[k]) for k in self.config.image_features if k in batch}}
@@ -185,21 +179,7 @@ class TactilePI05Policy(PI05Policy):
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
             return self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
 
-        losses_BHA, contact_B = self._by_contact(batch, compute)
-        if self.config.is_regression:  # from zeros at time 1 the velocity is minus the chunk, and its error the chunk's
-            losses_BHA = (losses_BHA + REGRESSION_SCALE**2).sqrt() - REGRESSION_SCALE
-        return losses_BHA, contact_B
-
-    def init_rtc_processor(self) -> None:
-        """LeRobot's, called again once a rollout has set ``config.rtc_config``.
-
-        Guidance pulls harder (up to 10 times) the earlier a denoising step is, as later ones make up for it. Regression has one.
-        """
-        super().init_rtc_processor()
-        if self.rtc_processor is not None and self.config.is_regression:
-            given = self.rtc_processor.rtc_config
-            weight = min(1.0, given.max_guidance_weight)
-            self.rtc_processor.rtc_config = dataclasses.replace(given, max_guidance_weight=weight)
+        return self._by_contact(batch, compute)
 
     @property
     def _num_actions(self) -> int:
@@ -260,7 +240,7 @@ class TactilePI05Policy(PI05Policy):
         """(B, H, A). ``observation.tactile`` is the window, (B, L, K): a caller that re-plans rarely has to bring it along.
 
         Args:
-            kwargs: LeRobot's, for real-time chunking; and, of flow matching, ``noise`` (B, H, 32) and ``num_steps``.
+            kwargs: LeRobot's, for real-time chunking; and ``noise`` (B, H, 32) and ``num_steps``.
         """
         self.eval()
         images, image_masks = self._preprocess_images(batch)
@@ -366,7 +346,12 @@ class TactilePI05Policy(PI05Policy):
 
     def _state(self, batch: dict[str, Tensor]) -> Tensor | None:
         """(B, 1, D) the state's token, of all rows at once: few rows are rounded elsewhere. None where the prompt has it."""
-        return None if self.config.has_discrete_state else self.model.state_token(batch[OBS_STATE].to(torch.float32))
+        if self.config.has_discrete_state:
+            return None
+        state_BS = batch[OBS_STATE].to(torch.float32)
+        if self.config.knows_hands:
+            state_BS = torch.cat([state_BS, batch[HAND_POSES].to(torch.float32)], dim=1)
+        return self.model.state_token(state_BS)
 
     def _readings(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
         """(B, L, P, R, C) readings and (B,) contact; None and None for vision only.
@@ -405,17 +390,6 @@ class TactilePI05Policy(PI05Policy):
                 f"{', '.join(missing)}; it has: {', '.join(batch)}"
             )
         return super()._preprocess_images(batch)
-
-    def get_optim_params(self) -> Any:
-        """All parameters, or those that Muon moves in a group of their own."""
-        if not self.config.optimizer_muon:
-            return super().get_optim_params()
-        hidden, rest = [], []
-        for name, p in self.named_parameters():
-            of_layers = "language_model.layers." in name or "gemma_expert.model.layers." in name
-            is_hidden = p.ndim == 2 and of_layers and "norm" not in name  # norms: of the expert, from the time
-            (hidden if is_hidden else rest).append(p)
-        return [{"params": rest}, {"params": hidden, BY_MUON: True}]
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         targets = super()._get_default_peft_targets()

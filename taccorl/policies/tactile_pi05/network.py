@@ -2,7 +2,7 @@
 
     Z̄ = Z_base + CrossAttn(Z_base, Z_touch)        the cross-attention's output is zero when training starts
     prefix = [Z̄, Z_touch]                          images, language and state; then M_pre tokens of touch
-    suffix = [Z_touch, actions]                     M_suf tokens of touch, then the noisy actions (regression: zeros)
+    suffix = [Z_touch, actions]                     M_suf tokens of touch, then the noisy actions
 
 Without pretrained weights the state is not in the prompt, in 256 steps a joint, but a token before the actions, as in π0.
 Without contact tokens of touch do not exist for the row: attention masks them, positions do not count them and the sum is left
@@ -129,30 +129,6 @@ class TactilePI05Pytorch(PI05Pytorch):
             torch.cat([starts_block_BT, starts_block_BT.new_zeros(len(starts_block_BT), num_tokens)], dim=1),
         )
 
-    def sample_noise(self, shape: Any, device: Any) -> Tensor:
-        if self.config.is_regression:
-            return torch.zeros(shape, dtype=torch.float32, device=device)
-        return super().sample_noise(shape, device)
-
-    def sample_time(self, bsize: int, device: Any) -> Tensor:
-        if self.config.is_regression:
-            return torch.ones(bsize, dtype=torch.float32, device=device)
-        return super().sample_time(bsize, device)
-
-    def sample_actions(
-        self,
-        images: list[Tensor],
-        img_masks: list[Tensor],
-        tokens: Tensor,
-        masks: Tensor,
-        noise: Tensor | None = None,
-        num_steps: int | None = None,
-        **kwargs: Any,
-    ) -> Tensor:
-        if self.config.is_regression:
-            noise, num_steps = None, 1
-        return super().sample_actions(images, img_masks, tokens, masks, noise=noise, num_steps=num_steps, **kwargs)
-
     def embed_suffix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         actions_BHD, valid_BH, starts_block_BH, condition_BD = super().embed_suffix(*args, **kwargs)
         before: list[tuple[Tensor, Tensor]] = []  # tokens and whether the row has them
@@ -189,7 +165,6 @@ def _backbone(config: TactilePI05Config) -> CompiledBackbone:
         return FullBackbone(config)
     return SmallBackbone(
         size,
-        precision=config.dtype,
         image_px=image_px,
         num_cameras=len(config.image_features),
         freeze_vision_encoder=config.freeze_vision_encoder,

@@ -27,6 +27,7 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     TACTILE,
     TactilePI05Config,
 )
+from taccorl.policies.tactile_pi05.hand_poses import HandPosesStep
 from taccorl.policies.tactile_pi05.tokenizer import PromptTokenizerStep
 
 SCHEME = "fixed_scale"
@@ -147,6 +148,8 @@ def make_tactile_pi05_pre_post_processors(
     before: list[ProcessorStep] = [common.rename_observations, common.add_batch_dim, relative]
     if config.use_relative_actions:
         before.append(RawStateStep())
+    if config.knows_hands:
+        before.append(HandPosesStep())
     before.append(common.normalize)
     if config.tactile:
         told = config.require_tactile_format()

@@ -103,8 +103,9 @@ class PromptTokenizerStep(TokenizerProcessorStep):
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, torch.Tensor]:
         texts = [text] if isinstance(text, str) else text
+        different = list(dict.fromkeys(texts))  # hundreds of rows of a batch share a handful of instructions
         found = self.input_tokenizer(
-            texts, truncation=False, padding="longest", padding_side="right", return_tensors="pt"
+            different, truncation=False, padding="longest", padding_side="right", return_tensors="pt"
         )
         length = found["input_ids"].shape[1]
         if length > self.max_length:
@@ -113,7 +114,9 @@ class PromptTokenizerStep(TokenizerProcessorStep):
                 f"--policy.tokenizer_max_length={length} when training starts"
             )
         fill = (0, self.max_length - length)
+        place = {text: row for row, text in enumerate(different)}
+        rows = torch.tensor([place[text] for text in texts])
         return {
-            "input_ids": torch.nn.functional.pad(found["input_ids"], fill),
-            "attention_mask": torch.nn.functional.pad(found["attention_mask"], fill),
+            "input_ids": torch.nn.functional.pad(found["input_ids"], fill)[rows],
+            "attention_mask": torch.nn.functional.pad(found["attention_mask"], fill)[rows],
         }

@@ -72,8 +72,8 @@ def _load(policy: PI05Policy, weights: dict[str, Tensor], said: str, *, may_miss
     if any(names for _, names in faults):
         config: Any = policy.config
         told = "; ".join(f"{len(names)} {what}, first {_first(names)}" for what, names in faults if names)
-        if config.backbone == "tiny" and any("vision_tower.vision_model." in name for name in unknown):
-            told += "; it saw with patches, before tiny had key points: train anew"
+        if config.backbone != "full":
+            told += f"; an earlier taccorl's {config.backbone} had other layers (CHANGELOG.md): train anew"
         raise TaccorlError(
             f"{said}: its weights are not those of this policy (--policy.backbone={config.backbone}, "
             f"--policy.tactile={str(config.tactile).lower()}, "

@@ -1,0 +1,142 @@
+"""Where both hands are, from the joint angles: forward kinematics of the arms, in the policy's preprocessor.
+
+A dataset's state is joint angles, and 1 mrad in each is 1 mm between two hands that meet. From scratch a policy does not learn
+the arms' geometry to that, so it is told (S features):
+
+    left TCP, right TCP in the world; right TCP in the frame of the left       position and the first two columns of the rotation
+
+The six numbers of a rotation are those of Zhou et al. 2019, On the Continuity of Rotation Representations in Neural Networks.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import ObservationProcessorStep
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.robot import ARMS, JOINTS, RobotConfig, add_arm
+
+HAND_POSES = "observation.hand_poses"
+"""(B, 27) [in units of ``WORLD_M`` and ``HAND_TO_HAND_M``; rotations without unit]."""
+NUM_HAND_POSES = 27
+WORLD_M = 0.25
+"""Unit of positions in the world."""
+HAND_TO_HAND_M = 0.1
+"""Unit of the position of one hand in the other's frame."""
+_PER_ARM = len(JOINTS) + 1  # and a gripper
+
+# B batch, J joints
+
+
+def arm_chains(robot: RobotConfig | None = None) -> list[list[list[list[float]]]]:
+    """Of each arm, (7, 4, 4): every link's frame in its parent's where the joint is at 0 (the first in the world), then the TCP
+    in link 6. A joint turns about its own z axis.
+
+    Args:
+        robot: None: the nominal one.
+    """
+    chains = []
+    for arm in ARMS:
+        spec = mujoco.MjSpec()
+        spec.compiler.degree = False
+        add_arm(spec, arm, robot or RobotConfig())
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qpos[:] = 0
+        mujoco.mj_kinematics(model, data)
+        joints = [model.joint(f"{arm}_{name}") for name in JOINTS]
+        frames = [_frame(data.xpos[j.bodyid[0]], data.xmat[j.bodyid[0]]) for j in joints]
+        site = model.site(f"{arm}_tcp").id
+        frames.append(_frame(data.site_xpos[site], data.site_xmat[site]))
+        before, chain = np.eye(4), []
+        for frame in frames:
+            chain.append(np.linalg.solve(before, frame).tolist())
+            before = frame
+        chains.append(chain)
+    return chains
+
+
+def _frame(position_m: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = matrix.reshape(3, 3), position_m
+    return frame
+
+
+def tcp_poses(state_BS: Tensor, chains: Tensor) -> list[Tensor]:
+    """World-from-TCP (B, 4, 4) of each arm.
+
+    Args:
+        state_BS: joint angles [rad] and gripper openings [m], arm by arm.
+        chains: (arms, 7, 4, 4), see ``arm_chains``.
+    """
+    poses = []
+    for arm, chain in enumerate(chains):
+        joints_BJ = state_BS[:, _PER_ARM * arm : _PER_ARM * arm + len(JOINTS)]
+        cos_BJ, sin_BJ = joints_BJ.cos(), joints_BJ.sin()
+        turns_BJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(*joints_BJ.shape, 1, 1)
+        turns_BJ44[..., 0, 0], turns_BJ44[..., 0, 1] = cos_BJ, -sin_BJ
+        turns_BJ44[..., 1, 0], turns_BJ44[..., 1, 1] = sin_BJ, cos_BJ
+        steps_BJ44 = chain[:-1] @ turns_BJ44
+        pose_B44 = steps_BJ44[:, 0]
+        for j in range(1, len(JOINTS)):
+            pose_B44 = pose_B44 @ steps_BJ44[:, j]
+        poses.append(pose_B44 @ chain[-1])
+    return poses
+
+
+def hand_poses(state_BS: Tensor, chains: Tensor) -> Tensor:
+    """(B, 27), see ``HAND_POSES``. Arguments as of ``tcp_poses``."""
+    left_B44, right_B44 = tcp_poses(state_BS, chains)
+    turn_B33 = left_B44[:, :3, :3].transpose(1, 2)
+    between_B3 = (turn_B33 @ (right_B44[:, :3, 3:] - left_B44[:, :3, 3:]))[:, :, 0]
+    told = []
+    for position_B3, rotation_B33 in (
+        (left_B44[:, :3, 3] / WORLD_M, left_B44[:, :3, :3]),
+        (right_B44[:, :3, 3] / WORLD_M, right_B44[:, :3, :3]),
+        (between_B3 / HAND_TO_HAND_M, turn_B33 @ right_B44[:, :3, :3]),
+    ):
+        told += [position_B3, rotation_B33[:, :, 0], rotation_B33[:, :, 1]]
+    return torch.cat(told, dim=1)
+
+
+@dataclass
+class HandPosesStep(ObservationProcessorStep):
+    """Adds ``HAND_POSES`` to an observation whose state is not normalised yet. A checkpoint holds the arms' geometry."""
+
+    chains: list[list[list[list[float]]]] = field(default_factory=arm_chains)
+
+    def __post_init__(self) -> None:
+        self._chains: dict[torch.device, Tensor] = {}
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """
+        Raises:
+            TaccorlError: the state has other joints than the arms.
+        """
+        state_BS = torch.as_tensor(observation[OBS_STATE])
+        if state_BS.shape[-1] != len(ACTION_NAMES):
+            raise TaccorlError(
+                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, hand poses follow from the {len(ACTION_NAMES)} of "
+                f"{', '.join(ACTION_NAMES)}: another robot needs --policy.hand_poses=false"
+            )
+        chains = self._chains.get(state_BS.device)
+        if chains is None:
+            chains = self._chains[state_BS.device] = torch.tensor(self.chains, device=state_BS.device)
+        leading = state_BS.shape[:-1]
+        told = hand_poses(state_BS.reshape(-1, state_BS.shape[-1]).to(torch.float32), chains)
+        return {**observation, HAND_POSES: told.reshape(*leading, NUM_HAND_POSES)}
+
+    def get_config(self) -> dict[str, Any]:
+        return {"chains": self.chains}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
