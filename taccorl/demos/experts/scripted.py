@@ -205,6 +205,11 @@ class ScriptedExpert(ABC):
         """
         raise TaccorlError(f"expert of {self.task}: can only begin at the beginning; write its remaining()")
 
+    @classmethod
+    def can_resume(cls) -> bool:
+        """Whether it can begin anywhere."""
+        return cls.remaining is not ScriptedExpert.remaining
+
     def resume(self) -> None:
         """Take over both arms in the simulation's present state, whatever another did since its reset.
 
