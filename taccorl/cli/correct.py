@@ -10,6 +10,8 @@ demonstrations (taccorl merge) and trained on (lerobot-train). Give every round 
 The policy's episodes and each correction lie in the store: a run that was stopped goes on.
 """
 
+import dataclasses
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -56,8 +58,7 @@ class CorrectConfig:
 def main(argv: list[str]) -> int:
     """0: corrected."""
     config = parse(CorrectConfig, argv, positional=None)
-    import dataclasses
-
+    os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
     from taccorl.data.lerobot_format import check_path
     from taccorl.demos.correct import CorrectionPlan, check_out, correct
     from taccorl.evaluation.policy_episodes import policy_episodes
@@ -90,15 +91,14 @@ def main(argv: list[str]) -> int:
     acted = policy_episodes(plan, lambda: opened.load(config.seed), config.num_envs, store, TextProgress())
     report = correct(plan, acted, out, store, config.engine)
     print(f"policy:    {report['policy_successes']} of {report['attempts']} episodes succeeded by themselves")
-    low, high = (100 * end for end in wilson_interval(report["episodes"], report["taken_over"]))
+    over, successes = report["taken_over"], report["episodes"]
+    low, high = (100 * end for end in wilson_interval(successes, over))
     causes = ", ".join(f"{cause} {count}" for cause, count in report["causes"].items())
-    print(f"taken over: {report['taken_over']} ({causes}); kept out, as the policy succeeded: {report['kept_out']}")
-    print(
-        f"expert:    {report['episodes']} of {report['taken_over']} succeeded "
-        f"({100 * report['episodes'] / report['taken_over']:.1f} %, 95 %: {low:.1f} … {high:.1f})"
-    )
+    print(f"kept out:  {report['kept_out']}, as the policy succeeded")
+    print(f"takeovers: {over} ({causes})")
+    print(f"expert:    {successes} of {over} succeeded ({100 * successes / over:.1f} %, 95 %: {low:.1f} … {high:.1f})")
     for outcome, count in report["outcomes"].items():
         print(f"           {outcome} {count}")
     print(f"dataset:   {out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
-    print(f"next:      taccorl view {out} --episode=0")
+    print(f"next:      taccorl merge --sim=DEMONSTRATIONS --sim={out} --out=…, then lerobot-train")
     return 0

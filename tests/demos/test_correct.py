@@ -212,7 +212,7 @@ def test_what_the_policy_completes_by_itself_is_kept_out_unless_all_is_asked_for
 def test_the_expert_has_the_tasks_full_time(sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sim.judge, "limit_steps", 10)
     done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, 0, 10))
-    assert done.takeover_step is not None and done.takeover_step + 3 > 8 and done.outcome == "unfinished"
+    assert len(done.actions) > 8 and done.outcome == "unfinished"
 
 
 # from which states ----------------------------------------------------------------------------------------------------
@@ -297,7 +297,9 @@ def test_the_dataset_holds_the_experts_rows_and_says_from_where(corrected: tuple
     assert dataset.num_episodes == report["episodes"] == 2
     for i, entry in enumerate(report["entries"][:2]):
         episode = dataset.episode(i)
-        made = episode.provenance["simulation"]["correction"]
+        simulation = episode.provenance["simulation"]
+        assert isinstance(simulation, dict)
+        made = simulation["correction"]
         assert made["takeover_step"] == entry["takeover_step"] < entry["policy_steps"]
         assert made["scene_seed"] == its.scene_seeds[i] and made["policy_digest"] == its.policy_digest
         assert "twin, not a robot" in episode.origin and episode.success
@@ -309,7 +311,7 @@ def test_the_dataset_holds_the_experts_rows_and_says_from_where(corrected: tuple
 
 @pytest.mark.slow
 def test_seed_and_actions_alone_bring_the_episode_back(corrected: tuple, sim: Simulation) -> None:
-    folder, its, report = corrected
+    folder, _, _ = corrected
     dataset = Dataset(folder / "out")
     for path in (folder / "store" / "correction").glob("[!.]*"):
         entry, actions = json.loads((path / "entry.json").read_text()), np.load(path / "actions.npy")

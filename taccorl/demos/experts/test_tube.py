@@ -58,7 +58,7 @@ class TestTubeExpert(ScriptedExpert):
             return chain(self.free("left"), self._left())
         if self.holds("right", tube):
             return self._go_on_inserting()
-        if self._task.inside(self._task.fit(self.sim))[0]:
+        if self.is_in(self._mating()) or self._task.inside(self._task.fit(self.sim))[0]:  # or falls in
             return self._leave()
         self.require_not_in_other_hand("right", tube)
         seat = self.body("stand") @ self._task.stand.seats["tube"]
