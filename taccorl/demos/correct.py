@@ -280,14 +280,14 @@ def correct(
     spec = plan.rows(sim)
     sim.close()
 
-    def said(k: int, artefact: Artefact) -> None:
+    def show(k: int, artefact: Artefact) -> None:
         entry = _entry(artefact.path)
         progress(f"episode {k}: {entry['outcome']}{', ' + entry['reason'] if entry['reason'] else ''}")
 
     made = (engine or LocalEngine()).map(
         functools.partial(run_correction, plan, acted, store),
         range(plan.episodes),
-        on_done=said,
+        on_done=show,
         name=lambda k: f"episode {k}",
         care=_CARE,
         instead=functools.partial(_lost_correction, plan, acted, store),
