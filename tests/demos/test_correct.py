@@ -156,6 +156,7 @@ def test_without_a_grasp_the_takeover_is_drawn_over_all_steps(sim: Simulation, s
         done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, seed, 10))
         share = np.random.default_rng([seed, 1]).uniform()
         assert (done.takeover_step, done.cause) == (int(10 * share), "drawn before the grasp")
+        assert done.takeover_step is not None
         assert done.outcome == "unfinished" and done.recorder is not None and len(done.recorder.rows) == 3
         assert len(done.actions) == done.takeover_step + 3
         steps.append(done.takeover_step)
