@@ -28,6 +28,10 @@ class UnreachableError(TaccorlError):
     """A pose that no joint angles of an arm reach."""
 
 
+class LostError(TaccorlError):
+    """A state from which an expert cannot complete its task. Messages have no numbers: they are counted."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """`` did you mean 'x'? `` for the closest known name, else the list of all; ends without a full stop."""
     names = sorted(str(k) for k in known)

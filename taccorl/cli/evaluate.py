@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from taccorl.evaluation.evaluate import Scenes
     from taccorl.evaluation.preflight import Check
     from taccorl.evaluation.rollouts import Actor
+    from taccorl.sim.twin import TwinConfig
 
 EXPERT = "expert"
 
@@ -92,11 +93,11 @@ def main(argv: list[str]) -> int:
     scenes.twin_config()  # read it before anything is loaded
     against = Path(config.against) if config.against else None
     stored = read_stored(against, scenes) if against is not None and is_stored(against) else None
-    opened = [_open(config.policy, scenes)]
+    opened = [open_policy(config.policy, scenes.twin_config())]
     if against is not None and stored is None:
         choice = PolicyChoice(type=EXPERT) if str(against) == EXPERT else PolicyChoice(path=against)
         choice.device = config.policy.device
-        opened.append(_open(choice, scenes))
+        opened.append(open_policy(choice, scenes.twin_config()))
     names = [one.name for one in opened] + ([stored.policy] if stored else [])
     if len(set(names)) < len(names):
         raise TaccorlError(f"--against={config.against}: is the policy itself; give another one")
@@ -104,7 +105,7 @@ def main(argv: list[str]) -> int:
     begun_s = time.monotonic()
     rollouts, rows = [], []
     for one in opened:
-        rollouts.append(score(scenes, one.load(config.seed), _Progress()))
+        rollouts.append(score(scenes, one.load(config.seed), TextProgress()))
         rows.append([rollout.row for rollout in rollouts[-1]])
         write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
     wall_s = time.monotonic() - begun_s
@@ -117,7 +118,7 @@ def main(argv: list[str]) -> int:
 
 
 @dataclass
-class _Opened:
+class OpenedPolicy:
     """A policy whose weights are not loaded yet."""
 
     name: str
@@ -133,7 +134,7 @@ class _Opened:
         return ExpertActor()
 
 
-def _open(choice: PolicyChoice, scenes: "Scenes") -> _Opened:
+def open_policy(choice: PolicyChoice, twin: "TwinConfig") -> OpenedPolicy:
     """Print what the checkpoint and the environment state, and end the command if they differ.
 
     Raises:
@@ -145,7 +146,7 @@ def _open(choice: PolicyChoice, scenes: "Scenes") -> _Opened:
         if choice.type != EXPERT:
             known = nearest(str(choice.type), [EXPERT])
             raise TaccorlError(f"--policy.type={choice.type}: {known}; a checkpoint is --policy.path=…")
-        return _Opened(EXPERT, "the scripted expert, which sees the simulator's poses", [])
+        return OpenedPolicy(EXPERT, "the scripted expert, which sees the simulator's poses", [])
     from lerobot.utils.import_utils import register_third_party_plugins
 
     import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
@@ -155,10 +156,10 @@ def _open(choice: PolicyChoice, scenes: "Scenes") -> _Opened:
 
     register_third_party_plugins()
     checkpoint = open_checkpoint(choice.path, choice.device)
-    checks = preflight(checkpoint.facts(), scenes.twin_config())
+    checks = preflight(checkpoint.facts(), twin)
     console().print(_preflight_table(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
-    return _Opened(str(choice.path), checkpoint.digest, checks, checkpoint)
+    return OpenedPolicy(str(choice.path), checkpoint.digest, checks, checkpoint)
 
 
 def _preflight_table(policy: str, checks: "list[Check]") -> Any:
@@ -188,7 +189,7 @@ def _check_places(config: EvaluateConfig) -> None:
         raise TaccorlError(f"--failures={config.failures}: at least 0")
 
 
-class _Progress:
+class TextProgress:
     """A line on stderr every ten seconds."""
 
     def __init__(self) -> None:
@@ -213,7 +214,7 @@ def _print(rows: list, comparisons: dict) -> None:
 
 
 def _write(
-    config: EvaluateConfig, scenes: "Scenes", opened: list[_Opened], rows: list, comparisons: dict, wall_s: float
+    config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy], rows: list, comparisons: dict, wall_s: float
 ) -> None:
     import dataclasses
 
@@ -234,7 +235,7 @@ def _write(
     (config.out / SUMMARY_FILE).write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[_Opened]) -> dict[str, str]:
+def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy]) -> dict[str, str]:
     import mujoco
 
     import taccorl
@@ -254,7 +255,7 @@ def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[_Opened]) -> d
 
 
 def _write_page(
-    config: EvaluateConfig, scenes: "Scenes", opened: list[_Opened], rows: list, comparisons: dict, rollouts: list
+    config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy], rows: list, comparisons: dict, rollouts: list
 ) -> None:
     from taccorl.evaluation.failed_episodes import choose_failures, execute_again
     from taccorl.views.evaluation_page import EvaluationPage, write_page

@@ -39,7 +39,7 @@ from taccorl.sim.twin_file import load_twin, twin_text
 ATTEMPT_VERSION = 2
 COLLECTION_VERSION = 2
 _MANY = 20  # attempts after which a success rate means something
-_AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long
+AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long
 
 Actions = Iterator[np.ndarray]
 Progress = Callable[[str], None]
@@ -68,7 +68,7 @@ class ExpertSource(Source):
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
         expert = experts.get(sim.task.name)(sim, rng, self.hands)
         expert.start()
-        for _ in range(round(_AFTER_S * CONTROL_HZ)):
+        for _ in range(round(AFTER_S * CONTROL_HZ)):
             while not expert.done:
                 yield expert.act()
             yield expert.act()

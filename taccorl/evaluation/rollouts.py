@@ -72,13 +72,16 @@ class Rollout:
     row: EpisodeRow
     actions: np.ndarray
     """(T, 14) float32, as they were given."""
+    states: np.ndarray
+    """(T + 1, 14) float32 ``observation.state`` before each action, and after the last."""
 
 
 class _Running:
     """Bookkeeping of one environment's episode."""
 
-    def __init__(self, subtasks: Mapping[str, Sequence[str]]) -> None:
+    def __init__(self, subtasks: Mapping[str, Sequence[str]], state: np.ndarray) -> None:
         self.actions: list[np.ndarray] = []
+        self.states = [state]
         self.clipped_steps = 0
         self.subtask_end_s: dict[str, dict[str, float | None]] = {
             arm: dict.fromkeys(names) for arm, names in subtasks.items()
@@ -87,8 +90,9 @@ class _Running:
         """Outcome and reason."""
         self.facts: dict[str, Any] = {}
 
-    def stepped(self, action: np.ndarray, facts: dict[str, Any]) -> None:
+    def stepped(self, action: np.ndarray, facts: dict[str, Any], state: np.ndarray) -> None:
         self.actions.append(action)
+        self.states.append(state)
         self.facts = facts
         self.clipped_steps += bool(facts["clipped"])
         now_s = facts["steps"] / CONTROL_HZ
@@ -116,7 +120,7 @@ def roll_out(
     """
     observation, _ = envs.reset(seed=[int(seed) for seed in seeds])
     subtasks = {arm: [s.name for s in own] for arm, own in envs.sim.task.subtasks().items()}
-    running = [_Running(subtasks) for _ in range(envs.num_envs)]
+    running = [_Running(subtasks, state.copy()) for state in observation[STATE_KEY]]
     for one, facts in zip(running, _each(envs.facts(), envs.num_envs), strict=True):
         one.facts = facts
     actor.begin(envs)
@@ -137,7 +141,7 @@ def roll_out(
         observation, *_ = envs.step(actions)
         facts = _each(envs.facts(), envs.num_envs)
         for i in np.flatnonzero(~over):
-            running[i].stepped(actions[i].copy(), facts[i])
+            running[i].stepped(actions[i].copy(), facts[i], observation[STATE_KEY][i].copy())
         over = np.array([one.end is not None for one in running])
         if progress is not None:
             successes = sum(one.end is not None and one.end[0] == SUCCESS for one in running)
@@ -169,7 +173,7 @@ def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, one: _Running) -> 
         reason=reason,
     )
     actions = np.array(one.actions, dtype=np.float32).reshape(-1, len(ACTION_NAMES))
-    return Rollout(row, actions)
+    return Rollout(row, actions, np.array(one.states, dtype=np.float32))
 
 
 def _bad_actions(actions: np.ndarray) -> dict[int, tuple[str, str]]:

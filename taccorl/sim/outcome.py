@@ -59,6 +59,11 @@ class Judge:
         self.subtask[ids] = self.lasted[ids] = 0
         self.verdict = self.task.look(scene)
 
+    def restart_clock(self) -> None:
+        """Time limit, and what must have held or lasted, begin anew from here; subtasks that are done stay done."""
+        self.steps[:] = self.held[:] = 0
+        self.lasted[:] = 0
+
     def update(self, scene: "Simulation", ids: np.ndarray | None = None) -> None:
         """After a control step of ``ids`` (all by default). An episode that is over keeps its outcome."""
         verdict = self.verdict = self.task.look(scene)

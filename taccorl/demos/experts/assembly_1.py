@@ -1,6 +1,7 @@
 """Assembly #1: left lifts the socket, right lifts the plug, they meet in the air and the plug goes in by touch."""
 
 from abc import abstractmethod
+from itertools import chain
 
 import numpy as np
 
@@ -15,6 +16,9 @@ _LEAN_RAD = 0.40  # hands lean away from each other, so that wrists and cameras 
 _GRIP_M = 0.028  # from the TCP to the part: it is gripped near the fingers' tips
 _LIFT_M, _LIFT_MPS = 0.10, 0.12
 _MEET_M = (0.32, 0.03, 0.16)  # the hole's mouth
+_NEAR_M = 0.03  # from there: near enough
+_LOW_M = 0.05  # a part in the air below that goes up before it goes anywhere
+_CLEAR_M = 0.04  # between the plug and a hole that may still move
 _LEFT_STEADINESS = 0.4  # of a hand that holds still for the other
 _FIRMER = 1.2  # than the hand that inserts: what it holds is pushed
 _LEVEL_RAD, _FREE_M = 0.03, 0.0004  # it brings a part that was pushed askew back to level once nothing pushes any more
@@ -24,6 +28,8 @@ _LONGEST_REGAIN_S = 1.0
 class AirAssembly(ScriptedExpert):
     """Both hands lift; the left one waits where they meet, the right one inserts and lets go."""
 
+    enough_m: float
+    """Depth from which the plug stays in its place."""
     _held_like: np.ndarray | None = None
     """(3, 3) how the left hand has come to hold the hole; level until then."""
 
@@ -49,6 +55,45 @@ class AirAssembly(ScriptedExpert):
     def finish(self, arm: str, subtask: str) -> Script:
         return self._hold(self._hole()) if arm == "left" else self._join()
 
+    def remaining(self, arm: str) -> Script:
+        if arm == "left":
+            part, grasp, _ = self.holder()
+            if self.holds("left", part):
+                return self._go_on_holding(part, grasp)
+            self.require_lying("left", part)
+            return chain(self.free("left"), self._left())
+        plug, grasp = self.plug()
+        if self.holds("right", plug):
+            return self._go_on_joining(plug, grasp)
+        if self._mating().fit(self).depth_m > self.enough_m:
+            return self._leave()
+        self.require_lying("right", plug)
+        return chain(self.free("right"), self._lift("right", plug, grasp), self._meet())
+
+    def _go_on_holding(self, part: Part, grasp: str) -> Script:
+        """With the part with the hole in the left hand."""
+        yield from self.firm("left", part.grasps[grasp].width_m, _FIRMER * self.config.grip_n)
+        if self.is_in(self._mating()):
+            self.flags.add("holder waits")
+            yield from self._hold(self._hole())
+            return
+        if self._hole()[2, 3] < _LOW_M:
+            yield from self.rise("left", _LIFT_M, _LIFT_MPS)
+        yield from self._bring_mouth()
+
+    def _go_on_joining(self, plug: Part, grasp: str) -> Script:
+        """With the plug in the right hand."""
+        yield from self.firm("right", plug.grasps[grasp].width_m)
+        if not self.is_in(self._mating()):
+            fit = self._mating().fit(self)
+            if fit.depth_m > -_CLEAR_M and fit.lateral_m < 2 * _CLEAR_M:  # out of the way of a left hand that may turn
+                back = self.hands["right"].pose.copy()
+                back[:3, 3] -= (_CLEAR_M + max(float(fit.depth_m), 0.0)) * self._mating().axis(self)
+                yield from self.move("right", back, speed_mps=_LIFT_MPS)
+            elif self.body(plug.name)[2, 3] < _LOW_M:
+                yield from self.rise("right", _LIFT_M, _LIFT_MPS)
+        yield from self._meet()
+
     def _lift(self, arm: str, part: Part, grasp: str) -> Script:
         goal = self.grasp(part, grasp, lean_rad=_LEAN_RAD, lift_m=0.004, pivot_m=_GRIP_M)
         above = goal.copy()
@@ -56,15 +101,19 @@ class AirAssembly(ScriptedExpert):
         yield from self.move(arm, self.near(above))
         yield from self.move(arm, goal, speed_mps=0.1, settle=True)
         yield from self.close(arm, part.grasps[grasp].width_m, self.config.grip_n * (_FIRMER if arm == "left" else 1.0))
-        up = self.hands[arm].pose.copy()
-        up[2, 3] += _LIFT_M
-        yield from self.move(arm, up, speed_mps=_LIFT_MPS)
+        yield from self.rise(arm, _LIFT_M, _LIFT_MPS)
 
     def _left(self) -> Script:
-        part, grasp, hole_name = self.holder()
+        part, grasp, _ = self.holder()
         yield from self._lift("left", part, grasp)
-        hole_from_tcp = inverse(self.body(part.name) @ part.holes[hole_name].part_from_hole) @ self.tcp("left")
-        mouth = transform(self.near(transform(_MEET_M))[:3, 3], self.world_from_level())
+        yield from self._bring_mouth()
+
+    def _bring_mouth(self) -> Script:
+        """Bring the hole level to where the hands meet, or leave it where it is if that is near, and hold it there."""
+        hole = self._hole()
+        hole_from_tcp = inverse(hole) @ self.tcp("left")
+        is_near = np.linalg.norm(hole[:3, 3] - _MEET_M) < _NEAR_M
+        mouth = transform((hole if is_near else self.near(transform(_MEET_M)))[:3, 3], self.world_from_level())
         yield from self.move("left", mouth @ hole_from_tcp, speed_mps=_LIFT_MPS, settle=True)
         self.flags.add("holder waits")
         yield from self._hold(mouth)
@@ -84,6 +133,10 @@ class AirAssembly(ScriptedExpert):
         part, _, hole_name = self.holder()
         return self.body(part.name) @ part.holes[hole_name].part_from_hole
 
+    def _mating(self) -> Mating:
+        holder, _, hole = self.holder()
+        return Mating.of(self.plug()[0], holder, hole)
+
     def _askew_rad(self) -> float:
         """How far the hole is turned from how it is to be held."""
         held_like = self.world_from_level() if self._held_like is None else self._held_like
@@ -100,13 +153,19 @@ class AirAssembly(ScriptedExpert):
     def _right(self) -> Script:
         yield from self.pause("right", 0.0, 0.4)
         yield from self._lift("right", *self.plug())
+        yield from self._meet()
+
+    def _meet(self) -> Script:
         yield from self.wait_for("holder waits")
         yield from self._join()
 
     def _join(self) -> Script:
         """From the plug held to the hand away from it."""
-        holder, _, hole = self.holder()
-        yield from self.push_in(Mating.of(self.plug()[0], holder, hole))
+        yield from self.push_in(self._mating())
+        yield from self._leave()
+
+    def _leave(self) -> Script:
+        """Open the right hand and take it away from the plug."""
         yield from self.open("right")
         away = self.hands["right"].pose.copy()
         away[:3, 3] -= 0.08 * away[:3, 2]
@@ -120,6 +179,7 @@ class Assembly1Expert(AirAssembly):
     """The mortise is 38 mm deep; the plug counts as in from 34 mm on."""
 
     task = "assembly_1"
+    enough_m = 0.0352
 
     def holder(self) -> tuple[Part, str, str]:
         assert isinstance(self.sim.task, Assembly1)
@@ -133,4 +193,4 @@ class Assembly1Expert(AirAssembly):
         return self.sim.task.plug, "head"
 
     def push_in(self, mating: Mating) -> Script:
-        yield from self.insert("right", mating, depth_m=0.042, enough_m=0.0352)
+        yield from self.insert("right", mating, depth_m=0.042, enough_m=self.enough_m)

@@ -16,6 +16,7 @@ class Assembly2Expert(AirAssembly):
     """The cradle is 34 mm deep; its stop is felt, and the centre of mass is then 15 mm inside."""
 
     task = "assembly_2"
+    enough_m = 0.032
 
     def holder(self) -> tuple[Part, str, str]:
         assert isinstance(self.sim.task, Assembly2)
@@ -29,7 +30,7 @@ class Assembly2Expert(AirAssembly):
         return self.sim.task.plug, "head"
 
     def push_in(self, mating: Mating) -> Script:
-        yield from self.insert("right", mating, depth_m=0.036, enough_m=0.032)
+        yield from self.insert("right", mating, depth_m=0.036, enough_m=self.enough_m)
         down = self.hands["right"].pose.copy()
         down[2, 3] -= _LET_DOWN_M
         yield from self.move("right", down, speed_mps=_LET_DOWN_MPS)

@@ -8,6 +8,7 @@ import numpy as np
 from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import DT_S, Aim, Mating, Script, ScriptedExpert
 from taccorl.demos.experts.se3 import inverse, turn
+from taccorl.errors import LostError
 from taccorl.sim.part import Part
 from taccorl.sim.tasks.puzzle import Puzzle
 from taccorl.sim.twin import CONTROL_HZ
@@ -22,8 +23,11 @@ _EASE_M = 0.002  # the hand lifts by that much before it presses again
 _IN_MOUTH_M, _AT_FLOOR_M, _FLOOR_M = 0.001, 0.0092, 0.010  # depth from which it has dropped in, lies, and of the hole
 _FASTER_IN_HOLE = 3.0  # than down to the tray, where a quick hand would hit hard: 0.6 N for each mm/s
 _LET_GO_M = 0.045  # between the pads: wider, the fingers would reach the knobs beside
+_LEVEL_RAD = 0.3  # a piece that leans by more cannot be gripped by its knob
+_NEAR_TRAY_M = 0.13  # from the tray's middle: in the other hand's way
 _LONGEST_S = 10.0  # to press on one piece
 _MOST_TRIES = 4  # to place one piece
+_HAND = {"triangle": "right", "circle": "left", "heart": "right"}
 
 
 @experts.register("puzzle")
@@ -43,21 +47,79 @@ class PuzzleExpert(ScriptedExpert):
         if arm == "right" and subtask == own[-1].name:
             yield from self._retreat(arm)
 
+    def remaining(self, arm: str) -> Script:
+        order = self._order()
+        own = [shape for shape in order if _HAND[shape] == arm]
+        for shape in own:
+            self._require_grippable(arm, shape)
+        return self._go_on(arm, own, order)
+
+    def _order(self) -> list[str]:
+        """Pieces that are not in yet, by turns: triangle, circle, heart; with the heart first where the right hand holds it."""
+        order = ["triangle", "circle", "heart"]
+        if self.holds("right", self._part("heart")) and not self._is_in("triangle"):
+            order.reverse()
+        return [shape for shape in order if not self._is_in(shape)]
+
+    def _go_on(self, arm: str, own: list[str], order: list[str]) -> Script:
+        """Place these pieces, the first of which may be in the hand, in turns with the other hand."""
+        for shape in own:
+            part, mating = self._part(shape), self._mating(shape)
+            if not self.holds(arm, part):
+                yield from self.free(arm)
+                yield from self._lift(arm, shape)
+            else:
+                yield from self.firm(arm, part.grasps["knob"].width_m)
+                low_m = float(mating.fit(self).depth_m) + _CARRY_M
+                if low_m > 0 and not self.is_in(mating):
+                    yield from self.move(arm, raised(self.hands[arm].pose, low_m), speed_mps=_NEAR_MPS)
+            before = order[: order.index(shape)]
+            if not {_is_in(other) for other in before} <= self.flags and self._is_over_tray(arm):
+                home = self.kinematics[arm].pose(np.array(self._task.home_rad[arm]))
+                yield from self.move(arm, self.near(home), speed_mps=_CARRY_MPS)
+            for other in before:
+                yield from self.wait_for(_is_in(other), self._task.time_limit_s)
+            yield from self._place(arm, shape)
+            self.flags.add(_is_in(shape))
+        yield from self._retreat(arm)
+
+    def _is_over_tray(self, arm: str) -> bool:
+        return bool(np.linalg.norm((self.tcp(arm) - self.body("tray"))[:2, 3]) < _NEAR_TRAY_M)
+
+    def _is_in(self, shape: str) -> bool:
+        """In its hole and let go."""
+        return bool(self._task.placed(self.sim, shape)[0])
+
+    def _require_grippable(self, arm: str, shape: str) -> None:
+        """
+        Raises:
+            LostError: the piece is neither in the hand nor lies on its underside.
+        """
+        part = self._part(shape)
+        if self.holds(arm, part):
+            return
+        self.require_not_in_other_hand(arm, part)
+        if self.body(shape)[2, 2] < np.cos(_LEVEL_RAD):
+            raise LostError(f"{shape} lies on another side")
+
+    def _mating(self, shape: str) -> Mating:
+        return Mating.of(self._part(shape), self._task.tray, shape)
+
     def _left(self) -> Script:
         yield from self.pause("left", 0.0, 1.0)
         yield from self._lift("left", "circle")
-        yield from self.wait_for("triangle is in", self._task.time_limit_s)
+        yield from self.wait_for(_is_in("triangle"), self._task.time_limit_s)
         yield from self._place("left", "circle")
-        self.flags.add("circle is in")
+        self.flags.add(_is_in("circle"))
         yield from self._retreat("left")
 
     def _right(self) -> Script:
         yield from self.pause("right", 0.0, 0.4)
         yield from self._lift("right", "triangle")
         yield from self._place("right", "triangle")
-        self.flags.add("triangle is in")
+        self.flags.add(_is_in("triangle"))
         yield from self._lift("right", "heart")
-        yield from self.wait_for("circle is in", self._task.time_limit_s)
+        yield from self.wait_for(_is_in("circle"), self._task.time_limit_s)
         yield from self._place("right", "heart")
         yield from self._retreat("right")
 
@@ -74,7 +136,7 @@ class PuzzleExpert(ScriptedExpert):
     def _place(self, arm: str, shape: str, *, is_near: bool = False) -> Script:
         """Carry a held piece to its hole, where it may be already, feel it in, let go, look; grip it again where it rests on
         the rim."""
-        mating = Mating.of(self._part(shape), self._task.tray, shape)
+        mating = self._mating(shape)
         for attempt in range(_MOST_TRIES):
             if attempt:
                 self.felt(arm, f"{shape} rests on the rim")
@@ -171,6 +233,11 @@ class PuzzleExpert(ScriptedExpert):
 
     def _part(self, shape: str) -> Part:
         return self._task.pieces[shape]
+
+
+def _is_in(shape: str) -> str:
+    """Flag."""
+    return f"{shape} is in"
 
 
 def raised(pose: np.ndarray, height_m: float) -> np.ndarray:

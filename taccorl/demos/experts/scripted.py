@@ -14,11 +14,12 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.mating import Aim, Mating, deflection
 from taccorl.demos.experts.se3 import between, inverse, rotvec, transform, turn
-from taccorl.errors import TaccorlError
+from taccorl.errors import LostError, TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
 from taccorl.sim.part import Part
 from taccorl.sim.robot import ARMS
@@ -34,6 +35,10 @@ _PEAK_OF_MEAN = 1.875  # of a minimum-jerk profile's speed
 _RECOIL_MPS = 0.08  # of a hand that has felt a block
 _LONGEST_PUSH_S = 12.0
 _AT_MOUTH_M = 0.004  # shallower is the rim, deeper is a wedge
+_STRAIGHT = 0.5  # of the turn that is felt: a part that is in the mouth and turned by less is pushed on
+_SAME_SIDE_RAD, _SAME_HEIGHT_M = 0.15, 0.005  # a part that lies like that lies on the side on which it lay at the reset
+_LOOSE_M = 0.001  # wider than a firm grip is not firm
+_OPEN_ENOUGH_M = 0.003  # narrower than open
 
 
 @dataclass(kw_only=True)
@@ -191,6 +196,32 @@ class ScriptedExpert(ABC):
         self._scripts[arm] = self.finish(arm, subtask)
         self.running.add(arm)
 
+    def remaining(self, arm: str) -> Script:
+        """What is left of the arm's work in the simulation's present state, wherever that is in the task.
+
+        Raises:
+            LostError: the task cannot be completed from there.
+            TaccorlError: this demonstrator can only begin at the beginning.
+        """
+        raise TaccorlError(f"expert of {self.task}: can only begin at the beginning; write its remaining()")
+
+    @classmethod
+    def can_resume(cls) -> bool:
+        """Whether it can begin anywhere."""
+        return cls.remaining is not ScriptedExpert.remaining
+
+    def resume(self) -> None:
+        """Take over both arms in the simulation's present state, whatever another did since its reset.
+
+        The first action repeats the command in force, so that the arms do not jump.
+
+        Raises:
+            LostError, TaccorlError: as ``remaining``.
+        """
+        self.stand_by()
+        self._scripts = {arm: self.remaining(arm) for arm in ARMS}
+        self.running = set(ARMS)
+
     @property
     def done(self) -> bool:
         """Both arms have nothing left to do."""
@@ -276,12 +307,32 @@ class ScriptedExpert(ABC):
 
         The command ends at 0, so a narrow part is squeezed with less: 26 N at 20 mm.
         """
+        yield from self._grip(arm, self._squeezed(width_m, force_n), 0.4)
+
+    def _squeezed(self, width_m: float, force_n: float | None) -> float:
+        """Opening [m] at which the pads press with ``force_n`` on a part of that width."""
         robot = self.sim.config.robot
         force_n = self.config.grip_n if force_n is None else force_n
         squeeze = force_n / robot.grip_stiffness_n_per_m
         if robot.pads == "sprung":
             squeeze += 2 * force_n / robot.pad_stiffness_n_per_m
-        yield from self._grip(arm, max(width_m - squeeze, 0.0), 0.4)
+        return max(width_m - squeeze, 0.0)
+
+    def firm(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
+        """Squeeze what another has gripped as ``close`` does, unless it is squeezed as firmly already."""
+        if self.hands[arm].opening_m > self._squeezed(width_m, force_n) + _LOOSE_M:
+            yield from self.close(arm, width_m, force_n)
+
+    def free(self, arm: str) -> Script:
+        """Open a hand that holds nothing, unless it is open."""
+        if self.hands[arm].opening_m < OPEN_M - _OPEN_ENOUGH_M:
+            yield from self.open(arm)
+
+    def rise(self, arm: str, height_m: float, speed_mps: float = 0.12) -> Script:
+        """Straight up."""
+        up = self.hands[arm].pose.copy()
+        up[2, 3] += height_m
+        yield from self.move(arm, up, speed_mps=speed_mps)
 
     def open(self, arm: str, width_m: float = OPEN_M) -> Script:
         """Open to ``width_m`` between the pads."""
@@ -308,12 +359,17 @@ class ScriptedExpert(ABC):
         Sideways and in rotation the hand gives way to what it feels, as a relaxed wrist does, so that the part finds its way
         once it is in the mouth. When it is blocked, it backs off, looks at the part in its hand again, which may have turned,
         and aims again with a smaller error. Afterwards the hand is still steady and learns nothing of its bias.
+        A part that is in the mouth already, and straight, is pushed on from where it is.
         """
         hand, config = self.hands[arm], self.config
-        aim = yield from self._bring_before(arm, mating, start_m)
+        depth, aim = start_m, self._first_aim(arm, mating)
+        if self.is_in(mating):
+            depth = float(mating.fit(self).depth_m)
+        else:
+            aim = yield from self._bring_before(arm, mating, aim, start_m)
         speed_mps = (self.rng.uniform(0.02, 0.03) if config.aim_m > 0 else 0.025) * config.speed
         hand.learns, hand.steadiness = False, 0.3
-        depth, began, free, holder = start_m, self.step_count, self.pushed(arm), self.body(mating.holder)
+        began, free, holder = self.step_count, self.pushed(arm), self.body(mating.holder)
         while self.step_count - began < _LONGEST_PUSH_S * CONTROL_HZ:
             fit, pushed = mating.fit(self), self.pushed(arm) - free
             at = float(fit.depth_m)
@@ -338,15 +394,24 @@ class ScriptedExpert(ABC):
             yield
         yield from self.pause(arm, 0.1, 0.25)
 
-    def _bring_before(self, arm: str, mating: Mating, start_m: float) -> Generator[None, None, Aim]:
-        """Carry a held part to ``start_m`` before the hole and look twice, the second time when it has come to rest."""
+    def is_in(self, mating: Mating) -> bool:
+        """Whether the part is past the mouth, and not wedged."""
+        fit = mating.fit(self)
+        in_mouth = fit.depth_m > _AT_MOUTH_M and fit.lateral_m < _AT_MOUTH_M
+        return bool(in_mouth and fit.tilt_rad < _STRAIGHT * self.config.feel_rad)
+
+    def _first_aim(self, arm: str, mating: Mating) -> Aim:
+        """With an error that nothing has corrected yet."""
         config = self.config
-        aim = Aim(
+        return Aim(
             off_m=self.rng.normal(size=2) * config.aim_m,
             off_rad=self.rng.normal(size=3) * config.aim_rad,
             part_from_tcp=inverse(self.body(mating.held)) @ self.tcp(arm),
             turned=mating.turned(self),
         )
+
+    def _bring_before(self, arm: str, mating: Mating, aim: Aim, start_m: float) -> Generator[None, None, Aim]:
+        """Carry a held part to ``start_m`` before the hole and look twice, the second time when it has come to rest."""
         for _ in range(2):
             yield from self.move(arm, partial(aim.pose, self, mating, start_m), speed_mps=0.12)
             yield from self.settle(arm)
@@ -408,6 +473,32 @@ class ScriptedExpert(ABC):
         pose[:3, 3] += pose[:3, 0] * rng.normal() * config.grasp_m
         pose[2, 3] += lift_m + abs(rng.normal()) * config.grasp_m / 2
         return pose
+
+    def holds(self, arm: str, part: Part) -> bool:
+        """Whether both pads of the hand touch the part."""
+        pads = 2 * ARMS.index(arm)
+        return bool(self.sim.pads_touching(part.name)[0, pads : pads + 2].all())
+
+    def require_lying(self, arm: str, part: Part) -> None:
+        """
+        Raises:
+            LostError: the part is in the other hand, lies on another side than at the reset, or does not lie on the table.
+        """
+        self.require_not_in_other_hand(arm, part)
+        pose = self.sim.task.reset(self.sim.draws[0]).poses[part.name]
+        began, now = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix(), self.body(part.name)
+        if began[2] @ now[2, :3] < math.cos(_SAME_SIDE_RAD):  # up, in the part's frame
+            raise LostError(f"{part.name} lies on another side")
+        if abs(now[2, 3] - pose[2]) > _SAME_HEIGHT_M:
+            raise LostError(f"{part.name} is in no hand and not where it can be gripped")
+
+    def require_not_in_other_hand(self, arm: str, part: Part) -> None:
+        """
+        Raises:
+            LostError: it is.
+        """
+        if any(self.holds(other, part) for other in ARMS if other != arm):
+            raise LostError(f"{part.name} is in the other hand")
 
     def body(self, name: str) -> np.ndarray:
         """World-from-body (4, 4) now."""

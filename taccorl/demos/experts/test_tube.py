@@ -1,12 +1,14 @@
 """Test Tube Insertion: left grips the rack's handle; right lifts the tube, turns it upright and brings it in by touch."""
 
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
 from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert, ScriptedExpertConfig
 from taccorl.demos.experts.se3 import inverse, transform, turn
+from taccorl.errors import LostError
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.test_tube import TestTube
 from taccorl.sim.twin import CONTROL_HZ
@@ -17,6 +19,13 @@ _LEAN_RIGHT_RAD = 0.575  # towards the cap; the hand then comes from above and b
 _TOWARDS_TIPS_M = 0.023  # of the tube, from the pads' middle: the fingers stay above the rack
 _GRIP_M = (0.0600, 0.0645)  # from the tube's bottom: clear of the stand's block now, of the rack later
 _HOVER_M = (0.400, 0.005, 0.110)  # of the upright tube's bottom
+_LIFT_M = 0.06
+_IN_STAND_M = 0.004
+_UPRIGHT_RAD, _ABOVE_HOLE_M, _CLEAR_M = (
+    0.5,
+    0.05,
+    0.02,
+)  # of a tube that can be brought to the hole's mouth from where it is
 _HEADING_RAD = np.deg2rad(55)  # of the hand above the rack
 _TURN_RADPS = 0.8  # fastest joint while the tube turns, on average
 _GIVE_WAY = 0.25  # at least: both plates of the rack hold the tube, and a stiff wrist would wedge it between them
@@ -40,6 +49,42 @@ class TestTubeExpert(ScriptedExpert):
     def finish(self, arm: str, subtask: str) -> Script:
         return self._hold() if arm == "left" else self._insert()
 
+    def remaining(self, arm: str) -> Script:
+        rack, tube = self._task.rack, self._task.tube
+        if arm == "left":
+            if self.holds("left", rack):
+                return self._go_on_holding()
+            self.require_lying("left", rack)
+            return chain(self.free("left"), self._left())
+        if self.holds("right", tube):
+            return self._go_on_inserting()
+        if self.is_in(self._mating()) or self._task.inside(self._task.fit(self.sim))[0]:  # or falls in
+            return self._leave()
+        self.require_not_in_other_hand("right", tube)
+        seat = self.body("stand") @ self._task.stand.seats["tube"]
+        if np.linalg.norm((inverse(seat) @ self.body("tube"))[:3, 3]) > _IN_STAND_M:
+            raise LostError("tube is in no hand and not in the stand")
+        return chain(self.free("right"), self._lift(), self._turn_upright(), self._insert_when_held())
+
+    def _go_on_holding(self) -> Script:
+        """With the rack in the left hand."""
+        yield from self.firm("left", self._task.rack.grasps["handle"].width_m)
+        self.flags.add("rack is held")
+        yield from self._hold()
+
+    def _go_on_inserting(self) -> Script:
+        """With the tube in the right hand."""
+        yield from self.firm("right", self._task.tube.grasps["middle"].width_m)
+        mating, tube = self._mating(), self.body("tube")
+        if not self.is_in(mating):
+            fit = mating.fit(self)
+            is_above = tube[2, 2] > np.cos(_UPRIGHT_RAD) and fit.lateral_m < _ABOVE_HOLE_M
+            if float(fit.depth_m) > -_CLEAR_M:  # off the hole it would be pulled over the rack, in the stand along it
+                yield from self.rise("right", float(fit.depth_m) + _CLEAR_M if is_above else _LIFT_M)
+            if not is_above:
+                yield from self._turn_upright()
+        yield from self._insert_when_held()
+
     def _left(self) -> Script:
         rack = self._task.rack
         goal = self.grasp(rack, "handle", lean_rad=_LEAN_LEFT_RAD, lift_m=0.004, pivot_m=_TIPS_M)
@@ -59,13 +104,22 @@ class TestTubeExpert(ScriptedExpert):
         yield from self.pause("right", 0.0, 0.4)
         yield from self._lift()
         yield from self._turn_upright()
+        yield from self._insert_when_held()
+
+    def _insert_when_held(self) -> Script:
         yield from self.wait_for("rack is held")
         yield from self._insert()
 
     def _insert(self) -> Script:
         """From the tube upright and held to the hand away from it."""
-        mating = Mating.of(self._task.tube, self._task.rack, "middle")
-        yield from self.insert("right", mating, depth_m=0.0445, enough_m=0.0425)
+        yield from self.insert("right", self._mating(), depth_m=0.0445, enough_m=0.0425)
+        yield from self._leave()
+
+    def _mating(self) -> Mating:
+        return Mating.of(self._task.tube, self._task.rack, "middle")
+
+    def _leave(self) -> Script:
+        """Open the right hand and take it away from the tube."""
         yield from self.open("right", _OPEN_M)
         away = self.hands["right"].pose @ transform((0, 0, -0.08))
         yield from self.move("right", away, speed_mps=0.12)
@@ -79,9 +133,7 @@ class TestTubeExpert(ScriptedExpert):
         yield from self.move("right", self.near(goal @ transform((0, 0, -0.06))))
         yield from self.move("right", goal, speed_mps=0.1, settle=True)
         yield from self.close("right", tube.grasps["middle"].width_m)
-        up = self.hands["right"].pose.copy()
-        up[2, 3] += 0.06
-        yield from self.move("right", up, speed_mps=0.12)
+        yield from self.rise("right", _LIFT_M)
 
     def _kept_clear(self, goal: np.ndarray) -> np.ndarray:
         """The same grasp moved along the tube to where no finger meets the stand, as the eye would."""

@@ -1,0 +1,104 @@
+"""``taccorl correct --policy.path=CHECKPOINT --task=assembly_2 [--episodes=128] [--out=outputs/assembly_2_corrections]``
+
+DAgger by takeover: the policy acts in the twin; at a drawn time after both parts are held, or when it stalls for a second, the
+task's scripted expert takes over and completes the task. Only the expert's rows become a LeRobot dataset, to be merged with the
+demonstrations (taccorl merge) and trained on (lerobot-train). Give every round of corrections another --seed.
+
+    --takeover=failures       keep out episodes in which the policy succeeds by itself (all: correct them, too)
+    --engine.workers=8        experts in so many processes
+
+The policy's episodes and each correction lie in the store: a run that was stopped goes on.
+"""
+
+import dataclasses
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
+from taccorl.cli.parse import parse
+from taccorl.errors import DatasetError, TaccorlError
+from taccorl.lineage.engines import Engine, LocalEngine
+
+
+@dataclass(kw_only=True)
+class CorrectConfig:
+    """The expert's corrections of a policy."""
+
+    policy: PolicyChoice = field(default_factory=PolicyChoice)
+    """--policy.path=CHECKPOINT."""
+    task: str
+    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's whose expert can take over."""
+    out: Path | None = None
+    """The dataset's folder; outputs/TASK_corrections if not given. It must not hold anything else."""
+    episodes: int = 128
+    """Scenes in which the policy acts; each gives one correction at most."""
+    num_envs: int = 64
+    """Environments in which the policy acts at once."""
+    seed: int = 0
+    """Of scenes, takeovers and the policy's random numbers."""
+    takeover: str = "failures"
+    """failures: of episodes in which the policy does not succeed by itself; all: of all."""
+    difficulty: str = "train"
+    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    twin: Path | None = None
+    """A twin.yaml; the nominal twin if not given."""
+    randomization: float = 1.0
+    """Share of the paper's reset ranges, 0 … 1; 0: the nominal scene."""
+    episode_length: int | None = None
+    """Control steps until the policy is cut off; the task's own limit if not given."""
+    images: bool = True
+    """Render the dataset's cameras (needs OpenGL). A policy with cameras needs OpenGL anyway."""
+    store: Path = Path("outputs/store")
+    """Finished episodes are kept here."""
+    engine: Engine = field(default_factory=LocalEngine)
+    """Where experts work: --engine.type=local --engine.workers=2, slurm, ray."""
+
+
+def main(argv: list[str]) -> int:
+    """0: corrected."""
+    config = parse(CorrectConfig, argv, positional=None)
+    os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
+    from taccorl.data.lerobot_format import check_path
+    from taccorl.demos.correct import CorrectionPlan, check_out, correct
+    from taccorl.evaluation.policy_episodes import policy_episodes
+    from taccorl.evaluation.statistics import wilson_interval
+    from taccorl.lineage.store import Store
+
+    plan = CorrectionPlan(
+        task=config.task,
+        policy="",
+        policy_digest="",
+        episodes=config.episodes,
+        difficulty=config.difficulty,
+        twin=config.twin,
+        randomization=config.randomization,
+        episode_length=config.episode_length,
+        takeover=config.takeover,
+        images=config.images,
+        seed=config.seed,
+    )
+    if config.num_envs < 1:
+        raise TaccorlError(f"--num_envs={config.num_envs}: at least 1")
+    out = config.out or Path("outputs") / f"{config.task}_corrections"
+    check_path(out)
+    if out.resolve().is_relative_to(config.store.resolve()) or config.store.resolve().is_relative_to(out.resolve()):
+        raise DatasetError(f"--out={out} and --store={config.store} lie in one another: choose another --out")
+    check_out(plan, out)
+    opened = open_policy(config.policy, plan.twin_config())
+    plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
+    store = Store(config.store)
+    acted = policy_episodes(plan, lambda: opened.load(config.seed), config.num_envs, store, TextProgress())
+    report = correct(plan, acted, out, store, config.engine)
+    print(f"policy:    {report['policy_successes']} of {report['attempts']} episodes succeeded by themselves")
+    over, successes = report["taken_over"], report["episodes"]
+    low, high = (100 * end for end in wilson_interval(successes, over))
+    causes = ", ".join(f"{cause} {count}" for cause, count in report["causes"].items())
+    print(f"kept out:  {report['kept_out']}, as the policy succeeded")
+    print(f"takeovers: {over} ({causes})")
+    print(f"expert:    {successes} of {over} succeeded ({100 * successes / over:.1f} %, 95 %: {low:.1f} … {high:.1f})")
+    for outcome, count in report["outcomes"].items():
+        print(f"           {outcome} {count}")
+    print(f"dataset:   {out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
+    print(f"next:      taccorl merge --sim=DEMONSTRATIONS --sim={out} --out=…, then lerobot-train")
+    return 0

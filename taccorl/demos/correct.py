@@ -1,0 +1,429 @@
+"""Corrections of a policy (DAgger): it acts, the task's scripted expert takes over, and the expert's rows become a dataset.
+
+    Ross, Gordon, Bagnell 2011 (arXiv:1011.0686); as takeovers: Kelly et al. 2019, HG-DAgger (arXiv:1810.02890)
+
+A policy's episodes come as scene seeds and actions. Each is executed again in one simulation up to the takeover, where the
+state must be the one that the policy was in, bit for bit. The dataset's episode begins with the first row after the takeover:
+windows of touch begin there, too, as at the start of any episode. Only successes are kept; everything else is counted.
+Letters in shapes: T control steps of the policy's episode.
+"""
+
+import dataclasses
+import functools
+import json
+import os
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+import taccorl
+from taccorl.data.dataset import PROVENANCE, episode_record
+from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
+from taccorl.demos.collect import AFTER_S, assemble, in_the_way, outcome_of
+from taccorl.demos.experts import experts
+from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
+from taccorl.errors import LostError, TaccorlError, UnreachableError, nearest
+from taccorl.lineage.canonical import canonical
+from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.lineage.manifest import read_manifest
+from taccorl.lineage.processes import Care, Failed
+from taccorl.lineage.stage import Artefact, Stage
+from taccorl.lineage.store import Store
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks import tasks
+from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+from taccorl.sim.twin_file import load_twin, twin_text
+
+VERSION = 1  # of an episode's correction
+CORRECTIONS_VERSION = 1  # of the dataset
+TAKEOVERS = ("failures", "all")
+KEPT_OUT = "policy succeeded"
+_WORD = "correct"  # apart from the scenes of other commands with the same seed
+_DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of an episode: ``default_rng([scene seed, which])``
+_CARE = Care(limit_s=600.0, tries=2)
+_STALL_STEPS = CONTROL_HZ  # 1 s
+_STILL = np.tile(
+    [0.02] * 6 + [0.001], 2
+)  # (14,) [rad, m]: range of a hand's joints and opening that is hardly a motion
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class PolicyEpisode:
+    """What a policy did in one scene, to its end."""
+
+    seed: int
+    """Of the scene."""
+    outcome: str
+    """``success``, or as in ``taccorl evaluate``."""
+    actions: np.ndarray
+    """(T, 14) float32, as they were given."""
+    states: np.ndarray
+    """(T + 1, 14) float32 ``observation.state`` before each action, and after the last."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectionPlan:
+    """What is corrected, and where."""
+
+    task: str
+    policy: str
+    """Name of the policy: the checkpoint's folder."""
+    policy_digest: str
+    episodes: int = 128
+    """Scenes in which the policy acts."""
+    difficulty: str = "train"
+    twin: Path | None = None
+    """A twin.yaml; the nominal twin if not given."""
+    randomization: float = 1.0
+    """Share of the paper's reset ranges."""
+    episode_length: int | None = None
+    """Control steps after which the policy is cut off; None: the task's own limit."""
+    takeover: str = "failures"
+    """``failures``: episodes in which the policy succeeds by itself are kept out; ``all``: they are corrected, too."""
+    images: bool = True
+    seed: int = 0
+    """Of scenes, takeovers and experts."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: an unknown word (the nearest is given), a number out of its range, an expert that cannot take over.
+        """
+        tasks.get(self.task)(self.difficulty)
+        if not experts.get(self.task).can_resume():
+            raise TaccorlError(f"--task={self.task}: its expert can only begin at the beginning; write its remaining()")
+        if self.takeover not in TAKEOVERS:
+            raise TaccorlError(f"--takeover={self.takeover}: {nearest(self.takeover, TAKEOVERS)}")
+        for name, least in (("episodes", 1), ("seed", 0), ("episode_length", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise TaccorlError(f"--{name}={value}: at least {least}")
+        if not 0 <= self.randomization <= 1:
+            raise TaccorlError(f"--randomization={self.randomization:g}: a share of the paper's reset ranges, 0 … 1")
+
+    @property
+    def scene_seeds(self) -> list[int]:
+        """Of the episodes; independent of how many there are, and of the scenes of other commands."""
+        return [self._scene_seed(k) for k in range(self.episodes)]
+
+    def _scene_seed(self, k: int) -> int:
+        key = (zlib.crc32(f"{_WORD} {self.task}".encode()), k)
+        state = np.random.SeedSequence(self.seed, spawn_key=key).generate_state(1, np.uint64)
+        return int(state[0] >> np.uint64(2))
+
+    def twin_config(self) -> TwinConfig:
+        """The twin to act in."""
+        return load_twin(self.twin) if self.twin else TwinConfig()
+
+    def make(self) -> Simulation:
+        """Its simulation."""
+        return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
+
+    def rows(self, sim: Simulation) -> DatasetSpec:
+        """What a row of the dataset holds."""
+        return with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=self.images)
+
+    def scene_config(self) -> dict[str, Any]:
+        """What the policy's episodes depend on besides the policy and their seeds."""
+        return {
+            "task": self.task,
+            "difficulty": self.difficulty,
+            "twin": twin_text(self.twin_config()),
+            "randomization": self.randomization,
+            "episode_length": self.episode_length,
+            "mujoco": mujoco.__version__,
+            "taccorl": taccorl.__version__,
+        }
+
+    def config(self, k: int) -> dict[str, Any]:
+        """What the correction of episode ``k`` depends on besides the policy's episodes."""
+        own = {"policy_digest": self.policy_digest, "takeover": self.takeover, "images": self.images, "origin": ORIGIN}
+        return canonical(self.scene_config() | own | {"root_seed": self.seed, "episode": k})
+
+
+def write_policy_episodes(episodes: Sequence[PolicyEpisode], folder: Path) -> None:
+    """As files of ``folder``: episodes.json and the rows of all episodes one after another."""
+    table = [{"seed": e.seed, "outcome": e.outcome, "steps": len(e.actions)} for e in episodes]
+    _dump(folder / "episodes.json", table)
+    np.save(folder / "actions.npy", np.concatenate([e.actions for e in episodes]))
+    np.save(folder / "states.npy", np.concatenate([e.states for e in episodes]))
+
+
+def read_policy_episode(folder: Path, k: int) -> PolicyEpisode:
+    """Episode ``k`` of what ``write_policy_episodes`` wrote."""
+    table = json.loads((folder / "episodes.json").read_text(encoding="utf-8"))
+    first, steps = sum(e["steps"] for e in table[:k]), table[k]["steps"]
+    actions = np.load(folder / "actions.npy", mmap_mode="r")[first : first + steps]
+    states = np.load(folder / "states.npy", mmap_mode="r")[first + k : first + k + steps + 1]
+    return PolicyEpisode(table[k]["seed"], table[k]["outcome"], np.array(actions), np.array(states))
+
+
+@dataclass
+class Correction:
+    """What became of one of the policy's episodes."""
+
+    outcome: str
+    """``success``; ``policy succeeded``: nothing to correct; ``not taken over``: the expert cannot go on from there; else how the
+    expert failed: the task's own category, ``timeout``, ``diverged``, ``unfinished``, ``unreachable``; ``not reproduced``."""
+    reason: str = ""
+    takeover_step: int | None = None
+    """First action of the expert; None: it did nothing."""
+    cause: str = ""
+    """Of the takeover: ``drawn``, ``stall``, or ``drawn before the grasp``: the parts were never in the hands."""
+    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 14), np.float32))
+    """(S, 14) float32 all that were executed since the reset: the policy's, then the expert's."""
+    felt: list[tuple[int, str]] = field(default_factory=list)
+    """(control step since the takeover, what the expert felt and corrected)."""
+    recorder: EpisodeRecorder | None = None
+    """Rows since the takeover."""
+
+
+def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, episode: PolicyEpisode) -> Correction:
+    """Execute the policy's episode up to the takeover and let the expert complete the task; it gets the task's full time."""
+    if episode.outcome == "success" and plan.takeover == "failures":
+        return Correction(KEPT_OUT)
+    takeover = _execute_until_takeover(sim, episode)
+    if takeover is None:
+        return Correction("not reproduced", "the policy's actions lead to another state than the policy was in")
+    step, cause = takeover
+    done = Correction("unfinished", takeover_step=step, cause=cause)
+    sim.judge.restart_clock()
+    done.recorder = EpisodeRecorder(sim, spec, np.random.default_rng([episode.seed, _PADS]))
+    expert = experts.get(plan.task)(sim, np.random.default_rng([episode.seed, _EXPERT]))
+    try:
+        expert.resume()
+        after = 0
+        while after < round(AFTER_S * CONTROL_HZ) and not sim.judge.outcome.over[0]:
+            done.recorder.step(expert.act())
+            after += expert.done
+        done.outcome = outcome_of(sim)
+    except LostError as error:
+        done.outcome, done.reason = "not taken over", str(error)
+    except UnreachableError as error:
+        done.outcome, done.reason = "unreachable", str(error)
+    own = np.array([row["action"] for row in done.recorder.rows], np.float32).reshape(-1, 14)
+    done.actions, done.felt = np.concatenate([episode.actions[:step], own]), expert.events
+    return done
+
+
+def _execute_until_takeover(sim: Simulation, episode: PolicyEpisode) -> tuple[int, str] | None:
+    """Reset and execute the policy's actions; returns the step of the takeover and its cause, None if not reproduced.
+
+    The step is drawn uniformly between the end of each arm's first subtask (both parts are held) and the policy's end, and over
+    all of its steps where that never happens. A stall is an earlier takeover.
+    """
+    share, num = np.random.default_rng([episode.seed, _DRAW]).uniform(), len(episode.actions)
+    drawn, early, subtasks = None, int(share * num), []
+    sim.reset([episode.seed])
+    snapshot = sim.snapshot()
+    for t in range(num):
+        if sim.judge.outcome.over[0]:
+            return None
+        subtasks.append(sim.judge.subtask[0].copy())
+        if drawn is None and (subtasks[t] >= 1).all():
+            drawn = t + int(share * (num - t))
+        last_s = slice(max(t - _STALL_STEPS, 0), t + 1)
+        if is_stall(episode.states[last_s], np.array(subtasks[last_s])) and not sim.judge.held[0]:
+            return _reproduced(sim, episode, t, "stall")
+        if t == drawn:
+            return _reproduced(sim, episode, t, "drawn")
+        if t == early:
+            snapshot = sim.snapshot()
+        sim.step(episode.actions[[t]].astype(np.float64))
+    sim.restore(snapshot)
+    return _reproduced(sim, episode, early, "drawn before the grasp")
+
+
+def _reproduced(sim: Simulation, episode: PolicyEpisode, t: int, cause: str) -> tuple[int, str] | None:
+    state = sim.proprioception()[0].astype(np.float32)
+    return (t, cause) if np.array_equal(state, episode.states[t]) else None
+
+
+def is_stall(states: np.ndarray, subtasks: np.ndarray) -> bool:
+    """Whether for a second no joint moved by 0.02 rad, no gripper by 1 mm, and no subtask ended; False if it is not yet a second.
+
+    Args:
+        states: (≤ 31, 14) joint angles [rad] and openings [m] of the last second.
+        subtasks: (≤ 31, 2) index of each arm's subtask.
+    """
+    if len(states) <= _STALL_STEPS:
+        return False
+    return bool((np.ptp(states, axis=0) < _STILL).all() and (subtasks[-1] == subtasks[0]).all())
+
+
+def correct(
+    plan: CorrectionPlan,
+    acted: Artefact,
+    out: Path,
+    store: Store,
+    engine: Engine | None = None,
+    progress: Progress = print,
+) -> dict[str, Any]:
+    """A LeRobot dataset at ``out`` of the expert's rows in the policy's episodes ``acted``; returns the report.
+
+    Args:
+        acted: folder of ``write_policy_episodes``, with ``plan.episodes`` of ``plan.scene_seeds``.
+
+    Raises:
+        InTheWayError: ``out`` holds something else.
+        TaccorlError: no takeover succeeded, nothing is written.
+    """
+    sim = plan.make()
+    spec = plan.rows(sim)
+    sim.close()
+
+    def show(k: int, artefact: Artefact) -> None:
+        entry = _entry(artefact.path)
+        progress(f"episode {k}: {entry['outcome']}{', ' + entry['reason'] if entry['reason'] else ''}")
+
+    made = (engine or LocalEngine()).map(
+        functools.partial(run_correction, plan, acted, store),
+        range(plan.episodes),
+        on_done=show,
+        name=lambda k: f"episode {k}",
+        care=_CARE,
+        instead=functools.partial(_lost_correction, plan, acted, store),
+    )
+    entries = [_entry(artefact.path) for artefact in made]
+    report = correction_report(plan, entries)
+    kept = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["outcome"] == "success"]
+    if not kept:
+        raise TaccorlError(
+            f"{plan.task}: no episode was corrected, nothing was written to {out}: {report['outcomes']}. More episodes, or "
+            "--takeover=all if the policy succeeds by itself"
+        )
+    stage = dataclasses.replace(_CORRECTIONS, fn=lambda _, inputs, folder: assemble(spec, report, inputs, folder))
+    config = {"task": plan.task, "policy": plan.policy, "policy_digest": plan.policy_digest, "seed": plan.seed}
+    store.run(stage, config | {"episodes": plan.episodes, "takeover": plan.takeover}, kept, destination=out)
+    return report
+
+
+def check_out(plan: CorrectionPlan, out: Path) -> None:
+    """Fail before the policy acts if ``out`` cannot be the dataset.
+
+    Raises:
+        InTheWayError: says what is there.
+    """
+    manifest = read_manifest(out) if out.is_dir() else None
+    if os.path.lexists(out) and (not manifest or manifest["stage"] != _CORRECTIONS.name):
+        raise in_the_way(out, _CORRECTIONS, plan.task)
+
+
+def run_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int) -> Artefact:
+    """Episode ``k`` corrected, or found in the store: entry.json, actions.npy; of a success dataset/ and episodes.json, too."""
+
+    def build(config: Any, inputs: list[Path], folder: Path) -> None:
+        _build(plan, k, config, inputs[0], folder)
+
+    return store.run(dataclasses.replace(_CORRECTION, fn=build), plan.config(k), [acted])
+
+
+def _lost_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int, end: Failed) -> Artefact:
+    """Episode ``k`` whose process did not come to an end of its own."""
+
+    def build(config: Any, inputs: list[Path], folder: Path) -> None:
+        _write(Correction(end.process, end.reason), read_policy_episode(inputs[0], k), k, folder)
+
+    return store.run(dataclasses.replace(_CORRECTION, fn=build), plan.config(k), [acted])
+
+
+def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
+    raise NotImplementedError("the function comes with the plan")
+
+
+_CORRECTION = Stage("correction", _not_yet, VERSION)
+_CORRECTIONS = Stage("corrections", _not_yet, CORRECTIONS_VERSION, manifest=f"{PROVENANCE}/manifest.json")
+
+
+def _build(plan: CorrectionPlan, k: int, config: dict[str, Any], acted: Path, folder: Path) -> None:
+    from taccorl.data.lerobot_format import write_episodes
+
+    episode, (sim, spec) = read_policy_episode(acted, k), _simulation(plan)
+    done = correct_episode(plan, sim, spec, episode)
+    if done.outcome == "success" and done.recorder is not None:
+        correction = {
+            "scene_seed": episode.seed,
+            "takeover_step": done.takeover_step,
+            "cause": done.cause,
+            "policy": plan.policy,
+            "policy_digest": plan.policy_digest,
+            "policy_outcome": episode.outcome,
+            "felt": [list(event) for event in done.felt],
+        }
+        name = f"{plan.task} seed {episode.seed}, from step {done.takeover_step}"
+        made = done.recorder.episode(name, config | {"correction": correction})
+        write_episodes([made], folder / "dataset")
+        _dump(folder / "episodes.json", [episode_record(made, "")])
+    _write(done, episode, k, folder)
+
+
+def _write(done: Correction, episode: PolicyEpisode, k: int, folder: Path) -> None:
+    """What every correction leaves."""
+    rows = len(done.recorder.rows) if done.recorder else 0
+    entry = {
+        "episode": k,
+        "scene_seed": episode.seed,
+        "policy_outcome": episode.outcome,
+        "policy_steps": len(episode.actions),
+        "outcome": done.outcome,
+        "reason": done.reason,
+        "takeover_step": done.takeover_step,
+        "cause": done.cause,
+        "rows": rows,
+    }
+    np.save(folder / "actions.npy", done.actions)
+    _dump(folder / "entry.json", entry)
+
+
+_made: dict[str, tuple[Simulation, DatasetSpec]] = {}
+
+
+def _simulation(plan: CorrectionPlan) -> tuple[Simulation, DatasetSpec]:
+    """Made once in a process."""
+    key = json.dumps(plan.config(0), sort_keys=True)
+    if key not in _made:
+        _made.clear()
+        sim = plan.make()
+        _made[key] = sim, plan.rows(sim)
+    return _made[key]
+
+
+def correction_report(plan: CorrectionPlan, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Counts of what the policy and the expert did. Entries: as in an entry.json."""
+
+    def count(values: Sequence[str]) -> dict[str, int]:
+        return dict(Counter(values).most_common())
+
+    over = [e for e in entries if e["takeover_step"] is not None]
+    return {
+        "task": plan.task,
+        "origin": ORIGIN,
+        "policy": plan.policy,
+        "policy_digest": plan.policy_digest,
+        "attempts": len(entries),
+        "policy_outcomes": count([e["policy_outcome"] for e in entries]),
+        "policy_successes": sum(e["policy_outcome"] == "success" for e in entries),
+        "kept_out": sum(e["outcome"] == KEPT_OUT for e in entries),
+        "taken_over": len(over),
+        "causes": count([e["cause"] for e in over]),
+        "outcomes": count([e["outcome"] + (f": {e['reason']}" * (e["outcome"] == "not taken over")) for e in entries]),
+        "episodes": sum(e["outcome"] == "success" for e in entries),
+        "rows": sum(e["rows"] for e in entries if e["outcome"] == "success"),
+        "entries": list(entries),
+    }
+
+
+def _entry(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "entry.json").read_text(encoding="utf-8"))
+
+
+def _dump(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

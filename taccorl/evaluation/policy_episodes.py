@@ -1,0 +1,66 @@
+"""The policy's part of corrections (``demos/correct.py``): episodes in batches, kept in the store as seeds and actions."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from taccorl.demos.correct import CorrectionPlan, PolicyEpisode, write_policy_episodes
+from taccorl.evaluation.evaluate import Scenes
+from taccorl.evaluation.rollouts import Actor, Progress, roll_out
+from taccorl.lineage.stage import Artefact, Stage
+from taccorl.lineage.store import Store
+
+VERSION = 1
+
+
+def policy_episodes(
+    plan: CorrectionPlan, load: Callable[[], Actor], num_envs: int, store: Store, progress: Progress | None = None
+) -> Artefact:
+    """Episodes of the policy in the plan's scenes, as ``write_policy_episodes`` writes them; from the store if they were made.
+
+    Args:
+        load: makes the actor; called only if it has to act.
+        num_envs: environments at once.
+    """
+
+    def build(config: Any, inputs: list[Path], folder: Path) -> None:
+        write_policy_episodes(_act(plan, load(), num_envs, progress), folder)
+
+    config = plan.scene_config() | {
+        "policy_digest": plan.policy_digest,
+        "seed": plan.seed,
+        "scene_seeds": plan.scene_seeds,
+        "num_envs": num_envs,  # the policy's random numbers are drawn for a batch
+    }
+    return store.run(dataclasses.replace(_STAGE, fn=build), config, [])
+
+
+def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
+    raise NotImplementedError("the function comes with the policy")
+
+
+_STAGE = Stage("policy_episodes", _not_yet, VERSION)
+
+
+def _act(plan: CorrectionPlan, actor: Actor, num_envs: int, progress: Progress | None) -> list[PolicyEpisode]:
+    """In the order of the scenes."""
+    scenes = Scenes(
+        tasks=(plan.task,),
+        seed=0,
+        difficulty=plan.difficulty,
+        twin=plan.twin,
+        randomization=plan.randomization,
+        episode_length=plan.episode_length,
+    )
+    size, found = min(num_envs, actor.max_batch or num_envs), []
+    actor.restart()
+    for first in range(0, plan.episodes, size):
+        seeds = plan.scene_seeds[first : first + size]
+        envs = scenes.environments(plan.task, len(seeds), images=actor.needs_images)
+        try:
+            rollouts = roll_out(envs, actor, seeds, progress)
+        finally:
+            envs.close()
+        found += [PolicyEpisode(r.row.seed, r.row.outcome, r.actions, r.states) for r in rollouts]
+    return found

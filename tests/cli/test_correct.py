@@ -1,0 +1,76 @@
+"""``taccorl correct`` as a user types it."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taccorl.cli.main import main
+from taccorl.data.dataset import Dataset
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "evaluation"))
+
+
+@pytest.fixture
+def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs the verb in an empty folder; (exit code, all that was printed)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: Any) -> tuple[int, str]:
+        code = main(list(map(str, words)))
+        shown = capsys.readouterr()
+        assert "Traceback" not in shown.out + shown.err
+        return code, shown.out + shown.err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--task=assembly2", "--policy.type=expert"), "did you mean 'assembly_2'"),
+        (("--task=puzzle",), "give --policy.path=CHECKPOINT"),
+        (("--task=puzzle", "--policy.type=expert", "--takeover=al"), "--takeover=al"),
+        (("--task=puzzle", "--policy.type=expert", "--num_envs=0"), "--num_envs=0"),
+        (("--task=puzzle", "--policy.type=expert", "--out=store/x", "--store=store"), "lie in one another"),
+        (("--task=puzzle", "--policy.type=expert", "--twin=none.yaml"), "none.yaml"),
+    ],
+)
+def test_wrong_words_end_before_the_policy_acts(words: tuple[str, ...], message: str, said: Any) -> None:
+    code, shown = said("correct", "--store=kept", *words)
+    assert code == 2 and message in shown and not Path("kept").exists()
+
+
+def test_what_lies_at_out_is_not_touched(said: Any, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").touch()
+    code, shown = said("correct", "--policy.type=expert", "--task=assembly_1", "--out=mine")
+    assert code == 2 and "mine is in the way" in shown and [p.name for p in (tmp_path / "mine").iterdir()] == ["file"]
+
+
+@pytest.mark.slow
+def test_a_folder_that_is_no_checkpoint_is_named(said: Any) -> None:
+    code, shown = said("correct", "--task=puzzle", "--policy.path=nowhere", "--store=kept")
+    assert code == 2 and "--policy.path=nowhere: no config.json there" in shown and not Path("kept").exists()
+
+
+@pytest.mark.slow
+def test_a_checkpoint_is_corrected_and_the_same_command_makes_nothing_again(said: Any, tmp_path: Path) -> None:
+    from tiny_checkpoint import write_checkpoint
+
+    checkpoint = write_checkpoint(tmp_path)
+    words = ("correct", f"--policy.path={checkpoint}", "--policy.device=cpu", "--task=assembly_2", "--store=kept")
+    words += ("--episodes=2", "--num_envs=2", "--episode_length=3", "--images=false", "--out=corrections")
+    code, shown = said(*words)
+    assert code == 0 and "preflight of" in shown and "0 of 2 episodes succeeded by themselves" in shown
+    assert "takeovers: 2 (drawn before the grasp 2)" in shown and "kept out:  0" in shown
+    report = json.loads((tmp_path / "corrections/meta/taccorl/collect_report.json").read_text())
+    assert Dataset(tmp_path / "corrections").num_episodes == report["episodes"] >= 1
+    assert report["policy_outcomes"] == {"timeout": 2} and len(report["policy_digest"]) == 64
+    before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "kept").rglob("*.npy"))
+    assert said(*words)[0] == 0
+    assert sorted(path.stat().st_mtime_ns for path in (tmp_path / "kept").rglob("*.npy")) == before
+    code, shown = said("lineage", "explain", "corrections", "--store=kept")
+    assert code == 0 and "policy_episodes" in shown and report["policy_digest"] in shown

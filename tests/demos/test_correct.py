@@ -1,0 +1,362 @@
+"""Corrections: where the expert takes over, from which states, and what becomes of each of the policy's episodes."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taccorl.data.dataset import Dataset
+from taccorl.demos.correct import (
+    CorrectionPlan,
+    PolicyEpisode,
+    correct,
+    correct_episode,
+    is_stall,
+    read_policy_episode,
+    write_policy_episodes,
+)
+from taccorl.demos.experts import experts
+from taccorl.demos.experts.scripted import EXACT
+from taccorl.errors import InTheWayError, LostError, TaccorlError
+from taccorl.lineage.engines import LocalEngine
+from taccorl.lineage.store import Store
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.tasks import tasks
+
+TASK = "assembly_2"
+PUSH_RAD = 0.02
+
+
+def plan(**changes: object) -> CorrectionPlan:
+    values: dict = {"task": TASK, "policy": "a policy", "policy_digest": "0" * 64, "episodes": 2, "images": False}
+    return CorrectionPlan(**{**values, **changes})
+
+
+@pytest.fixture(scope="module")
+def sim() -> Simulation:
+    return plan().make()
+
+
+Act = Callable[[int], np.ndarray | None]
+
+
+def acted(sim: Simulation, seed: int, act: Act, outcome: str = "timeout") -> PolicyEpisode:
+    """The episode of a policy that does ``act(t)`` until that is None."""
+    sim.reset([seed])
+    actions, states = [], [sim.proprioception()[0]]
+    while (action := act(len(actions))) is not None:
+        actions.append(action.astype(np.float32))
+        sim.step(actions[-1][None].astype(np.float64))
+        states.append(sim.proprioception()[0])
+    return PolicyEpisode(seed, outcome, np.array(actions).reshape(-1, 14), np.array(states, np.float32))
+
+
+def held_still(sim: Simulation, seed: int, steps: int) -> PolicyEpisode:
+    return acted(sim, seed, lambda t: sim.targets[0].copy() if t < steps else None)
+
+
+def pushed_expert(sim: Simulation, seed: int, after: int) -> PolicyEpisode:
+    """The expert; ``after`` steps after both parts are held its joints are pushed off by 0.02 rad over 10 steps, and it ends."""
+    expert = experts.get(sim.task.name)(sim, np.random.default_rng([seed, 1]))
+    push = np.random.default_rng(seed).normal(size=14) * PUSH_RAD
+    push[[6, 13]] = 0.0
+    held_at: list[int] = []
+
+    def act(t: int) -> np.ndarray | None:
+        if t == 0:
+            expert.start()
+        if not held_at and (sim.judge.subtask[0] >= 1).all():
+            held_at.append(t)
+        since = t - held_at[0] - after if held_at else 0
+        return None if since > 10 else np.clip(expert.act() + np.clip(since / 10, 0, 1) * push, ACTION_LOW, ACTION_HIGH)
+
+    return acted(sim, seed, act)
+
+
+def test_policy_episodes_are_read_as_they_were_written(sim: Simulation, tmp_path: Path) -> None:
+    written = [held_still(sim, seed, steps) for seed, steps in ((5, 3), (6, 0), (7, 4))]
+    write_policy_episodes(written, tmp_path)
+    for k, episode in enumerate(written):
+        read = read_policy_episode(tmp_path, k)
+        assert (read.seed, read.outcome) == (episode.seed, episode.outcome)
+        assert np.array_equal(read.actions, episode.actions) and read.actions.shape == ((3, 0, 4)[k], 14)
+        assert np.array_equal(read.states, episode.states) and len(read.states) == len(read.actions) + 1
+
+
+def test_a_stall_is_a_second_without_motion_and_without_progress() -> None:
+    still, same = np.zeros((31, 14)), np.zeros((31, 2), int)
+    assert is_stall(still, same)
+    assert not is_stall(still[1:], same[1:])  # 30 rows are 29 steps
+    for column, amount, stalls in ((0, 0.019, True), (0, 0.021, False), (13, 0.0009, True), (13, 0.0011, False)):
+        moved = still.copy()
+        moved[15, column] = amount
+        assert is_stall(moved, same) is stalls
+    assert not is_stall(still, np.repeat([[0, 1], [1, 1]], (20, 11), axis=0))
+
+
+def test_scenes_do_not_depend_on_their_number_and_are_not_those_of_an_evaluation() -> None:
+    assert plan(episodes=4).scene_seeds[:2] == plan().scene_seeds
+    assert min(plan(episodes=50).scene_seeds) > 1000 + 10**6
+    assert not set(plan(episodes=50, seed=1).scene_seeds) & set(plan(episodes=50).scene_seeds)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"task": "assembly2"}, "did you mean"),
+        ({"takeover": "failure"}, "--takeover=failure: did you mean 'failures'?"),
+        ({"episodes": 0}, "--episodes=0"),
+        ({"seed": -1}, "--seed=-1"),
+        ({"randomization": 2.0}, "--randomization=2"),
+    ],
+)
+def test_wrong_words_are_named(changes: dict, message: str) -> None:
+    with pytest.raises(TaccorlError, match=message.replace("?", r"\?")):
+        plan(**changes)
+
+
+def test_an_expert_that_begins_at_the_beginning_only_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    from taccorl.demos.experts.scripted import ScriptedExpert
+
+    monkeypatch.setattr(experts.get("puzzle"), "remaining", ScriptedExpert.remaining)
+    with pytest.raises(TaccorlError, match="--task=puzzle"):
+        plan(task="puzzle")
+
+
+# where the expert takes over ------------------------------------------------------------------------------------------
+
+
+class Stub:
+    """In the expert's place: holds still, and has finished."""
+
+    def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
+        self.sim, self.events, self.done = sim, [], True
+
+    can_resume = classmethod(lambda cls: True)
+
+    def resume(self) -> None:
+        pass
+
+    def act(self) -> np.ndarray:
+        return self.sim.targets[0].astype(np.float32)
+
+
+@pytest.fixture
+def stub(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taccorl.demos.correct.AFTER_S", 0.1)
+    monkeypatch.setattr("taccorl.demos.correct.experts.get", lambda task: Stub)
+
+
+def test_without_a_grasp_the_takeover_is_drawn_over_all_steps(sim: Simulation, stub: None) -> None:
+    steps = []
+    for seed in range(4):
+        done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, seed, 10))
+        share = np.random.default_rng([seed, 1]).uniform()
+        assert (done.takeover_step, done.cause) == (int(10 * share), "drawn before the grasp")
+        assert done.takeover_step is not None
+        assert done.outcome == "unfinished" and done.recorder is not None and len(done.recorder.rows) == 3
+        assert len(done.actions) == done.takeover_step + 3
+        steps.append(done.takeover_step)
+    assert len(set(steps)) > 2
+
+
+def test_a_policy_that_holds_still_has_stalled_after_a_second(sim: Simulation, stub: None) -> None:
+    done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, 1, 40))
+    assert (done.takeover_step, done.cause) == (30, "stall")
+
+
+def test_after_the_grasp_the_takeover_is_drawn_up_to_the_policys_end(
+    sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    update = type(sim.judge).update
+
+    def lifted_at_6(judge, scene, ids=None) -> None:
+        update(judge, scene, ids)
+        judge.subtask[judge.steps >= 6] = 1
+
+    monkeypatch.setattr(type(sim.judge), "update", lifted_at_6)
+    found = set()
+    for seed in range(5):
+        done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, seed, 10))
+        share = np.random.default_rng([seed, 1]).uniform()
+        assert (done.takeover_step, done.cause) == (6 + int(4 * share), "drawn")
+        found.add(done.takeover_step)
+    assert len(found) > 2
+
+
+def test_the_first_row_is_the_policys_state_at_the_takeover(sim: Simulation, stub: None) -> None:
+    episode = held_still(sim, 3, 10)
+    done = correct_episode(plan(), sim, plan().rows(sim), episode)
+    assert done.recorder is not None and done.takeover_step is not None
+    first = done.recorder.rows[0]["observation.state"]
+    assert np.array_equal(first, episode.states[done.takeover_step])
+    assert np.array_equal(done.actions[: done.takeover_step], episode.actions[: done.takeover_step])
+
+
+def test_a_state_that_is_off_by_one_bit_is_not_corrected(sim: Simulation, stub: None) -> None:
+    episode = held_still(sim, 3, 10)
+    episode.states[:, 4] = np.nextafter(episode.states[:, 4], np.float32(9))
+    done = correct_episode(plan(), sim, plan().rows(sim), episode)
+    assert done.outcome == "not reproduced" and done.takeover_step is None and not len(done.actions)
+
+
+def test_what_the_policy_completes_by_itself_is_kept_out_unless_all_is_asked_for(sim: Simulation, stub: None) -> None:
+    episode = held_still(sim, 3, 10)
+    episode = PolicyEpisode(episode.seed, "success", episode.actions, episode.states)
+    assert correct_episode(plan(), sim, plan().rows(sim), episode).outcome == "policy succeeded"
+    assert correct_episode(plan(takeover="all"), sim, plan().rows(sim), episode).takeover_step is not None
+
+
+def test_the_expert_has_the_tasks_full_time(sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sim.judge, "limit_steps", 10)
+    done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, 0, 10))
+    assert len(done.actions) > 8 and done.outcome == "unfinished"
+
+
+# from which states ----------------------------------------------------------------------------------------------------
+
+
+def put(sim: Simulation, part: str, *, up_m: float = 0.0, rolled: bool = False) -> None:
+    """Move a free part up, or roll it about its own z axis onto another side."""
+    at = sim.model.joint(part).qposadr[0]
+    sim.arrays["qpos"][0, at + 2] += up_m
+    if rolled:
+        w, x, y, z = sim.arrays["qpos"][0, at + 3 : at + 7]
+        half = np.sqrt(0.5)
+        sim.arrays["qpos"][0, at + 3 : at + 7] = half * np.array([w - z, x + y, y - x, z + w])
+    sim.batch.forward(np.array([0]))
+
+
+@pytest.mark.parametrize(("how", "message"), [({"rolled": True}, "another side"), ({"up_m": 0.2}, "in no hand")])
+@pytest.mark.parametrize("part", ["plug", "cradle"])
+def test_a_part_that_cannot_be_gripped_is_a_lost_state(sim: Simulation, part: str, how: dict, message: str) -> None:
+    sim.reset([0])
+    put(sim, part, **how)
+    with pytest.raises(LostError, match=f"{part} .*{message}"):
+        experts.get(TASK)(sim, np.random.default_rng(0)).resume()
+
+
+def test_a_lost_state_is_counted(sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(expert: object, arm: str) -> None:
+        raise LostError("plug is lost")
+
+    monkeypatch.setattr(experts.get(TASK), "remaining", lost)
+    done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, 3, 4))
+    assert (done.outcome, done.reason) == ("not taken over", "plug is lost")
+
+
+@pytest.mark.parametrize("task", ["assembly_1", "assembly_2", "test_tube", "puzzle"])
+def test_arms_do_not_jump_at_the_takeover(task: str) -> None:
+    sim = Simulation(tasks.get(task)())
+    sim.reset([0])
+    goal = sim.targets[0] + np.r_[np.full(6, 0.05), 0, np.full(6, -0.05), 0]
+    for k in range(4):
+        sim.step((sim.targets[0] + (goal - sim.targets[0]) * (k + 1) / 4)[None])
+    before = sim.targets[0].copy()
+    expert = experts.get(task)(sim, np.random.default_rng(0), EXACT)
+    expert.resume()
+    assert np.abs(expert.act() - before)[[*range(6), *range(7, 13)]].max() < 0.02
+    sim.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["assembly_1", "assembly_2", "test_tube", "puzzle"])
+@pytest.mark.parametrize("after", [5, 45])
+def test_the_expert_completes_what_was_pushed_by_20_mrad(task: str, after: int) -> None:
+    sim = Simulation(tasks.get(task)())
+    its = plan(task=task)
+    done = correct_episode(its, sim, its.rows(sim), pushed_expert(sim, 11, after))
+    assert done.cause == "drawn" and done.outcome == "success", (done.outcome, done.reason)
+    sim.close()
+
+
+# the dataset ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def corrected(sim: Simulation, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CorrectionPlan, dict]:
+    """Two episodes of a policy that is the expert, pushed in mid-air; and one in which it succeeds."""
+    folder, its = tmp_path_factory.mktemp("corrected"), plan(episodes=3)
+    episodes = [pushed_expert(sim, seed, 30) for seed in its.scene_seeds[:2]]
+    episodes.append(PolicyEpisode(its.scene_seeds[2], "success", np.zeros((1, 14), np.float32), np.zeros((2, 14))))
+    (folder / "acted").mkdir()
+    write_policy_episodes(episodes, folder / "acted")
+    store = Store(folder / "store")
+    report = correct(its, store.source(folder / "acted"), folder / "out", store, progress=lambda _: None)
+    return folder, its, report
+
+
+@pytest.mark.slow
+def test_the_dataset_holds_the_experts_rows_and_says_from_where(corrected: tuple, sim: Simulation) -> None:
+    folder, its, report = corrected
+    assert report["policy_outcomes"] == {"timeout": 2, "success": 1} and report["kept_out"] == 1
+    assert report["taken_over"] == 2 and report["outcomes"] == {"success": 2, "policy succeeded": 1}
+    dataset = Dataset(folder / "out")
+    assert dataset.num_episodes == report["episodes"] == 2
+    for i, entry in enumerate(report["entries"][:2]):
+        episode = dataset.episode(i)
+        simulation = episode.provenance["simulation"]
+        assert isinstance(simulation, dict)
+        made = simulation["correction"]
+        assert made["takeover_step"] == entry["takeover_step"] < entry["policy_steps"]
+        assert made["scene_seed"] == its.scene_seeds[i] and made["policy_digest"] == its.policy_digest
+        assert "twin, not a robot" in episode.origin and episode.success
+        acted = read_policy_episode(folder / "acted", i)
+        assert np.array_equal(episode.arrays["observation.state"][0], acted.states[made["takeover_step"]])
+        assert len(episode.arrays["action"]) == entry["rows"]
+        assert episode.arrays["sim.success"][-1, 0] == 1
+
+
+@pytest.mark.slow
+def test_seed_and_actions_alone_bring_the_episode_back(corrected: tuple, sim: Simulation) -> None:
+    folder, _, _ = corrected
+    dataset = Dataset(folder / "out")
+    for path in (folder / "store" / "correction").glob("[!.]*"):
+        entry, actions = json.loads((path / "entry.json").read_text()), np.load(path / "actions.npy")
+        if entry["outcome"] != "success":
+            assert not len(actions)
+            continue
+        sim.reset([entry["scene_seed"]])
+        states = []
+        for action in actions:
+            states.append(sim.state_rows()[0])
+            sim.step(action[None].astype(np.float64))
+        stored = dataset.episode(entry["episode"]).arrays["sim.state"]
+        assert np.array_equal(stored, np.array(states)[entry["takeover_step"] :])
+
+
+@pytest.mark.slow
+def test_again_nothing_is_made_and_any_number_of_workers_gives_the_same(corrected: tuple, tmp_path: Path) -> None:
+    folder, its, report = corrected
+    store = Store(folder / "store")
+    made = {path.name: path.stat().st_mtime_ns for path in store.artefacts()}
+    acted = store.source(folder / "acted")
+    assert correct(its, acted, folder / "out", store, progress=lambda _: None) == report
+    assert {path.name: path.stat().st_mtime_ns for path in store.artefacts()} == made
+    other = Store(tmp_path / "store")
+    assert correct(its, acted, tmp_path / "out", other, LocalEngine(workers=2), lambda _: None) == report
+    one, two = (next((place / "out/data").rglob("*.parquet")) for place in (folder, tmp_path))
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_nothing_is_written_where_nothing_was_corrected(tmp_path: Path) -> None:
+    its = plan(episodes=1)
+    done = PolicyEpisode(its.scene_seeds[0], "success", np.zeros((1, 14), np.float32), np.zeros((2, 14), np.float32))
+    (tmp_path / "acted").mkdir()
+    write_policy_episodes([done], tmp_path / "acted")
+    store = Store(tmp_path / "store")
+    with pytest.raises(TaccorlError, match=r"no episode was corrected.*policy succeeded.*--takeover=all"):
+        correct(its, store.source(tmp_path / "acted"), tmp_path / "out", store, progress=lambda _: None)
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_folder_is_in_the_way(tmp_path: Path) -> None:
+    from taccorl.demos.correct import check_out
+
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").touch()
+    with pytest.raises(InTheWayError, match="out is in the way"):
+        check_out(plan(), tmp_path / "out")
