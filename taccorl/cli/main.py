@@ -11,6 +11,7 @@ VERBS = {
     "twin": {
         "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them",
         "augment": "a few demonstrations from the twin → many new ones (MimicGen), with a report of yield and coverage",
+        "execute": "stored actions (augment --rows=actions) → LeRobot dataset, or frames for training without any video",
         "evaluate": "how good a policy is in the twin: success with its interval, failures, two policies on the same scenes",
         "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
         "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",
