@@ -1,4 +1,4 @@
-"""Demonstrations stored as seeds and actions, and executed again: the same attempts, the same numbers, and what is not is said."""
+"""Demonstrations stored as seeds and actions, and executed again: the same attempts and numbers, and what differs is counted."""
 
 import json
 import shutil
