@@ -84,8 +84,6 @@ def _render_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | Non
             arrays[key][row + first : row + first + len(part)] = resized(pictures, resolution)
         spent["rendering"] += rendered_s - began_s
         spent["resizing and writing"] += time.perf_counter() - rendered_s
-    for array in arrays.values():
-        array.flush()
     return spent
 
 
