@@ -5,6 +5,9 @@ pictures: MimicGen for two hands, held objects carried over. Beside it a report:
 The dataset is the same for any number of workers: --engine.workers=2, --engine.type=ray, --engine.type=slurm. An attempt that
 kills its process twice, or does not end within ten minutes, is then one that failed; --engine.workers=1 works in the command's
 own process, which nothing outlives.
+
+--rows=actions writes seeds and float32 actions, 24 kB an episode, instead of a dataset: physics only. ``taccorl execute`` makes
+the dataset on the machine where it is needed.
 """
 
 import time
@@ -46,6 +49,8 @@ class AugmentConfig:
     """Of all attempts, at least 0; another seed gives other scenes."""
     stratify: bool = False
     """After the first half, choose attempts that begin where episodes are few; the report says what that did."""
+    rows: str = "dataset"
+    """dataset; or actions: seeds and actions alone, for taccorl execute."""
     engine: Engine = field(default_factory=LocalEngine)
     """Where to work: --engine.type=local --engine.workers=2, slurm, ray."""
 
@@ -68,10 +73,10 @@ def main(argv: list[str]) -> int:
     before, began = {path.name for path in store.artefacts()}, Spent(cpu_s(children=True), time.perf_counter())
     report = augment(plan, config.source, out, store, config.engine)
     spent = Spent(cpu_s(children=True) - began.cpu_s, time.perf_counter() - began.wall_s)
-    used = made_attempts(plan, config.source, store, report["attempts"])
+    used = [made.folder for made in made_attempts(plan, config.source, store, report["attempts"])]
     known = isinstance(config.engine, LocalEngine) and not any(folder.name in before for folder in used)
     page = write_report(plan, config.source, out, store, report["attempts"], spent=spent if known else None)
-    print(f"dataset: {out}  ({report['episodes']} episodes, {report['rows']} rows): {plan.origin}")
+    print(f"{config.rows + ':':8s} {out}  ({report['episodes']} episodes, {report['rows']} rows): {plan.origin}")
     if (chosen := report.get("stratify")) is None:
         print(f"yield:   {Share(successes=report['episodes'], attempts=report['attempts'])}")
     else:
@@ -81,7 +86,10 @@ def main(argv: list[str]) -> int:
     if known:
         print(f"took:    {spent.wall_s / 60:.1f} min, {spent.cpu_s / report['episodes']:.1f} CPU-s for each episode")
     print(f"report:  {page}")
-    print(f"next:    taccorl view {out} --episode=0")
+    if plan.rows == "dataset":
+        print(f"next:    taccorl view {out} --episode=0")
+    else:
+        print(f"next:    taccorl execute --source={out} --out={out}_dataset")
     return 0
 
 
@@ -110,6 +118,7 @@ def _plan(config: AugmentConfig) -> "AugmentPlan":
         images=config.images,
         seed=config.seed,
         stratify=config.stratify,
+        rows=config.rows,  # pyright: ignore[reportArgumentType]  # checked there
     )
     plan.twin_config()
     return plan

@@ -12,6 +12,7 @@ VERBS = {
         "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them",
         "augment": "a few demonstrations from the twin → many new ones (MimicGen), with a report of yield and coverage",
         "correct": "the expert takes over where a policy fails → dataset of its corrections (DAgger)",
+        "execute": "stored actions (augment --rows=actions) → LeRobot dataset, or frames for training without any video",
         "evaluate": "how good a policy is in the twin: success with its interval, failures, two policies on the same scenes",
         "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
         "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",

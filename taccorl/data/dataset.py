@@ -47,6 +47,15 @@ class Dataset:
         self._tasks = _read_tasks(self.root)
         self.spec, self.skipped = _read_spec(self.root, self.info)
         """``skipped``: feature key → why episodes do not have it."""
+        self.unstored = _without_videos(self.info, self._table)
+        """Cameras without videos: their frames are in the cache of training alone (taccorl execute --pictures=cache)."""
+        if self.unstored:
+            kept = {key: f for key, f in self.spec.features.items() if key not in self.unstored}
+            self.spec = dataclasses.replace(self.spec, features=kept)
+            why = (
+                "not stored as video; frames are in the cache of training (lerobot-train --dataset.cache=gpu|host|disk)"
+            )
+            self.skipped |= dict.fromkeys(self.unstored, why)
         self._records = _read_records(self.root, self._table)
         manifest = self.root / PROVENANCE / "manifest.json"
         self.provenance: dict[str, Any] | None = _read_json(manifest) if manifest.is_file() else None
@@ -62,12 +71,22 @@ class Dataset:
         """Rows of one episode, as ``meta/episodes`` counts them."""
         return int(self._entry(index)["length"])
 
+    def first_row(self, index: int) -> int:
+        """Of one episode, in the whole dataset."""
+        return int(self._entry(index)["dataset_from_index"])
+
     def data_file(self, index: int) -> Path:
         """The parquet file that holds the episode, perhaps among others."""
         return self._file("data_path", "data/", index)
 
     def video(self, index: int, key: str) -> Video:
-        """The episode's part of a video file."""
+        """The episode's part of a video file.
+
+        Raises:
+            DatasetError: its frames are in the cache of training alone.
+        """
+        if key in self.unstored:
+            raise DatasetError(f"{self.root}: {key}: {self.skipped[key]}")
         path = self._file("video_path", f"videos/{key}/", index, video_key=key)
         return Video(path, float(self._entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
 
@@ -159,7 +178,8 @@ class Dataset:
 
     def video_problems(self) -> list[str]:
         """Proof, without decoding, that every row has its own frame: packets of each video file against the episodes' rows."""
-        cameras = [key for key, f in self.info["features"].items() if f["dtype"] == "video"]
+        features = self.info["features"]
+        cameras = [key for key, f in features.items() if f["dtype"] == "video" and key not in self.unstored]
         problems = []
         for key in cameras:
             files: dict[Path, list[int]] = {}
@@ -327,6 +347,12 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
             f"a writer that died before finalize(), or an incomplete copy"
         )
     return rows
+
+
+def _without_videos(info: dict[str, Any], table: list[dict[str, Any]]) -> tuple[str, ...]:
+    """Cameras of whose videos no episode says anything."""
+    cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
+    return tuple(key for key in cameras if table and not any(n.startswith(f"videos/{key}/") for n in table[0]))
 
 
 def _read_tasks(root: Path) -> dict[int, str]:

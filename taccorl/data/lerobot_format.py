@@ -80,6 +80,20 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
     return features
 
 
+def declare_pictures(root: Path, spec: DatasetSpec) -> None:
+    """Add the picture features of ``spec`` to ``info.json`` of a dataset without videos: its frames are in the cache of training
+    alone (``taccorl.training.rendered_frames``)."""
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text(encoding="utf-8"))
+    features = lerobot_features(spec, spec.keys("video"))
+    info["features"] = {
+        key: info["features"].get(key) or features[key]
+        for key in [*spec.features, *info["features"]]
+        if key in info["features"] or key in features
+    }
+    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+
+
 def check_path(path: Path) -> None:
     """
     Raises:
@@ -336,6 +350,12 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
     """
     for path in (*roots, destination):
         check_path(path)
+    for root in roots:
+        if unstored := Dataset(root).unstored:
+            raise DatasetError(
+                f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training, so it cannot be merged: "
+                "make it with taccorl execute --pictures=video"
+            )
     if len(roots) == 1:
         shutil.copytree(roots[0], destination, dirs_exist_ok=True)
     else:

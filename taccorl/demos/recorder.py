@@ -6,6 +6,7 @@ rendered again.
 """
 
 import dataclasses
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -60,6 +61,10 @@ class EpisodeRecorder:
     dense: bool = False
     """Keep a 200 Hz trajectory as well, for recordings as the drivers would write them."""
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
+    physics_s: float = 0.0
+    """Of wall time, in all steps so far."""
+    touch_s: float = 0.0
+    """Likewise."""
 
     def __post_init__(self) -> None:
         self._dense = DenseRecorder(self.sim) if self.dense else None
@@ -73,14 +78,19 @@ class EpisodeRecorder:
         """
         action = np.asarray(action, dtype=np.float32)
         sim = self.sim
+        began_s = time.perf_counter()
+        touch = sim.touch(self.sensor_rng)[0]
+        self.touch_s += time.perf_counter() - began_s
         row = {
             "observation.state": sim.proprioception()[0].astype(np.float32),
-            "observation.tactile": sim.touch(self.sensor_rng)[0],
+            "observation.tactile": touch,
             "sim.state": sim.state_rows(np.array([0]))[0],
             "sim.seed": sim.seeds[:1].copy(),
             "sim.subtask": sim.judge.subtask[0].astype(np.int16),
         }
+        began_s = time.perf_counter()
         sim.step(action[None].astype(np.float64), watch=self._dense.watch() if self._dense else watch)
+        self.physics_s += time.perf_counter() - began_s
         row["action"] = sim.executed[0].astype(np.float32)
         if intended is not None:
             row[EXECUTED], row["action"] = row["action"], np.asarray(intended, np.float32)

@@ -23,6 +23,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
 from torch import Tensor
 
+from taccorl.data.dataset import Dataset
 from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
@@ -31,7 +32,8 @@ Place = Literal["none", "disk", "host", "gpu"]
 PLACES: tuple[Place, ...] = get_args(Place)
 SHARE_OF_FREE = 0.8
 """Of the memory that is free, so much may be taken: training wants some, too."""
-_AT_ONCE = 64  # frames that are resized together
+AT_ONCE = 64
+"""Frames that are resized together."""
 _log = logging.getLogger(__name__)
 
 
@@ -69,7 +71,10 @@ def _write_frames(config: FramesConfig, inputs: list[Path], out_dir: Path) -> No
         for episode in range(meta.total_episodes):
             files.setdefault((key, inputs[0] / meta.get_video_file_path(episode, key)), []).append(episode)
     out_dir.mkdir(parents=True, exist_ok=True)
-    arrays = {key: _empty(out_dir, meta, key, config.resolution) for key in meta.video_keys}
+    arrays = {
+        key: empty_frames(out_dir, key, meta.total_frames, config.resolution or tuple(meta.features[key]["shape"][:2]))
+        for key in meta.video_keys
+    }
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         jobs = [
             pool.submit(_decode, arrays[key], path, meta, key, episodes, config.resolution)
@@ -84,14 +89,15 @@ def _write_frames(config: FramesConfig, inputs: list[Path], out_dir: Path) -> No
 FRAMES = Stage(name="frames", fn=_write_frames, version=1)
 
 
-def _file(folder: Path, key: str) -> Path:
+def frames_file(folder: Path, key: str) -> Path:
+    """Of a camera, in the artefact: (N, 3, rows, columns) uint8."""
     return folder / f"{key}.npy"
 
 
-def _empty(folder: Path, meta: LeRobotDatasetMetadata, key: str, resolution: tuple[int, int] | None) -> np.memmap:
-    rows, columns = resolution or tuple(meta.features[key]["shape"][:2])
-    shape = (meta.total_frames, 3, rows, columns)
-    return np.lib.format.open_memmap(_file(folder, key), mode="w+", dtype=np.uint8, shape=shape)
+def empty_frames(folder: Path, key: str, num_rows: int, resolution: tuple[int, int]) -> np.memmap:
+    """That file, of zeros, to be written."""
+    shape = (num_rows, 3, *resolution)
+    return np.lib.format.open_memmap(frames_file(folder, key), mode="w+", dtype=np.uint8, shape=shape)
 
 
 def _decode(
@@ -127,7 +133,7 @@ def _decode(
             if abs(frame.pts * step_s - times_s[done + len(waiting)]) > 0.5 / meta.fps:
                 continue  # of an episode that the dataset no longer has
             waiting.append(frame.to_ndarray(format="rgb24"))
-            if len(waiting) == _AT_ONCE:
+            if len(waiting) == AT_ONCE:
                 out[rows[done : done + len(waiting)]] = resized(np.stack(waiting), resolution)
                 done, waiting = done + len(waiting), []
     if waiting:
@@ -188,16 +194,31 @@ def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_r
         store = Store(request.store)
         dataset, config = store.dataset(root), FramesConfig(request.resolution)
         if store.find(FRAMES, config, [dataset]) is None:
+            if unstored := Dataset(root).unstored:
+                renders = f"taccorl execute --source=… --out={root} --pictures=cache{_option(request.resolution)}"
+                raise DatasetError(
+                    f"{root}: has no videos of {', '.join(unstored)}, and {store.root} has no frames of it at "
+                    f"{_size(request.resolution)}: {renders} --store={request.store} renders them; --dataset.cache_store= names "
+                    "another store"
+                )
             _log.info("decoding %d frames of %s into %s, once", num_rows * len(cameras), root, store.root)
         folder = store.run(FRAMES, config, [dataset]).path
         for key in cameras:
-            arrays[key] = np.load(_file(folder, key), mmap_mode="c")
+            arrays[key] = np.load(frames_file(folder, key), mmap_mode="c")
             if len(arrays[key]) != num_rows:
                 raise DatasetError(
-                    f"{_file(folder, key)}: {len(arrays[key])} frames, the dataset {root} has {num_rows} rows. Remove {folder}; "
-                    "the next run decodes anew"
+                    f"{frames_file(folder, key)}: {len(arrays[key])} frames, the dataset {root} has {num_rows} rows. "
+                    f"Remove {folder}; the next run makes them anew"
                 )
     return Frames(arrays, request.place, request.device, numbers_bytes)
+
+
+def _size(resolution: tuple[int, int] | None) -> str:
+    return "the size that the dataset states" if resolution is None else f"{resolution[0]}×{resolution[1]} pixels"
+
+
+def _option(resolution: tuple[int, int] | None) -> str:
+    return "" if resolution is None else f" --resolution={resolution[0]}x{resolution[1]}"
 
 
 def _fitting(place: Place, needed: int, device: str) -> Place:

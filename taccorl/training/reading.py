@@ -33,7 +33,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from taccorl.errors import TaccorlError
+from taccorl.errors import DatasetError, TaccorlError
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.training.frame_cache import CacheRequest, Frames, open_frames
@@ -245,6 +245,17 @@ class FastReader(DatasetReader):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._cache = _requested
+        cameras = self._meta.video_keys
+        self._has_videos = all(f"videos/{key}/file_index" in self._meta.episodes.column_names for key in cameras)  # pyright: ignore
+        if not self._has_videos:
+            if self._cache is None:
+                raise DatasetError(
+                    f"{self.root}: has no videos of {', '.join(cameras)}; its frames are in the cache of training alone: "
+                    "--dataset.cache=gpu (host, disk), or taccorl execute --pictures=video makes a dataset with videos"
+                )
+            assert self._meta.stats is not None, "LeRobot writes statistics with every dataset"
+            for key in cameras:  # LeRobot puts ImageNet's there
+                self._meta.stats.setdefault(key, {})
         given = [v for v in (*args, *kwargs.values()) if isinstance(v, Deltas)]
         self._relative_actions = given[0].relative_actions if given else None
 
@@ -252,6 +263,13 @@ class FastReader(DatasetReader):
         return {
             k: v for k, v in self.__dict__.items() if k not in ("_columns", "_gathered")
         }  # a worker makes its own, of the same files
+
+    def _check_cached_episodes_sufficient(self) -> bool:
+        if self._has_videos:
+            return super()._check_cached_episodes_sufficient()
+        table: Any = self.hf_dataset
+        wanted = range(self._meta.total_episodes) if self.episodes is None else self.episodes
+        return set(wanted) <= {int(episode) for episode in table.unique("episode_index")}
 
     def _build_index_mapping(self) -> None:
         super()._build_index_mapping()
@@ -341,7 +359,11 @@ class FastReader(DatasetReader):
             windows, padding = self._get_query_indices(index, episode)
         item: dict[str, Any] = {k: column.rows([row])[0] for k, column in columns.items() if k not in windows}
         item |= padding | self._query_hf_dataset(windows)
-        if self._meta.video_keys:
+        if self._meta.video_keys and not self._has_videos:
+            gathered: Any = self.batch([row])
+            for key in self._meta.video_keys:
+                item[key] = gathered[key][0] if self._return_uint8 else gathered[key][0].to(torch.float32) / 255
+        elif self._meta.video_keys:
             times_s = self._get_query_timestamps(item["timestamp"].item(), windows)
             item = self._query_videos(times_s, episode) | item
         if self._image_transforms is not None:

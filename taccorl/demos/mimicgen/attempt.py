@@ -1,29 +1,27 @@
-"""One attempt in the twin: physics only, a pure function of (spec, sources, twin, seed, k); then what is kept is done again.
+"""One attempt in the twin: physics and gates only, a pure function of (spec, sources, twin, seed, k).
 
-An attempt that succeeds is executed a second time from its stored actions: that must end in the same state bit for bit, shows
-what the gates judge, and gives the rows with touch. So physics comes first, and touch and pictures only for what is kept.
+Touch and pictures are only for what is kept: rows come from executing its stored actions again (``execute.py``).
 """
 
 import functools
+import hashlib
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from taccorl.data.spec import DatasetSpec
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.mimicgen.director import Director, Wish
-from taccorl.demos.mimicgen.disturbance import Exact, disturbed
+from taccorl.demos.mimicgen.disturbance import Disturbance, Exact
 from taccorl.demos.mimicgen.expert_contact import ExpertContact
-from taccorl.demos.mimicgen.gates import GateKeeper, Measured, foreign_contact
+from taccorl.demos.mimicgen.gates import GateKeeper, foreign_contact
 from taccorl.demos.mimicgen.rest import RestOffset, joint_addresses
 from taccorl.demos.mimicgen.schedule import DeadlockError
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import check_closed_loop
 from taccorl.demos.mimicgen.touching import Touching
-from taccorl.demos.recorder import EpisodeRecorder
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation
@@ -57,14 +55,19 @@ class Attempted:
     """(T, 14) float32 as they were executed."""
     intended: np.ndarray | None = None
     """(T, 14) float32 what an attempt that is disturbed was to do; None: what it did."""
-    last_state: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """(row_size,) after the last action."""
+    last_state: str = ""
+    """``state_digest`` after the last action."""
     provenance: dict[str, object] = field(default_factory=dict)
     cpu_s: float = 0.0
 
     @property
     def success(self) -> bool:
         return self.outcome == "success"
+
+
+def state_digest(sim: Simulation) -> str:
+    """SHA-256 of simulation 0's state row, bit for bit."""
+    return hashlib.sha256(np.ascontiguousarray(sim.state_rows()[0]).tobytes()).hexdigest()
 
 
 class TwinScene:
@@ -115,10 +118,11 @@ class Hands:
             self.joints_rad[arm] = joints
             self._rest[arm] = RestOffset(joints, command[7 * a : 7 * a + 6].copy(), lag_s)
 
-    def action(self, wishes: Mapping[str, Wish]) -> np.ndarray:
-        """(14,) float32 joint targets [rad] and openings [m]."""
+    def action(self, wishes: Mapping[str, Wish], pushed: Collection[str] = ()) -> np.ndarray:
+        """(14,) float32 joint targets [rad] and openings [m]. Of arms that are ``pushed`` off their way no rest is learnt."""
         action, qpos = np.empty(14), self.sim.arrays["qpos"][0]
-        still = [arm for arm, rest in self._rest.items() if self.learn and rest.is_still and not wishes[arm].contact]
+        may_learn = [arm for arm in ARMS if self.learn and arm not in pushed and not wishes[arm].contact]
+        still = [arm for arm in may_learn if self._rest[arm].is_still]
         if still:
             self._touching.look(self.sim.state_rows()[0])
         for a, arm in enumerate(ARMS):
@@ -173,76 +177,43 @@ class Attempts:
             contact_hands=functools.partial(ExpertContact, sim) if self._feels else None,
         )
         done = Attempted(k, scene_seed, "unfinished")
-        actions, is_exact, after = [], [], 0
+        spec = self.spec.datagen_config.disturbance
+        disturbance = Disturbance(spec, np.random.default_rng([scene_seed, _DISTURBANCE])) if self._disturbs else None
         exact = Exact(sim) if self._disturbs else None
+        gates, states, actions, intended, after = GateKeeper(sim), [], [], [], 0
         while after < _AFTER_STEPS and not sim.judge.outcome.over[0]:
             try:
                 wishes = director.step(scene, hands.joints_rad)
             except DeadlockError as error:
                 done.outcome, done.reason = "deadlock", str(error)
                 break
-            action = hands.action(wishes)
+            if disturbance is not None and exact is not None:
+                disturbance.update(wishes, {arm: director.ahead(arm) for arm in ARMS}, exact.look())
+            action = hands.action(wishes, disturbance.pushed if disturbance else ())
             if hands.unreached_m > _UNREACHABLE_M:
                 done.outcome = "unreachable"
                 done.reason = f"{hands.unreached} is out of reach by {hands.unreached_m * 1e3:.1f} mm"
                 break
-            if exact is not None:
-                is_exact.append(exact.look())
-            sim.step(action[None].astype(np.float64))
-            actions.append(action)
+            intended.append(action)
+            actions.append(disturbance.executed(action) if disturbance else action)
+            states.append(sim.state_rows()[0])
+            sim.step(actions[-1][None].astype(np.float64), watch=gates.watch())
             after += director.done
         done.actions = np.array(actions, np.float32).reshape(-1, 14)
-        self._end(done)
-        done.provenance = self._provenance(director, k, scene_seed)
-        if self._disturbs and done.success:
-            self._disturb(done, np.array(is_exact))
-        done.cpu_s = time.process_time() - began_s
-        return done
-
-    def _end(self, done: Attempted) -> None:
-        """What the judge says now."""
-        outcome = self.sim.judge.outcome
+        if disturbance:
+            done.intended = np.array(intended, np.float32).reshape(-1, 14)
+        outcome = sim.judge.outcome
         if outcome.over[0]:
             done.outcome = "success" if outcome.success[0] else str(outcome.failure[0])
-        done.last_state = self.sim.state_rows()[0]
-
-    def _disturb(self, done: Attempted, is_exact: np.ndarray) -> None:
-        """Do a success again with its arms pushed off their way. One whose success takes longer now stands still until then."""
-        sim, spec = self.sim, self.spec.datagen_config.disturbance
-        waits = [done.actions[-1:]] * _AFTER_STEPS
-        intended = np.concatenate([done.actions, *waits])
-        is_exact = np.pad(is_exact, ((0, _AFTER_STEPS), (0, 0)), mode="edge")
-        rng = np.random.default_rng([done.scene_seed, _DISTURBANCE])
-        executed, num = disturbed(intended, is_exact, spec, rng), 0
-        sim.reset([done.scene_seed])
-        while num < len(executed) and not sim.judge.outcome.over[0]:
-            sim.step(executed[[num]].astype(np.float64))
-            num += 1
-        done.actions, done.intended, done.outcome = executed[:num], intended[:num], "unfinished"
-        self._end(done)
-        if not done.success:
-            done.reason = "disturbed; undisturbed it succeeds"
-
-    def redo(self, done: Attempted, spec: DatasetSpec, noise: np.random.Generator | None = None) -> EpisodeRecorder:
-        """Execute a success again from its stored actions, with touch, under the gates; its outcome may become a gate's name."""
-        sim = self.sim
-        sim.reset([done.scene_seed])
-        recorder, gates = EpisodeRecorder(sim, spec, noise), GateKeeper(sim)
-        for t, action in enumerate(done.actions):
-            recorder.step(action, gates.watch(), None if done.intended is None else done.intended[t])
-        gates.see_actions(done.actions)
-        states = np.stack([row["sim.state"] for row in recorder.rows])
-        measured = gates.measured
-        done.provenance["gates"] = measured.told()
-        if not (np.array_equal(sim.state_rows()[0], done.last_state) and sim.judge.outcome.success[0]):
-            done.outcome, done.reason = "not reproduced", "the stored actions end in another state than the attempt did"
-        elif reason := self._refused(measured, states):
-            done.outcome, done.reason = reason
-        return recorder
-
-    def _refused(self, measured: Measured, states: np.ndarray) -> tuple[str, str] | None:
-        """Gate that a success does not pass and why."""
-        return measured.refused(self.spec.gates) or foreign_contact(self.sim, states)
+        done.last_state = state_digest(sim)
+        done.provenance = self._provenance(director, k, scene_seed)
+        if done.success:
+            gates.see_actions(done.actions)
+            done.provenance["gates"] = gates.measured.told()
+            if refused := gates.measured.refused(self.spec.gates) or foreign_contact(sim, np.stack(states)):
+                done.outcome, done.reason = refused
+        done.cpu_s = time.process_time() - began_s
+        return done
 
     def _provenance(self, director: Director, k: int, scene_seed: int) -> dict[str, object]:
         choices = []

@@ -3,6 +3,7 @@
 An attempt's key is made of all that decides: the spec, the sources' content, the twin, the seed, its number. So a run that was
 killed goes on where it was, another spec or other sources never mix with it, and any number of workers gives the same dataset.
 An attempt that kills its process twice (``crashed``) or does not end (``hung``) is counted like any other that failed.
+Attempts are physics; rows of a success, with touch and pictures, are another artefact, which ``rows: actions`` leaves out.
 """
 
 import dataclasses
@@ -15,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -26,12 +27,14 @@ from taccorl.data.episode import Episode
 from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
 from taccorl.demos.collect import REPORT, assemble, in_the_way
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
+from taccorl.demos.mimicgen.execution import DIFFERS, Demonstration, Execution, execute
 from taccorl.demos.mimicgen.from_dataset import read_sources, simulation_told
 from taccorl.demos.mimicgen.source import SourcePool
-from taccorl.demos.mimicgen.spec import MimicSpec, check_task
+from taccorl.demos.mimicgen.spec import GatesSpec, MimicSpec, check_task
+from taccorl.demos.mimicgen.stored_actions import META, write_stored
 from taccorl.demos.mimicgen.stratify import ResetSpace, first_attempts, next_round
-from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
-from taccorl.errors import TaccorlError
+from taccorl.demos.recorder import ORIGIN, with_simulator
+from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
@@ -44,8 +47,10 @@ from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
-VERSION = 2  # of an attempt
+VERSION = 3  # of an attempt
+ROWS_VERSION = 1  # of a success's rows
 AUGMENTED_VERSION = 3  # of the dataset
+ACTIONS_VERSION = 1  # of stored actions
 _ROUND = (
     20  # attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end
 )
@@ -54,6 +59,19 @@ _HUNDRED = 100
 _CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
 
 Progress = Callable[[str], None]
+Rows = Literal["dataset", "actions"]
+
+
+@dataclass(frozen=True)
+class Made:
+    """An attempt in the store."""
+
+    folder: Path
+    """As ``run_attempt`` says, without rows."""
+    entry: dict[str, Any]
+    """How it ended, its rows included."""
+    seconds: float
+    """That its process took, rows included."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +90,8 @@ class AugmentPlan:
     seed: int = 0
     stratify: bool = False
     """Fill the poor boxes of the reset space (``stratify.py``). An attempt does not depend on it, only which are made."""
+    rows: Rows = "dataset"
+    """What is written: a LeRobot dataset, or seeds and actions (``stored_actions.py``). Attempts are the same."""
     origin: str = field(default=ORIGIN)
 
     def __post_init__(self) -> None:
@@ -79,6 +99,8 @@ class AugmentPlan:
             raise TaccorlError(f"--episodes={self.episodes}: at least one")
         if self.seed < 0:
             raise TaccorlError(f"--seed={self.seed}: seeds are 0, 1, 2, …")
+        if self.rows not in get_args(Rows):
+            raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, get_args(Rows))}")
         if self.stratify and not self.space.rows:
             raise TaccorlError(f"--stratify=true: nothing is drawn at a reset of {self.spec.task}, no box can be poor")
 
@@ -103,17 +125,23 @@ class AugmentPlan:
         """The twin to generate in."""
         return load_twin(self.twin) if self.twin else TwinConfig()
 
+    @property
+    def stage(self) -> Stage:
+        """That publishes the successes."""
+        return _AUGMENTED if self.rows == "dataset" else _ACTIONS
+
     def make(self) -> Simulation:
         """Its simulation."""
         task = tasks.get(self.spec.task)(self.difficulty)
         check_task(self.spec, task)
         return Simulation(task, self.twin_config(), scale=self.randomization)
 
-    def rows(self, sim: Simulation) -> DatasetSpec:
+    def contract(self, sim: Simulation) -> DatasetSpec:
         """What a new episode's rows hold."""
         disturbs = self.spec.datagen_config.disturbance.joint_rad > 0
-        contract = load_dataset_spec(find_spec("taccorl_bimanual"))
-        return with_simulator(contract, sim, pictures=self.images, executed=disturbs)
+        return with_simulator(
+            load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=self.images, executed=disturbs
+        )
 
     def config(self, k: int) -> dict[str, Any]:
         """What attempt ``k`` depends on besides the sources; not on how many there are."""
@@ -137,7 +165,7 @@ class AugmentPlan:
 def augment(
     plan: AugmentPlan, source: Path, out: Path, store: Store, engine: Engine | None = None, progress: Progress = print
 ) -> dict[str, Any]:
-    """A LeRobot dataset at ``out`` of ``plan.episodes`` successes made of those at ``source``; returns the report.
+    """``plan.episodes`` successes made of those at ``source``, as ``plan.rows`` says, at ``out``; returns the report.
 
     Raises:
         TaccorlError: sources that do not fit or are not as written, something else at ``out``, or hardly any attempt succeeds.
@@ -146,7 +174,7 @@ def augment(
     engine, entries, made = engine or LocalEngine(), [], []
     # Before anything is sent away: what does not fit is refused here.
     sim = _attempts(plan, sources.path, sources.digest).sim
-    spec = plan.rows(sim)
+    spec = plan.contract(sim)
     fn = functools.partial(run_attempt, plan, sources, store)
     lost = functools.partial(_lost_attempt, plan, sources, store)
 
@@ -175,12 +203,19 @@ def augment(
     kept = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["outcome"] == "success"]
     report = _report(plan, entries)
 
-    def collection(_: Any, inputs: list[Path], folder: Path) -> None:
-        assemble(spec, report, inputs, folder)
-
-    stage = dataclasses.replace(_AUGMENTED, fn=collection)
     config = {"task": plan.spec.task, "spec": plan.spec.digest, "attempts": len(entries)}
-    store.run(stage, config | ({"stratify": True} if plan.stratify else {}), kept, destination=out)
+    config |= {"stratify": True} if plan.stratify else {}
+
+    def write(_: Any, inputs: list[Path], folder: Path) -> None:
+        if plan.rows == "dataset":
+            assemble(spec, report, inputs, folder)
+        else:
+            common = plan.config(0) | {"sources": sources.digest}
+            write_stored(
+                folder, common, dataclasses.asdict(plan.spec), report, [demonstration_of(path) for path in inputs]
+            )
+
+    store.run(dataclasses.replace(plan.stage, fn=write), config, kept, destination=out)
     return report
 
 
@@ -205,23 +240,28 @@ def check_out(plan: AugmentPlan, source: Path, out: Path, store: Store) -> None:
         InTheWayError: says what is at ``out``.
     """
     if os.path.lexists(out) and not _may_be_of(plan, store.source(source), out, store):
-        raise in_the_way(out, _AUGMENTED, plan.spec.task)
+        raise in_the_way(out, plan.stage, plan.spec.task)
 
 
 def _may_be_of(plan: AugmentPlan, sources: Artefact, out: Path, store: Store) -> bool:
-    """Whether the dataset at ``out`` is made of attempts of this very plan, and of as many successes."""
-    manifest, report = read_manifest(out), out / PROVENANCE / REPORT
-    if not manifest or manifest["stage"] != _AUGMENTED.name or not report.is_file():
+    """Whether what is at ``out`` is made of attempts of this very plan, and of as many successes."""
+    manifest = read_manifest(out)
+    if not manifest or manifest["stage"] != plan.stage.name:
         return False
-    told = json.loads(report.read_text(encoding="utf-8"))
+    path = out / (PROVENANCE / REPORT if plan.rows == "dataset" else META)
+    if not path.is_file():
+        return False
+    told = json.loads(path.read_text(encoding="utf-8"))
+    told = told if plan.rows == "dataset" else told["report"]
     if told["episodes"] != plan.episodes or ("stratify" in told) != plan.stratify:
         return False
-    attempts = {store.key(_ATTEMPT, plan.config(entry["attempt"]), [sources]) for entry in told["entries"]}
+    stage = _ROWS if plan.rows == "dataset" else _ATTEMPT
+    attempts = {store.key(stage, plan.config(entry["attempt"]), [sources]) for entry in told["entries"]}
     return {entry["key"] for entry in manifest["inputs"]} <= attempts
 
 
-def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> list[Path]:
-    """Folders of the plan's first ``num`` attempts in the store, each as ``run_attempt`` says; nothing is made.
+def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> list[Made]:
+    """The plan's first ``num`` attempts, out of the store; nothing is made.
 
     Raises:
         TaccorlError: one of them is not there.
@@ -229,30 +269,62 @@ def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> li
     sources, found, entries = store.source(source), [], []
     while len(found) < num:
         for k in _next_numbers(plan, entries)[: num - len(found)]:
-            artefact = store.find(_ATTEMPT, plan.config(k), [sources])
-            if artefact is None:
+            attempt = store.find(_ATTEMPT, plan.config(k), [sources])
+            if attempt is None:
                 raise TaccorlError(f"{store.root}: attempt {k} is not there any more; augment again makes it again")
-            found.append(artefact.path)
-            entries.append(_entry(artefact.path))
+            rows = store.find(_ROWS, plan.config(k), [sources]) if plan.rows == "dataset" else None
+            parts = [attempt.path, *([rows.path] if rows else [])]
+            entry = _entry(parts[-1])
+            found.append(Made(attempt.path, entry, sum(read_manifest(part)["seconds"] for part in parts)))
+            entries.append(entry)
     return found
 
 
 def run_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int) -> Artefact:
-    """Attempt ``k``, from the store if it has been made: entry.json, actions.npy, and of a success dataset/, episodes.json."""
+    """Attempt ``k``, from the store if it has been made: entry.json, actions.npy, where disturbed intended.npy. Of a
+    success, where the plan wants rows, these: entry.json, dataset/, episodes.json."""
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
-        _build(plan, sources, k, config, folder)
+        _build(plan, sources, k, folder)
 
-    return store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
+    attempt = store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
+    if plan.rows == "actions" or _entry(attempt.path)["outcome"] != "success":
+        return attempt
+
+    def build_rows(config: Any, inputs: list[Path], folder: Path) -> None:
+        _build_rows(plan, sources, attempt.path, config, folder)
+
+    # A function of the sources alone, as the attempt is: its key is known where the attempt is gone.
+    return store.run(dataclasses.replace(_ROWS, fn=build_rows), plan.config(k), [sources])
 
 
 def _lost_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int, end: Failed) -> Artefact:
     """Attempt ``k`` whose process did not come to an end of its own: what it leaves is how that was."""
+    lost = Attempted(k, plan.scene_seed(k), end.process, end.reason)
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
-        _write(Attempted(k, plan.scene_seed(k), end.process, end.reason), folder)
+        _write(lost, folder)
 
-    return store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
+    def build_rows(config: Any, inputs: list[Path], folder: Path) -> None:
+        _dump_entry(_entry_of(lost), folder)
+
+    attempt = store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
+    if _entry(attempt.path)["outcome"] != "success":
+        return attempt
+    return store.run(dataclasses.replace(_ROWS, fn=build_rows), plan.config(k), [sources])
+
+
+def demonstration_of(folder: Path) -> Demonstration:
+    """An attempt as it is stored."""
+    entry, intended = _entry(folder), folder / "intended.npy"
+    return Demonstration(
+        attempt=entry["attempt"],
+        scene_seed=entry["scene_seed"],
+        actions=np.load(folder / "actions.npy"),
+        intended=np.load(intended) if intended.is_file() else None,
+        last_state=entry["last_state"],
+        provenance=entry["provenance"],
+    )
 
 
 def is_attempt(folder: Path) -> bool:
@@ -267,20 +339,14 @@ def attempt_episode(folder: Path) -> Episode:
     Raises:
         TaccorlError: it broke before its first action.
     """
-    config, entry, actions = _config(folder), _entry(folder), np.load(folder / "actions.npy")
-    if not len(actions):
+    config, entry, stored = _config(folder), _entry(folder), demonstration_of(folder)
+    if not len(stored.actions):
         raise TaccorlError(
             f"{folder}: attempt {entry['attempt']} has no actions to show: {entry['outcome']}: {entry['reason']}"
         )
-    sim, scene_seed = simulation_told(config), entry["scene_seed"]
-    disturbed = (folder / "intended.npy").is_file()
-    contract = load_dataset_spec(find_spec("taccorl_bimanual"))
-    spec = with_simulator(contract, sim, pictures=config["images"], executed=disturbed)
-    sim.reset([scene_seed])
-    recorder = EpisodeRecorder(sim, spec, np.random.default_rng([scene_seed, 2]))
-    intended = np.load(folder / "intended.npy") if disturbed else [None] * len(actions)
-    for action, wanted in zip(actions, intended, strict=True):
-        recorder.step(action, intended=wanted)
+    sim, contract = simulation_told(config), load_dataset_spec(find_spec("taccorl_bimanual"))
+    spec = with_simulator(contract, sim, pictures=config["images"], executed=stored.intended is not None)
+    recorder = execute(sim, stored, spec, GatesSpec(**config["spec"]["gates"])).recorder
     told = {key: value for key, value in config.items() if key != "spec"} | {"mimicgen": entry["provenance"]}
     ended = f"{entry['outcome']}: {entry['reason']}" if entry["reason"] else entry["outcome"]
     episode = recorder.episode(f"{config['task']} attempt {entry['attempt']}, {ended}", told)
@@ -303,38 +369,70 @@ def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
 
 
 _ATTEMPT = Stage("mimicgen", _not_yet, VERSION)
+_ROWS = Stage("mimicgen_rows", _not_yet, ROWS_VERSION)
 _AUGMENTED = Stage("augmented", _not_yet, AUGMENTED_VERSION, manifest=f"{PROVENANCE}/manifest.json")
+_ACTIONS = Stage("actions", _not_yet, ACTIONS_VERSION)
 
 
-def _build(plan: AugmentPlan, sources: Artefact, k: int, config: dict[str, Any], folder: Path) -> None:
+def _build(plan: AugmentPlan, sources: Artefact, k: int, folder: Path) -> None:
+    try:
+        done = _attempts(plan, sources.path, sources.digest).run(k)
+    except Exception as error:  # one attempt must not end a run of hundreds; it is counted, with where it broke
+        done = Attempted(k, -1, "error", _where(error))
+    _write(done, folder)
+
+
+def _build_rows(plan: AugmentPlan, sources: Artefact, attempt: Path, config: dict[str, Any], folder: Path) -> None:
+    """Of a success."""
+    sim, stored, entry = _attempts(plan, sources.path, sources.digest).sim, demonstration_of(attempt), _entry(attempt)
+    try:
+        done = execute(sim, stored, plan.contract(sim), plan.spec.gates)
+        entry |= {"outcome": done.outcome, "reason": done.reason}
+    except Exception as error:
+        done, entry = None, entry | {"outcome": "error", "reason": _where(error)}
+    if done and done.outcome == "success":
+        told = {key: value for key, value in config.items() if key != "spec"} | {"sources": sources.digest}
+        write_execution(done, stored, told, folder)
+    _dump_entry(entry, folder)
+
+
+def write_execution(done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path) -> None:
+    """Rows of an execution as dataset/ with one episode, and its record, episodes.json.
+
+    Args:
+        told: what the simulation was, for the episode's provenance.
+    """
     from taccorl.data.lerobot_format import write_episodes
 
-    attempts = _attempts(plan, sources.path, sources.digest)
-    spec = plan.rows(attempts.sim)
-    try:
-        done = attempts.run(k)
-        recorder = attempts.redo(done, spec, np.random.default_rng([done.scene_seed, 2])) if done.success else None
-    except Exception as error:  # one attempt must not end a run of hundreds; it is counted, with where it broke
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        reason = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
-        done, recorder = Attempted(k, -1, "error", reason), None
-    if done.success and recorder is not None:
-        told = {key: value for key, value in config.items() if key != "spec"} | {"mimicgen": done.provenance}
-        episode = recorder.episode(f"{plan.spec.task} attempt {k}", told | {"sources": sources.digest})
-        episode = dataclasses.replace(episode, origin=plan.origin)
-        write_episodes([episode], folder / "dataset")
-        (folder / "episodes.json").write_text(json.dumps([episode_record(episode, sources.digest)]), encoding="utf-8")
-    _write(done, folder)
+    made = stored.provenance if done.is_same else stored.provenance | {DIFFERS: True}
+    episode = done.recorder.episode(f"{told['task']} attempt {stored.attempt}", told | {"mimicgen": made})
+    episode = dataclasses.replace(episode, origin=told["origin"])
+    write_episodes([episode], folder / "dataset")
+    (folder / "episodes.json").write_text(json.dumps([episode_record(episode, told["sources"])]), encoding="utf-8")
+
+
+def _where(error: Exception) -> str:
+    """An error and the line that raised it."""
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
 
 
 def _write(done: Attempted, folder: Path) -> None:
     """What every attempt leaves."""
-    rows = len(done.actions)
-    entry = {"attempt": done.k, "outcome": done.outcome, "rows": rows, "seconds": rows / CONTROL_HZ}
-    entry |= {"reason": done.reason, "scene_seed": done.scene_seed, "provenance": done.provenance}
     np.save(folder / "actions.npy", done.actions)
     if done.intended is not None:
         np.save(folder / "intended.npy", done.intended)
+    _dump_entry(_entry_of(done), folder)
+
+
+def _entry_of(done: Attempted) -> dict[str, Any]:
+    rows = len(done.actions)
+    entry = {"attempt": done.k, "outcome": done.outcome, "rows": rows, "seconds": rows / CONTROL_HZ}
+    entry |= {"reason": done.reason, "scene_seed": done.scene_seed, "last_state": done.last_state}
+    return entry | {"provenance": done.provenance}
+
+
+def _dump_entry(entry: dict[str, Any], folder: Path) -> None:
     (folder / "entry.json").write_text(json.dumps(entry, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
@@ -363,7 +461,7 @@ def _report(plan: AugmentPlan, entries: list[dict[str, Any]]) -> dict[str, Any]:
         "outcomes": _outcomes(entries),
         "episodes": _successes(entries),
         "rows": sum(e["rows"] for e in entries if e["outcome"] == "success"),
-        "entries": [{key: value for key, value in e.items() if key != "provenance"} for e in entries],
+        "entries": [{k: v for k, v in e.items() if k not in ("provenance", "last_state")} for e in entries],
     }
     if plan.stratify:
         first = entries[: first_attempts(plan.episodes)]

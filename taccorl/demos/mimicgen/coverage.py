@@ -1,6 +1,5 @@
 """What became of a run's attempts, and where in the reset space they began: yields with intervals, box by box."""
 
-import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +11,6 @@ from scipy.stats import binomtest
 
 from taccorl.demos.mimicgen.augment import AugmentPlan, made_attempts
 from taccorl.demos.mimicgen.stratify import first_attempts, given_up
-from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.store import Store
 
 
@@ -87,8 +85,8 @@ class Attempt:
 def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: int) -> list[Attempt]:
     """Out of the store. What was drawn follows from the seeds, of attempts that broke as well."""
     found = []
-    for folder in made_attempts(plan, source, store, num_attempts):
-        entry = json.loads((folder / "entry.json").read_text(encoding="utf-8"))
+    for made in made_attempts(plan, source, store, num_attempts):
+        entry = made.entry
         k = entry["attempt"]
         used = entry["provenance"].get("subtasks", [])
         found.append(
@@ -100,8 +98,8 @@ def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: i
                 sources=frozenset(s["source"] for s in used),
                 draw=plan.draw(k),
                 rows=entry["rows"],
-                process_s=read_manifest(folder)["seconds"],
-                folder=folder,
+                process_s=made.seconds,
+                folder=made.folder,
             )
         )
     return found

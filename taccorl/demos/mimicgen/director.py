@@ -93,6 +93,17 @@ class ContactHands(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Ahead:
+    """Control steps of an arm's present path, from the next one on, before it must be exact; 0: it must be in the next one;
+    infinite: not on this path, as far as is known."""
+
+    gripper: float
+    """Before its gripper begins to open or close."""
+    contact: float
+    """Before contact (``contact_lead_steps`` before what it holds touches its mate), or before another moves it."""
+
+
 @dataclass
 class Choice:
     """What an attempt does in one subtask; goes into the provenance."""
@@ -216,6 +227,24 @@ class Director:
                 wishes[arm] = hand.last
             hand.seen = scene.tcp(arm)
         return wishes
+
+    def ahead(self, arm: str) -> Ahead:
+        """What comes on the arm's path after the steps so far."""
+        hand, cue = self._hands[arm], self.schedule.upcoming(arm)
+        if arm in self._handed_over:
+            return Ahead(0, 0)
+        if cue is None or hand.path is None:
+            return Ahead(math.inf, math.inf)
+        path, first = hand.path, max(cue.step - len(hand.path.bridge), 0)
+        rows, bridge_left = path.rows[first:], max(len(path.bridge) - cue.step, 0)
+
+        def steps(found: np.ndarray) -> float:
+            return float(bridge_left + np.argmax(found)) if found.any() else math.inf
+
+        contact = steps(rows >= path.contact)
+        if path.is_handed_over:
+            contact = min(contact, max(path.num_own - cue.step, 0))
+        return Ahead(steps(path.track.gripper_acts[rows]), contact)
 
     def _in_contact(self, cues: Mapping[str, Cue]) -> Mapping[str, Wish]:
         """What others wish for the arms that they move now."""

@@ -1,16 +1,23 @@
-"""What pushes the arms of an attempt off their way, so that new episodes show the way back.
+"""Disturbance of the arms in transport, so that new episodes show the way back.
 
     executed(t) = intended(t) + strength(t) · drift(t)         the dataset's ``action`` is what was intended
 
 A policy that has only seen successes does not know what to do 10 mm beside them. Here an arm drifts off while the action that
 is shown still leads to where the demonstration was: DART, Laskey et al. 2017, Noise Injection for Robust Imitation Learning
 (arXiv:1703.09327), with noise that lasts, as an arm follows its command in a tenth of a second and white noise hardly moves it.
+
+The strength of an arm is 0 while its gripper moves, while it is ``Exact``, while either arm is at contact (from
+``contact_lead_steps`` before it) or moved by an expert, 0.4 s before and after that, and 0.8 s before its gripper moves. It is
+known when an action is sent: what is ahead follows from the arm's path (``Director.ahead``). So the attempt itself is disturbed,
+nothing is executed twice, and an expert that moves the hands in contact acts on what the disturbed transport left.
 """
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
+from taccorl.demos.mimicgen.director import Ahead, Wish
 from taccorl.demos.mimicgen.spec import DisturbanceSpec
 from taccorl.demos.mimicgen.touching import Touching
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
@@ -18,31 +25,61 @@ from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
-# T rows
 _CLEAR_STEPS = 12  # before and after what must be exact: 0.4 s, four times the arm's lag
+_APPROACH_STEPS = (
+    12  # more before a gripper moves: a hand that comes down on a part beside its place turns or shifts it
+)
 _RAMP_STEPS = 12
 _MOVES_M = 2e-4  # of an opening in a step
 _JOINTS, _PER_ARM = 6, 7
 
 
-def disturbed(
-    intended: np.ndarray, is_exact: np.ndarray, spec: DisturbanceSpec, rng: np.random.Generator
-) -> np.ndarray:
-    """What is executed: joints drift, openings are as intended.
+class Disturbance:
+    """Of one attempt. Once a control step: ``update``, then ``executed``."""
 
-    Args:
-        intended: (T, 14) float32 joint targets [rad] and openings [m].
-        is_exact: (T, 2) whether an arm may not be pushed when the action is sent (``Exact``).
+    def __init__(self, spec: DisturbanceSpec, rng: np.random.Generator) -> None:
+        self._spec, self._rng = spec, rng
+        self._off_rad = np.zeros(_JOINTS * len(ARMS))
+        self._since = np.full(len(ARMS), np.inf)
+        """(2,) steps since an arm had to be exact."""
+        self._opening_m: dict[str, float] = {}
+        self.strength = np.zeros(len(ARMS))
+        """(2,) of each arm now, 0 … 1."""
+        self._is_first = True
 
-    Returns:
-        (T, 14) float32, within the limits of actions.
-    """
-    off_rad, strength = drift(len(intended), spec, rng), strengths(intended, is_exact)
-    executed = intended.astype(float)
-    for a in range(len(ARMS)):
-        joints = slice(_PER_ARM * a, _PER_ARM * a + _JOINTS)
-        executed[:, joints] += strength[:, [a]] * off_rad[:, _JOINTS * a : _JOINTS * (a + 1)]
-    return np.clip(executed, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+    @property
+    def pushed(self) -> list[str]:
+        """Arms that are pushed off their way now."""
+        return [arm for arm, strength in zip(ARMS, self.strength, strict=True) if strength > 0]
+
+    def update(self, wishes: Mapping[str, Wish], ahead: Mapping[str, Ahead], is_exact: np.ndarray) -> None:
+        """
+        Args:
+            wishes: of the coming control step.
+            ahead: of each arm, after these wishes.
+            is_exact: (2,) of each arm now (``Exact``).
+        """
+        contact = min(each.contact for each in ahead.values())
+        before = np.empty(len(ARMS))
+        for a, arm in enumerate(ARMS):
+            opening_m = wishes[arm].opening_m
+            moves = abs(opening_m - self._opening_m.get(arm, opening_m)) > _MOVES_M
+            self._opening_m[arm] = opening_m
+            before[a] = min(contact, max(ahead[arm].gripper - _APPROACH_STEPS, 0))
+            must_be = moves or is_exact[a] or min(contact, ahead[arm].gripper) == 0
+            self._since[a] = 0 if must_be else self._since[a] + 1
+        self.strength = np.clip((np.minimum(before, self._since) - _CLEAR_STEPS) / _RAMP_STEPS, 0, 1)
+        if not self._is_first:
+            self._off_rad = drifted(self._off_rad, self._spec, self._rng)
+        self._is_first = False
+
+    def executed(self, intended: np.ndarray) -> np.ndarray:
+        """(14,) float32 within the limits of actions: joints of ``intended`` (14,) [rad] drift, openings [m] do not."""
+        executed = intended.astype(float)
+        for a in range(len(ARMS)):
+            joints = slice(_PER_ARM * a, _PER_ARM * a + _JOINTS)
+            executed[joints] += self.strength[a] * self._off_rad[_JOINTS * a : _JOINTS * (a + 1)]
+        return np.clip(executed, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 
 
 class Exact:
@@ -64,24 +101,7 @@ class Exact:
         return np.array([self._have_met.any() or self._touching.holds_fast(arm) for arm in ARMS])
 
 
-def strengths(intended: np.ndarray, is_exact: np.ndarray) -> np.ndarray:
-    """(T, 2) of each arm, 0 … 1: none in rows (T, 2) that are exact or while its gripper moves, nor 0.4 s before and after; full
-    another 0.4 s away."""
-    strength = np.ones((len(intended), len(ARMS)))
-    for a in range(len(ARMS)):
-        opening_m = intended[:, _PER_ARM * a + _JOINTS].astype(float)
-        exact = is_exact[:, a] | (np.abs(np.diff(opening_m, prepend=opening_m[:1])) > _MOVES_M)
-        rows = np.flatnonzero(exact)
-        if len(rows):
-            away = np.abs(np.arange(len(intended))[:, None] - rows).min(1)
-            strength[:, a] = np.clip((away - _CLEAR_STEPS) / _RAMP_STEPS, 0, 1)
-    return strength
-
-
-def drift(num_rows: int, spec: DisturbanceSpec, rng: np.random.Generator) -> np.ndarray:
-    """(T, 12) [rad] an Ornstein–Uhlenbeck process of each joint, from 0 at the first row."""
+def drifted(off_rad: np.ndarray, spec: DisturbanceSpec, rng: np.random.Generator) -> np.ndarray:
+    """(12,) [rad] an Ornstein–Uhlenbeck process of each joint, a control step after ``off_rad`` (12,)."""
     kept = math.exp(-1 / (CONTROL_HZ * spec.time_s))
-    off = np.zeros((num_rows, _JOINTS * len(ARMS)))
-    for t in range(1, num_rows):
-        off[t] = kept * off[t - 1] + math.sqrt(1 - kept**2) * spec.joint_rad * rng.normal(size=off.shape[1])
-    return off
+    return kept * off_rad + math.sqrt(1 - kept**2) * spec.joint_rad * rng.normal(size=off_rad.shape)

@@ -7,13 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from taccorl.data.episode import EXECUTED
-from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.demos.mimicgen.attempt import Attempts
+from taccorl.demos.mimicgen.attempt import Attempted, Attempts, state_digest
 from taccorl.demos.mimicgen.coverage import Share
 from taccorl.demos.mimicgen.source import Source, SourcePool
 from taccorl.demos.mimicgen.spec import MimicSpec
-from taccorl.demos.recorder import with_simulator
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
@@ -55,31 +52,27 @@ def score_generation(
 
     Args:
         sources: from any twin.
-        check: execute what is kept a third time, in a simulation of its own, for ``Score.broken``.
+        check: execute what is kept again, in a simulation of its own, for ``Score.broken``.
     """
     sim, other = (Simulation(tasks.get(spec.task)(), twin) for _ in range(2))
-    rows = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
     attempts, score = Attempts(SourcePool(spec, sources), sim, seed), Score()
     for k in range(num_attempts):
         done = attempts.run(k)
         if done.success:
-            recorder = attempts.redo(done, rows)
-            if done.success:
-                score.duration_s.append(len(done.actions) / CONTROL_HZ)
-                if check:
-                    stored = np.stack([row.get(EXECUTED, row["action"]) for row in recorder.rows])
-                    score.broken += not _holds(other, done.scene_seed, stored, done.last_state)
+            score.duration_s.append(len(done.actions) / CONTROL_HZ)
+            if check:
+                score.broken += not _holds(other, done)
         score.outcomes.append(done.outcome)
         score.cpu_s.append(done.cpu_s)
     return score
 
 
-def _holds(sim: Simulation, scene_seed: int, actions: np.ndarray, last_state: np.ndarray) -> bool:
-    """Whether stored actions (T, 14) end where the attempt did, in place."""
-    sim.reset([scene_seed])
-    for action in actions:
+def _holds(sim: Simulation, done: Attempted) -> bool:
+    """Whether an attempt's stored actions end where it did, in place."""
+    sim.reset([done.scene_seed])
+    for action in done.actions:
         sim.step(action[None].astype(np.float64))
-    return bool(np.array_equal(sim.state_rows()[0], last_state) and sim.task.look(sim).goal[0])
+    return bool(state_digest(sim) == done.last_state and sim.task.look(sim).goal[0])
 
 
 def stiffened(twin: TwinConfig, factor: float) -> TwinConfig:

@@ -112,8 +112,8 @@ class SplitNoiseSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class DisturbanceSpec:
-    """What pushes the arms off their way in new episodes, so that these show the way back (``disturbance.py``): ``action`` is
-    what was intended, ``sim.executed`` what was sent."""
+    """What pushes the arms off their way in transport in new episodes, so that these show the way back (``disturbance.py``):
+    ``action`` is what was intended, ``sim.executed`` what was sent."""
 
     joint_rad: float = 0.0
     """Standard deviation of each joint's drift; 0: none. 0.02 moves a hand by about 10 mm."""
@@ -315,12 +315,6 @@ def _closed_loop_mistakes(generation: GenerationSpec) -> Iterator[tuple[str, str
             "datagen_config/retarget",
             "eef_command sends poses as they were commanded, but closed_loop_expert says where the hands are to be; take "
             "held_object or eef, or contact_mode: replay",
-        )
-    if generation.disturbance.joint_rad > 0:
-        yield (
-            "datagen_config/disturbance",
-            "disturbed episodes do again what was done undisturbed, and closed_loop_expert would no longer follow from touch; "
-            "leave one of them out",
         )
     if generation.noise.contact != NoiseSpec():
         yield (

@@ -16,6 +16,7 @@ from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.scripted import EXACT
 from taccorl.demos.mimicgen.attempt import Attempts, Hands, attempt_seeds
 from taccorl.demos.mimicgen.director import Wish
+from taccorl.demos.mimicgen.execution import Demonstration, execute
 from taccorl.demos.mimicgen.from_dataset import SourceReader, read_sources, simulation_of
 from taccorl.demos.mimicgen.gates import Measured, foreign_contact
 from taccorl.demos.mimicgen.rest import RestOffset
@@ -50,6 +51,16 @@ def succeeded(pool, sim):
     """The first attempt that succeeds."""
     attempts = Attempts(pool, sim, seed=11)
     return next(done for k in range(6) if (done := attempts.run(k)).success)
+
+
+def stored(done) -> Demonstration:
+    return Demonstration(
+        attempt=done.k,
+        scene_seed=done.scene_seed,
+        actions=done.actions,
+        intended=done.intended,
+        last_state=done.last_state,
+    )
 
 
 # sources ------------------------------------------------------------------------------------------------------------------
@@ -202,7 +213,7 @@ def test_seeds_are_of_root_task_and_attempt_and_not_those_of_collect():
 def test_an_attempt_is_the_same_whatever_ran_before(pool, succeeded):
     again = Attempts(pool, Simulation(Assembly2()), seed=11).run(succeeded.k)
     np.testing.assert_array_equal(again.actions, succeeded.actions)
-    np.testing.assert_array_equal(again.last_state, succeeded.last_state)
+    assert again.last_state == succeeded.last_state
     assert again.outcome == "success"
     assert again.provenance["subtasks"] == succeeded.provenance["subtasks"]
 
@@ -222,8 +233,9 @@ def test_replay_of_commands_sends_the_source_s_commands_and_learns_nothing(colle
 
 @pytest.mark.slow
 def test_a_success_is_done_again_bit_for_bit_and_its_last_frame_is_whole(pool, sim, rows_spec, succeeded):
-    recorder = Attempts(pool, sim, seed=11).redo(succeeded, rows_spec, np.random.default_rng(0))
-    assert succeeded.outcome == "success"
+    done = execute(sim, stored(succeeded), rows_spec, pool.spec.gates)
+    assert done.is_same and done.outcome == "success"
+    recorder = done.recorder
     assert len(recorder.rows) == len(succeeded.actions)
     np.testing.assert_array_equal([row["action"] for row in recorder.rows], succeeded.actions)
     assert sim.task.look(sim).goal[0]  # not a part in flight
@@ -241,18 +253,30 @@ def test_a_success_is_done_again_bit_for_bit_and_its_last_frame_is_whole(pool, s
 
 
 @pytest.mark.slow
-def test_actions_that_were_not_the_attempts_are_not_reproduced(pool, sim, rows_spec, succeeded):
-    changed = dataclasses.replace(succeeded, actions=succeeded.actions.copy(), provenance={})
-    changed.actions[200, 9] += np.float32(1e-3)
-    Attempts(pool, sim, seed=11).redo(changed, rows_spec)
-    assert changed.outcome == "not reproduced"
+def test_an_execution_that_ends_elsewhere_counts_if_it_is_a_success_that_passes_the_gates(sim, rows_spec, succeeded):
+    changed = dataclasses.replace(succeeded, actions=succeeded.actions.copy())
+    changed.actions[10, 0] += np.float32(1e-6)
+    done = execute(sim, stored(changed), rows_spec, GatesSpec())
+    assert not done.is_same and done.outcome == "success"
+    strict = execute(sim, stored(changed), rows_spec, GatesSpec(max_force_n=1.0))
+    assert strict.outcome == "force"
+    assert "N between mating parts, the gate is 1" in strict.reason
+    assert (
+        execute(sim, stored(succeeded), rows_spec, GatesSpec(max_force_n=1.0)).outcome == "success"
+    )  # judged when made
 
 
 @pytest.mark.slow
-def test_a_gate_that_is_not_passed_is_the_outcome(pool, sim, rows_spec, succeeded):
+def test_actions_that_do_not_reach_the_goal_are_not_reproduced(sim, rows_spec, succeeded):
+    cut = dataclasses.replace(succeeded, actions=succeeded.actions[:200])
+    done = execute(sim, stored(cut), rows_spec, GatesSpec())
+    assert not done.is_same and done.outcome == "not reproduced"
+
+
+@pytest.mark.slow
+def test_a_gate_that_is_not_passed_is_the_outcome(pool, sim, succeeded):
     spec = dataclasses.replace(pool.spec, gates=GatesSpec(max_force_n=1.0))
-    strict = dataclasses.replace(succeeded, provenance={})
-    Attempts(SourcePool(spec, pool.sources), sim, seed=11).redo(strict, rows_spec)
+    strict = Attempts(SourcePool(spec, pool.sources), sim, seed=11).run(succeeded.k)
     assert strict.outcome == "force"
     assert "N between mating parts, the gate is 1" in strict.reason
 

@@ -113,8 +113,12 @@ def test_physics_that_ends_in_nan_is_counted_and_leaves_no_trace_in_the_next_att
     report = augment(plan(episodes=1), collected, tmp_path / "new", Store(tmp_path / "store"), progress=lambda _: None)
     assert report["outcomes"] == {"diverged": 1, "success": 1}
     assert report["entries"][0]["rows"] == 40
-    actions = [np.load(path / "actions.npy") for path in made_attempts(plan(), collected, Store(folder / "store"), 2)]
-    mine = [np.load(path / "actions.npy") for path in made_attempts(plan(), collected, Store(tmp_path / "store"), 2)]
+    actions = [
+        np.load(made.folder / "actions.npy") for made in made_attempts(plan(), collected, Store(folder / "store"), 2)
+    ]
+    mine = [
+        np.load(made.folder / "actions.npy") for made in made_attempts(plan(), collected, Store(tmp_path / "store"), 2)
+    ]
     assert np.array_equal(mine[1], actions[1])
     assert np.isfinite(mine[0]).all()
     assert np.isfinite(Dataset(tmp_path / "new").episode(0).arrays["sim.state"]).all()
@@ -134,13 +138,13 @@ def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again
     shutil.copytree(augmented[0] / "store", tmp_path / "store")  # it holds attempt 1, which succeeds
     monkeypatch.setattr(module, "run_attempt", deadly_attempt)
     store, some, engine = Store(tmp_path / "store"), plan(episodes=1), LocalEngine(workers=2)
-    shutil.rmtree(made_attempts(some, collected, store, 1)[0])
+    shutil.rmtree(made_attempts(some, collected, store, 1)[0].folder)
     report = augment(some, collected, tmp_path / "new", store, engine, progress=lambda _: None)
     assert report["outcomes"] == {"crashed": 1, "success": 1}
     crashed = report["entries"][0]
     assert crashed["reason"] == "the worker process was killed by SIGSEGV while it had this item"
     assert crashed["scene_seed"] == some.scene_seed(0)
-    (folder, _) = made_attempts(some, collected, store, 2)
+    folder = made_attempts(some, collected, store, 2)[0].folder
     with pytest.raises(
         TaccorlError, match="attempt 0 has no actions to show: crashed: the worker process was killed by SIGSEGV"
     ):

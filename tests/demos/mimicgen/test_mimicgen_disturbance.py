@@ -1,15 +1,18 @@
 """Arms that are pushed off their way while the action still leads to where they were to be; and what must be exact is exact."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
 from taccorl.alignment.dataset_rows import read_dataset
 from taccorl.data.dataset import Dataset
-from taccorl.demos.mimicgen.attempt import Attempts
+from taccorl.demos.mimicgen.attempt import Attempts, state_digest
 from taccorl.demos.mimicgen.augment import AugmentPlan, attempt_episode, augment, made_attempts
-from taccorl.demos.mimicgen.disturbance import Exact, disturbed, drift, strengths
+from taccorl.demos.mimicgen.director import Ahead, Wish
+from taccorl.demos.mimicgen.disturbance import Disturbance, Exact, drifted
+from taccorl.demos.mimicgen.execution import Demonstration, execute
 from taccorl.demos.mimicgen.from_dataset import read_sources
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import DisturbanceSpec, load_mimic_spec, with_options
@@ -24,44 +27,82 @@ LEFT, RIGHT = np.r_[:6], np.r_[7:13]
 SPEC = with_options(load_mimic_spec("assembly_2"), disturbance=DisturbanceSpec(joint_rad=0.02, time_s=0.7))
 
 
-@pytest.fixture(scope="module")
-def two_hands():
-    """(T, 14) and (T, 2): the left gripper moves in row 20, both arms have to be exact from row 100 on."""
-    intended = ((ACTION_LOW + ACTION_HIGH) / 2 + np.linspace(-0.1, 0.1, 120)[:, None]).astype(np.float32)
-    intended[:, [6, 13]] = 0.05
-    intended[20:, 6] = 0.01
-    return intended, np.tile(np.arange(120)[:, None] >= 100, (1, 2))
+FREE = Ahead(math.inf, math.inf)
 
 
-def test_nothing_drifts_where_a_gripper_moves_or_parts_meet(two_hands):
-    left, right = strengths(*two_hands).T
-    # 12 steps without, 12 steps of a ramp
-    assert [left[k] for k in (2, 8, 20, 32, 38, 44, 76, 82, 88, 110)] == [0.5, 0, 0, 0, 0.5, 1, 1, 0.5, 0, 0]
-    assert [right[k] for k in (0, 20, 76, 82, 88, 119)] == [1, 1, 1, 0.5, 0, 0]  # its own gripper rests
-    assert (strengths(two_hands[0][:, [*RIGHT, 13] * 2], np.zeros((120, 2), bool)) == 1).all()
+def wishes(left_m: float = 0.05, right_m: float = 0.05) -> dict[str, Wish]:
+    return {arm: Wish(goal=np.eye(4), opening_m=m) for arm, m in zip(ARMS, (left_m, right_m), strict=True)}
+
+
+def strengths_of(steps) -> np.ndarray:
+    """(T, 2) of (wishes, ahead of the left, ahead of the right, is exact) in turn."""
+    disturbance, found = Disturbance(DisturbanceSpec(joint_rad=0.02), np.random.default_rng(1)), []
+    for wish, left, right, exact in steps:
+        disturbance.update(wish, {"left": left, "right": right}, np.array(exact))
+        found.append(disturbance.strength)
+    return np.array(found)
+
+
+def test_nothing_drifts_from_0_8_s_before_a_gripper_moves_to_0_4_s_after():
+    # The left gripper moves in row 60 alone: it is 59 steps ahead after the first.
+    ahead = [Ahead(59 - k if k < 60 else math.inf, math.inf) for k in range(100)]
+    found = strengths_of([(wishes(0.05 if k < 60 else 0.01), ahead[k], FREE, (False, False)) for k in range(100)])
+    left, right = found.T
+    # 12 + 12 steps without before it, 12 after it, 12 steps of a ramp
+    assert [left[k] for k in (0, 23, 29, 35, 47, 60, 72, 78, 84, 99)] == [1, 1, 0.5, 0, 0, 0, 0, 0.5, 1, 1]
+    assert (right == 1).all()  # its own gripper rests
+
+
+def test_nothing_drifts_from_0_4_s_before_contact_of_either_arm_nor_while_another_moves_it():
+    contact = [Ahead(math.inf, max(40 - k, 0)) for k in range(60)]
+    taken = [Ahead(0, 0)] * 20
+    left = [*contact, *taken, *[FREE] * 40]
+    found = strengths_of([(wishes(), each, FREE, (False, False)) for each in left])
+    np.testing.assert_array_equal(found[:, 0], found[:, 1])
+    assert [found[k, 0] for k in (0, 16, 22, 28, 40, 79)] == [1, 1, 0.5, 0, 0, 0]
+    # 0.4 s after the last row that the expert moved, and a ramp; the other arm's contact keeps an arm only while it is ahead
+    assert [found[k, 0] for k in (91, 97, 103, 119)] == [0, 0.5, 1, 1]
+
+
+def test_an_exact_arm_does_not_drift_and_the_other_does():
+    found = strengths_of([(wishes(), FREE, FREE, (k == 20, False)) for k in range(60)])
+    assert [found[k, 0] for k in (19, 20, 32, 38, 44)] == [1, 0, 0, 0.5, 1]
+    assert (found[:, 1] == 1).all()
 
 
 def test_a_drift_has_the_spread_and_the_time_that_were_asked_for():
-    off = drift(40_000, DisturbanceSpec(joint_rad=0.02, time_s=0.7), np.random.default_rng(0))
-    assert off.shape == (40_000, 12)
-    assert (off[0] == 0).all()
+    rng, spec, off = np.random.default_rng(0), DisturbanceSpec(joint_rad=0.02, time_s=0.7), [np.zeros(12)]
+    for _ in range(39_999):
+        off.append(drifted(off[-1], spec, rng))
+    off = np.array(off)
     np.testing.assert_allclose(off.std(0), 0.02, rtol=0.08)  # 40 000 rows are 1900 times 21: 1.6 % standard error
     lagged = [np.corrcoef(x[:-21], x[21:])[0, 1] for x in off.T]  # 0.7 s at 30 Hz
     np.testing.assert_allclose(np.mean(lagged), np.exp(-1), atol=0.03)
     assert np.abs(np.corrcoef(off.T) - np.eye(12)).max() < 0.15
 
 
-def test_joints_are_pushed_and_openings_are_not(two_hands):
-    intended, is_exact = two_hands
-    executed = disturbed(intended, is_exact, DisturbanceSpec(joint_rad=0.02), np.random.default_rng(1))
-    assert executed.dtype == np.float32
-    np.testing.assert_array_equal(executed[:, [6, 13]], intended[:, [6, 13]])
-    pushed = (executed != intended)[:, [*LEFT, *RIGHT]].reshape(-1, 2, 6)
-    np.testing.assert_array_equal(pushed[1:].any(2), strengths(intended, is_exact)[1:] > 0)
-    assert not pushed[0].any()
-    far = disturbed(intended, is_exact, DisturbanceSpec(joint_rad=50.0), np.random.default_rng(1))
-    assert ((far >= ACTION_LOW) & (far <= ACTION_HIGH)).all()
-    np.testing.assert_array_equal(disturbed(intended, is_exact, DisturbanceSpec(), np.random.default_rng(1)), intended)
+def executed(joint_rad: float, exact=(False, False)) -> tuple[np.ndarray, np.ndarray]:
+    """(60, 14) what is sent, and (14,) what was intended in each row."""
+    disturbance, intended = Disturbance(DisturbanceSpec(joint_rad=joint_rad), np.random.default_rng(1)), None
+    intended = ((ACTION_LOW + ACTION_HIGH) / 2).astype(np.float32)
+    sent = []
+    for _ in range(60):
+        disturbance.update(wishes(), {"left": FREE, "right": FREE}, np.array(exact))
+        sent.append(disturbance.executed(intended))
+    return np.array(sent), intended
+
+
+def test_joints_are_pushed_and_openings_are_not():
+    sent, intended = executed(0.02)
+    assert sent.dtype == np.float32
+    assert (sent[:, [6, 13]] == intended[[6, 13]]).all()
+    assert (sent[0] == intended).all()  # a drift begins at 0
+    assert (sent[1:, [*LEFT, *RIGHT]] != intended[[*LEFT, *RIGHT]]).all()
+    one, _ = executed(0.02, exact=(True, False))
+    assert (one[:, LEFT] == intended[LEFT]).all()
+    np.testing.assert_array_equal(one[:, RIGHT], sent[:, RIGHT])
+    far, _ = executed(50.0)
+    assert ((far >= ACTION_LOW.astype(np.float32)) & (far <= ACTION_HIGH.astype(np.float32))).all()
 
 
 def test_an_arm_is_exact_that_grips_on_the_table_and_both_are_once_parts_have_met(collected):
@@ -84,63 +125,57 @@ def test_an_arm_is_exact_that_grips_on_the_table_and_both_are_once_parts_have_me
         assert on_the_table.max() < closing + 40
 
 
-@pytest.fixture(scope="module")
-def pool(collected):
-    return SourcePool(SPEC, read_sources(collected, SPEC))
+@pytest.fixture(scope="module", params=["replay", "closed_loop_expert"])
+def pool(request, collected):
+    spec = with_options(SPEC, contact_mode=request.param)
+    return SourcePool(spec, read_sources(collected, spec))
 
 
 @pytest.fixture(scope="module")
-def both(pool):
-    """The first attempt that succeeds disturbed, and the same one undisturbed."""
-    sim, calm = (
-        Simulation(Assembly2()),
-        dataclasses.replace(SPEC, datagen_config=load_mimic_spec("assembly_2").datagen_config),
-    )
-    attempts = Attempts(pool, sim, seed=11)
-    pushed = next(done for k in range(8) if (done := attempts.run(k)).success)
-    return pushed, Attempts(SourcePool(calm, pool.sources), sim, seed=11).run(pushed.k)
-
-
-def tcps(actions, scene_seed):
-    """(T, 2, 3) [m] where the hands are before each action."""
-    sim, found = Simulation(Assembly2()), []
-    sim.reset([scene_seed])
-    for action in actions:
-        found.append(np.stack([sim.tcp(arm)[0, :3, 3] for arm in ARMS]))
-        sim.step(action[None].astype(np.float64))
-    return np.stack(found), sim.state_rows()[0]
+def pushed(pool):
+    """The first attempt that succeeds."""
+    attempts = Attempts(pool, Simulation(Assembly2()), seed=11)
+    return next(done for k in range(8) if (done := attempts.run(k)).success)
 
 
 @pytest.mark.slow
-def test_a_disturbed_hand_leaves_its_way_and_is_back_where_it_grips(both):
-    pushed, calm = both
-    assert calm.success
-    assert calm.intended is None
-    num = min(len(pushed.actions), len(calm.actions))
-    np.testing.assert_array_equal(pushed.intended[:num], calm.actions[:num])
-    np.testing.assert_array_equal(pushed.intended[num:], np.tile(calm.actions[-1:], (len(pushed.intended) - num, 1)))
-    (way, state), (calm_way, _) = tcps(pushed.actions, pushed.scene_seed), tcps(calm.actions, calm.scene_seed)
-    np.testing.assert_array_equal(state, pushed.last_state)
-    off_mm = 1e3 * np.linalg.norm(way[:num] - calm_way[:num], axis=2)
-    strength = strengths(pushed.intended, np.zeros((len(pushed.intended), 2), bool))[:num]
-    grips = [int(np.argmax(strength[:, a] == 0)) + 12 for a in range(2)]
-    for a, grip in enumerate(grips):
-        full = off_mm[:grip, a][strength[:grip, a] == 1]
-        assert np.median(full) > 4
-        assert full.max() < 60
-        assert off_mm[grip, a] < 1.5  # 0.4 s after the last push, four time constants of the arm
-
-
-@pytest.mark.slow
-def test_rows_show_what_was_intended_and_keep_what_was_executed(both, pool):
-    pushed, _ = both
+def test_a_disturbed_attempt_drifts_in_transport_and_is_exact_where_it_grips_and_joins(pushed):
     sim = Simulation(Assembly2())
-    attempts = Attempts(pool, sim, seed=11)
-    spec = AugmentPlan(spec=SPEC, images=False).rows(sim)
-    done = dataclasses.replace(pushed, provenance={})
-    recorder = attempts.redo(done, spec)
-    assert done.success, done.reason
-    episode = recorder.episode("pushed", {})
+    sim.reset([pushed.scene_seed])
+    exact, off = Exact(sim), np.abs(pushed.actions - pushed.intended)
+    assert (off[:, [6, 13]] == 0).all()
+    met = False
+    for t, action in enumerate(pushed.actions):
+        is_exact = exact.look()
+        met |= bool(sim.contact("plug", "cradle").touching[0])
+        for a, joints in enumerate((LEFT, RIGHT)):
+            if is_exact[a]:
+                assert (off[t, joints] == 0).all(), t
+        if met:
+            assert (off[t] == 0).all(), t
+        sim.step(action[None].astype(np.float64))
+    assert met
+    assert state_digest(sim) == pushed.last_state  # what is stored is what was executed
+    for a, (joints, column) in enumerate(((LEFT, 6), (RIGHT, 13))):
+        closes = int(np.argmax(np.diff(pushed.actions[:, column]) < -0.002))
+        assert (off[closes - 20 : closes + 12, joints] == 0).all(), a
+        assert np.median(off[2 : closes - 40, joints]) > 0.005  # of a standard deviation of 0.02
+
+
+@pytest.mark.slow
+def test_rows_show_what_was_intended_and_keep_what_was_executed(pushed, pool):
+    sim = Simulation(Assembly2())
+    spec = AugmentPlan(spec=SPEC, images=False).contract(sim)
+    stored = Demonstration(
+        attempt=pushed.k,
+        scene_seed=pushed.scene_seed,
+        actions=pushed.actions,
+        intended=pushed.intended,
+        last_state=pushed.last_state,
+    )
+    done = execute(sim, stored, spec, pool.spec.gates)
+    assert done.is_same and done.outcome == "success"
+    episode = done.recorder.episode("pushed", {})
     np.testing.assert_array_equal(episode.arrays["action"], pushed.intended)
     np.testing.assert_array_equal(episode.arrays["sim.executed"], pushed.actions)
     # Where an arm is off, the action leads back: it does not move along with the joints.
@@ -151,12 +186,10 @@ def test_rows_show_what_was_intended_and_keep_what_was_executed(both, pool):
 
 
 @pytest.mark.slow
-def test_an_attempt_that_fails_when_disturbed_says_so(pool):
-    wild = with_options(SPEC, disturbance=DisturbanceSpec(joint_rad=0.3))
-    done = Attempts(SourcePool(wild, pool.sources), Simulation(Assembly2()), seed=11).run(0)
-    assert not done.success
-    assert done.reason == "disturbed; undisturbed it succeeds"
-    assert done.intended is not None
+def test_the_provenance_states_disturbance_and_who_moves_the_hands_in_contact(pushed, pool):
+    assert pushed.provenance["disturbance"] == {"joint_rad": 0.02, "time_s": 0.7}
+    assert pushed.provenance["contact_mode"] == pool.spec.datagen_config.contact_mode
+    assert ("corrections" in pushed.provenance) == (pool.spec.datagen_config.contact_mode == "closed_loop_expert")
 
 
 @pytest.mark.slow
@@ -173,7 +206,7 @@ def test_a_disturbed_dataset_says_how_and_is_no_source(collected, tmp_path):
     with pytest.raises(DatasetError, match=r"sim\.executed, what was sent to them, is not there: taccorl merge"):
         merged.executed()
     attempts = made_attempts(plan, collected, Store(tmp_path / "store"), told["mimicgen"]["attempt"] + 1)
-    again = attempt_episode(attempts[-1])
+    again = attempt_episode(attempts[-1].folder)
     for key in ("action", "sim.executed", "sim.state"):
         np.testing.assert_array_equal(again.arrays[key], episode.arrays[key])
     with pytest.raises(DatasetError, match=r"pushed off their way .* Give the dataset that it was made of"):

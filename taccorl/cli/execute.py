@@ -1,0 +1,100 @@
+"""``taccorl execute --source=outputs/many_actions --out=outputs/many [--pictures=video|cache|none] [--resolution=112x112]``
+
+Stored actions (``taccorl augment --rows=actions``) into a LeRobot dataset, on the machine where it is needed: every demonstration
+is executed once, by as many workers as --engine.workers says. Demonstrations that are no success here are left out and counted.
+
+--pictures=cache encodes no video: frames are rendered into the cache from which lerobot-train --dataset.cache=gpu|host|disk reads
+them, at the policy's resolution. Only with that option can such a dataset be trained on.
+"""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from taccorl.cli.parse import parse
+from taccorl.errors import DatasetError, TaccorlError
+from taccorl.lineage.engines import Engine, LocalEngine
+
+
+@dataclass(kw_only=True)
+class ExecuteConfig:
+    """A dataset out of stored actions."""
+
+    source: Path
+    """Folder of stored actions: taccorl augment --rows=actions."""
+    out: Path
+    """The dataset's folder. It must not hold anything else."""
+    store: Path = Path("outputs/store")
+    """Finished episodes and rendered frames are kept here; lerobot-train finds frames by --dataset.cache_store."""
+    pictures: str = "video"
+    """video; cache: frames for lerobot-train --dataset.cache alone; none."""
+    resolution: str | None = None
+    """Of frames in the cache, rows x columns: 112x112, as --policy.image_resolution; the cameras' own 224x224 if not given."""
+    engine: Engine = field(default_factory=LocalEngine)
+    """Where to work: --engine.type=local --engine.workers=16, slurm, ray."""
+
+
+def main(argv: list[str]) -> int:
+    """0: executed; 1: executed, but demonstrations were left out."""
+    config = parse(ExecuteConfig, argv, positional=None)
+    resolution = _resolution(config)
+    from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
+    from taccorl.lineage.store import Store
+
+    plan = ExecutePlan(source=config.source, pictures=config.pictures)  # pyright: ignore[reportArgumentType]  # checked there
+    _check_places(config)
+    store = Store(config.store)
+    report, seconds = execute_stored(plan, config.out, store, config.engine)
+    if plan.pictures == "cache":
+        from taccorl.training.rendered_frames import render_frames
+
+        frames, of_frames = render_frames(config.out, resolution, store, config.engine)
+        seconds |= of_frames
+    print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
+    print(
+        f"differs: {report['differs']} of {report['demonstrations']} end in another state here than when they were made"
+    )
+    if report["dropped"]:
+        print(f"dropped: {', '.join(f'{num} {outcome}' for outcome, num in report['dropped'].items())}")
+    if seconds:
+        print(f"took:    {', '.join(f'{part} {s:.2f} s' for part, s in seconds.items())} for each episode")
+    if plan.pictures == "cache":
+        print(f"frames:  {frames.path}")
+        size = "" if resolution is None else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"
+        print(
+            f"next:    lerobot-train --policy.type=tactile_pi05 --policy.backbone=small --policy.push_to_hub=false{size} "
+            f"--dataset.repo_id=local/{config.out.name} --dataset.root={config.out} --dataset.cache=gpu "
+            f"--dataset.cache_store={config.store}"
+        )
+    else:
+        print(f"next:    taccorl view {config.out} --episode=0")
+    return int(bool(report["dropped"]))
+
+
+def _resolution(config: ExecuteConfig) -> tuple[int, int] | None:
+    """
+    Raises:
+        TaccorlError: not rows x columns, or without effect.
+    """
+    if config.resolution is None:
+        return None
+    if config.pictures != "cache":
+        raise TaccorlError(
+            f"--resolution={config.resolution} has no effect with --pictures={config.pictures}: leave it out, or take "
+            "--pictures=cache"
+        )
+    found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", config.resolution)
+    if not found:
+        raise TaccorlError(f"--resolution={config.resolution}: rows x columns, e.g. 112x112")
+    return int(found[1]), int(found[2])
+
+
+def _check_places(config: ExecuteConfig) -> None:
+    """Places that lie in one another would change while they are read."""
+    from taccorl.data.lerobot_format import check_path
+
+    check_path(config.out)
+    out = config.out.resolve()
+    for option, place in {"--source": config.source.resolve(), "--store": config.store.resolve()}.items():
+        if out.is_relative_to(place) or place.is_relative_to(out):
+            raise DatasetError(f"--out={config.out} and {option}={place} lie in one another: choose another --out")

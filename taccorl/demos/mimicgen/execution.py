@@ -1,0 +1,75 @@
+"""Execute a stored demonstration again: its rows with touch, and whether it still is the success that it was.
+
+MuJoCo on another CPU may differ in the last bit, and contact makes a bit grow. So the last state is compared, and where it is
+another one, what counts is the success and the gates.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taccorl.data.spec import DatasetSpec
+from taccorl.demos.mimicgen.attempt import state_digest
+from taccorl.demos.mimicgen.gates import GateKeeper, foreign_contact
+from taccorl.demos.mimicgen.spec import GatesSpec
+from taccorl.demos.recorder import EpisodeRecorder
+from taccorl.sim.simulation import Simulation
+
+DIFFERS = "last_state_differs"
+"""In the provenance of an episode: its execution ended in another state than its attempt."""
+_PAD_NOISE = 2  # with the scene's seed
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Demonstration:
+    """What is stored of a success."""
+
+    attempt: int
+    scene_seed: int
+    actions: np.ndarray
+    """(T, 14) float32 joint targets [rad] and openings [m] as they were executed."""
+    intended: np.ndarray | None
+    """(T, 14) float32 the dataset's ``action`` where that is another one; None: ``actions``."""
+    last_state: str
+    """``state_digest`` after the last action."""
+    provenance: dict[str, object] = field(default_factory=dict)
+
+
+@dataclass(kw_only=True)
+class Execution:
+    """What became of a demonstration that was executed again."""
+
+    recorder: EpisodeRecorder
+    outcome: str
+    """``success``; a failure's category of the task or ``not reproduced``; or the gate that was not passed."""
+    reason: str
+    is_same: bool
+    """Whether the last state is that of the attempt, bit for bit."""
+
+
+def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, gates: GatesSpec) -> Execution:
+    """
+    Args:
+        sim: of the task, difficulty, twin and randomisation that the demonstration was made in.
+        rows: what a row holds (``with_simulator``).
+        gates: what an execution that differs must keep.
+    """
+    seed, intended = demonstration.scene_seed, demonstration.intended
+    sim.reset([seed])
+    recorder, keeper = EpisodeRecorder(sim, rows, np.random.default_rng([seed, _PAD_NOISE])), GateKeeper(sim)
+    for t, action in enumerate(demonstration.actions):
+        recorder.step(action, keeper.watch(), None if intended is None else intended[t])
+    done = Execution(
+        recorder=recorder, outcome="success", reason="", is_same=state_digest(sim) == demonstration.last_state
+    )
+    if done.is_same:
+        return done
+    outcome = sim.judge.outcome
+    if not outcome.success[0]:
+        done.outcome = str(outcome.failure[0]) or "not reproduced"
+        done.reason = "executed again, the stored actions end in another state, without success"
+    else:
+        keeper.see_actions(demonstration.actions)
+        states = np.stack([row["sim.state"] for row in recorder.rows])
+        done.outcome, done.reason = keeper.measured.refused(gates) or foreign_contact(sim, states) or ("success", "")
+    return done

@@ -1,0 +1,140 @@
+"""Demonstrations stored as seeds and float32 actions: a folder with ``meta.json``, ``actions.npy`` and, where the arms were
+disturbed, ``intended.npy``.
+
+    meta.json     format, task, difficulty, twin (a file's text), randomization, spec, origin, versions, action_time, report;
+                  of each episode: attempt, scene_seed, rows, last_state (SHA-256 of the last state row), provenance
+    actions.npy   (ΣT, 14) float32 joint targets [rad] and openings [m] as they were executed, episode after episode
+    intended.npy  (ΣT, 14) float32 the dataset's ``action`` of these rows
+
+24 kB an episode. ``taccorl execute`` makes a dataset of it where it is needed.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.demos.mimicgen.execution import Demonstration
+from taccorl.demos.mimicgen.spec import GatesSpec
+from taccorl.errors import DatasetError
+
+FORMAT = 1
+META, ACTIONS, INTENDED = "meta.json", "actions.npy", "intended.npy"
+SIMULATION = ("task", "difficulty", "twin", "randomization", "origin", "root_seed", "mujoco", "taccorl", "sources")
+"""What the episodes of a folder have in common, as an episode's provenance has it."""
+_ACTION_SIZE = 14
+
+
+@dataclass(frozen=True, eq=False)
+class StoredActions:
+    """Such a folder, read."""
+
+    root: Path
+    meta: dict[str, Any]
+    demonstrations: list[Demonstration]
+
+    @property
+    def is_disturbed(self) -> bool:
+        return self.meta["disturbed"]
+
+    @property
+    def gates(self) -> GatesSpec:
+        return GatesSpec(**self.meta["spec"]["gates"])
+
+    @property
+    def simulation(self) -> dict[str, Any]:
+        """Of ``SIMULATION``."""
+        return {key: self.meta[key] for key in SIMULATION}
+
+
+def write_stored(
+    folder: Path,
+    simulation: Mapping[str, Any],
+    spec: Mapping[str, Any],
+    report: Mapping[str, Any],
+    demonstrations: Sequence[Demonstration],
+) -> None:
+    """
+    Args:
+        simulation: what ``SIMULATION`` names.
+        spec: of the generation, as JSON values.
+    """
+    intended = [d.intended for d in demonstrations if d.intended is not None]
+    episodes = [
+        {"attempt": d.attempt, "scene_seed": d.scene_seed, "rows": len(d.actions), "last_state": d.last_state}
+        | {"provenance": d.provenance}
+        for d in demonstrations
+    ]
+    meta = {"format": FORMAT, **{key: simulation[key] for key in SIMULATION}, "spec": spec, "disturbed": bool(intended)}
+    meta |= {"action_time": action_time(), "report": report, "episodes": episodes}
+    np.save(folder / ACTIONS, np.concatenate([d.actions for d in demonstrations]))
+    if intended:
+        np.save(folder / INTENDED, np.concatenate(intended))
+    (folder / META).write_text(json.dumps(meta, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def read_stored(root: Path) -> StoredActions:
+    """
+    Raises:
+        DatasetError: no such folder, another format or action-time convention, or files of other lengths than meta.json says.
+    """
+    path = root / META
+    if not path.is_file():
+        raise DatasetError(f"{root}: has no {META}; taccorl augment --rows=actions writes such folders")
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DatasetError(f"{path}: is not JSON ({error}): copy the folder again") from error
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
+        raise DatasetError(
+            f"{path}: format {found!r}, this taccorl reads {FORMAT}; make it again: taccorl augment --rows=actions"
+        )
+    if meta["action_time"] != action_time():
+        raise DatasetError(
+            f"{path}: action_time is {meta['action_time']}, this taccorl executes {action_time()}; make it again: "
+            "taccorl augment --rows=actions"
+        )
+    rows = [episode["rows"] for episode in meta["episodes"]]
+    actions = _read_actions(root / ACTIONS, sum(rows))
+    intended = _read_actions(root / INTENDED, sum(rows)) if meta["disturbed"] else None
+    ends = np.cumsum(rows)
+    return StoredActions(
+        root,
+        meta,
+        [
+            Demonstration(
+                attempt=episode["attempt"],
+                scene_seed=episode["scene_seed"],
+                actions=actions[end - num : end],
+                intended=None if intended is None else intended[end - num : end],
+                last_state=episode["last_state"],
+                provenance=episode["provenance"],
+            )
+            for episode, num, end in zip(meta["episodes"], rows, ends, strict=True)
+        ],
+    )
+
+
+def action_time() -> str | None:
+    """The convention of the data spec: when an action is reached."""
+    return load_dataset_spec(find_spec("taccorl_bimanual")).action_time
+
+
+def _read_actions(path: Path, num_rows: int) -> np.ndarray:
+    try:
+        actions = np.load(path)
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(
+            f"{path}: cannot be read ({type(error).__name__}: {error}): copy the folder whole"
+        ) from error
+    if actions.shape != (num_rows, _ACTION_SIZE) or actions.dtype != np.float32:
+        raise DatasetError(
+            f"{path}: {actions.dtype} {list(actions.shape)}, {META} says float32 [{num_rows}, {_ACTION_SIZE}]: copy the folder "
+            "whole"
+        )
+    return actions

@@ -1,0 +1,154 @@
+"""Demonstrations stored as seeds and actions, and executed again: the same attempts and numbers, and what differs is counted."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taccorl.data.dataset import Dataset
+from taccorl.demos.collect import REPORT
+from taccorl.demos.mimicgen import augment as module
+from taccorl.demos.mimicgen.augment import AugmentPlan, augment, made_attempts
+from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
+from taccorl.demos.mimicgen.execution import Demonstration
+from taccorl.demos.mimicgen.spec import DisturbanceSpec, load_mimic_spec, with_options
+from taccorl.demos.mimicgen.stored_actions import ACTIONS, META, SIMULATION, read_stored, write_stored
+from taccorl.errors import DatasetError, InTheWayError, TaccorlError
+from taccorl.lineage.engines import LocalEngine
+from taccorl.lineage.store import Store
+
+PARQUET = "data/chunk-000/file-000.parquet"
+SPEC = with_options(load_mimic_spec("assembly_2"), disturbance=DisturbanceSpec(joint_rad=0.02))
+
+
+def quiet(_: str) -> None:
+    pass
+
+
+def written(folder: Path, rows: tuple[int, ...] = (3, 2), disturbed: bool = True) -> Path:
+    """Stored actions that nothing has made."""
+    folder.mkdir(parents=True)
+    rng, made = np.random.default_rng(0), []
+    for k, num in enumerate(rows):
+        actions = rng.normal(size=(num, 14)).astype(np.float32)
+        demonstration = Demonstration(
+            attempt=3 * k,
+            scene_seed=2**61 + k,
+            actions=actions,
+            intended=actions + 1 if disturbed else None,
+            last_state=f"{k:064x}",
+            provenance={"attempt": 3 * k},
+        )
+        made.append(demonstration)
+    write_stored(folder, dict.fromkeys(SIMULATION, "x"), {"gates": {"max_force_n": 5.0}}, {"episodes": len(rows)}, made)
+    return folder
+
+
+@pytest.mark.parametrize("disturbed", [False, True])
+def test_what_is_read_is_what_was_written(tmp_path, disturbed):
+    stored = read_stored(written(tmp_path / "a", disturbed=disturbed))
+    assert [len(d.actions) for d in stored.demonstrations] == [3, 2]
+    expected = np.random.default_rng(0).normal(size=(5, 14)).astype(np.float32)
+    np.testing.assert_array_equal(np.concatenate([d.actions for d in stored.demonstrations]), expected)
+    first, second = stored.demonstrations
+    assert (second.attempt, second.scene_seed, second.last_state) == (3, 2**61 + 1, f"{1:064x}")
+    assert stored.is_disturbed == disturbed
+    if disturbed:
+        np.testing.assert_array_equal(first.intended, first.actions + 1)
+    else:
+        assert first.intended is None
+    assert stored.gates.max_force_n == 5.0
+    assert stored.meta["action_time"] == "next_row"
+
+
+def test_what_is_damaged_is_named(tmp_path):
+    with pytest.raises(DatasetError, match=r"has no meta\.json; taccorl augment --rows=actions"):
+        read_stored(tmp_path)
+    short = written(tmp_path / "short")
+    np.save(short / ACTIONS, np.zeros((4, 14), np.float32))
+    with pytest.raises(DatasetError, match=r"actions\.npy: float32 \[4, 14\], meta\.json says float32 \[5, 14\]"):
+        read_stored(short)
+    other = written(tmp_path / "other")
+    meta = json.loads((other / META).read_text())
+    (other / META).write_text(json.dumps(meta | {"format": 9}))
+    with pytest.raises(DatasetError, match="format 9"):
+        read_stored(other)
+    (other / META).write_text(json.dumps(meta | {"action_time": "this_row"}))
+    with pytest.raises(DatasetError, match="action_time is this_row"):
+        read_stored(other)
+    with pytest.raises(TaccorlError, match=r"--rows=action: .*actions"):
+        AugmentPlan(spec=SPEC, rows="action")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TaccorlError, match=r"--pictures=vidio: .*video"):
+        ExecutePlan(source=tmp_path, pictures="vidio")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.fixture(scope="module")
+def made(collected, tmp_path_factory):
+    """A folder with actions/, and dataset/ of the same attempts out of the same store."""
+    folder = tmp_path_factory.mktemp("stored")
+    store = Store(folder / "store")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_ROUND", 2)
+        for rows in ("actions", "dataset"):
+            plan = AugmentPlan(spec=SPEC, episodes=2, images=False, rows=rows)
+            augment(plan, collected, folder / rows, store, progress=quiet)
+    return folder
+
+
+@pytest.mark.slow
+def test_both_forms_are_of_the_same_attempts_and_executing_gives_the_bytes_of_the_dataset(made, collected):
+    stored = read_stored(made / "actions")
+    plans = [AugmentPlan(spec=SPEC, episodes=2, images=False, rows=rows) for rows in ("actions", "dataset")]
+    num = stored.meta["report"]["attempts"]
+    found = [[each.folder for each in made_attempts(p, collected, Store(made / "store"), num)] for p in plans]
+    assert found[0] == found[1]
+    for i, demonstration in enumerate(stored.demonstrations):
+        episode = Dataset(made / "dataset").episode(i)
+        np.testing.assert_array_equal(episode.arrays["sim.executed"], demonstration.actions)
+        np.testing.assert_array_equal(episode.arrays["action"], demonstration.intended)
+        assert episode.provenance["simulation"]["mimicgen"] == demonstration.provenance
+    plan, store = ExecutePlan(source=made / "actions", pictures="none"), Store(made / "elsewhere")
+    report, seconds = execute_stored(plan, made / "again", store, progress=quiet)
+    assert (report["episodes"], report["differs"], report["dropped"]) == (2, 0, {})
+    assert set(seconds) == {"physics", "touch", "writing"}
+    assert (made / "again" / PARQUET).read_bytes() == (made / "dataset" / PARQUET).read_bytes()
+    again, seconds = execute_stored(plan, made / "again", store, progress=quiet)
+    assert again == report and seconds == {}, "a second run makes nothing"
+    assert json.loads((made / "again" / "meta/taccorl" / REPORT).read_text()) == report
+
+
+@pytest.mark.slow
+def test_two_workers_give_the_bytes_of_one_and_a_killed_run_goes_on_from_the_store(made, collected, tmp_path):
+    plan = AugmentPlan(spec=SPEC, episodes=2, images=False, rows="actions")
+    augment(plan, collected, tmp_path / "a", Store(tmp_path / "store"), LocalEngine(workers=2), progress=quiet)
+    for name in (ACTIONS, META, "intended.npy"):
+        assert (tmp_path / "a" / name).read_bytes() == (made / "actions" / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_what_does_not_succeed_here_is_dropped_and_counted_and_a_bit_that_differs_is_counted(made, tmp_path):
+    changed = shutil.copytree(made / "actions", tmp_path / "changed")
+    (changed / "manifest.json").unlink()  # a source of its own: made elsewhere
+    meta = json.loads((changed / META).read_text())
+    meta["episodes"][0]["last_state"] = "0" * 64  # another CPU's
+    (changed / META).write_text(json.dumps(meta))
+    actions = np.load(changed / ACTIONS)
+    actions[meta["episodes"][0]["rows"] :] = actions[meta["episodes"][0]["rows"]]  # the second one stands still
+    np.save(changed / ACTIONS, actions)
+    plan = ExecutePlan(source=changed, pictures="none")
+    report, _ = execute_stored(plan, tmp_path / "new", Store(tmp_path / "store"), progress=quiet)
+    assert (report["demonstrations"], report["episodes"], report["differs"]) == (2, 1, 2)
+    assert sum(report["dropped"].values()) == 1
+    episode = Dataset(tmp_path / "new").episode(0)
+    assert episode.provenance["simulation"]["mimicgen"]["last_state_differs"] is True
+    with pytest.raises(InTheWayError):
+        execute_stored(
+            ExecutePlan(source=made / "actions"), tmp_path / "new", Store(tmp_path / "store"), progress=quiet
+        )
+    spoilt = shutil.copytree(made / "actions", tmp_path / "spoilt")
+    (spoilt / ACTIONS).chmod(0o644)
+    np.save(spoilt / ACTIONS, actions)
+    with pytest.raises(DatasetError, match="its files are not as written"):
+        execute_stored(ExecutePlan(source=spoilt), tmp_path / "x", Store(tmp_path / "store"), progress=quiet)

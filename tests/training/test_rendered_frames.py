@@ -1,0 +1,119 @@
+"""Datasets whose pictures are frames in the cache alone: the numbers of the video form, frames as rendered, refused elsewhere."""
+
+import dataclasses
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import lerobot_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tiny_dataset import tiny_spec, write_tiny
+
+import taccorl.lerobot_plugin  # noqa: F401
+from taccorl.cli.main import main as cli
+from taccorl.data.dataset import Dataset
+from taccorl.data.lerobot_format import declare_pictures, merge
+from taccorl.demos.mimicgen.augment import AugmentPlan, augment
+from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
+from taccorl.demos.mimicgen.from_dataset import simulation_told
+from taccorl.demos.mimicgen.spec import load_mimic_spec
+from taccorl.errors import DatasetError
+from taccorl.lineage.engines import LocalEngine
+from taccorl.lineage.store import Store
+from taccorl.training import reading
+from taccorl.training.frame_cache import FRAMES, CacheRequest, FramesConfig, empty_frames, resized
+from taccorl.training.reading import FastReader
+from taccorl.training.rendered_frames import render_frames
+
+FRONT = "observation.images.front"
+
+
+@pytest.fixture
+def declared(tmp_path: Path) -> Path:
+    """Numbers of two episodes, 14 and 11 rows, with a camera in info.json and no video."""
+    root = write_tiny(tmp_path / "declared", rows=(14, 11), cameras=0)
+    declare_pictures(root, tiny_spec(cameras=1))
+    return root
+
+
+def load(root: Path, monkeypatch: pytest.MonkeyPatch, request: CacheRequest | None) -> LeRobotDataset:
+    monkeypatch.setattr(reading, "_requested", request)
+    monkeypatch.setattr(lerobot_dataset, "DatasetReader", FastReader)
+    return LeRobotDataset("local/tiny", root=root, video_backend="pyav", return_uint8=True)
+
+
+def test_the_plain_reader_refuses_it_with_the_way_out_and_check_does_not_crash(declared, tmp_path, monkeypatch, capsys):
+    with pytest.raises(DatasetError, match=r"declared: has no videos of observation\.images\.front.*--dataset\.cache="):
+        load(declared, monkeypatch, None)
+    dataset = Dataset(declared)
+    assert dataset.unstored == (FRONT,)
+    assert dataset.episode(0).picture_keys == ()
+    assert dataset.video_problems() == []
+    with pytest.raises(DatasetError, match=r"observation\.images\.front: not stored as video"):
+        dataset.video(0, FRONT)
+    with pytest.raises(DatasetError, match=r"declared: has no videos of .* cannot be merged"):
+        merge([declared, declared], tmp_path / "both")
+    cli(["check", str(declared)])
+    assert "not stored as video" in " ".join(capsys.readouterr().out.split())
+
+
+def test_frames_that_the_cache_lacks_are_named_with_the_command(declared, tmp_path, monkeypatch):
+    request = CacheRequest(place="host", resolution=(20, 28), store=tmp_path / "store", device="cpu")
+    said = r"declared: has no videos of .*no frames of it at 20×28 pixels: taccorl execute .*--resolution=20x28"
+    with pytest.raises(DatasetError, match=said):
+        load(declared, monkeypatch, request).__getitems__([0])
+
+
+def test_frames_in_the_cache_are_what_batches_and_rows_hold(declared, tmp_path, monkeypatch):
+    frames = np.random.default_rng(0).integers(0, 256, (25, 3, 20, 28), dtype=np.uint8)
+
+    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
+        empty_frames(out_dir, FRONT, 25, (20, 28))[:] = frames
+
+    store = Store(tmp_path / "store")
+    store.run(dataclasses.replace(FRAMES, fn=put), FramesConfig((20, 28)), [store.dataset(declared)])
+    monkeypatch.setattr(av, "open", lambda *_, **__: pytest.fail("PyAV is not needed"))
+    request = CacheRequest(place="host", resolution=(20, 28), store=tmp_path / "store", device="cpu")
+    dataset = load(declared, monkeypatch, request)
+    (batch,) = dataset.__getitems__([24, 3, 14])
+    assert torch.equal(batch[FRONT], torch.from_numpy(frames[[24, 3, 14]]))
+    assert torch.equal(dataset[14][FRONT], torch.from_numpy(frames[14]))
+    assert batch["frame_index"].tolist() == [10, 3, 0]
+    assert dataset.meta.stats[FRONT] == {}  # LeRobot puts ImageNet's there
+
+
+def test_a_dataset_without_cameras_or_states_has_nothing_to_render(declared, tmp_path):
+    with pytest.raises(DatasetError, match=r"has 1 cameras and no sim\.state"):
+        render_frames(declared, None, Store(tmp_path / "store"), LocalEngine(), lambda _: None)
+
+
+@pytest.mark.slow
+def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected, tmp_path, monkeypatch):
+    store, quiet = Store(tmp_path / "store"), lambda _: None
+    plan = AugmentPlan(spec=load_mimic_spec("assembly_2"), episodes=1, rows="actions")
+    augment(plan, collected, tmp_path / "actions", store, progress=quiet)
+    execute_stored(ExecutePlan(source=tmp_path / "actions"), tmp_path / "video", store, progress=quiet)
+    with monkeypatch.context() as patch:
+        patch.setattr(av, "open", lambda *_, **__: pytest.fail("PyAV is not needed"))
+        cached = ExecutePlan(source=tmp_path / "actions", pictures="cache")
+        execute_stored(cached, tmp_path / "cache", store, progress=quiet)
+        artefact, seconds = render_frames(tmp_path / "cache", (28, 28), store, LocalEngine(), quiet)
+    assert set(seconds) == {"rendering", "resizing and writing"}
+    video, numbers = Dataset(tmp_path / "video"), Dataset(tmp_path / "cache")
+    assert set(video.info["features"]) == set(numbers.info["features"])
+    keys = [key for key, f in numbers.info["features"].items() if f["dtype"] != "video"]
+    theirs, ours = video.values(0, keys), numbers.values(0, keys)
+    for key in keys:
+        np.testing.assert_array_equal(ours[key], theirs[key])
+    told = numbers.episode(0).provenance["simulation"]
+    states = ours["sim.state"][[0, 100, -1]]
+    shown = list(simulation_told(told).render_states(states, ["front", "left_wrist", "right_wrist"]))
+    for camera in ("front", "left_wrist", "right_wrist"):
+        frames = np.load(artefact.path / f"observation.images.{camera}.npy")
+        expected = resized(np.stack([images[camera] for images in shown]), (28, 28))
+        np.testing.assert_array_equal(frames[[0, 100, -1]], expected)
+    request = CacheRequest(place="host", resolution=(28, 28), store=tmp_path / "store", device="cpu")
+    (batch,) = load(tmp_path / "cache", monkeypatch, request).__getitems__([100])
+    np.testing.assert_array_equal(batch[FRONT][0].numpy(), np.load(artefact.path / f"{FRONT}.npy")[100])
