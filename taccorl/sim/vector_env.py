@@ -22,6 +22,7 @@ from gymnasium.vector.utils import batch_space
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.actions import ACTION_NAMES, check_actions
 from taccorl.sim.episode_seeds import EpisodeSeeds
+from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.simulation import Simulation, Snapshot, checked_seeds
 from taccorl.sim.spaces import (
     CAMERAS,
@@ -321,8 +322,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         """
         valid = rows & ~self.sim.diverged
         self._state = np.where(valid[:, None], self.sim.proprioception(), self._state).astype(np.float32)
-        noise = [np.random.default_rng(of) for of in zip(self.sim.seeds, self.sim.judge.steps, strict=True)]
-        self._tactile = np.where(valid[:, None], self.sim.touch(noise), self._tactile)
+        tactile = self.sim.touch(ScanNoise(self.sim.seeds, self.sim.judge.steps))
+        self._tactile = tactile if valid.all() else np.where(valid[:, None], tactile, self._tactile)
         self._unseen |= valid
         facts = self._judged()
         self._facts = facts if rows.all() else _rows_from(self._facts, facts, rows)
