@@ -235,7 +235,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             tactile[:, k] = self._tactile
         facts = self._facts
         truncated = np.asarray(facts["failure"] == "timeout")
-        observation, info = self._end(truncated & final_images)
+        observation, info = self._end(truncated if final_images else np.zeros_like(truncated))
         return Chunk(
             observation=observation,
             reward=reward,
@@ -331,10 +331,10 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
 
     def _refuse_bad(self, actions: np.ndarray) -> np.ndarray:
         """``actions`` (N, 14) that the simulation takes; episodes with a bad one end."""
-        bad = beyond_reason(actions).any(axis=1)
+        bad = np.any(beyond_reason(actions), axis=1)
         if not bad.any():
             return actions
-        ended = bad & ~self._over
+        ended = np.asarray(bad & ~self._over)
         if ended.any():
             ids = np.flatnonzero(ended)
             self.sim.judge.fail(ids, BAD_ACTION)
