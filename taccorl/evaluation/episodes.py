@@ -13,8 +13,6 @@ from taccorl.evaluation.statistics import PairedComparison, wilson_interval
 
 ROWS_FILE, SUMMARY_FILE = "episodes.jsonl", "evaluation.json"
 SUCCESS = "success"
-BAD_ACTION = "bad_action"
-"""Category of an episode whose policy gave NaN, or a target far beyond the limits."""
 
 
 @dataclass(frozen=True, kw_only=True)

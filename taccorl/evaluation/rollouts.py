@@ -9,9 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from taccorl.errors import TaccorlError
-from taccorl.evaluation.episodes import BAD_ACTION, SUCCESS, EpisodeRow
-from taccorl.sim.actions import ACTION_NAMES, check_actions
+from taccorl.evaluation.episodes import SUCCESS, EpisodeRow
+from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.outcome import BAD_ACTION
 from taccorl.sim.robot import ARMS
 from taccorl.sim.spaces import STATE_KEY, Observation
 from taccorl.sim.twin import CONTROL_HZ
@@ -91,9 +91,12 @@ class _Running:
         self.facts: dict[str, Any] = {}
 
     def stepped(self, action: np.ndarray, facts: dict[str, Any], state: np.ndarray) -> None:
+        self.facts = facts
+        if facts["failure"] == BAD_ACTION:  # not carried out
+            self.end = (BAD_ACTION, str(facts["reason"]))
+            return
         self.actions.append(action)
         self.states.append(state)
-        self.facts = facts
         self.clipped_steps += bool(facts["clipped"])
         now_s = facts["steps"] / CONTROL_HZ
         for arm, done in zip(ARMS, facts["subtask"], strict=True):
@@ -109,8 +112,8 @@ def roll_out(
 ) -> list[Rollout]:
     """One episode in each of the N environments, in the scenes ``seeds``, in their order.
 
-    An episode ends alone: by success, failure, time limit or divergence as the environment judges, as ``bad_action`` where
-    the actor gives NaN or a target far beyond the limits, or with the category that the actor itself names.
+    An episode ends alone: by success, failure, time limit, divergence or a bad action as the environment judges, or with the
+    category that the actor itself names.
 
     Args:
         envs: with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
@@ -130,13 +133,12 @@ def roll_out(
             pictures = envs.observe(images=True)
         acted = actor.act({**pictures, **observation})
         actions = shaped(acted.actions, envs.num_envs).astype(np.float32)
-        given_up = _bad_actions(actions) | acted.given_up
-        for i, end in given_up.items():
+        for i, end in acted.given_up.items():
             running[i].end = running[i].end or end
         over = np.array([one.end is not None for one in running])
         if over.all():
             break
-        # The environment checks all rows, and may still move one that ended here: it is held where it is.
+        # The environment may still move one that the actor gave up: it is held where it is.
         actions[over] = observation[STATE_KEY][over]
         observation, *_ = envs.step(actions)
         facts = _each(envs.facts(), envs.num_envs)
@@ -174,17 +176,6 @@ def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, one: _Running) -> 
     )
     actions = np.array(one.actions, dtype=np.float32).reshape(-1, len(ACTION_NAMES))
     return Rollout(row, actions, np.array(one.states, dtype=np.float32))
-
-
-def _bad_actions(actions: np.ndarray) -> dict[int, tuple[str, str]]:
-    """Environment → (``bad_action``, which joint), of targets (N, 14) that the environment would refuse."""
-    found: dict[int, tuple[str, str]] = {}
-    for i, action in enumerate(actions.astype(float)):
-        try:
-            check_actions(action[None])
-        except TaccorlError as error:
-            found[i] = (BAD_ACTION, str(error).replace("of simulation 0 ", ""))
-    return found
 
 
 def _each(facts: dict[str, Any], n: int) -> list[dict[str, Any]]:

@@ -16,16 +16,26 @@ exactly. Targets beyond are clipped, as the driver does."""
 _ABSURD = np.array([*([2 * np.pi] * 6), 0.5] * 2)  # beyond any limit by this much: another unit
 
 
+def beyond_reason(actions: np.ndarray) -> np.ndarray:
+    """(…, 14) bool: NaN, or so far beyond the limits that it is another unit; a little beyond is clipped."""
+    return ~((actions >= ACTION_LOW - _ABSURD) & (actions <= ACTION_HIGH + _ABSURD))
+
+
 def check_actions(actions: np.ndarray) -> None:
     """Targets (N, …, 14) are numbers in rad and m; a little beyond the limits is not wrong, it is clipped.
 
     Raises:
         TaccorlError: names the joint, the simulation, the value and the limits.
     """
-    beyond = ~((actions >= ACTION_LOW - _ABSURD) & (actions <= ACTION_HIGH + _ABSURD))  # NaN is beyond, too
-    if beyond.any():
+    if (beyond := beyond_reason(actions)).any():
         at = np.argwhere(beyond)[0]
-        raise TaccorlError(
-            f"action: {ACTION_NAMES[at[-1]]} of simulation {at[0]} is {actions[tuple(at)]:g}, limits are "
-            f"{ACTION_LOW[at[-1]]:g} … {ACTION_HIGH[at[-1]]:g}. Joints are in rad, the gripper's opening is in m."
-        )
+        raise TaccorlError(why_bad(actions[tuple(at[:-1])], f" of simulation {at[0]}"))
+
+
+def why_bad(action: np.ndarray, whose: str = "") -> str:
+    """Names the first joint of a bad action (14,), its value and limits."""
+    k = int(beyond_reason(action).argmax())
+    return (
+        f"action: {ACTION_NAMES[k]}{whose} is {action[k]:g}, limits are {ACTION_LOW[k]:g} … {ACTION_HIGH[k]:g}. "
+        "Joints are in rad, the gripper's opening is in m."
+    )

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from taccorl.sim.simulation import Simulation
 
 
+BAD_ACTION = "bad_action"
+"""Category of an episode that was given NaN, or a target far beyond the limits."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What became of each of N episodes so far."""
@@ -19,7 +23,7 @@ class Outcome:
     success: np.ndarray
     """(N,) bool: the goal has held for 0.5 s after release, and nothing had failed before."""
     failure: np.ndarray
-    """(N,) object: '' or the category: the task's own, ``timeout`` or ``diverged``."""
+    """(N,) object: '' or the category: the task's own, ``timeout``, ``diverged`` or ``bad_action``."""
     partial: np.ndarray
     """(N,) int, newest."""
 
@@ -89,6 +93,10 @@ class Judge:
                 waiting = stepped & (before[:, a] == k)
                 if waiting.any():
                     self.subtask[waiting & subtask.done(scene), a] = k + 1
+
+    def fail(self, ids: np.ndarray, category: str) -> None:
+        """End the episodes of ``ids`` that are not over."""
+        self.failure[ids[~self.outcome.over[ids]]] = category
 
     def snapshot(self, ids: np.ndarray) -> dict[str, np.ndarray]:
         return {

@@ -20,7 +20,7 @@ TOUCH_M = 1e-6
 """Solids of one part this close share a face: nothing can be between them."""
 _SLIVER_M = 1e-5  # narrower pieces of surface are what cutting left over
 _FLAT_RAD = 1e-4
-_NEAR_M = 0.004  # pads rarely go deeper
+NEAR_M = 0.004  # pads rarely go deeper
 _CELL_M, _MAX_CELLS = 0.006, 4096
 _MAX_RECTANGLES = 8
 _POINTS_AT_ONCE = 1000
@@ -46,7 +46,7 @@ class Surface:
 
     def depth(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depth (S,) of (S, 3) points within the part, and the direction (S, 3) in which it grows."""
-        cells = self._cells
+        cells = self.cells
         at = np.clip((points_m - cells.origin_m) / cells.size_m, 0, np.array(cells.shape) - 1).astype(int)
         cell = np.ravel_multi_index((at[:, 0], at[:, 1], at[:, 2]), cells.shape)
         depth, inward = np.empty(len(points_m)), np.empty(points_m.shape)
@@ -55,7 +55,7 @@ class Surface:
             pieces = cells.pieces[cell[some], : cells.num_pieces[cell[some]].max()]
             edges = cells.edges[cell[some], : cells.num_edges[cell[some]].max()]
             depth[some], inward[some] = self._depth(points_m[some], pieces, edges)
-        far = np.nonzero(depth > _NEAR_M)[0]
+        far = np.nonzero(depth > NEAR_M)[0]
         if len(far):
             everything = [np.arange(count)[None] for count in (len(self.normals), len(self.edges_m))]
             for some in _blocks(far):
@@ -64,7 +64,7 @@ class Surface:
         return depth, inward
 
     @functools.cached_property
-    def _cells(self) -> "_Cells":
+    def cells(self) -> "_Cells":
         """Made when first asked for: most parts are never pressed at a seam."""
         low, high = self.corners_m.min(axis=(0, 1)), self.corners_m.max(axis=(0, 1))
         size = _CELL_M
@@ -76,12 +76,12 @@ class Surface:
         def lists(low: np.ndarray, high: np.ndarray, is_near: np.ndarray) -> np.ndarray:
             """(cells, L) which of the boxes low … high (B, 3) are near, filled up with B."""
             gap = np.maximum(0, np.maximum(low - centres[:, None], centres[:, None] - high) - size / 2)
-            is_near = is_near & (dot(gap, gap) < _NEAR_M**2)
+            is_near = is_near & (dot(gap, gap) < NEAR_M**2)
             order = np.argsort(~is_near, axis=1, kind="stable")[:, : is_near.sum(axis=1).max(initial=0)]
             return np.where(np.take_along_axis(is_near, order, axis=1), order, len(low))
 
         above = np.abs(centres @ self.normals.T - dot(self.normals, self.corners_m[:, 0]))
-        reaches = above < _NEAR_M + size / 2 * np.abs(self.normals).sum(axis=1)
+        reaches = above < NEAR_M + size / 2 * np.abs(self.normals).sum(axis=1)
         pieces = lists(self.corners_m.min(axis=1), self.corners_m.max(axis=1), reaches)
         edges = lists(self.edges_m.min(axis=1), self.edges_m.max(axis=1), np.array(True))
         shape = (int(counts[0]), int(counts[1]), int(counts[2]))
@@ -89,7 +89,7 @@ class Surface:
         return _Cells(low, size, shape, pieces, num_pieces, edges, num_edges)
 
     @functools.cached_property
-    def _piece_table(self) -> np.ndarray:
+    def piece_table(self) -> np.ndarray:
         """(8, Q + 1): normal, offset, centre and radius² of a sphere about each piece; a last one that is never near."""
         centres = self.corners_m.mean(axis=1)
         radius = np.linalg.norm(self.corners_m - centres[:, None], axis=2).max(axis=1) + TOUCH_M
@@ -98,7 +98,7 @@ class Surface:
         return np.concatenate([table, np.array([[0, 0, 0, FAR_M, 0, 0, 0, 0]]).T], axis=1)
 
     @functools.cached_property
-    def _edge_table(self) -> np.ndarray:
+    def edge_table(self) -> np.ndarray:
         """(6, M + 1): start and vector of each edge; a last one that is never near."""
         table = np.concatenate([self.edges_m[:, 0], self.edges_m[:, 1] - self.edges_m[:, 0]], axis=1).T
         return np.concatenate([table, np.array([[FAR_M, 0, 0, 1, 0, 0]]).T], axis=1)
@@ -108,7 +108,7 @@ class Surface:
         x, y, z = points_m.T[:, :, None]
         depth, inward = np.full(len(points_m), FAR_M), np.zeros(points_m.shape)
         if edges.size:
-            sx, sy, sz, ex, ey, ez = np.take(self._edge_table, edges, axis=1)
+            sx, sy, sz, ex, ey, ez = np.take(self.edge_table, edges, axis=1)
             dx, dy, dz = x - sx, y - sy, z - sz
             share = np.clip((dx * ex + dy * ey + dz * ez) / (ex * ex + ey * ey + ez * ez), 0.0, 1.0)
             away = dx - share * ex, dy - share * ey, dz - share * ez
@@ -116,7 +116,7 @@ class Surface:
             nearest = np.arange(len(points_m)), square.argmin(axis=1)
             depth = np.minimum(np.sqrt(square[nearest]), FAR_M)
             inward = np.stack([a[nearest] for a in away], axis=1) / np.maximum(depth, TINY_M)[:, None]
-        nx, ny, nz, offset, cx, cy, cz, radius_squared = np.take(self._piece_table, pieces, axis=1)
+        nx, ny, nz, offset, cx, cy, cz, radius_squared = np.take(self.piece_table, pieces, axis=1)
         under = offset - (x * nx + y * ny + z * nz)
         apart = (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2
         under[(under < -2 * TOUCH_M) | (apart - under * under > radius_squared)] = FAR_M
@@ -142,7 +142,7 @@ def _blocks(points: np.ndarray) -> Iterator[np.ndarray]:
 
 
 class _Cells(NamedTuple):
-    """Boxes of one size over a part, and what of its surface is within ``_NEAR_M`` of each."""
+    """Boxes of one size over a part, and what of its surface is within ``NEAR_M`` of each."""
 
     origin_m: np.ndarray
     size_m: float

@@ -7,12 +7,14 @@ import numpy as np
 from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
+from taccorl.sim.blocks import Blocks
 from taccorl.sim.effects.added import PAST_POSITIONS, PAST_TIME_S, AddedEffects
 from taccorl.sim.effects.camera_past import place_past
 from taccorl.sim.pad import PadArray
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.robot import PADS
 from taccorl.sim.sensors import Noise, Sensor, TactileFrames
+from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.tasks.task import Contact, Task
 from taccorl.sim.twin import TwinConfig
 
@@ -30,6 +32,8 @@ class SeenScene:
     effects: AddedEffects
     pads: PadArray
     sensor: Sensor
+    blocks: Blocks
+    """Threads for what is computed of each simulation by itself."""
     action_actuators: np.ndarray
     _encoders: np.ndarray
     _bodies: dict[str, int]
@@ -57,14 +61,31 @@ class SeenScene:
     def reading(self) -> np.ndarray:
         """(N, 4, 32, 12) float32 what the pads read before gain, noise and rounding: a pure function of the state, and of
         the past where effects remember it."""
-        reading = self.sensor.reading(*self.pads.touch(self.batch), None)
+        spec = self.sensor.spec
+        reading = np.empty((self.num_sims, len(PADS), spec.rows, spec.columns), np.float32)
+
+        def read(start: int, end: int) -> None:
+            reading[start:end] = self.sensor.reading(*self.pads.touch(self.batch, start, end), None)
+
+        self.blocks.run(read, self.num_sims)
         for transform in self.sensor.transforms:
             reading = transform(reading)
         return reading
 
     def touch(self, noise: Noise = None) -> np.ndarray:
         """(N, 1536) int16 counts above baseline now; without ``noise`` (one generator, or one a simulation) no noise."""
-        counts = self.sensor.digitise(self.reading(), noise)
+        reading = self.reading()
+        if not isinstance(noise, ScanNoise):
+            return self._above_baseline(self.sensor.digitise(reading, noise))
+        above = np.empty((self.num_sims, reading[0].size), np.int16)
+
+        def convert(start: int, end: int) -> None:
+            above[start:end] = self._above_baseline(self.sensor.digitise(reading[start:end], noise.of(start, end)))
+
+        self.blocks.run(convert, self.num_sims)
+        return above
+
+    def _above_baseline(self, counts: np.ndarray) -> np.ndarray:
         return TactileFrames(counts, self.sensor.baseline, PADS, self.sensor.spec).counts_above_baseline
 
     def render(
@@ -142,7 +163,8 @@ class SeenScene:
         return self._renderers[cameras, size]
 
     def close(self) -> None:
-        """Free OpenGL contexts."""
+        """Free OpenGL contexts and threads."""
+        self.blocks.close()
         for renderer in self._renderers.values():
             renderer.close()
         self._renderers.clear()

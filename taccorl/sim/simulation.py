@@ -13,6 +13,7 @@ from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, check_actions
+from taccorl.sim.blocks import Blocks
 from taccorl.sim.effects.added import AddedEffects
 from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.outcome import Judge
@@ -95,6 +96,7 @@ class Simulation(SeenScene):
         self.spec = build_spec(self.config, task)
         self.model = self.spec.compile()
         self.batch = Batch(self.model, num_sims, num_threads)
+        self.blocks = Blocks(self.batch.nthread)
         self.arrays = {name: self.batch.bind(name) for name in _BOUND}
         self.judge = Judge(task, num_sims, CONTROL_HZ)
         self.pads = PadArray(self.model, PADS)
@@ -240,7 +242,7 @@ class Simulation(SeenScene):
             stage = stages.mjSTAGE_ACC if all_of_it else stages.mjSTAGE_VEL if end in watched else stages.mjSTAGE_NONE
             self.batch.step(ids, nstep=end - done, stage=stage)
             done = end
-            ids = self._sound(ids)
+            ids = self._sound(ids, at_end=all_of_it)
             if self.effects.rewrites:
                 self.effects.feel(stepped if ids is None else ids, self.config.physics.timestep_s)
             if watch and end in watched:
@@ -250,12 +252,16 @@ class Simulation(SeenScene):
         if self.effects.past:
             self.effects.past.keep()
 
-    def _sound(self, ids: np.ndarray | None) -> np.ndarray | None:
-        """Those of ``ids`` that have not diverged. A simulation of NaNs would cost twenty times a sound one's time."""
-        finite = np.isfinite(self.arrays["qvel"]).all(1) & np.isfinite(self.arrays["qpos"]).all(1)
-        bad = ~finite | self.batch.warning[:, _UNSTABLE, 1].any(1)
-        if not bad.any():
+    def _sound(self, ids: np.ndarray | None, *, at_end: bool) -> np.ndarray | None:
+        """Those of ``ids`` that have not diverged. A simulation of NaNs would cost twenty times a sound one's time.
+
+        Before the end of a control step MuJoCo's own warnings are enough: it checks the state at the beginning of a step.
+        """
+        qvel, qpos, warned = self.arrays["qvel"], self.arrays["qpos"], self.batch.warning[:, _UNSTABLE, 1]
+        if not warned.any() and not (at_end and not (np.isfinite(qvel).all() and np.isfinite(qpos).all())):
             return ids
+        finite = np.isfinite(qvel).all(1) & np.isfinite(qpos).all(1)
+        bad = ~finite | warned.any(1)
         self.diverged |= bad
         ids = np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
         return ids[~bad[ids]]

@@ -20,8 +20,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.actions import ACTION_NAMES, check_actions
+from taccorl.sim.actions import ACTION_NAMES, beyond_reason, why_bad
 from taccorl.sim.episode_seeds import EpisodeSeeds
+from taccorl.sim.outcome import BAD_ACTION
+from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.simulation import Simulation, Snapshot, checked_seeds
 from taccorl.sim.spaces import (
     CAMERAS,
@@ -83,13 +85,15 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     """N environments of ``task``. Reward is 1 at the step that completes the task, else 0.
 
     An episode terminates with success or failure (``info["failure"]``) and is truncated when time is up. A simulation that
-    diverges fails as ``diverged``, its seed in ``info["seed"]``, its last observation the one before; the others go on.
+    diverges fails as ``diverged``, its seed in ``info["seed"]``, its last observation the one before. An action that is NaN or
+    far beyond the limits is not carried out: its episode fails as ``bad_action``, ``info["reason"]`` says why. The others go on.
 
     Seeds (``EpisodeSeeds``): after ``reset(seed=s)`` environment i's k-th episode has the scene seed ``episode_seed(s, i, k)``.
     After ``reset(seed=[s0, s1, …])`` environment i begins with scene seed sᵢ itself, so ``info["seed"]`` brings a scene back.
 
     ``info`` has, for each environment: ``is_success``, ``failure`` ('' or the category), ``partial``, ``seed``, ``subtask``
-    (left, right), ``steps``, ``clipped`` (an action lay beyond the limits) and ``measures`` (privileged, names with units).
+    (left, right), ``steps``, ``clipped`` (an action lay beyond the limits), ``reason`` ('' or which joint of a bad action) and
+    ``measures`` (privileged, names with units).
     """
 
     def __init__(
@@ -151,6 +155,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self._pictures = {
             name: np.zeros((num_envs, *IMAGE_SHAPE), dtype=np.uint8) for name in CAMERAS if images != "never"
         }
+        self._reason = np.full(num_envs, "", dtype=object)
         self._unseen = np.zeros(num_envs, dtype=bool)
         """(N,) bool: moved since its pictures were rendered."""
         self._facts: dict[str, Any] = {}
@@ -197,32 +202,40 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         """One control step (1/30 s) with targets (N, 14) [rad, m].
 
         Raises:
-            TaccorlError: wrong shape, a value that is no number or far beyond the limits.
+            TaccorlError: wrong shape.
         """
         chunk = self.step_chunk(shaped(actions, self.num_envs)[:, None])
         return chunk.observation, chunk.reward, chunk.terminated, chunk.truncated, chunk.info
 
-    def step_chunk(self, actions: np.ndarray) -> Chunk:
+    def step_chunk(self, actions: np.ndarray, *, final_images: bool = False) -> Chunk:
         """H control steps with targets (N, H, 14), as a policy gives them. An episode that ends within stands still.
 
+        Args:
+            final_images: with ``images="on_request"``, render the last observation of episodes that ran out of time, too:
+                ``info["final_obs"]`` then has the pictures from which the value of a truncated episode is estimated.
+
         Raises:
-            TaccorlError: as ``step``.
+            TaccorlError: wrong shape; ``final_images`` where nothing can be rendered.
         """
+        if final_images and self.images == "never":
+            raise TaccorlError(
+                'step_chunk: final_images, but images are "never" to be rendered here; make the environment with "on_request"'
+            )
         self._check_open("step")
         actions = shaped(actions, self.num_envs, None)
         if not self._begun:
             raise TaccorlError("step: call reset() first")
-        check_actions(actions)  # all of it, before any of it acts
         reward, num_steps = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.int64)
         tactile = np.empty((*actions.shape[:2], NUM_TAXELS), dtype=np.int16)
         self._clipped = np.zeros(self.num_envs, dtype=bool)
         for k in range(actions.shape[1]):
-            num_steps += ~self._over
-            reward += self._advance(actions[:, k])
+            advanced, earned = self._advance(actions[:, k])
+            num_steps += advanced
+            reward += earned
             tactile[:, k] = self._tactile
         facts = self._facts
-        truncated = facts["failure"] == "timeout"
-        observation, info = self._end()
+        truncated = np.asarray(facts["failure"] == "timeout")
+        observation, info = self._end(truncated if final_images else np.zeros_like(truncated))
         return Chunk(
             observation=observation,
             reward=reward,
@@ -275,9 +288,10 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             observation |= {IMAGE_KEYS[name]: pictures for name, pictures in self._pictures.items()}
         return observation
 
-    def _look(self) -> None:
-        """Render those that have moved. Pictures that were handed out are never written to again."""
-        ids = np.flatnonzero(self._unseen & ~self.sim.diverged)
+    def _look(self, wanted: np.ndarray | None = None) -> None:
+        """Render those of ``wanted`` (N,) bool (all by default) that have moved. Pictures that were handed out are never
+        written to again."""
+        ids = np.flatnonzero(self._unseen & ~self.sim.diverged & (True if wanted is None else wanted))
         if not ids.size:
             return
         for name, new in self.sim.render(CAMERAS, ids).items():
@@ -299,20 +313,36 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self.sim.reset([self._seeds.draw(i) for i in ids.tolist()], ids)
         if state is not None:
             self.sim.restore(state, ids)
-        self._over[ids], self._clipped[ids] = self.sim.judge.outcome.over[ids], False
+        self._over[ids], self._clipped[ids], self._reason[ids] = self.sim.judge.outcome.over[ids], False, ""
         self._take(np.isin(self._all, ids))
 
-    def _advance(self, actions: np.ndarray) -> np.ndarray:
-        """One control step of those that are not over; (N,) reward."""
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One control step of those that are not over: (N,) bool, which of them it moved, and (N,) reward."""
+        actions = self._refuse_bad(actions)
         running = ~self._over
         if not running.any():
-            return np.zeros(self.num_envs)
+            return running, np.zeros(self.num_envs)
         self.sim.step(actions, None if running.all() else np.flatnonzero(running))
         self._clipped = self._clipped | (running & self.sim.clipped)
         self._take(running)
         outcome = self.sim.judge.outcome
         self._over = outcome.over
-        return (running & outcome.success).astype(np.float64)
+        return running, (running & outcome.success).astype(np.float64)
+
+    def _refuse_bad(self, actions: np.ndarray) -> np.ndarray:
+        """``actions`` (N, 14) that the simulation takes; episodes with a bad one end."""
+        bad = np.any(beyond_reason(actions), axis=1)
+        if not bad.any():
+            return actions
+        ended = np.asarray(bad & ~self._over)
+        if ended.any():
+            ids = np.flatnonzero(ended)
+            self.sim.judge.fail(ids, BAD_ACTION)
+            for i in ids.tolist():
+                self._reason[i] = why_bad(actions[i])
+            self._over = self._over | ended
+            self._facts = _rows_from(self._facts, self._judged(), ended)
+        return np.where(bad[:, None], self.sim.targets, actions)
 
     def _take(self, rows: np.ndarray) -> None:
         """Read what has changed in ``rows`` (N,) bool. A diverged simulation's sensors keep what they read before.
@@ -321,8 +351,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         """
         valid = rows & ~self.sim.diverged
         self._state = np.where(valid[:, None], self.sim.proprioception(), self._state).astype(np.float32)
-        noise = [np.random.default_rng(of) for of in zip(self.sim.seeds, self.sim.judge.steps, strict=True)]
-        self._tactile = np.where(valid[:, None], self.sim.touch(noise), self._tactile)
+        tactile = self.sim.touch(ScanNoise(self.sim.seeds, self.sim.judge.steps))
+        self._tactile = tactile if valid.all() else np.where(valid[:, None], tactile, self._tactile)
         self._unseen |= valid
         facts = self._judged()
         self._facts = facts if rows.all() else _rows_from(self._facts, facts, rows)
@@ -339,17 +369,22 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             "subtask": judge.subtask.copy(),
             "steps": judge.steps.copy(),
             "clipped": self._clipped.copy(),
+            "reason": self._reason.copy(),
             "measures": {name: np.array(values) for name, values in verdict.measures.items()},
         }
 
-    def _end(self) -> tuple[Observation, dict[str, Any]]:
-        """Observation and info after a chunk, and autoreset of what is over."""
+    def _end(self, pictured: np.ndarray) -> tuple[Observation, dict[str, Any]]:
+        """Observation and info after a chunk, and autoreset of what is over; ``pictured`` (N,) bool: final pictures wanted."""
         images, ended, info = self.images == "always", self._over.copy(), {}
         if self.autoreset is AutoresetMode.SAME_STEP and ended.any():
             before, ids = self.observe(images), np.flatnonzero(ended)
+            if pictured.any():
+                self._look(pictured)
             info = {"final_obs": np.full(self.num_envs, None, dtype=object), "final_info": _masked(self.facts(), ended)}
             for i in ids.tolist():
                 info["final_obs"][i] = {name: values[i].copy() for name, values in before.items()}
+                if pictured[i] and not images:
+                    info["final_obs"][i] |= {IMAGE_KEYS[c]: views[i].copy() for c, views in self._pictures.items()}
             info |= {f"_{name}": ended.copy() for name in info}
             self._begin(ids)
         return self.observe(images), info | _masked(self.facts(), np.ones(self.num_envs, dtype=bool))

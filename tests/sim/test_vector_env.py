@@ -267,10 +267,6 @@ def test_wrong_input_is_named(episode: ExpertEpisode) -> None:
             envs.step(wrong)
     with pytest.raises(TaccorlError, match=r"wanted is \(2, H, 14\)"):
         envs.step_chunk(np.zeros((2, 0, 14)))
-    with pytest.raises(TaccorlError, match="right_gripper of simulation 1 is nan"):
-        broken = for_all(episode.actions[:3], 2)
-        broken[1, 2, 13] = np.nan
-        envs.step_chunk(broken)
     with pytest.raises(TaccorlError, match="reset_mask"):
         envs.reset(options={"reset_mask": np.array([0, 1])})
 
@@ -281,12 +277,55 @@ def test_calls_answer_for_every_environment() -> None:
     assert envs.get_attr("_max_episode_steps") == (900, 900, 900)
 
 
-def test_a_bad_value_late_in_a_chunk_is_refused_before_any_of_it_acts():
-    env = TaccorlVectorEnv("bench", num_envs=2, num_threads=1)
-    env.reset(seed=0)
-    before = env.sim.snapshot()
-    actions = np.repeat(env.sim.targets[:, None], 4, axis=1).astype(np.float32)
-    actions[1, 3, 9] = np.nan
-    with pytest.raises(TaccorlError, match="right_joint3 of simulation 1 is nan"):
-        env.step_chunk(actions)
-    np.testing.assert_array_equal(env.sim.snapshot().physics, before.physics)
+def test_a_bad_action_ends_its_own_episode_and_is_not_carried_out(episode: ExpertEpisode) -> None:
+    healthy, ill = vector(3), vector(3)
+    actions = for_all(episode.actions[MIDDLE : MIDDLE + 4], 3)
+    broken = actions.copy()
+    broken[1, 2, 9], broken[2, 3, 1] = np.nan, 90.0  # degrees
+    chunks = []
+    for envs, given in ((healthy, actions), (ill, broken)):
+        envs.reset(seed=[SEED, 2, 3], options={"state": together(*[episode.middle] * 3)})
+        chunks.append(envs.step_chunk(given))
+    sound, chunk = chunks
+    assert chunk.num_steps.tolist() == [4, 2, 3] and not chunk.reward.any()
+    assert chunk.terminated.tolist() == [False, True, True] and not chunk.truncated.any()
+    final = chunk.info["final_info"]
+    assert final["failure"].tolist() == ["", "bad_action", "bad_action"]
+    assert final["reason"][1].startswith("action: right_joint3 is nan") and "left_joint2 is 90" in final["reason"][2]
+    assert final["steps"].tolist() == [MIDDLE + 4, MIDDLE + 2, MIDDLE + 3]
+    assert same(row(chunk.observation, 0), row(sound.observation, 0))
+    # What came before the bad action was carried out, and the pads stand still after it.
+    assert np.array_equal(chunk.tactile[1, :2], sound.tactile[1, :2])
+    assert np.array_equal(chunk.tactile[1, 2:], np.repeat(sound.tactile[1, 1:2], 2, axis=0))
+    assert chunk.info["failure"].tolist() == ["", "", ""] and chunk.info["reason"].tolist() == ["", "", ""]
+    single = TaccorlEnv("assembly_1", images=False)
+    assert same(row(chunk.observation, 1), single.reset(seed=int(chunk.info["seed"][1]))[0])
+
+
+def test_an_episode_that_is_over_takes_any_action_without_autoreset(episode: ExpertEpisode) -> None:
+    envs = vector(2, autoreset=AutoresetMode.DISABLED)
+    envs.reset(seed=0)
+    nonsense = np.full((2, 1, 14), np.nan)
+    assert envs.step_chunk(nonsense).terminated.all()
+    still = envs.step_chunk(nonsense)
+    assert still.num_steps.tolist() == [0, 0] and still.info["failure"].tolist() == ["bad_action"] * 2
+
+
+def test_pictures_of_the_last_observation_of_who_ran_out_of_time(
+    monkeypatch: pytest.MonkeyPatch, episode: ExpertEpisode
+) -> None:
+    camera = Camera(monkeypatch)
+    envs = vector(3, images="on_request", max_episode_steps=3)
+    envs.reset(seed=0)
+    actions = for_all(episode.actions[:3], 3)
+    actions[1, 1, 0] = np.nan
+    chunk = envs.step_chunk(actions, final_images=True)
+    assert chunk.truncated.tolist() == [True, False, True] and camera.asked == [[0, 2]]
+    final = chunk.info["final_obs"]
+    assert [final[i][FRONT][0, 0, 0] for i in (0, 2)] == [1, 21] and FRONT not in final[1]
+    assert FRONT not in chunk.observation
+    # The pictures of the new episodes are taken anew.
+    assert envs.observe(images=True)[FRONT][:, 0, 0, 0].tolist() == [2, 12, 22]
+    assert FRONT not in envs.step_chunk(for_all(episode.actions[:3], 3)).info["final_obs"][0]
+    with pytest.raises(TaccorlError, match="on_request"):
+        vector(1).step_chunk(np.zeros((1, 1, 14)), final_images=True)

@@ -21,9 +21,11 @@ import numpy as np
 from taccorl.data.spec import SensorSpec
 from taccorl.errors import TaccorlError, nearest
 from taccorl.plugins import Registry
+from taccorl.sim.sensors.noise import ScanNoise
 
-type Noise = np.random.Generator | Sequence[np.random.Generator] | None
-"""One generator for all sims; or one each, so that a sim's noise is the same alone and in a batch; or no noise."""
+type Noise = np.random.Generator | Sequence[np.random.Generator] | ScanNoise | None
+"""One generator for all sims; or one each, so that a sim's noise is the same alone and in a batch, which ``ScanNoise`` computes
+faster; or no noise."""
 
 
 class Transform(Protocol):
@@ -143,6 +145,9 @@ def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
         return None
     if isinstance(noise, np.random.Generator):
         return noise.standard_normal(shape, dtype=np.float32)
-    if len(noise) != shape[0]:
-        raise TaccorlError(f"noise: {len(noise)} generators for {shape[0]} sims; give one each, or one for all")
+    count = len(noise.seeds if isinstance(noise, ScanNoise) else noise)
+    if count != shape[0]:
+        raise TaccorlError(f"noise: {count} generators for {shape[0]} sims; give one each, or one for all")
+    if isinstance(noise, ScanNoise):
+        return noise.draw(shape)
     return np.stack([rng.standard_normal(shape[1:], dtype=np.float32) for rng in noise])

@@ -1,0 +1,39 @@
+"""Work on N simulations in blocks, one a thread. It pays for compiled code without Python's lock (``numba.njit(nogil=True)``)."""
+
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+_LEAST = 4  # simulations in a block: handing over a block costs 20 µs, the touch of one simulation 40
+
+
+class Blocks:
+    """Threads that share the simulations out; with one thread, or few simulations, all is done by the caller.
+
+    Args:
+        num_threads: ≥ 1.
+    """
+
+    def __init__(self, num_threads: int = 1) -> None:
+        self.num_threads = num_threads
+        self._pool: ThreadPoolExecutor | None = None
+
+    def run(self, work: Callable[[int, int], object], num_sims: int) -> None:
+        """``work(start, end)`` for blocks that make up 0 … ``num_sims``; each writes only what belongs to its own."""
+        count = min(self.num_threads, num_sims // _LEAST)
+        if count <= 1:
+            work(0, num_sims)
+            return
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.num_threads - 1, thread_name_prefix="taccorl")
+        ends = [num_sims * k // count for k in range(count + 1)]
+        others = [self._pool.submit(work, *block) for block in itertools.pairwise(ends[1:])]
+        work(0, ends[1])
+        for other in others:
+            other.result()
+
+    def close(self) -> None:
+        """End the threads; the next ``run`` starts new ones."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None

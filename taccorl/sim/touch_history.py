@@ -1,0 +1,48 @@
+"""The last L touch readings of every environment, for policies that read a history.
+
+    history = TouchHistory(envs.num_envs, 10)
+    observation, _ = envs.reset(seed=0)
+    history.reset(observation["observation.tactile"])
+    chunk = envs.step_chunk(policy(history.window))
+    history.follow(chunk)
+
+Letters in shapes: N environments, L readings, H control steps of a chunk, K taxels.
+"""
+
+import numpy as np
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.spaces import NUM_TAXELS, TACTILE_KEY
+from taccorl.sim.vector_env import Chunk
+
+
+class TouchHistory:
+    """One window each, on the CPU. Before there have been L readings of an episode its first one is repeated."""
+
+    def __init__(self, num_envs: int, length: int) -> None:
+        """
+        Args:
+            length: L ≥ 1.
+        """
+        if length < 1:
+            raise TaccorlError(f"touch history: length {length}; give at least 1")
+        self.window = np.zeros((num_envs, length, NUM_TAXELS), dtype=np.int16)
+        """(N, L, K) counts above baseline, oldest first."""
+
+    def reset(self, first: np.ndarray, mask: np.ndarray | None = None) -> None:
+        """Begin anew with readings ``first`` (N, K) in the environments of ``mask`` (N,) bool (all by default)."""
+        mask = np.ones(len(self.window), dtype=bool) if mask is None else mask
+        self.window[mask] = first[mask, None]
+
+    def append(self, readings: np.ndarray, num_steps: np.ndarray) -> None:
+        """Add the first ``num_steps`` (N,) of the ``readings`` (N, H, K)."""
+        length = self.window.shape[1]
+        both = np.concatenate([self.window, readings], axis=1)
+        newest = num_steps[:, None] + np.arange(length)
+        self.window = np.take_along_axis(both, newest[:, :, None], axis=1)
+
+    def follow(self, chunk: Chunk) -> None:
+        """Add what a chunk read; environments that it reset within begin anew with the new episode's first reading."""
+        self.append(chunk.tactile, chunk.num_steps)
+        if "_final_obs" in chunk.info:
+            self.reset(chunk.observation[TACTILE_KEY], chunk.info["_final_obs"])

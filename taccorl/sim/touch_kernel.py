@@ -1,0 +1,560 @@
+"""Depth and rate of every taxel as compiled loops over simulations: what ``PadArray`` computes, many threads at once.
+
+The same equations as ``signed_distance`` and ``part_surface``, one pair of pad and geom at a time, with the same results bit for
+bit: products of three terms are fused as BLAS fuses them in ``matrix @ grid``, all others are not. The loops hold no lock of
+Python's, so blocks of simulations run in parallel.
+
+Letters in shapes: as in ``taccorl.sim.pad``, and F faces, R seams, U surfaces of parts, Q their pieces, E sides of a piece,
+M edges, C cells.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba.extending import intrinsic
+
+from taccorl.sim.part_surface import NEAR_M, TOUCH_M, Surface
+from taccorl.sim.signed_distance import FAR_M, FLAT_M, TINY_M, Capsules, Cylinders, Polyhedra, Shapes
+
+_CAPSULE, _CYLINDER, _SOLID = 0, 1, 2
+_ZERO, _TINY = np.float32(0), np.float32(TINY_M)
+
+
+class FeltGeoms(NamedTuple):
+    """The geoms that pads can feel, in the order of their kinds."""
+
+    geom: np.ndarray
+    """(G,) ids."""
+    body: np.ndarray
+    """(G,)"""
+    feels: np.ndarray
+    """(P, G) bool: the pad feels it."""
+    bound_m: np.ndarray
+    """(G,) radius of the bounding sphere; infinite for a plane."""
+    centre_m: np.ndarray
+    """(G, 3) of the bounding box."""
+    extent_m: np.ndarray
+    """(G, 3) half the bounding box."""
+    kind: np.ndarray
+    """(G,) capsule, cylinder or convex solid."""
+    radius_m: np.ndarray
+    """(G,) float32, of capsules and cylinders; as ``half_m``."""
+    half_m: np.ndarray
+    faces: np.ndarray
+    """(G, 2) first and one past the last face."""
+    normals: np.ndarray
+    """(F, 3) float32"""
+    offsets_m: np.ndarray
+    """(F,) float32"""
+    covered: np.ndarray
+    """(F,) bool"""
+    seams: np.ndarray
+    """(G, 2) first and one past the last seam."""
+    seam_face: np.ndarray
+    """(R,) number of its face."""
+    seam_axes: np.ndarray
+    """(R, 2, 3) float32; centres and halves (R, 2)."""
+    seam_centres_m: np.ndarray
+    seam_halves_m: np.ndarray
+    surface: np.ndarray
+    """(G,) number of its part's surface; −1: it has no seam."""
+    body_from_geom: np.ndarray
+    """(G, 3, 4)"""
+    own_pieces: np.ndarray
+    """(U, 2) first and one past the last piece of each surface; as ``own_edges``."""
+    own_edges: np.ndarray
+    pieces: np.ndarray
+    """(Q, 8): normal, offset, centre and radius² of a sphere about it."""
+    side_normals: np.ndarray
+    """(Q, E, 3)"""
+    side_offsets_m: np.ndarray
+    """(Q, E)"""
+    edges: np.ndarray
+    """(M, 6): start and vector."""
+    cell_origin_m: np.ndarray
+    """(U, 3)"""
+    cell_size_m: np.ndarray
+    """(U,)"""
+    cell_counts: np.ndarray
+    """(U, 3) along x, y, z."""
+    first_cell: np.ndarray
+    """(U,)"""
+    cell_pieces: np.ndarray
+    """(C, 2) first and one past the last entry of ``piece_list``; as ``cell_edges``."""
+    cell_edges: np.ndarray
+    piece_list: np.ndarray
+    edge_list: np.ndarray
+
+
+class Pads(NamedTuple):
+    """The pads of one model."""
+
+    site: np.ndarray
+    """(P,) id of the taxel frame."""
+    box: np.ndarray
+    """(P,) id of the geom."""
+    finger: np.ndarray
+    """(P,) body of the site."""
+    plate: np.ndarray
+    """(P,) body of the box."""
+    sprung: np.ndarray
+    """(P',) numbers of the sprung pads."""
+    plate_point_m: np.ndarray
+    """(P', 3) a point of the undeformed surface in the box's frame, and its normal (P', 3)."""
+    plate_normal: np.ndarray
+    root: np.ndarray
+    """(nbody,) root of each body's tree."""
+    half_m: np.ndarray
+    """(3,) of the taxels' rectangle."""
+    grid: np.ndarray
+    """(3, K) float32 rows x, y, 1."""
+
+
+class Fields(NamedTuple):
+    """``KINEMATIC_FIELDS`` of N simulations; matrices are (…, 9)."""
+
+    site_xpos: np.ndarray
+    site_xmat: np.ndarray
+    geom_xpos: np.ndarray
+    geom_xmat: np.ndarray
+    cvel: np.ndarray
+    subtree_com: np.ndarray
+
+
+def shape_tables(shapes: Sequence[Shapes]) -> dict[str, np.ndarray]:
+    """The fields of ``FeltGeoms`` that follow from the shapes alone: ``geom``, and all from ``kind`` on."""
+    of_model = ("body", "feels", "bound_m", "centre_m", "extent_m")
+    rows: dict[str, list[Any]] = {name: [] for name in FeltGeoms._fields if name not in of_model}
+    surfaces: list[Surface] = []
+    num_faces = num_seams = 0
+    for one in shapes:
+        # Among geoms of equal depth the first counts: by kind, then by id.
+        for k in np.argsort(one.geoms, kind="stable"):
+            rows["geom"].append(one.geoms[k])
+            solid = isinstance(one, Polyhedra)
+            seams = one.seams[k] if isinstance(one, Polyhedra) else None
+            if isinstance(one, Polyhedra):
+                surface = one.surfaces[k]
+                rows["normals"] += list(one.normals[k])
+                rows["offsets_m"] += list(one.offsets_m[k])
+                rows["covered"] += list(one.covered[k])
+                if isinstance(surface, Surface) and all(surface is not known for known in surfaces):
+                    surfaces.append(surface)
+                numbers = [u for u, known in enumerate(surfaces) if known is surface]
+                rows["kind"].append(_SOLID)
+                rows["surface"].append(numbers[0] if numbers else -1)
+                rows["body_from_geom"].append(one.body_from_geom[k])
+            else:
+                assert isinstance(one, Capsules | Cylinders)
+                rows["kind"].append(_CAPSULE if isinstance(one, Capsules) else _CYLINDER)
+                rows["surface"].append(-1)
+                rows["body_from_geom"].append(np.zeros((3, 4)))
+            rows["radius_m"].append(0 if isinstance(one, Polyhedra) else one.radius_m[k, 0])
+            rows["half_m"].append(0 if isinstance(one, Polyhedra) else one.half_length_m[k, 0])
+            if seams is not None:
+                rows["seam_face"] += list(seams.faces)
+                rows["seam_axes"] += list(seams.axes.reshape(-1, 2, 3))
+                rows["seam_centres_m"] += list(seams.centres_m.reshape(-1, 2))
+                rows["seam_halves_m"] += list(seams.halves_m.reshape(-1, 2))
+            end_face = num_faces + (one.normals.shape[1] if solid else 0)
+            end_seam = num_seams + (0 if seams is None else len(seams.faces))
+            rows["faces"].append((num_faces, end_face))
+            rows["seams"].append((num_seams, end_seam))
+            num_faces, num_seams = end_face, end_seam
+    _add_surfaces(rows, surfaces)
+    shapes_of_rows = {
+        "normals": (3,),
+        "seam_axes": (2, 3),
+        "seam_centres_m": (2,),
+        "seam_halves_m": (2,),
+        "edges": (6,),
+    }
+    shapes_of_rows |= {
+        "pieces": (8,),
+        "own_pieces": (2,),
+        "own_edges": (2,),
+        "cell_origin_m": (3,),
+        "cell_counts": (3,),
+    }
+    shapes_of_rows |= {"cell_pieces": (2,), "cell_edges": (2,), "seams": (2,), "faces": (2,), "body_from_geom": (3, 4)}
+    single = ("radius_m", "half_m", "normals", "offsets_m", "seam_axes", "seam_centres_m", "seam_halves_m")
+    whole = ("geom", "kind", "faces", "seams", "seam_face", "surface", "own_pieces", "own_edges", "cell_counts")
+    whole += ("first_cell", "cell_pieces", "cell_edges", "piece_list", "edge_list")
+    kinds = dict.fromkeys(single, np.float32) | dict.fromkeys(whole, np.int64) | {"covered": np.bool_}
+    sides = {name: np.array(rows.pop(name)) for name in ("side_normals", "side_offsets_m")}
+    tables = {
+        name: np.array(values, kinds.get(name, np.float64)).reshape(-1, *shapes_of_rows.get(name, ()))
+        for name, values in rows.items()
+    }
+    return tables | sides
+
+
+def _add_surfaces(rows: dict[str, list[Any]], surfaces: Sequence[Surface]) -> None:
+    num_sides = max((surface.side_normals.shape[1] for surface in surfaces), default=1)
+    num_pieces = num_edges = 0
+    rows["side_normals"], rows["side_offsets_m"] = [np.zeros((num_sides, 3))], [np.ones(num_sides)]
+    rows["pieces"] = [np.zeros(8)]  # a first one that no list names, so that no table is empty
+    num_pieces = 1
+    for surface in surfaces:
+        cells, count = surface.cells, surface.side_normals.shape[1]
+        for normals, offsets in zip(surface.side_normals, surface.side_offsets_m, strict=True):
+            rows["side_normals"].append(np.pad(normals, ((0, num_sides - count), (0, 0))))
+            rows["side_offsets_m"].append(np.pad(offsets, (0, num_sides - count), constant_values=1.0))
+        rows["pieces"] += list(surface.piece_table.T[:-1])
+        rows["edges"] += list(surface.edge_table.T[:-1])
+        rows["own_pieces"].append((num_pieces, num_pieces + len(surface.normals)))
+        rows["own_edges"].append((num_edges, num_edges + len(surface.edges_m)))
+        rows["cell_origin_m"].append(cells.origin_m)
+        rows["cell_size_m"].append(cells.size_m)
+        rows["cell_counts"].append(cells.shape)
+        rows["first_cell"].append(len(rows["cell_pieces"]))
+        for near, lists, counts, first in (
+            ("piece", cells.pieces, cells.num_pieces, num_pieces),
+            ("edge", cells.edges, cells.num_edges, num_edges),
+        ):
+            ends = len(rows[f"{near}_list"]) + np.cumsum(counts)
+            rows[f"cell_{near}s"] += list(zip(ends - counts, ends, strict=True))
+            rows[f"{near}_list"] += list(lists[np.arange(lists.shape[1]) < counts[:, None]] + first)
+        num_pieces += len(surface.normals)
+        num_edges += len(surface.edges_m)
+
+
+@intrinsic
+def _fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """a b + c, rounded once."""
+    return a(a, b, c), lambda _context, builder, _signature, values: builder.fma(*values)
+
+
+@numba.njit(inline="always")
+def _sum3(a0, b0, a1, b1, a2, b2):
+    """a₀ b₀ + a₁ b₁ + a₂ b₂ as BLAS adds them up."""
+    return _fma(a2, b2, _fma(a1, b1, a0 * b0))  # pyright: ignore[reportCallIssue] (Numba passes the first one)
+
+
+@numba.njit(inline="always")
+def _cross(a, b):
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@numba.njit(inline="always")
+def _row_times(row, matrix):
+    """(3,) row vector times a (9,) matrix."""
+    return (
+        _sum3(row[0], matrix[0], row[1], matrix[3], row[2], matrix[6]),
+        _sum3(row[0], matrix[1], row[1], matrix[4], row[2], matrix[7]),
+        _sum3(row[0], matrix[2], row[1], matrix[5], row[2], matrix[8]),
+    )
+
+
+@numba.njit(inline="always")
+def _times(matrix, column):
+    """(9,) matrix times a (3,) column vector."""
+    return (
+        _sum3(matrix[0], column[0], matrix[1], column[1], matrix[2], column[2]),
+        _sum3(matrix[3], column[0], matrix[4], column[1], matrix[5], column[2]),
+        _sum3(matrix[6], column[0], matrix[7], column[1], matrix[8], column[2]),
+    )
+
+
+@numba.njit(inline="always")
+def _motion(fields, n, body, root, point):
+    """Angular velocity, and velocity of the body at a point (3,), in the world; cvel is (ω, v at subtree_com[root])."""
+    cvel, com = fields.cvel[n, body], fields.subtree_com[n, root[body]]
+    turn = (cvel[0], cvel[1], cvel[2])
+    across = _cross(turn, (point[0] - com[0], point[1] - com[1], point[2] - com[2]))
+    return turn, (cvel[3] + across[0], cvel[4] + across[1], cvel[5] + across[2])
+
+
+@numba.njit(inline="always")
+def _difference(a, b):
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@numba.njit(nogil=True, cache=True)
+def _place(geoms, pads, fields, n, p, g, position, velocity):
+    """Whether the boxes of pad p and geom g meet; then writes the pad's (3, 3) ``position`` and ``velocity`` in its frame."""
+    geom, half = geoms.geom[g], pads.half_m
+    site_pos, site_mat = fields.site_xpos[n, pads.site[p]], fields.site_xmat[n, pads.site[p]]
+    away = _difference(fields.geom_xpos[n, geom], site_pos)
+    mat = fields.geom_xmat[n, geom]
+    # Columns of the pad's axes in the geom's frame, and the pad's origin there.
+    x = _row_times((site_mat[0], site_mat[3], site_mat[6]), mat)
+    y = _row_times((site_mat[1], site_mat[4], site_mat[7]), mat)
+    z = _row_times((site_mat[2], site_mat[5], site_mat[8]), mat)
+    back = _row_times(away, mat)
+    origin = (-back[0], -back[1], -back[2])
+    centre = _difference(geoms.centre_m[g], origin)
+    extent = geoms.extent_m[g]
+    for j, axis in enumerate((x, y, z)):
+        reach = half[j] + _sum3(extent[0], abs(axis[0]), extent[1], abs(axis[1]), extent[2], abs(axis[2]))
+        if not abs(_sum3(centre[0], axis[0], centre[1], axis[1], centre[2], axis[2])) < reach:
+            return False
+    for i in range(3):
+        reach = extent[i] + _sum3(abs(x[i]), half[0], abs(y[i]), half[1], abs(z[i]), half[2])
+        if not abs(centre[i]) < reach:
+            return False
+    turn_1, shift_1 = _motion(fields, n, pads.finger[p], pads.root, site_pos)
+    turn_2, shift_2 = _motion(fields, n, geoms.body[g], pads.root, site_pos)
+    turn = _row_times(_difference(turn_1, turn_2), mat)
+    shift = _row_times(_difference(shift_1, shift_2), mat)
+    over_x, over_y = _cross(turn, x), _cross(turn, y)
+    for i in range(3):
+        position[i, 0], position[i, 1], position[i, 2] = x[i], y[i], origin[i]
+        velocity[i, 0], velocity[i, 1], velocity[i, 2] = over_x[i], over_y[i], shift[i]
+    return True
+
+
+@numba.njit(inline="always")
+def _at(row, grid, k):
+    return _sum3(row[0], grid[0, k], row[1], grid[1, k], row[2], grid[2, k])
+
+
+@numba.njit(nogil=True, cache=True)
+def _in_round(kind, radius, half, position, velocity, grid, depth, rate):
+    """A capsule or cylinder: the deeper of it and what is in ``depth`` and ``rate`` (K,)."""
+    for k in range(grid.shape[1]):
+        x, y, z = _at(position[0], grid, k), _at(position[1], grid, k), _at(position[2], grid, k)
+        if kind == _CAPSULE:
+            z = z - min(max(z, -half), half)
+            distance = np.sqrt(x * x + y * y + z * z)
+            deep = radius - distance
+        else:
+            distance = np.sqrt(x * x + y * y)
+            deep = min(radius - distance, half - abs(z))
+        if deep > depth[k]:
+            depth[k] = deep
+            vx, vy, vz = _at(velocity[0], grid, k), _at(velocity[1], grid, k), _at(velocity[2], grid, k)
+            if kind == _CAPSULE:
+                rate[k] = (x * vx + y * vy + z * vz) / -max(distance, _TINY)
+            elif half - abs(z) < radius - distance:
+                rate[k] = -vz * np.sign(z)
+            else:
+                rate[k] = (x * vx + y * vy) / -max(distance, _TINY)
+
+
+@numba.njit(nogil=True, cache=True)
+def _in_solid(geoms, g, position, velocity, grid, depth, rate, under, deepest, nearest):
+    """A convex solid: the deeper of it and what is in ``depth`` and ``rate`` (K,); the last three are work space."""
+    first, end = geoms.faces[g, 0], geoms.faces[g, 1]
+    for f in range(first, end):
+        normal, row = geoms.normals[f], under[f - first]
+        for j in range(3):
+            row[j] = -_sum3(normal[0], position[0, j], normal[1], position[1, j], normal[2], position[2, j])
+        row[2] += geoms.offsets_m[f]
+        if f == first:
+            for k in range(grid.shape[1]):
+                deepest[k], nearest[k] = _at(row, grid, k), 0
+        else:
+            for k in range(grid.shape[1]):
+                value = _at(row, grid, k)
+                nearest[k] = f - first if value <= deepest[k] else nearest[k]
+                deepest[k] = value if value <= deepest[k] else deepest[k]
+    seamed = geoms.surface[g] >= 0
+    for k in range(grid.shape[1]):
+        if not deepest[k] > _ZERO:
+            continue
+        if seamed and _at_seam(geoms, g, position, grid, k, under, deepest[k]):
+            deep, speed = _in_part(geoms, g, position, velocity, grid, k)
+            if deep > depth[k]:
+                depth[k], rate[k] = deep, speed
+        elif deepest[k] > depth[k]:
+            normal = geoms.normals[first + nearest[k]]
+            a = -_sum3(normal[0], velocity[0, 0], normal[1], velocity[1, 0], normal[2], velocity[2, 0])
+            b = -_sum3(normal[0], velocity[0, 1], normal[1], velocity[1, 1], normal[2], velocity[2, 1])
+            c = -_sum3(normal[0], velocity[0, 2], normal[1], velocity[1, 2], normal[2], velocity[2, 2])
+            depth[k] = deepest[k]
+            rate[k] = _sum3(a, grid[0, k], b, grid[1, k], c, grid[2, k])
+
+
+@numba.njit(nogil=True, cache=True)
+def _at_seam(geoms, g, position, grid, k, under, deepest):
+    """Whether the nearest point of the solid's own faces is where another solid of the part covers it."""
+    first, end = geoms.faces[g, 0], geoms.faces[g, 1]
+    for f in range(first, end):
+        if geoms.covered[f] and _at(under[f - first], grid, k) == deepest:
+            return True
+    for r in range(geoms.seams[g, 0], geoms.seams[g, 1]):
+        if _at(under[geoms.seam_face[r]], grid, k) != deepest:
+            continue
+        inside = True
+        for side in range(2):
+            axis = geoms.seam_axes[r, side]
+            a = _sum3(axis[0], position[0, 0], axis[1], position[1, 0], axis[2], position[2, 0])
+            b = _sum3(axis[0], position[0, 1], axis[1], position[1, 1], axis[2], position[2, 1])
+            c = _sum3(axis[0], position[0, 2], axis[1], position[1, 2], axis[2], position[2, 2])
+            c -= geoms.seam_centres_m[r, side]
+            inside &= abs(_sum3(a, grid[0, k], b, grid[1, k], c, grid[2, k])) < geoms.seam_halves_m[r, side]
+        if inside:
+            return True
+    return False
+
+
+@numba.njit(inline="always")
+def _combined(matrix, weights):
+    """Columns of a (3, ≥ 3) matrix times weights (3,), not fused: as ``signed_distance._combined``."""
+    a, b, c = weights
+    return (
+        matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c,
+        matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2] * c,
+        matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c,
+    )
+
+
+@numba.njit(nogil=True, cache=True)
+def _in_part(geoms, g, position, velocity, grid, k):
+    """Depth and rate of taxel k in the whole part that solid g belongs to, float32."""
+    where = (np.float64(grid[0, k]), np.float64(grid[1, k]), np.float64(grid[2, k]))
+    pose = geoms.body_from_geom[g]
+    turned = _combined(pose, _combined(position, where))
+    point = (turned[0] + pose[0, 3], turned[1] + pose[1, 3], turned[2] + pose[2, 3])
+    speed = _combined(pose, _combined(velocity, where))
+    u = geoms.surface[g]
+    cell = 0
+    for i in range(3):
+        at = (point[i] - geoms.cell_origin_m[u, i]) / geoms.cell_size_m[u]
+        cell = cell * geoms.cell_counts[u, i] + int(min(max(at, 0.0), geoms.cell_counts[u, i] - 1.0))
+    cell += geoms.first_cell[u]
+    pieces = geoms.piece_list[geoms.cell_pieces[cell, 0] : geoms.cell_pieces[cell, 1]]
+    edges = geoms.edge_list[geoms.cell_edges[cell, 0] : geoms.cell_edges[cell, 1]]
+    depth, inward = _to_surface(geoms, point, pieces, edges)
+    if depth > NEAR_M:
+        pieces = np.arange(geoms.own_pieces[u, 0], geoms.own_pieces[u, 1])
+        edges = np.arange(geoms.own_edges[u, 0], geoms.own_edges[u, 1])
+        depth, inward = _to_surface(geoms, point, pieces, edges)
+    rate = inward[0] * speed[0] + inward[1] * speed[1] + inward[2] * speed[2]
+    return np.float32(depth), np.float32(rate)
+
+
+@numba.njit(nogil=True, cache=True)
+def _to_surface(geoms, point, pieces, edges):
+    """Distance of a point (3,) to the nearest of these edges and of these pieces that it lies under, and away from it."""
+    x, y, z = point
+    depth, inward = FAR_M, (0.0, 0.0, 0.0)
+    least = np.inf
+    for e in edges:
+        edge = geoms.edges[e]
+        sx, sy, sz, ex, ey, ez = edge[0], edge[1], edge[2], edge[3], edge[4], edge[5]
+        dx, dy, dz = x - sx, y - sy, z - sz
+        share = min(max((dx * ex + dy * ey + dz * ez) / (ex * ex + ey * ey + ez * ez), 0.0), 1.0)
+        ax, ay, az = dx - share * ex, dy - share * ey, dz - share * ez
+        square = ax * ax + ay * ay + az * az
+        if square < least:
+            least, inward = square, (ax, ay, az)
+    if least < np.inf:
+        depth = min(np.sqrt(least), FAR_M)
+        length = max(depth, TINY_M)
+        inward = (inward[0] / length, inward[1] / length, inward[2] / length)
+    for q in pieces:
+        piece = geoms.pieces[q]
+        nx, ny, nz = piece[0], piece[1], piece[2]
+        under = piece[3] - (x * nx + y * ny + z * nz)
+        if under < -2 * TOUCH_M or under >= depth:
+            continue
+        ox, oy, oz = x - piece[4], y - piece[5], z - piece[6]
+        if ox * ox + oy * oy + oz * oz - under * under > piece[7]:
+            continue
+        over = True
+        for e in range(geoms.side_offsets_m.shape[1]):
+            side = geoms.side_normals[q, e]
+            over &= x * side[0] + y * side[1] + z * side[2] - geoms.side_offsets_m[q, e] < FLAT_M
+        if over:
+            depth, inward = under, (-nx, -ny, -nz)
+    return depth, inward
+
+
+@numba.njit(nogil=True, cache=True)
+def _compressed(pads, fields, n, s, depth, rate):
+    """Compression of the plate of sprung pad s and its rate, (K,); see ``PadArray.compression``."""
+    p = pads.sprung[s]
+    site, box = pads.site[p], pads.box[p]
+    site_pos, site_mat, box_mat = fields.site_xpos[n, site], fields.site_xmat[n, site], fields.geom_xmat[n, box]
+    normal = _row_times(_times(box_mat, pads.plate_normal[s]), site_mat)
+    off = _times(box_mat, pads.plate_point_m[s])
+    centre = fields.geom_xpos[n, box]
+    plate = _difference((centre[0] + off[0], centre[1] + off[1], centre[2] + off[2]), site_pos)
+    point = _row_times(plate, site_mat)
+    n_z = normal[2]
+    along = normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2]
+    d = (normal[0] / n_z, normal[1] / n_z, -along / n_z)
+    turn_1, shift_1 = _motion(fields, n, pads.plate[p], pads.root, site_pos)
+    turn_2, shift_2 = _motion(fields, n, pads.finger[p], pads.root, site_pos)
+    turn, shift = _row_times(_difference(turn_1, turn_2), site_mat), _row_times(_difference(shift_1, shift_2), site_mat)
+    m = _cross(normal, turn)
+    moving = normal[0] * shift[0] + normal[1] * shift[1] + normal[2] * shift[2]
+    v = ((m[2] * d[0] - m[0]) / n_z, (m[2] * d[1] - m[1]) / n_z, (m[2] * d[2] - moving) / n_z)
+    d0, d1, d2 = np.float32(d[0]), np.float32(d[1]), np.float32(d[2])
+    v0, v1, v2 = np.float32(v[0]), np.float32(v[1]), np.float32(v[2])
+    grid = pads.grid
+    for k in range(grid.shape[1]):
+        depth[k] = _sum3(d0, grid[0, k], d1, grid[1, k], d2, grid[2, k])
+        rate[k] = _sum3(v0, grid[0, k], v1, grid[1, k], v2, grid[2, k])
+
+
+@numba.njit(nogil=True, cache=True)
+def take_off_sinking(depth, rate, plate_depth, plate_rate):
+    """``without_sinking`` of one pad (K,), in place."""
+    furthest, beyond = -1, -np.inf
+    for k in range(len(depth)):
+        if depth[k] > _ZERO and depth[k] - plate_depth[k] > beyond:
+            furthest, beyond = k, depth[k] - plate_depth[k]
+    sunk, sunk_rate = _ZERO, _ZERO
+    if furthest >= 0 and depth[furthest] - plate_depth[furthest] > _ZERO:
+        sunk, sunk_rate = depth[furthest] - plate_depth[furthest], rate[furthest] - plate_rate[furthest]
+    for k in range(len(depth)):
+        depth[k] -= sunk
+        if depth[k] > _ZERO:
+            rate[k] -= sunk_rate
+        else:
+            depth[k], rate[k] = _ZERO, _ZERO
+
+
+@numba.njit(nogil=True, cache=True)
+def penetration(geoms, pads, fields, off_sinking, depth, rate):
+    """Writes ``depth`` and ``rate`` (N, P, K), zeros before; with or without the part's sinking."""
+    grid = pads.grid
+    position, velocity = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
+    most = 1
+    for g in range(len(geoms.geom)):
+        most = max(most, geoms.faces[g, 1] - geoms.faces[g, 0])
+    under, deepest = np.empty((most, 3), np.float32), np.empty(grid.shape[1], np.float32)
+    nearest = np.empty(grid.shape[1], np.int32)
+    plate_depth, plate_rate = np.empty(grid.shape[1], np.float32), np.empty(grid.shape[1], np.float32)
+    # Most pairs end in the innermost lines: no views of arrays there, which cost more than the numbers.
+    geom, feels, bound, half = geoms.geom, geoms.feels, geoms.bound_m, pads.half_m
+    geom_pos, site_pos, site_mat = fields.geom_xpos, fields.site_xpos, fields.site_xmat
+    for n in range(len(depth)):
+        for p in range(len(pads.site)):
+            site, met = pads.site[p], False
+            x, y, z = site_pos[n, site, 0], site_pos[n, site, 1], site_pos[n, site, 2]
+            xx, xy, xz = site_mat[n, site, 0], site_mat[n, site, 1], site_mat[n, site, 2]
+            yx, yy, yz = site_mat[n, site, 3], site_mat[n, site, 4], site_mat[n, site, 5]
+            zx, zy, zz = site_mat[n, site, 6], site_mat[n, site, 7], site_mat[n, site, 8]
+            for g in range(len(geom)):
+                at = geom[g]
+                dx, dy, dz = geom_pos[n, at, 0] - x, geom_pos[n, at, 1] - y, geom_pos[n, at, 2] - z
+                is_near = feels[p, g] and abs(_sum3(dx, xx, dy, yx, dz, zx)) < bound[g] + half[0]
+                is_near = is_near and abs(_sum3(dx, xy, dy, yy, dz, zy)) < bound[g] + half[1]
+                is_near = is_near and abs(_sum3(dx, xz, dy, yz, dz, zz)) < bound[g] + half[2]
+                if not (is_near and _place(geoms, pads, fields, n, p, g, position, velocity)):
+                    continue
+                met = True
+                if geoms.kind[g] == _SOLID:
+                    _in_solid(geoms, g, position, velocity, grid, depth[n, p], rate[n, p], under, deepest, nearest)
+                else:
+                    radius, long = geoms.radius_m[g], geoms.half_m[g]
+                    _in_round(geoms.kind[g], radius, long, position, velocity, grid, depth[n, p], rate[n, p])
+            if met and off_sinking:
+                for s in range(len(pads.sprung)):
+                    if pads.sprung[s] == p:
+                        _compressed(pads, fields, n, s, plate_depth, plate_rate)
+                        take_off_sinking(depth[n, p], rate[n, p], plate_depth, plate_rate)
+
+
+@numba.njit(nogil=True, cache=True)
+def compression(pads, fields, depth, rate):
+    """Writes ``depth`` and ``rate`` (N, P', K) of the plates of the sprung pads."""
+    for n in range(len(depth)):
+        for s in range(len(pads.sprung)):
+            _compressed(pads, fields, n, s, depth[n, s], rate[n, s])
