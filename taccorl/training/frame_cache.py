@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import av
+import cv2
 import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -150,6 +151,11 @@ def resized(pictures: np.ndarray, resolution: tuple[int, int] | None) -> np.ndar
     """(B, rows, columns, 3) uint8 → (B, 3, *resolution) uint8, as the policy resizes them, rounded to whole values."""
     if resolution is None or pictures.shape[1:3] == tuple(resolution):
         return pictures.transpose(0, 3, 1, 2)
+    if pictures.shape[1:3] == (2 * resolution[0], 2 * resolution[1]):
+        # Means of four values: twenty times faster in whole numbers.
+        size = resolution[1], resolution[0]
+        halved = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures]
+        return np.stack(halved).transpose(0, 3, 1, 2)
     small = resize_with_pad_torch(torch.from_numpy(pictures).to(torch.float32) / 255, *resolution)
     return (small * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 3, 1, 2).numpy()
 

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, default_collate
 import taccorl.lerobot_plugin  # noqa: F401
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.training import frame_cache, reading
-from taccorl.training.frame_cache import CacheRequest, Frames
+from taccorl.training.frame_cache import CacheRequest, Frames, resized
 from taccorl.training.reading import FastReader, WholeBatch, cache_request
 
 WINDOWS = {TOUCH: [k / 30 for k in range(-9, 1)], "action": [k / 30 for k in range(10)]}
@@ -74,6 +74,17 @@ def test_smaller_pictures_are_those_that_the_policy_would_make_rounded(root, tmp
         small = resize_with_pad_torch(full, 20, 28).permute(0, 3, 1, 2)
         assert batch[key].shape == (len(ROWS), 3, 20, 28)
         assert (batch[key] / 255 - small).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_pictures_of_half_the_side_are_means_of_four_values_as_the_policy_makes_them():
+    """(1 + 2 + 3 + 4) / 4 = 2.5: halves are rounded up, which is as near as down."""
+    tiny = np.zeros((1, 2, 4, 3), np.uint8)
+    tiny[0, :, :2, 0] = [[1, 2], [3, 4]]
+    tiny[0, :, 2:, 1] = 200
+    assert resized(tiny, (1, 2))[0, :, 0].tolist() == [[3, 0], [0, 200], [0, 0]]
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 224, 224, 3), dtype=np.uint8)
+    wanted = resize_with_pad_torch(torch.from_numpy(pictures).to(torch.float32) / 255, 112, 112).permute(0, 3, 1, 2)
+    assert (torch.from_numpy(resized(pictures, (112, 112))) / 255 - wanted).abs().max() <= 0.5 / 255 + 1e-6
 
 
 def test_lerobots_loader_gives_whole_batches_in_the_order_that_it_draws(root, tmp_path, monkeypatch):
