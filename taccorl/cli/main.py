@@ -12,6 +12,7 @@ VERBS = {
         "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them",
         "augment": "a few demonstrations from the twin → many new ones (MimicGen), with a report of yield and coverage",
         "evaluate": "how good a policy is in the twin: success with its interval, failures, two policies on the same scenes",
+        "post-train": "a policy → a better one: PPO in the twin, held to real demonstrations",
         "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
         "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",
         "add-effect": "the twin with one effect more, with the fitted values",
