@@ -15,6 +15,7 @@ from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from torch import Tensor
 from torch.utils.data import default_collate
 
+from taccorl.data.dataset import Dataset
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
@@ -59,21 +60,21 @@ class RealAnchor:
         root = settings.dataset
         if not (root / "meta" / "info.json").is_file():
             raise TaccorlError(f"--anchor.dataset={root}: no LeRobot dataset (meta/info.json) there")
+        features = Dataset(root).info["features"]
+        if missing := [key for key in policy.config.input_features or {} if key not in features]:
+            raise TaccorlError(f"--anchor.dataset={root}: has no {', '.join(missing)}, inputs of the policy")
+        if IS_SIM not in features and not settings.allow_simulated:
+            _refuse_simulated(root)
         reading.install()
         self._dataset: Any = factory.make_dataset(_Options(settings, policy.config))  # pyright: ignore[reportArgumentType]
         meta = self._dataset.meta
         policy.config.match_dataset(meta)
-        inputs = policy.config.input_features or {}
-        if missing := [key for key in inputs if key not in meta.features]:
-            raise TaccorlError(f"--anchor.dataset={root}: has no {', '.join(missing)}, inputs of the policy")
         self.rows = torch.arange(len(self._dataset))
-        if IS_SIM in meta.features:
+        if IS_SIM in features:
             is_sim = torch.as_tensor(self._dataset.hf_dataset.data.column(IS_SIM).to_numpy().astype("float32"))
             self.rows = torch.nonzero(is_sim.reshape(-1) < 0.5)[:, 0]
             if not len(self.rows):
                 raise TaccorlError(f"--anchor.dataset={root}: all of its rows are simulated ({IS_SIM})")
-        elif not settings.allow_simulated:
-            _refuse_simulated(root)
         _log.info("anchor: %d rows of %d episodes of %s", len(self.rows), meta.total_episodes, root)
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
