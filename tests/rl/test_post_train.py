@@ -1,0 +1,116 @@
+"""The command: a run at its smallest, its folders, a run that is stopped and goes on, and input that does not fit."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_checkpoint import write_checkpoint
+from tiny_dataset import write_tiny
+
+from taccorl.cli.main import main
+from taccorl.evaluation.policy_actor import open_checkpoint
+
+GAIN = ("0.013333333333333334", "0.0133333333")  # the tests' policies, and datasets
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_checkpoint(tmp_path_factory.mktemp("start"))
+    for file in folder.glob("*.json"):
+        file.write_text(file.read_text().replace(*GAIN))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("real") / "dataset", cameras=3)
+
+
+def options(start: Path, real: Path, out: Path, **changes: Any) -> list[str]:
+    given = {
+        "policy.path": start,
+        "env.task": "assembly_2",
+        "env.num_envs": 2,
+        "env.decisions": 2,
+        "env.episode_length": 12,
+        "anchor.dataset": real,
+        "anchor.batch_size": 2,
+        "ppo.actor_lr": 1e-4,
+        "noise_check": False,
+        "iterations": 1,
+        "save_freq": 1,
+        "out": out,
+        **changes,
+    }
+    return ["post-train", *(f"--{name}={value}" for name, value in given.items())]
+
+
+def progress(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
+
+
+def weights(out: Path) -> dict[str, torch.Tensor]:
+    return open_checkpoint(out / "checkpoints" / "last" / "pretrained_model", "cpu").load(0).policy.state_dict()
+
+
+def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "out"
+    assert main(options(start, real, out)) == 0
+    printed = capsys.readouterr().out
+    assert "mrad" in printed and "mm" in printed
+    (row,) = progress(out)
+    assert row["decisions"] == 4 and row["first_ratio_error"] < 1e-5 and row["anchor_loss"] > 0 and row["drift"] > 0
+    assert set(row["seconds"]) == {"pictures", "policy", "physics", "update"}
+    before, after = open_checkpoint(start, "cpu").load(0).policy.state_dict(), weights(out)
+    moved = [name for name, value in before.items() if not torch.equal(value, after[name])]
+    assert moved and not any("paligemma.model" in name for name in moved)
+    assert main(options(start, real, out)) == 2  # in use
+    assert "--resume=true" in capsys.readouterr().err
+
+
+def test_input_that_does_not_fit_is_refused_before_anything_is_written(
+    start: Path, real: Path, tmp_path: Path, capsys: Any
+) -> None:
+    out = tmp_path / "out"
+    cases = [
+        ({"env.task": "asembly_2"}, "assembly_2"),
+        ({"anchor.dataset": tmp_path}, "--anchor.dataset"),
+        ({"policy.path": tmp_path}, "--policy.path"),
+        ({"resume": True}, "--resume=true"),
+        ({"noise.level": -1}, "--noise.level=-1"),
+    ]
+    for changes, word in cases:
+        assert main(options(start, real, out, **changes)) == 2
+        assert word in capsys.readouterr().err and not out.exists()
+    without = [o for o in options(start, real, out) if "anchor.dataset" not in o]
+    assert main(without) == 2 and "--anchor.weight=0" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_stopped_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
+    """Two iterations at once, and one, a line that was written without its checkpoint, a stop, and one more."""
+    more = {"ppo.privileged_critic": True}
+    assert main(options(start, real, tmp_path / "once", iterations=2, **more)) == 0
+    out = tmp_path / "twice"
+    assert main(options(start, real, out, **more)) == 0
+    with (out / "progress.jsonl").open("a") as file:
+        file.write('{"iteration": 2}\n')
+    assert main(options(start, real, out, iterations=2, resume=True, **{**more, "ppo.clip": 0.3})) == 2
+    assert "ppo.clip" in capsys.readouterr().err
+    assert main(options(start, real, out, iterations=2, resume=True, **more)) == 0
+    once, twice = weights(tmp_path / "once"), weights(out)
+    assert all(torch.equal(value, twice[name]) for name, value in once.items())
+    rows = [[{k: v for k, v in row.items() if k != "seconds"} for row in progress(p)] for p in (tmp_path / "once", out)]
+    assert rows[0] == rows[1] and len(rows[0]) == 2
+
+
+def test_every_configuration_of_post_training_is_read() -> None:
+    from taccorl.cli.parse import parse
+    from taccorl.cli.post_train import PostTrainConfig
+
+    files = sorted((Path(__file__).parents[2] / "configs" / "post_train").glob("*.yaml"))
+    assert {f.stem for f in files} >= {"paper", "small", "tiny"}
+    found = {f.stem: parse(PostTrainConfig, [f"--config_path={f}"]) for f in files}
+    assert found["paper"] == PostTrainConfig()
