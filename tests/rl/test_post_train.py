@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tiny_checkpoint import write_checkpoint
@@ -104,6 +105,71 @@ def test_stopped_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tm
     assert all(torch.equal(value, twice[name]) for name, value in once.items())
     rows = [[{k: v for k, v in row.items() if k != "seconds"} for row in progress(p)] for p in (tmp_path / "once", out)]
     assert rows[0] == rows[1] and len(rows[0]) == 2
+
+
+def run(start: Path, out: Path, lines: list[str], **changes: Any) -> Any:
+    from taccorl.rl.post_train import PostTraining
+    from taccorl.rl.settings import AnchorSettings, EnvSettings, PolicySettings, PostTrainSettings
+
+    settings = PostTrainSettings(
+        policy=PolicySettings(path=start),
+        env=EnvSettings(task="assembly_2", num_envs=2, decisions=2, episode_length=12),
+        anchor=AnchorSettings(weight=0),
+        out=out,
+        **changes,
+    )
+    return PostTraining(settings, lines.append)
+
+
+def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path) -> None:
+    lines: list[str] = []
+    made = run(start, tmp_path / "out", lines, noise_check=False, keep_checkpoints=1)
+    bias = made._actor.model.action_out_proj.bias
+    for iteration, success in ((10, 0.6), (20, 0.8), (30, 0.5)):
+        with torch.no_grad():
+            bias.fill_(iteration)
+        made._iteration, made._recent = iteration, [success] * 5
+        made._guard_collapse()
+        made._save()
+    assert sorted(p.name for p in (tmp_path / "out" / "checkpoints").iterdir()) == ["000020", "000030", "best", "last"]
+    assert bias.unique().tolist() == [30]  # 0.5 is no collapse
+    made._recent = [0.39, 0.0, 0.1, 0.2, 0.41]
+    made._guard_collapse()
+    assert bias.unique().tolist() == [30] and not any("warning" in line for line in lines)
+    made._recent = [0.39, 0.0, 0.1, 0.2, 0.3]
+    made._guard_collapse()
+    assert bias.unique().tolist() == [20] and "000020" in lines[-1]
+    assert made._ppo.actor_optimizer.param_groups[0]["lr"] == pytest.approx(2.5e-6)
+    made.world.envs.close()
+
+
+def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    from taccorl.rl import post_train
+
+    lines: list[str] = []
+    made = run(start, tmp_path / "out", lines, noise_check=False)
+    for with_noise, warned in (("timeout", True), ("success", False)):
+        found = iter([["success", "success"], ["timeout", with_noise]])
+        monkeypatch.setattr(post_train, "first_episodes", lambda *_, found=found: next(found))
+        lines.clear()
+        made._check_noise()
+        assert any("--noise.level" in line for line in lines) is warned
+        assert "100.0% without" in "".join(lines)
+    made.world.envs.close()
+
+
+def test_noise_at_the_hand_is_that_of_the_kinematics() -> None:
+    """2e-4 rad at one joint of the left arm, in every step of the chunk: as far as the hand moves by it."""
+    from taccorl.demos.experts.kinematics import ArmKinematics
+    from taccorl.rl.exploration import hand_shift_m
+    from taccorl.sim.robot import RobotConfig
+
+    arm, targets, noise = ArmKinematics("left", RobotConfig()), np.zeros((1, 3, 14)), np.zeros((1, 3, 14))
+    targets[:, :, :6] = [0.3, 1.2, -1.0, 0.1, 0.4, 0.2]
+    noise[:, :, 1] = 2e-4
+    moved = arm.pose(targets[0, 0, :6] + noise[0, 0, :6])[:3, 3] - arm.pose(targets[0, 0, :6])[:3, 3]
+    assert hand_shift_m(arm, targets, noise, 0) == pytest.approx([np.linalg.norm(moved)], rel=1e-3)
+    assert hand_shift_m(arm, targets, np.roll(noise, 7, axis=2), 0) == pytest.approx([0.0])
 
 
 def test_every_configuration_of_post_training_is_read() -> None:
