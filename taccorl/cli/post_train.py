@@ -23,7 +23,7 @@ class PostTrainConfig(PostTrainSettings):
 
 def main(argv: list[str]) -> int:
     """0: all iterations are done."""
-    config = parse(PostTrainConfig, argv, positional=None)
+    config = parse(PostTrainConfig, argv, positional=None, prog="taccorl post-train")
     import logging
 
     from lerobot.utils.import_utils import register_third_party_plugins
