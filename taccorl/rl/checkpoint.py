@@ -60,7 +60,7 @@ def policy_folder(out: Path, name: str = LAST) -> Path:
     folder = out / "checkpoints" / name
     if not (folder / _STATE).is_file():
         raise TaccorlError(
-            f"--resume=true: {folder} holds no checkpoint of post-training; leave --resume away to begin"
+            f"--resume=true: {folder} holds no checkpoint of post-training; remove {out} and begin again"
         )
     return folder / _POLICY
 

@@ -116,6 +116,9 @@ class PostTraining:
 
     def _load(self, opened: Checkpoint) -> TactilePI05Policy:
         policy: Any = opened.load(self.settings.seed).policy
+        torch.backends.cudnn.benchmark = (
+            False  # numbers of rows vary with the episodes that end, and each would be tuned
+        )
         torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = self.settings.policy.tf32
         return policy
 
@@ -197,7 +200,9 @@ class PostTraining:
             with (settings.out / PROGRESS).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             self._report(_line(row))
-            self._recent = ([*self._recent, row["success"]] if row["episodes"] else self._recent)[-settings.save_freq :]
+            if row["episodes"]:
+                longest = max(settings.save_freq, settings.collapse_iterations)
+                self._recent = [*self._recent, row["success"]][-longest:]
             self._guard_collapse()
             if is_due:
                 self._save()
@@ -217,7 +222,7 @@ class PostTraining:
         }
 
     def _save(self) -> None:
-        score = fmean(self._recent) if self._recent else 0.0
+        score = fmean(self._recent[-self.settings.save_freq :] or [0.0])
         is_best = score > self._best
         self._best = max(score, self._best)
         state = {
