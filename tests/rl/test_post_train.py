@@ -1,6 +1,9 @@
 """The command: a run at its smallest, its folders, a run that is stopped and goes on, and input that does not fit."""
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -90,12 +93,18 @@ def test_input_that_does_not_fit_is_refused_before_anything_is_written(
 
 
 @pytest.mark.slow
-def test_stopped_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
-    """Two iterations at once, and one, a line that was written without its checkpoint, a stop, and one more."""
+def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
+    """Two iterations at once, and one, kill -9, a line that was written without its checkpoint, and one more."""
     more = {"ppo.privileged_critic": True}
     assert main(options(start, real, tmp_path / "once", iterations=2, **more)) == 0
     out = tmp_path / "twice"
-    assert main(options(start, real, out, **more)) == 0
+    command = [sys.executable, "-m", "taccorl.cli.main", *options(start, real, out, iterations=2, **more)]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (out / "checkpoints" / "last").exists() and running.poll() is None:
+        time.sleep(0.01)
+    running.kill()
+    running.wait()
+    assert [row["iteration"] for row in progress(out)][:1] == [1]
     with (out / "progress.jsonl").open("a") as file:
         file.write('{"iteration": 2}\n')
     assert main(options(start, real, out, iterations=2, resume=True, **{**more, "ppo.clip": 0.3})) == 2
