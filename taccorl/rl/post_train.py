@@ -29,7 +29,7 @@ from taccorl.rl.exploration import measure_noise
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, RATIO_GUARD
-from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes
+from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
 from taccorl.rl.settings import PostTrainSettings
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.twin import TwinConfig
@@ -133,6 +133,13 @@ class PostTraining:
             self._report_noise(twin)
             if self.settings.noise_check:
                 self._check_noise()
+        if self.settings.env.stagger:
+            stagger(self.world, self._actor, self._sde, self._generator, self._decisions_of_an_episode())
+            self._clock.restart()
+
+    def _decisions_of_an_episode(self) -> int:
+        """At the time limit."""
+        return math.ceil(self.world.envs.sim.judge.limit_steps / self._actor.policy.config.n_action_steps)
 
     def _report_noise(self, twin: TwinConfig) -> None:
         batch, generator = self.world.observe().batch, torch.Generator().manual_seed(self.settings.seed)
@@ -146,12 +153,10 @@ class PostTraining:
     def _check_noise(self) -> None:
         """Warn if noise costs the policy more than half of its successes."""
         settings, rates = self.settings, []
-        limit_steps = self.world.envs.sim.judge.limit_steps
-        decisions = math.ceil(limit_steps / self._actor.policy.config.n_action_steps) + 1
         for sde in (FlowSDE(dataclasses.replace(settings.noise, level=0.0)), self._sde):
             self.world.restart(settings.seed + _CHECK_SEED)
             generator = torch.Generator().manual_seed(settings.seed)
-            found = first_episodes(self.world, self._actor, sde, generator, decisions)
+            found = first_episodes(self.world, self._actor, sde, generator, self._decisions_of_an_episode())
             rates.append(found.count(SUCCESS) / len(found))
         self.world.restart(settings.seed)
         self._clock.restart()

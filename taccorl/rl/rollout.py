@@ -91,6 +91,10 @@ class World(Protocol):
         """Execute chunks (N, n, A), as the policy gives them; reset what ended."""
         ...
 
+    def reset(self, rows_N: Tensor) -> None:
+        """Begin the next episode where ``rows_N`` (bool)."""
+        ...
+
 
 @dataclass(frozen=True)
 class Rollout:
@@ -202,12 +206,28 @@ def first_episodes(
 ) -> list[str | None]:
     """Outcome of the first episode of each environment of a world that was just restarted; None: not over by then."""
     found: list[str | None] = [None] * world.num_envs
-    shape: tuple[int, int] = tuple(actor.scored_HD.shape)  # pyright: ignore[reportAssignmentType]
     for _ in range(max_decisions):
-        draws = sde.draw(world.num_envs, shape, generator, actor.scored_HD.device)
-        sampled, _ = actor.sample(world.observe().batch, sde, draws)
-        acted = world.act(actor.actions(sampled.chunk_BHD))
+        acted = _decide(world, actor, sde, generator)
         found = [one or new for one, new in zip(found, acted.outcomes, strict=True)]
         if all(found):
             break
     return found
+
+
+def stagger(world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator, num_decisions: int) -> None:
+    """Act for so many decisions, an episode's length, and reset each environment once, at a random one of them.
+
+    Else all environments would be in the same phase of the task in every iteration.
+    """
+    begin_N = torch.randint(num_decisions, (world.num_envs,), generator=generator)
+    for k in range(num_decisions):
+        if (begin_N == k).any():
+            world.reset(begin_N == k)
+        _decide(world, actor, sde, generator)
+
+
+def _decide(world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator) -> Acted:
+    shape: tuple[int, int] = tuple(actor.scored_HD.shape)  # pyright: ignore[reportAssignmentType]
+    draws = sde.draw(world.num_envs, shape, generator, actor.scored_HD.device)
+    sampled, _ = actor.sample(world.observe().batch, sde, draws)
+    return world.act(actor.actions(sampled.chunk_BHD))

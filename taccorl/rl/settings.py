@@ -49,6 +49,9 @@ class EnvSettings:
     """Share of the paper's reset ranges, 0 … 1."""
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
+    stagger: bool = True
+    """Before the first iteration, act for an episode's length and begin episodes at random times in it, so that environments are
+    in different phases of the task."""
 
     def __post_init__(self) -> None:
         """

@@ -101,7 +101,7 @@ class TwinWorld:
         last = self._before_reset(truncated) if truncated.any() else None
         if (over := truncated | terminated).any():
             with self._clock.part("physics"):
-                self._reset(over)
+                self.reset(torch.from_numpy(over))
         reward = np.where(bad, 0.0, chunk.reward)
         return Acted(
             reward_N=torch.from_numpy(reward).float(),
@@ -117,7 +117,8 @@ class TwinWorld:
         ids = np.flatnonzero(rows)
         return self._seen({key: x[ids] for key, x in observation.items()}, self._window_NLK[ids], ids)
 
-    def _reset(self, over: np.ndarray) -> None:
+    def reset(self, rows_N: Tensor) -> None:
+        over = rows_N.numpy()
         self._episode_N[over] += 1
         self._observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": over})
         self._window_NLK[over] = self._repeated(self._observation[TACTILE_KEY][over])

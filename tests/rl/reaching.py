@@ -87,9 +87,9 @@ class LineWorld:
         self.num_envs = num_envs
         self.generator = torch.Generator().manual_seed(seed)
         self.distance, self.age = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.long)
-        self._reset(torch.ones(num_envs, dtype=torch.bool))
+        self.reset(torch.ones(num_envs, dtype=torch.bool))
 
-    def _reset(self, mask: Tensor) -> None:
+    def reset(self, mask: Tensor) -> None:
         self.distance[mask] = 2 * torch.rand(int(mask.sum()), generator=self.generator) - 1
         self.age[mask] = 0
 
@@ -108,5 +108,5 @@ class LineWorld:
         outcomes = [
             SUCCESS if w else "timeout" if o else None for w, o in zip(won.tolist(), late.tolist(), strict=True)
         ]
-        self._reset(won | late)
+        self.reset(won | late)
         return Acted(reward_N=won.float(), terminated_N=won, truncated_N=late, last=last, outcomes=outcomes)

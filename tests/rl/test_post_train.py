@@ -39,6 +39,7 @@ def options(start: Path, real: Path, out: Path, **changes: Any) -> list[str]:
         "env.num_envs": 2,
         "env.decisions": 2,
         "env.episode_length": 12,
+        "env.stagger": False,
         "anchor.dataset": real,
         "anchor.batch_size": 2,
         "ppo.actor_lr": 1e-4,
@@ -122,7 +123,7 @@ def run(start: Path, out: Path, lines: list[str], **changes: Any) -> Any:
 
     settings = PostTrainSettings(
         policy=PolicySettings(path=start),
-        env=EnvSettings(task="assembly_2", num_envs=2, decisions=2, episode_length=12),
+        env=EnvSettings(task="assembly_2", num_envs=2, decisions=2, episode_length=12, stagger=False),
         anchor=AnchorSettings(weight=0),
         out=out,
         **changes,

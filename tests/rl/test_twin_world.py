@@ -141,6 +141,18 @@ def test_an_action_that_is_no_action_ends_the_episode_as_a_failure(envs: Taccorl
     assert envs.facts()["seed"].tolist() == [episode_seed(5, 0, 0), episode_seed(5, 1, 1)]
 
 
+def test_a_reset_is_of_its_rows_only(envs: TaccorlVectorEnv, opened: Any) -> None:
+    world = make_world(envs, opened)
+    world.act(home(world))
+    before = world.observe()
+    world.reset(torch.tensor([False, True]))
+    after = world.observe()
+    assert envs.facts()["steps"].tolist() == [5, 0]
+    assert envs.facts()["seed"].tolist() == [episode_seed(5, 0, 0), episode_seed(5, 1, 1)]
+    for key, value in before.batch.items():
+        assert torch.equal(value[0], after.batch[key][0]), key
+
+
 def test_a_stopped_world_goes_on_bit_for_bit(envs: TaccorlVectorEnv, opened: Any, tmp_path: Path) -> None:
     world = make_world(envs, opened)
     moves = [0.2 * torch.randn(N, 5, 14, generator=torch.Generator().manual_seed(k)) for k in range(4)]
