@@ -233,14 +233,15 @@ def train(iterations: int, beta: float | None = None) -> tuple[float, float, flo
     return before, success(), DemoAnchor(policy, 1.0).measure(torch.Generator().manual_seed(3), 2000)
 
 
-def test_a_few_updates_raise_success() -> None:
-    before, after, _ = train(15)
-    assert before < 0.3 and after > before
+def test_ppo_learns_to_reach() -> None:
+    before, after, _ = train(8)
+    assert before < 0.3 and after > 0.8
 
 
 @pytest.mark.slow
-def test_ppo_learns_to_reach_and_the_anchor_holds_it_back() -> None:
-    before, after, drift = train(120)
-    assert before < 0.3 and after > 0.8
-    _, _, held = train(120, beta=1.0)
-    assert held < drift
+def test_the_anchor_holds_the_policy_to_the_demonstrations() -> None:
+    """Flow loss on the demonstrations after 120 updates: the larger β, the smaller; success stays."""
+    found = [train(120, beta) for beta in (None, 0.1, 1.0)]
+    assert all(before < 0.3 and after > 0.8 for before, after, _ in found)
+    free, loose, held = (drift for _, _, drift in found)
+    assert held < loose < 0.5 * free
