@@ -180,12 +180,16 @@ def test_float32_weights_keep_a_small_learning_rate() -> None:
 
 
 def test_stopped_and_resumed_learner_is_the_same_bit_for_bit() -> None:
+    """After a warm-up, which does not begin again, and a step, whose moments count."""
+    settings = PPOSettings(actor_lr=3e-4, batch_size=64, critic_warmup=1)
+
     def after(resumed: bool) -> torch.Tensor:
-        learner, generator = ppo(LinePolicy()), torch.Generator().manual_seed(9)
-        learner.update(rollout(learner), generator)
+        learner, generator = ppo(LinePolicy(), settings), torch.Generator().manual_seed(9)
+        for _ in range(2):
+            learner.update(rollout(learner), generator)
         if resumed:
             state, own = learner.state_dict(), [p.detach().clone() for p in learner.actor.trained_parameters()]
-            learner = ppo(LinePolicy(seed=8))
+            learner = ppo(LinePolicy(seed=8), settings)
             for p, value in zip(learner.actor.trained_parameters(), own, strict=True):
                 p.data.copy_(value)
             learner.load_state_dict(state)
