@@ -1,0 +1,38 @@
+"""``taccorl post-train --policy.path=CHECKPOINT --env.task=assembly_2 --anchor.dataset=DATASET [--env.twin=twin.yaml]``
+
+PPO in the twin from a co-trained policy, held to real demonstrations by a supervised term (paper §3.4).
+
+    --anchor.weight=1         β; 0: no anchor
+    --out=FOLDER              checkpoints/last/pretrained_model is a LeRobot policy; progress.jsonl has a line an iteration
+    --resume=true             go on from the last checkpoint in --out
+    --config_path=FILE        settings from a file, such as configs/post_train/small.yaml
+
+Defaults are the paper's table of post-training parameters.
+"""
+
+from dataclasses import dataclass
+
+from taccorl.cli.parse import parse
+from taccorl.rl.settings import PostTrainSettings
+
+
+@dataclass(kw_only=True)
+class PostTrainConfig(PostTrainSettings):
+    """Post-training of a policy in the twin."""
+
+
+def main(argv: list[str]) -> int:
+    """0: all iterations are done."""
+    config = parse(PostTrainConfig, argv, positional=None, prog="taccorl post-train")
+    import logging
+
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
+    from taccorl.rl.post_train import post_train
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    register_third_party_plugins()
+    folder = post_train(config, lambda text: print(text, flush=True))
+    print(f"wrote {folder}")
+    return 0

@@ -1,0 +1,53 @@
+"""Generalised advantage estimation over decisions (Schulman et al., arXiv 1506.02438).
+
+    δ_t = r_t + γ V'_t − V_t        A_t = δ_t + γ λ (1 − end_t) A_{t+1}        R_t = A_t + V_t
+
+r_t is the sum of rewards within a chunk. V'_t is the value of what follows decision t: of the next observation while the episode
+goes on, of its last observation, before the reset, where time ran out, and 0 after success or failure.
+
+Letters in shapes: T decisions of an environment, N environments.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Advantages(NamedTuple):
+    """Both (T, N)."""
+
+    advantage_TN: Tensor
+    return_TN: Tensor
+
+
+def estimate_advantages(
+    reward_TN: Tensor,
+    value_TN: Tensor,
+    next_value_TN: Tensor,
+    end_TN: Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
+) -> Advantages:
+    """
+    Args:
+        next_value_TN: V'; 0 where the episode succeeded or failed.
+        end_TN: bool, the episode ended in this decision, whichever way: no credit passes to the decision before a reset.
+    """
+    advantage_TN, later_N = torch.zeros_like(reward_TN), torch.zeros_like(reward_TN[0])
+    for t in reversed(range(len(reward_TN))):
+        error_N = reward_TN[t] + gamma * next_value_TN[t] - value_TN[t]
+        advantage_TN[t] = later_N = error_N + gamma * gae_lambda * torch.where(end_TN[t], 0.0, later_N)
+    return Advantages(advantage_TN, advantage_TN + value_TN)
+
+
+def normalise(advantage: Tensor) -> Tensor:
+    """Mean 0, deviation 1 over the whole rollout."""
+    return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-5)
+
+
+def explained_variance(value: Tensor, returns: Tensor) -> float:
+    """1 − Var[R − V] / Var[R]; 1: the critic predicts returns exactly, 0: no better than their mean."""
+    spread = returns.var(correction=0)
+    return float("nan") if spread == 0 else float(1 - (returns - value).var(correction=0) / spread)

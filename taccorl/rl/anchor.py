@@ -1,0 +1,122 @@
+"""The real-data anchor, paper §3.4: L = L_PPO + β · E_real[ℓ_flow], with B_real rows in every optimiser step.
+
+The flow loss is the one that the policy is co-trained by, image randomisation included; steps of a chunk beyond an episode's end
+do not count.
+"""
+
+import logging
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.datasets import factory
+from lerobot.utils.random_utils import get_rng_state, set_rng_state
+from torch import Tensor
+from torch.utils.data import default_collate
+
+from taccorl.data.dataset import Dataset
+from taccorl.errors import DatasetError, TaccorlError
+from taccorl.policies.tactile_pi05.mixture import IS_SIM
+from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+from taccorl.rl.settings import AnchorSettings
+from taccorl.training import reading
+from taccorl.training.cotrain import check_domains
+
+_log = logging.getLogger(__name__)
+
+
+class Anchor(Protocol):
+    """Something that adds its gradient to that of PPO."""
+
+    def backward(self, generator: torch.Generator, micro_batch: int) -> float:
+        """Add the gradient of β · ℓ of one optimiser step's rows; the loss ℓ, without β."""
+        ...
+
+    def measure(self, generator: torch.Generator, num_rows: int) -> float:
+        """Loss ℓ of rows, with fixed noise: the drift from the real data."""
+        ...
+
+
+class _Options:
+    """What LeRobot's ``make_dataset`` and our cache read of a training's configuration."""
+
+    def __init__(self, settings: AnchorSettings, policy_config: Any) -> None:
+        self.dataset: Any = DatasetConfig(repo_id="local/anchor", root=str(settings.dataset))
+        self.dataset.cache, self.dataset.cache_store = settings.cache, str(settings.cache_store)
+        self.trainable_config, self.tolerance_s, self.num_workers = policy_config, 1e-4, 0
+
+
+class RealAnchor:
+    """Rows of a LeRobot dataset, drawn with replacement, through the policy's own preprocessor."""
+
+    def __init__(self, settings: AnchorSettings, policy: TactilePI05Policy, preprocessor: Any) -> None:
+        """
+        Raises:
+            TaccorlError: no such dataset, a simulated one, or features that are not the policy's.
+        """
+        assert settings.dataset is not None
+        self._policy, self._preprocessor, self._settings = policy, preprocessor, settings
+        root = settings.dataset
+        if not (root / "meta" / "info.json").is_file():
+            raise TaccorlError(f"--anchor.dataset={root}: no LeRobot dataset (meta/info.json) there")
+        features = Dataset(root).info["features"]
+        if missing := [key for key in policy.config.input_features or {} if key not in features]:
+            raise TaccorlError(f"--anchor.dataset={root}: has no {', '.join(missing)}, inputs of the policy")
+        if IS_SIM not in features and not settings.allow_simulated:
+            _refuse_simulated(root)
+        reading.install()
+        self._dataset: Any = factory.make_dataset(_Options(settings, policy.config))  # pyright: ignore[reportArgumentType]
+        meta = self._dataset.meta
+        policy.config.match_dataset(meta)
+        self.rows = torch.arange(len(self._dataset))
+        if IS_SIM in features:
+            is_sim = torch.as_tensor(self._dataset.hf_dataset.data.column(IS_SIM).to_numpy().astype("float32"))
+            self.rows = torch.nonzero(is_sim.reshape(-1) < 0.5)[:, 0]
+            if not len(self.rows):
+                raise TaccorlError(f"--anchor.dataset={root}: all of its rows are simulated ({IS_SIM})")
+        _log.info("anchor: %d rows of %d episodes of %s", len(self.rows), meta.total_episodes, root)
+
+    def backward(self, generator: torch.Generator, micro_batch: int) -> float:
+        rows = self._draw(self._settings.batch_size, generator)
+        self._policy.train()
+        loss = 0.0
+        for part in rows.split(micro_batch):
+            share = self._loss(part) * (len(part) / len(rows))
+            (self._settings.weight * share).backward()
+            loss += float(share.detach())
+        self._policy.eval()
+        return loss
+
+    @torch.no_grad()
+    def measure(self, generator: torch.Generator, num_rows: int) -> float:
+        rows = self._draw(num_rows, generator)
+        state = get_rng_state()
+        torch.manual_seed(0)
+        parts = [float(self._loss(part)) * len(part) for part in rows.split(self._settings.batch_size)]
+        set_rng_state(state)
+        return sum(parts) / num_rows
+
+    def _draw(self, num_rows: int, generator: torch.Generator) -> Tensor:
+        return self.rows[torch.randint(len(self.rows), (num_rows,), generator=generator)]
+
+    def _loss(self, rows: Tensor) -> Tensor:
+        items = self._dataset.__getitems__(rows.tolist())
+        batch = items[0] if isinstance(items[0], reading.WholeBatch) else default_collate(items)
+        for key in self._dataset.meta.camera_keys:
+            if key in batch and batch[key].dtype == torch.uint8:
+                batch[key] = batch[key].to(torch.float32) / 255.0
+        return self._policy.forward(self._preprocessor(batch))[0]
+
+
+def _refuse_simulated(root: Path) -> None:
+    """
+    Raises:
+        TaccorlError: its episodes come from the twin.
+    """
+    try:
+        check_domains([root], [])
+    except DatasetError as error:
+        raise TaccorlError(
+            f"--anchor.dataset={root}: is not accepted as real data: {error}. --anchor.allow_simulated=true takes it all the same"
+        ) from error

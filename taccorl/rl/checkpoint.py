@@ -1,0 +1,80 @@
+"""Checkpoints of post-training: a LeRobot policy folder, and what is needed to go on bit for bit.
+
+    checkpoints/000010/pretrained_model/       policy and processors, as lerobot-train writes them
+    checkpoints/000010/training_state/state.pt critic, optimisers, random states, environments, counters
+    checkpoints/last, checkpoints/best         links
+
+A checkpoint is written beside its place and renamed: a process that is killed leaves the last one whole.
+"""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.policy_actor import Checkpoint
+
+LAST, BEST = "last", "best"
+_POLICY, _STATE = "pretrained_model", Path("training_state") / "state.pt"
+_TRAIN_CONFIG = "train_config.json"  # lerobot-train's; names the dataset that the policy was trained on
+
+
+def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict[str, Any]) -> Path:
+    """Write ``checkpoints/<iteration>``; returns it.
+
+    Args:
+        opened: the checkpoint that post-training began or resumed from, for its processors.
+        policy: with the weights of now.
+    """
+    folder = out / "checkpoints" / f"{iteration:06d}"
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    (unfinished / _STATE).parent.mkdir(parents=True)
+    policy.save_pretrained(unfinished / _POLICY)
+    for processor in (opened.preprocessor, opened.postprocessor):
+        processor.save_pretrained(unfinished / _POLICY)
+    if (opened.path / _TRAIN_CONFIG).is_file():
+        shutil.copy(opened.path / _TRAIN_CONFIG, unfinished / _POLICY)
+    torch.save(state, unfinished / _STATE)
+    shutil.rmtree(folder, ignore_errors=True)
+    unfinished.rename(folder)
+    link(folder, LAST)
+    return folder
+
+
+def link(folder: Path, name: str) -> None:
+    """``checkpoints/<name>`` → ``folder``, in one step."""
+    new = folder.with_name(f".{name}.new")
+    new.unlink(missing_ok=True)
+    new.symlink_to(folder.name)
+    new.replace(folder.with_name(name))
+
+
+def policy_folder(out: Path, name: str = LAST) -> Path:
+    """
+    Raises:
+        TaccorlError: there is no such checkpoint.
+    """
+    folder = out / "checkpoints" / name
+    if not (folder / _STATE).is_file():
+        raise TaccorlError(
+            f"--resume=true: {folder} holds no checkpoint of post-training; remove {out} and begin again"
+        )
+    return folder / _POLICY
+
+
+def load_state(policy_path: Path) -> dict[str, Any]:
+    """State beside a policy folder. It is a pickle: load only what you wrote."""
+    return torch.load(policy_path.parent / _STATE, map_location="cpu", weights_only=False)
+
+
+def prune(out: Path, keep: int) -> None:
+    """Delete all but the newest ``keep`` checkpoints, and those that are linked."""
+    root = out / "checkpoints"
+    linked = {(root / name).resolve() for name in (LAST, BEST)}
+    folders = sorted(p for p in root.iterdir() if p.name.isdigit())
+    for folder in folders[: -keep or None]:
+        if folder.resolve() not in linked:
+            shutil.rmtree(folder)

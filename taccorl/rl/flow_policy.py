@@ -1,0 +1,157 @@
+"""A flow-matching policy as PPO uses it: sample with Flow-SDE, score what was sampled, and give the critic its features.
+
+Sampling and scoring run the same computation: one pass over the prefix, whose keys and values are kept, then the action expert
+for each denoising step, in evaluation mode. So the ratio of probabilities before the first update is 1 up to the rounding of
+float32.
+
+Letters in shapes: B batch, T tokens of the prefix, H horizon, D padded action, A action, F features of the critic.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from lerobot.policies.pi05.modeling_pi05 import make_att_2d_masks, prepare_attention_masks_4d
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from torch import Tensor, nn
+
+from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+from taccorl.rl.flow_sde import Draws, FlowSDE, Sampled, Velocity
+from taccorl.rl.settings import PolicySettings
+
+Batch = dict[str, Tensor]
+Compute = Callable[[Any, Velocity, Tensor], tuple[Tensor, ...]]
+"""(rows, velocity field of these rows, their features (n, F)) → tensors with n rows."""
+
+
+class FlowPolicy(ABC):
+    """Interface of PPO to a policy."""
+
+    scored_HD: Tensor
+    """(H, D) bool: numbers of a chunk that are executed."""
+
+    @abstractmethod
+    def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
+        """``compute`` for groups of rows that are computed together; results in the order of the batch."""
+
+    @abstractmethod
+    def actions(self, chunk_BHD: Tensor) -> Tensor:
+        """(B, n, A) executed actions of a denoised chunk, before the postprocessor."""
+
+    @abstractmethod
+    def trained_parameters(self) -> list[nn.Parameter]:
+        """Parameters that the actor's optimiser moves."""
+
+    @torch.no_grad()
+    def sample(self, batch: Batch, sde: FlowSDE, draws: Draws) -> tuple[Sampled, Tensor]:
+        """Chunks with their log-probability, and (B, F) features."""
+
+        def compute(rows: Any, velocity: Velocity, features_BF: Tensor) -> tuple[Tensor, ...]:
+            return *sde.sample(velocity, draws.rows(rows), self.scored_HD), features_BF
+
+        *sampled, features_BF = self.each(batch, compute)
+        return Sampled(*sampled), features_BF
+
+    @torch.no_grad()
+    def features(self, batch: Batch) -> Tensor:
+        """(B, F) for the critic."""
+        return self.each(batch, lambda rows, velocity, features_BF: (features_BF,))[0]
+
+    def log_prob(self, batch: Batch, sde: FlowSDE, before_BSHD: Tensor, after_BSHD: Tensor, step_BS: Tensor) -> Tensor:
+        """(B,) log-probability of stored steps; differentiable."""
+
+        def compute(rows: Any, velocity: Velocity, features_BF: Tensor) -> tuple[Tensor, ...]:
+            return (sde.log_prob(velocity, before_BSHD[rows], after_BSHD[rows], step_BS[rows], self.scored_HD),)
+
+        return self.each(batch, compute)[0]
+
+
+class _Prefix(NamedTuple):
+    """Keys and values of the prefix, and its mean valid token."""
+
+    valid_BT: Tensor
+    cache: Any
+    mean_BF: Tensor
+
+
+class TactileFlowPolicy(FlowPolicy):
+    """``TactilePI05Policy`` for PPO. Acts with its last weights: an exponential mean of weights is not what PPO moves."""
+
+    def __init__(self, policy: TactilePI05Policy, settings: PolicySettings, num_steps: int) -> None:
+        """
+        Args:
+            policy: in evaluation mode, so that weights that acted, possibly an exponential mean, are those that are trained.
+            num_steps: K_denoise, also of the checkpoints that are written.
+
+        Raises:
+            TaccorlError: the policy was trained by regression and has no flow.
+        """
+        if policy.config.is_regression:
+            raise TaccorlError(
+                f"--policy.path={settings.path}: was trained by --policy.objective=regression, which has no probability of "
+                "actions; post-training needs --policy.objective=flow_matching"
+            )
+        policy.eval()
+        policy.averaged, policy.config.average_decay = None, 0.0
+        policy.config.num_inference_steps = num_steps
+        self.policy, self.model = policy.float(), policy.model
+        if settings.trained == "expert":
+            for parameter in self.model.paligemma_with_expert.paligemma.parameters():
+                parameter.requires_grad_(False)
+        config = policy.config
+        assert config.output_features is not None, "the policy has set them"
+        scored_HD = torch.zeros(config.chunk_size, config.max_action_dim, dtype=torch.bool, device=config.device)
+        scored_HD[: config.n_action_steps, : config.output_features["action"].shape[0]] = True
+        self.scored_HD = scored_HD
+
+    def trained_parameters(self) -> list[nn.Parameter]:
+        return [p for p in self.policy.parameters() if p.requires_grad]
+
+    def actions(self, chunk_BHD: Tensor) -> Tensor:
+        return self.policy._finished(chunk_BHD)[:, : self.policy.config.n_action_steps]
+
+    def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
+        assert not self.policy.training, "sampling and scoring use the kernels of evaluation mode"
+        policy = self.policy
+        batch = {k: x.to(torch.float32) / 255 if x.dtype == torch.uint8 else x for k, x in batch.items()}
+        images, image_masks = policy._preprocess_images(batch)
+        images = policy._tokens(images)
+        prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        shapes: list[torch.Size] = []
+
+        def of_rows(rows: Any) -> Tensor:
+            seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
+            prefix = self._prefix(*seen, *(x[rows] for x in prompt))
+            features_BF = prefix.mean_BF
+            if not policy.config.has_discrete_state:  # else the prompt has it
+                features_BF = torch.cat([features_BF, batch[OBS_STATE][rows].to(torch.float32)], dim=1)
+
+            def velocity(x_BHD: Tensor, t_B: Tensor) -> Tensor:
+                return self.model.denoise_step(prefix.valid_BT, prefix.cache, x_BHD, t_B)
+
+            results = compute(rows, velocity, features_BF)
+            shapes[:] = [x.shape[1:] for x in results]
+            return torch.cat([x.reshape(len(x), -1) for x in results], dim=1)
+
+        packed, _ = policy._by_contact(batch, of_rows)
+        parts = packed.split([shape.numel() for shape in shapes], dim=1)
+        return tuple(x.reshape(len(x), *shape) for x, shape in zip(parts, shapes, strict=True))
+
+    def _prefix(self, images: list[Tensor], masks: list[Tensor], tokens: Tensor, token_mask: Tensor) -> _Prefix:
+        """As LeRobot's ``sample_actions`` computes it."""
+        backbone = self.model.paligemma_with_expert
+        embedded_BTD, valid_BT, starts_block_BT = self.model.embed_prefix(images, masks, tokens, token_mask)
+        mask = prepare_attention_masks_4d(make_att_2d_masks(valid_BT, starts_block_BT))
+        backbone.paligemma.model.language_model.config._attn_implementation = "eager"  # pyright: ignore
+        (hidden_BTD, _), cache = backbone.forward(
+            attention_mask=mask,
+            position_ids=torch.cumsum(valid_BT, dim=1) - 1,
+            past_key_values=None,
+            inputs_embeds=[embedded_BTD, None],
+            use_cache=True,
+        )
+        weight_BT = valid_BT.to(torch.float32) / valid_BT.sum(dim=1, keepdim=True)
+        mean_BF = (hidden_BTD.to(torch.float32) * weight_BT[:, :, None]).sum(dim=1)
+        return _Prefix(valid_BT, cache, mean_BF.detach())

@@ -1,0 +1,129 @@
+"""Flow-SDE: sampling of a flow-matching policy with a known probability (π_RL, arXiv 2510.25889, as the paper uses it).
+
+LeRobot's flow runs from noise at t = 1 to the action at t = 0, in K Euler steps of length d = 1/K, t_k = 1 − k/K:
+
+    x_t = t ε + (1 − t) a        v = dx_t/dt = ε − a        ε̂ = x_t + (1 − t) v        score = −ε̂ / t
+    Euler        x ← x − d v
+    stochastic   x ← x − d v − s_k² ε̂ / (2 t) + s_k N(0, 1),      s_k = level · √(d t / (1 − t))
+
+with t = 1 read as t_1 in the denominator, so s_0 = level for every K; K = 4, level 0.5: s = 0.500, 0.433, 0.250, 0.144. Both
+steps have the same marginals as K → ∞. A stochastic step is a Gaussian; its density is the policy's probability in PPO.
+
+Noise is injected, and the density counted, in the scored numbers of a chunk only: executed steps, real dimensions. Everything
+else takes Euler steps. Without noise the result is that of the policy's own sampling, bit for bit.
+
+Letters in shapes: B batch, H horizon, D padded action, K denoising steps, S stochastic steps (1 or K).
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from taccorl.rl.settings import FlowSDESettings
+
+Velocity = Callable[[Tensor, Tensor], Tensor]
+"""(x (B, H, D), t (B,)) → dx/dt (B, H, D)."""
+
+
+class Draws(NamedTuple):
+    """Random numbers of a sample, drawn before it, so that rows can be computed in any grouping."""
+
+    initial_BHD: Tensor
+    """x at t = 1."""
+    noise_BSHD: Tensor
+    step_BS: Tensor
+    """Index k of the step that each noise belongs to; −1: unused."""
+
+    def rows(self, rows: Any) -> "Draws":
+        """Those of some rows."""
+        return Draws(*(x[rows] for x in self))
+
+
+class Sampled(NamedTuple):
+    """Result of sampling; ``before`` and ``after`` are x around each stochastic step."""
+
+    chunk_BHD: Tensor
+    before_BSHD: Tensor
+    after_BSHD: Tensor
+    log_prob_B: Tensor
+
+
+class FlowSDE:
+    """One function, ``mean``, gives the transition both for sampling and for scoring."""
+
+    def __init__(self, settings: FlowSDESettings) -> None:
+        self.num_steps, self.level = settings.num_steps, settings.level
+        self.num_stochastic = settings.num_steps if settings.stochastic_steps == "all" else 1
+        # As lerobot.policies.common.flow_matching.euler_integrate computes them, for the same bits.
+        self.dt = -1.0 / self.num_steps
+        self.times = [1.0 + k * self.dt for k in range(self.num_steps)]
+
+    @property
+    def stds(self) -> list[float]:
+        """s_k, in normalised actions."""
+        rest = [1 - t if t < 1 else -self.dt for t in self.times]
+        return [self.level * math.sqrt(-self.dt * t / r) for t, r in zip(self.times, rest, strict=True)]
+
+    def draw(self, num_rows: int, shape: tuple[int, int], generator: torch.Generator, device: Any = "cpu") -> Draws:
+        """Of ``num_rows`` samples of ``shape`` (H, D), from a generator on the CPU: the same numbers on every device."""
+        initial = torch.randn(num_rows, *shape, generator=generator)
+        noise = torch.randn(num_rows, self.num_stochastic, *shape, generator=generator)
+        if self.num_stochastic == 1:
+            step = torch.randint(self.num_steps, (num_rows, 1), generator=generator)
+        else:
+            step = torch.arange(self.num_steps).expand(num_rows, -1)
+        if self.level == 0:
+            step = torch.full_like(step, -1)
+        return Draws(initial.to(device), noise.to(device), step.to(device))
+
+    def mean(self, x_BHD: Tensor, v_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean (B, H, D) of x after step k, and the standard deviation (B, 1, 1) where ``noisy``."""
+        t = torch.tensor(self.times, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
+        std = torch.tensor(self.stds, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
+        euler_BHD = x_BHD + self.dt * v_BHD
+        noise_hat_BHD = x_BHD + (1 - t) * v_BHD
+        return torch.where(noisy_BHD, euler_BHD - std**2 / (2 * t) * noise_hat_BHD, euler_BHD), std
+
+    def sample(self, velocity: Velocity, draws: Draws, scored_HD: Tensor) -> Sampled:
+        """Denoise ``draws.initial_BHD``."""
+        x, step_BS = draws.initial_BHD, draws.step_BS
+        before, after = torch.zeros_like(draws.noise_BSHD), torch.zeros_like(draws.noise_BSHD)
+        log_prob_B = x.new_zeros(len(x))
+        for k in range(self.num_steps):
+            s = k if self.num_stochastic > 1 else 0
+            is_noisy_B = step_BS[:, s] == k
+            noisy_BHD = is_noisy_B[:, None, None] & scored_HD
+            k_B = torch.full((len(x),), k, device=x.device)
+            mean, std = self.mean(x, velocity(x, self._time(k_B, x)), k_B, noisy_BHD)
+            new = torch.where(noisy_BHD, mean + std * draws.noise_BSHD[:, s], mean)
+            chosen = is_noisy_B[:, None, None]
+            before[:, s], after[:, s] = torch.where(chosen, x, before[:, s]), torch.where(chosen, new, after[:, s])
+            log_prob_B = log_prob_B + _log_density(new, mean, std, noisy_BHD)
+            x = new
+        return Sampled(x, before, after, log_prob_B)
+
+    def log_prob(
+        self, velocity: Velocity, before_BSHD: Tensor, after_BSHD: Tensor, step_BS: Tensor, scored_HD: Tensor
+    ) -> Tensor:
+        """(B,) log-density of stored stochastic steps, summed over steps and scored numbers; differentiable in ``velocity``."""
+        total_B = before_BSHD.new_zeros(len(before_BSHD))
+        for s in range(self.num_stochastic):
+            x, k_B = before_BSHD[:, s], step_BS[:, s]
+            noisy_BHD = (k_B >= 0)[:, None, None] & scored_HD
+            mean, std = self.mean(x, velocity(x, self._time(k_B, x)), k_B, noisy_BHD)
+            total_B = total_B + _log_density(after_BSHD[:, s], mean, std, noisy_BHD)
+        return total_B
+
+    def _time(self, k_B: Tensor, x: Tensor) -> Tensor:
+        return torch.tensor(self.times, dtype=torch.float32, device=x.device)[k_B]
+
+
+def _log_density(x_BHD: Tensor, mean_BHD: Tensor, std: Tensor, counted_BHD: Tensor) -> Tensor:
+    """(B,) sum of Gaussian log-densities of what is counted."""
+    std = std.clamp(min=torch.finfo(x_BHD.dtype).tiny)  # level 0: nothing is counted
+    z = (x_BHD - mean_BHD) / std
+    densities = -0.5 * z * z - std.log() - 0.5 * math.log(2 * math.pi)
+    return torch.where(counted_BHD, densities, 0.0).sum(dim=(1, 2))

@@ -1,0 +1,345 @@
+"""Post-training: rollouts in the twin and updates by turns, with checkpoints that go on bit for bit on a CPU.
+
+``progress.jsonl`` in the run's folder has one line an iteration: success and outcomes of the episodes that ended in it, losses,
+KL divergence, gradient norms, explained variance, seconds of each part.
+"""
+
+import dataclasses
+import json
+import logging
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+from gymnasium.vector import AutoresetMode
+from lerobot.utils.random_utils import get_rng_state, set_rng_state
+
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
+from taccorl.evaluation.preflight import preflight, refuse_differences
+from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+from taccorl.rl import checkpoint
+from taccorl.rl.anchor import RealAnchor
+from taccorl.rl.critic import Critic
+from taccorl.rl.exploration import measure_noise
+from taccorl.rl.flow_policy import TactileFlowPolicy
+from taccorl.rl.flow_sde import FlowSDE
+from taccorl.rl.ppo import PPO, RATIO_GUARD
+from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
+from taccorl.rl.settings import PostTrainSettings
+from taccorl.rl.twin_world import TwinWorld
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import load_twin
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+PROGRESS, SETTINGS = "progress.jsonl", "settings.json"
+_MAY_CHANGE = ("iterations", "resume", "save_freq", "keep_checkpoints", "noise_check", "out")
+_CHECK_SEED = 1_000_000_007  # added to the run's: scenes of the noise check are not those of training
+_DRIFT_BATCHES = 4  # of the anchor's rows, for the drift in progress.jsonl
+_log = logging.getLogger(__name__)
+
+Report = Callable[[str], None]
+
+
+def post_train(settings: PostTrainSettings, report: Report = print) -> Path:
+    """Run all iterations; returns the policy's folder of the last checkpoint.
+
+    Raises:
+        TaccorlError: a policy, dataset, twin or folder that does not fit; out of GPU memory.
+    """
+    try:
+        run = PostTraining(settings, report)
+        try:
+            run.run()
+        finally:
+            run.world.envs.close()
+    except torch.OutOfMemoryError as error:
+        raise TaccorlError(
+            f"post-training: out of GPU memory: {str(error).splitlines()[0]} Lower --ppo.micro_batch={settings.ppo.micro_batch} "
+            f"first (results stay), then --env.num_envs={settings.env.num_envs} or the policy's image_resolution"
+        ) from error
+    return checkpoint.policy_folder(settings.out)
+
+
+class PostTraining:
+    """One run: everything that is made once, and the loop."""
+
+    def __init__(self, settings: PostTrainSettings, report: Report) -> None:
+        """
+        Raises:
+            TaccorlError: as ``post_train``.
+        """
+        self.settings, self._report = settings, report
+        _check_folder(settings)
+        twin = load_twin(settings.env.twin) if settings.env.twin else TwinConfig()
+        self._opened = _open(settings, twin)
+        policy = self._load(self._opened)
+        device = torch.device(str(policy.config.device))
+        self._actor = TactileFlowPolicy(policy, settings.policy, settings.noise.num_steps)
+        self._sde, self._clock = FlowSDE(settings.noise), Clock(device)
+        self._generator = torch.Generator().manual_seed(settings.seed)
+        needs_images = bool(policy.config.image_features)
+        envs = _environments(settings, twin, images=needs_images)
+        self.world = TwinWorld(
+            envs,
+            policy.config,
+            self._opened.preprocessor,
+            self._opened.postprocessor,
+            privileged=settings.ppo.privileged_critic,
+            clock=self._clock,
+        )
+        self.world.restart(settings.seed)
+        seen = self.world.observe()
+        num_features = self._actor.features({k: x[:1] for k, x in seen.batch.items()}).shape[1]
+        critic = Critic(num_features, seen.privileged_NP.shape[1]).to(device)
+        self._anchor = (
+            RealAnchor(settings.anchor, policy, self._opened.preprocessor) if settings.anchor.dataset else None
+        )
+        self._ppo = PPO(
+            self._actor,
+            critic,
+            self._sde,
+            settings.ppo,
+            self._anchor if settings.anchor.weight > 0 else None,
+            ratio_guard=math.inf if settings.policy.tf32 else RATIO_GUARD,
+        )
+        self._iteration, self._best = 0, 0.0
+        self._recent: list[float] = []
+        if settings.resume:
+            self._resume(checkpoint.load_state(self._opened.path))
+        else:
+            self._begin(twin)
+
+    def _load(self, opened: Checkpoint) -> TactilePI05Policy:
+        policy: Any = opened.load(self.settings.seed).policy
+        torch.backends.cudnn.benchmark = (
+            False  # numbers of rows vary with the episodes that end, and each would be tuned
+        )
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = self.settings.policy.tf32
+        return policy
+
+    def _begin(self, twin: TwinConfig) -> None:
+        out = self.settings.out
+        out.mkdir(parents=True, exist_ok=True)
+        (out / SETTINGS).write_text(json.dumps(_to_json(self.settings), indent=1) + "\n", encoding="utf-8")
+        (out / PROGRESS).write_text("")
+        num = sum(p.numel() for p in self._actor.trained_parameters())
+        self._report(f"post-training {self.settings.policy.path}: {num / 1e6:.2f} million weights are trained")
+        if self._sde.level > 0:
+            self._report_noise(twin)
+            if self.settings.noise_check:
+                self._check_noise()
+        if self.settings.env.stagger:
+            stagger(self.world, self._actor, self._sde, self._generator, self._decisions_of_an_episode())
+            self._clock.restart()
+
+    def _decisions_of_an_episode(self) -> int:
+        """At the time limit."""
+        return math.ceil(self.world.envs.sim.judge.limit_steps / self._actor.policy.config.n_action_steps)
+
+    def _report_noise(self, twin: TwinConfig) -> None:
+        batch, generator = self.world.observe().batch, torch.Generator().manual_seed(self.settings.seed)
+        found = measure_noise(self._actor, self._sde, batch, self._opened.postprocessor, twin.robot, generator)
+        for one in found:
+            self._report(
+                f"noise of level {self._sde.level:g} in {'all steps' if one.step < 0 else f'step {one.step}'}: "
+                f"joints {1e3 * one.joints_rad:.2f} mrad, hand {one.hand_mm:.2f} mm, gripper {one.gripper_mm:.2f} mm (rms)"
+            )
+
+    def _check_noise(self) -> None:
+        """Warn if noise costs the policy more than half of its successes."""
+        settings, rates = self.settings, []
+        for sde in (FlowSDE(dataclasses.replace(settings.noise, level=0.0)), self._sde):
+            self.world.restart(settings.seed + _CHECK_SEED)
+            generator = torch.Generator().manual_seed(settings.seed)
+            found = first_episodes(self.world, self._actor, sde, generator, self._decisions_of_an_episode())
+            rates.append(found.count(SUCCESS) / len(found))
+        self.world.restart(settings.seed)
+        self._clock.restart()
+        without, with_noise = rates
+        self._report(
+            f"success of the start over {settings.env.num_envs} episodes: {without:.1%} without noise, {with_noise:.1%} with"
+        )
+        if with_noise < 0.5 * without:
+            self._report(
+                f"warning: noise of level {self._sde.level:g} costs more than half of the successes: lower --noise.level"
+            )
+
+    def _resume(self, state: dict[str, Any]) -> None:
+        self._ppo.load_state_dict(state["ppo"])
+        self.world.load_state_dict(state["world"])
+        self._generator.set_state(state["generator"])
+        self._iteration, self._best, self._recent = state["iteration"], state["best"], list(state["recent"])
+        progress = self.settings.out / PROGRESS
+        lines = progress.read_text(encoding="utf-8").splitlines()
+        progress.write_text("".join(f"{line}\n" for line in lines[: self._iteration]), encoding="utf-8")
+        self._report(f"resumed at iteration {self._iteration} of {self.settings.iterations}")
+        set_rng_state(state["random"])
+
+    def run(self) -> None:
+        """The iterations that are left."""
+        settings = self.settings
+        while self._iteration < settings.iterations:
+            rollout = collect(
+                self.world,
+                self._actor,
+                self._ppo.critic,
+                self._sde,
+                settings.env.decisions,
+                settings.ppo,
+                self._generator,
+                self._clock,
+            )
+            with self._clock.part("update"):
+                facts = self._ppo.update(rollout.decisions, self._generator)
+            self._iteration += 1
+            row = self._row(rollout, facts)
+            is_due = self._iteration % settings.save_freq == 0 or self._iteration == settings.iterations
+            if is_due and self._anchor is not None:
+                rows = _DRIFT_BATCHES * settings.anchor.batch_size
+                row["drift"] = self._anchor.measure(torch.Generator().manual_seed(settings.seed), rows)
+            with (settings.out / PROGRESS).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+            self._report(_line(row))
+            if row["episodes"]:
+                longest = max(settings.save_freq, settings.collapse_iterations)
+                self._recent = [*self._recent, row["success"]][-longest:]
+            self._guard_collapse()
+            if is_due:
+                self._save()
+
+    def _row(self, rollout: Rollout, facts: dict[str, float]) -> dict[str, Any]:
+        episodes = sum(rollout.outcomes.values())
+        return {
+            "iteration": self._iteration,
+            "decisions": self._iteration * len(rollout.decisions),
+            "episodes": episodes,
+            "success": rollout.outcomes[SUCCESS] / episodes if episodes else 0.0,
+            "outcomes": dict(rollout.outcomes),
+            **rollout.facts,
+            **facts,
+            "actor_lr": self._ppo.actor_optimizer.param_groups[0]["lr"],
+            "seconds": {name: round(s, 3) for name, s in self._clock.restart().items()},
+        }
+
+    def _save(self) -> None:
+        score = fmean(self._recent[-self.settings.save_freq :] or [0.0])
+        is_best = score > self._best
+        self._best = max(score, self._best)
+        state = {
+            "ppo": self._ppo.state_dict(),
+            "world": self.world.state_dict(),
+            "generator": self._generator.get_state(),
+            "random": get_rng_state(),
+            "iteration": self._iteration,
+            "best": self._best,
+            "recent": self._recent,
+        }
+        folder = checkpoint.save(self.settings.out, self._iteration, self._opened, self._actor.policy, state)
+        if is_best:
+            checkpoint.link(folder, checkpoint.BEST)
+        if self.settings.keep_checkpoints:
+            checkpoint.prune(self.settings.out, self.settings.keep_checkpoints)
+
+    def _guard_collapse(self) -> None:
+        """Go back to the best checkpoint, with half of the learning rate, if success has fallen by half for long."""
+        count = self.settings.collapse_iterations
+        last = self._recent[-count:]
+        if not count or len(last) < count or self._best == 0 or max(last) >= 0.5 * self._best:
+            return
+        folder = checkpoint.policy_folder(self.settings.out, checkpoint.BEST)
+        best = TactilePI05Policy.from_pretrained(folder, config=self._actor.policy.config)
+        self._actor.policy.load_state_dict(best.state_dict())
+        lr = 0.5 * self._ppo.actor_optimizer.param_groups[0]["lr"]
+        self._ppo.load_state_dict({**checkpoint.load_state(folder)["ppo"], "num_updates": self._ppo.num_updates})
+        self._ppo.actor_optimizer.param_groups[0]["lr"] = lr
+        self._recent = []
+        self._report(
+            f"warning: success was below half of the best ({self._best:.1%}) for {count} iterations: back to "
+            f"{folder.parent.resolve().name}, actor's learning rate now {lr:.2g}"
+        )
+
+
+def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
+    """
+    Raises:
+        TaccorlError: no path, another kind of policy, or one that does not fit the environment.
+    """
+    path = checkpoint.policy_folder(settings.out) if settings.resume else settings.policy.path
+    if path is None:
+        raise TaccorlError("missing --policy.path=…/pretrained_model, a checkpoint of tactile_pi05")
+    opened = open_checkpoint(path, settings.policy.device)
+    config: Any = opened.config
+    if config.type != "tactile_pi05":
+        raise TaccorlError(f"--policy.path={path}: is of type {config.type}; post-training knows tactile_pi05")
+    config.dtype = "float32"  # a step of 5e-6 is lost in bfloat16
+    refuse_differences(preflight(opened.facts(), twin), str(path))
+    return opened
+
+
+def _environments(settings: PostTrainSettings, twin: TwinConfig, *, images: bool) -> TaccorlVectorEnv:
+    env = settings.env
+    if env.task is None:
+        raise TaccorlError("missing --env.task=…, such as assembly_2")
+    return TaccorlVectorEnv(
+        env.task,
+        env.num_envs,
+        difficulty=env.difficulty,
+        twin=twin,
+        images="on_request" if images else "never",
+        randomization=env.randomization,
+        num_threads=min(env.num_envs, len(os.sched_getaffinity(0))),
+        autoreset=AutoresetMode.DISABLED,
+        max_episode_steps=env.episode_length,
+    )
+
+
+def _check_folder(settings: PostTrainSettings) -> None:
+    """
+    Raises:
+        TaccorlError: ``out`` is in use, or what is to be resumed had other settings, or an anchor has no dataset.
+    """
+    out = settings.out
+    if settings.anchor.weight > 0 and settings.anchor.dataset is None:
+        raise TaccorlError(
+            "missing --anchor.dataset=…, a dataset of real demonstrations; without one: --anchor.weight=0"
+        )
+    if not settings.resume:
+        if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+            raise TaccorlError(
+                f"--out={out}: holds files already; nothing was touched: give another folder, or --resume=true to go on there"
+            )
+        return
+    if not (out / SETTINGS).is_file():
+        raise TaccorlError(f"--resume=true: {out} holds no post-training ({SETTINGS}); leave --resume away to begin")
+    before, now = json.loads((out / SETTINGS).read_text(encoding="utf-8")), _to_json(settings)
+    if changed := [
+        f"--{name} {before.get(name)} there, {now[name]} here" for name in now if before.get(name) != now[name]
+    ]:
+        raise TaccorlError(f"--resume=true: {out} was begun with other settings: {'; '.join(changed)}")
+
+
+def _to_json(settings: PostTrainSettings) -> dict[str, Any]:
+    """Name, such as ``ppo.clip``, → value, of what a resumed run must have in common."""
+    values: dict[str, Any] = {}
+    for name, value in dataclasses.asdict(settings).items():
+        if isinstance(value, dict):
+            values |= {f"{name}.{inner}": v for inner, v in value.items()}
+        elif name not in _MAY_CHANGE:
+            values[name] = value
+    values.pop("policy.device")
+    return {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
+
+
+def _line(row: dict[str, Any]) -> str:
+    seconds = ", ".join(f"{name} {s:.1f}" for name, s in row["seconds"].items())
+    anchor = f", anchor {row['anchor_loss']:.4f}" if "anchor_loss" in row else ""
+    actor = f", KL {row['kl']:.4f}, clipped {row['clip_fraction']:.1%}" if "kl" in row else ""
+    return (
+        f"iteration {row['iteration']}: success {row['success']:.1%} of {row['episodes']} episodes, explained variance "
+        f"{row['explained_variance']:.2f}{actor}{anchor}; seconds: {seconds}"
+    )

@@ -1,0 +1,201 @@
+"""Settings of post-training; the defaults are the paper's table of post-training parameters. Free of torch."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from taccorl.errors import TaccorlError, nearest
+
+_STOCHASTIC_STEPS = ("one", "all")
+_TRAINED = ("expert", "all")
+
+
+@dataclass(kw_only=True)
+class PolicySettings:
+    """The policy to post-train."""
+
+    path: Path | None = None
+    """Folder pretrained_model of a checkpoint of tactile_pi05, trained by flow matching."""
+    device: str | None = None
+    """cpu, cuda, …; as in the checkpoint if not given."""
+    trained: str = "expert"
+    """expert: action expert and touch, the vision-language model stays as it is; all: every weight."""
+    tf32: bool = False
+    """On a GPU, multiply float32 matrices with 10-bit mantissas: faster, but ratios before the first update differ from 1."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: unknown part.
+        """
+        if self.trained not in _TRAINED:
+            raise TaccorlError(f"--policy.trained={self.trained}: {nearest(self.trained, _TRAINED)}")
+
+
+@dataclass(kw_only=True)
+class EnvSettings:
+    """The twin, and how many of it."""
+
+    task: str | None = None
+    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's."""
+    twin: Path | None = None
+    """A twin.yaml; the nominal twin if not given."""
+    num_envs: int = 128
+    """N_env: environments at once."""
+    decisions: int = 36
+    """C: chunks of actions of each environment in an iteration. Episodes go on in the next one."""
+    difficulty: str = "train"
+    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    randomization: float = 1.0
+    """Share of the paper's reset ranges, 0 … 1."""
+    episode_length: int | None = None
+    """Control steps until an episode is cut off; the task's own limit if not given."""
+    stagger: bool = True
+    """Before the first iteration, act for an episode's length and begin episodes at random times in it, so that environments are
+    in different phases of the task."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: a number below 1.
+        """
+        _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions)
+
+
+@dataclass(kw_only=True)
+class FlowSDESettings:
+    """Exploration."""
+
+    num_steps: int = 4
+    """K_denoise. The policy's num_inference_steps is set to it."""
+    level: float = 0.5
+    """σ_SDE: standard deviation of the first stochastic step, in normalised actions. 0: no noise."""
+    stochastic_steps: str = "one"
+    """one: a step drawn for each decision, the others are Euler's; all: every step."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: a setting out of its range.
+        """
+        _at_least("noise", 1, num_steps=self.num_steps)
+        _at_least("noise", 0, level=self.level)
+        if self.stochastic_steps not in _STOCHASTIC_STEPS:
+            known = nearest(self.stochastic_steps, _STOCHASTIC_STEPS)
+            raise TaccorlError(f"--noise.stochastic_steps={self.stochastic_steps}: {known}")
+
+
+@dataclass(kw_only=True)
+class AnchorSettings:
+    """The supervised term on real data."""
+
+    dataset: Path | None = None
+    """Folder of a LeRobot dataset with real demonstrations; of a co-training dataset only its real rows are used."""
+    weight: float = 1.0
+    """β; 0: no anchor."""
+    batch_size: int = 32
+    """B_real: rows of every optimiser step."""
+    allow_simulated: bool = False
+    """Take a dataset of simulated demonstrations."""
+    cache: str = "none"
+    """none, disk, host or gpu: decode its pictures once (as lerobot-train's --dataset.cache)."""
+    cache_store: Path = Path("outputs/store")
+    """Folder of decoded pictures."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: a number below its range.
+        """
+        _at_least("anchor", 0, weight=self.weight)
+        _at_least("anchor", 1, batch_size=self.batch_size)
+
+
+@dataclass(kw_only=True)
+class PPOSettings:
+    """PPO over decisions: one decision is one chunk of actions."""
+
+    gamma: float = 0.99
+    """γ, for each decision."""
+    gae_lambda: float = 0.95
+    """λ_GAE."""
+    clip: float = 0.2
+    """ε_clip."""
+    epochs: int = 1
+    """E_update."""
+    batch_size: int = 512
+    """B_RL: decisions of an optimiser step; the last one of an epoch may have fewer."""
+    micro_batch: int = 128
+    """Decisions in memory at once; results do not depend on it but for rounding."""
+    actor_lr: float = 5e-6
+    """η_π."""
+    critic_lr: float = 1e-4
+    """η_V."""
+    weight_decay: float = 0.01
+    """Of both optimisers, AdamW with β = (0.9, 0.95) as in RLinf."""
+    max_grad_norm: float = 1.0
+    """Gradients of actor and critic are clipped to this norm separately."""
+    kl_stop: float = 0.05
+    """The actor's remaining updates of an iteration are left out once KL(old ‖ new) is larger."""
+    critic_epochs: int = 1
+    """Epochs of the critic alone: its inputs are stored, so they cost little."""
+    critic_warmup: int = 0
+    """First iterations in which only the critic is trained."""
+    privileged_critic: bool = False
+    """The critic also sees the simulator's state; it is discarded after training."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: a number below its range.
+        """
+        _at_least("ppo", 1, epochs=self.epochs, batch_size=self.batch_size, micro_batch=self.micro_batch)
+        _at_least("ppo", 1, critic_epochs=self.critic_epochs)
+        _at_least("ppo", 0, critic_warmup=self.critic_warmup, kl_stop=self.kl_stop, clip=self.clip)
+
+
+@dataclass(kw_only=True)
+class PostTrainSettings:
+    """A run of post-training."""
+
+    policy: PolicySettings = field(default_factory=PolicySettings)
+    """Which policy, and what of it is trained."""
+    env: EnvSettings = field(default_factory=EnvSettings)
+    """Task, twin and number of environments."""
+    noise: FlowSDESettings = field(default_factory=FlowSDESettings)
+    """Exploration by Flow-SDE."""
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+    """Advantages, updates, critic."""
+    anchor: AnchorSettings = field(default_factory=AnchorSettings)
+    """Real data that the policy is held to."""
+    iterations: int = 100
+    """Rollouts, each with its update; of the whole run, also after --resume=true."""
+    seed: int = 0
+    """Of scenes, noise and order."""
+    out: Path = Path("outputs/post_trained")
+    """Folder of checkpoints and progress.jsonl. It must not exist, or be empty, unless --resume=true."""
+    resume: bool = False
+    """Go on from the last checkpoint in --out."""
+    save_freq: int = 10
+    """Iterations between checkpoints."""
+    keep_checkpoints: int = 3
+    """The newest that are kept, beside the best; 0: all."""
+    noise_check: bool = True
+    """Before the first iteration, compare success with and without noise, one episode in each environment."""
+    collapse_iterations: int = 5
+    """After so many iterations with less than half of the best success: back to the best checkpoint, half the learning rate.
+    0: never."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: a number below its range.
+        """
+        for name, least in (("iterations", 1), ("seed", 0), ("save_freq", 1), ("keep_checkpoints", 0)):
+            if getattr(self, name) < least:
+                raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
+
+
+def _at_least(group: str, least: int, **values: float) -> None:
+    for name, value in values.items():
+        if not value >= least:
+            raise TaccorlError(f"--{group}.{name}={value:g}: at least {least}")

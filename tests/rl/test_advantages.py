@@ -1,0 +1,67 @@
+"""Generalised advantage estimation by hand, at both ends of λ, and across resets."""
+
+import pytest
+import torch
+
+from taccorl.rl.advantages import estimate_advantages, explained_variance, normalise
+
+
+def episodes(seed: int = 0) -> dict[str, torch.Tensor]:
+    """12 decisions of 7 environments, with successes and time limits."""
+    g = torch.Generator().manual_seed(seed)
+    reward, value, last = (torch.rand(12, 7, generator=g) for _ in range(3))
+    terminated = torch.rand(12, 7, generator=g) < 0.2
+    end = terminated | (torch.rand(12, 7, generator=g) < 0.2)
+    following = torch.cat([value[1:], last[-1:]])
+    next_value = torch.where(terminated, 0.0, torch.where(end, last, following))
+    return {"reward_TN": reward, "value_TN": value, "next_value_TN": next_value, "end_TN": end}
+
+
+def test_three_decisions_by_hand() -> None:
+    """γ = 0.5, λ = 0.5; the second ends the episode by its time limit, with V = 8 for the last observation.
+    δ = 0 + 0.5·4 − 2 = 0; 1 + 0.5·8 − 4 = 1; 0 + 0.5·6 − 1 = 2. A = 0 + 0.25·1 = 0.25; 1; 2. R = A + V = 2.25; 5; 3."""
+    column = {
+        "reward_TN": [0.0, 1.0, 0.0],
+        "value_TN": [2.0, 4.0, 1.0],
+        "next_value_TN": [4.0, 8.0, 6.0],
+        "end_TN": [False, True, False],
+    }
+    given = {name: torch.tensor(x)[:, None] for name, x in column.items()}
+    advantage, returns = estimate_advantages(**given, gamma=0.5, gae_lambda=0.5)
+    assert advantage[:, 0].tolist() == [0.25, 1.0, 2.0] and returns[:, 0].tolist() == [2.25, 5.0, 3.0]
+
+
+def test_at_lambda_one_returns_are_discounted_sums() -> None:
+    given = episodes()
+    _, returns = estimate_advantages(**given, gamma=0.99, gae_lambda=1.0)
+    reward, next_value, end = given["reward_TN"], given["next_value_TN"], given["end_TN"]
+    for n in range(7):
+        later = 0.0
+        for t in reversed(range(12)):
+            is_last = bool(end[t, n]) or t == 11
+            later = float(reward[t, n]) + 0.99 * (float(next_value[t, n]) if is_last else later)
+            assert returns[t, n].item() == pytest.approx(later, abs=1e-5)
+
+
+def test_at_lambda_zero_advantages_are_one_step_errors() -> None:
+    given = episodes()
+    advantage, _ = estimate_advantages(**given, gamma=0.9, gae_lambda=0.0)
+    error = given["reward_TN"] + 0.9 * given["next_value_TN"] - given["value_TN"]
+    torch.testing.assert_close(advantage, error)
+
+
+def test_no_credit_passes_over_a_reset() -> None:
+    given = episodes()
+    before, _ = estimate_advantages(**given, gamma=0.99, gae_lambda=0.95)
+    t = int(given["end_TN"][:, 0].nonzero()[0])
+    given["reward_TN"][t + 1 :] += 100.0
+    after, _ = estimate_advantages(**given, gamma=0.99, gae_lambda=0.95)
+    assert torch.equal(before[: t + 1, 0], after[: t + 1, 0]) and not torch.equal(before[t + 1 :, 0], after[t + 1 :, 0])
+
+
+def test_normalised_advantages_and_explained_variance() -> None:
+    found = normalise(torch.tensor([1.0, 2.0, 3.0, 6.0]))  # mean 3, deviation √3.5
+    assert found.tolist() == pytest.approx([(x - 3) / (3.5**0.5 + 1e-5) for x in (1, 2, 3, 6)])
+    returns = torch.tensor([0.0, 1.0, 0.0, 1.0])
+    assert explained_variance(returns + 5, returns) == pytest.approx(1.0)  # an offset is not variance
+    assert explained_variance(torch.zeros(4), returns) == pytest.approx(0.0)

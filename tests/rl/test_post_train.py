@@ -1,0 +1,192 @@
+"""The command: a run at its smallest, its folders, a run that is stopped and goes on, and input that does not fit."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny_checkpoint import write_checkpoint
+from tiny_dataset import write_tiny
+
+from taccorl.cli.main import main
+from taccorl.evaluation.policy_actor import open_checkpoint
+
+GAIN = ("0.013333333333333334", "0.0133333333")  # the tests' policies, and datasets
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_checkpoint(tmp_path_factory.mktemp("start"))
+    for file in folder.glob("*.json"):
+        file.write_text(file.read_text().replace(*GAIN))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("real") / "dataset", cameras=3)
+
+
+def options(start: Path, real: Path, out: Path, **changes: Any) -> list[str]:
+    given = {
+        "policy.path": start,
+        "env.task": "assembly_2",
+        "env.num_envs": 2,
+        "env.decisions": 2,
+        "env.episode_length": 12,
+        "env.stagger": False,
+        "anchor.dataset": real,
+        "anchor.batch_size": 2,
+        "ppo.actor_lr": 1e-4,
+        "noise_check": False,
+        "iterations": 1,
+        "save_freq": 1,
+        "out": out,
+        **changes,
+    }
+    return ["post-train", *(f"--{name}={value}" for name, value in given.items())]
+
+
+def progress(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
+
+
+def weights(out: Path) -> dict[str, torch.Tensor]:
+    return open_checkpoint(out / "checkpoints" / "last" / "pretrained_model", "cpu").load(0).policy.state_dict()
+
+
+def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "out"
+    assert main(options(start, real, out)) == 0
+    printed = capsys.readouterr().out
+    assert "mrad" in printed and "mm" in printed
+    (row,) = progress(out)
+    assert row["decisions"] == 4 and row["first_ratio_error"] < 1e-5 and row["anchor_loss"] > 0 and row["drift"] > 0
+    assert set(row["seconds"]) == {"pictures", "policy", "physics", "update"}
+    before, after = open_checkpoint(start, "cpu").load(0).policy.state_dict(), weights(out)
+    moved = [name for name, value in before.items() if not torch.equal(value, after[name])]
+    assert moved and not any("paligemma.model" in name for name in moved)
+    assert main(options(start, real, out)) == 2  # in use
+    assert "--resume=true" in capsys.readouterr().err
+
+
+def test_input_that_does_not_fit_is_refused_before_anything_is_written(
+    start: Path, real: Path, tmp_path: Path, capsys: Any
+) -> None:
+    out = tmp_path / "out"
+    cases = [
+        ({"env.task": "asembly_2"}, "assembly_2"),
+        ({"anchor.dataset": tmp_path}, "--anchor.dataset"),
+        ({"policy.path": tmp_path}, "--policy.path"),
+        ({"resume": True}, "--resume=true"),
+        ({"noise.level": -1}, "--noise.level=-1"),
+    ]
+    for changes, word in cases:
+        assert main(options(start, real, out, **changes)) == 2
+        assert word in capsys.readouterr().err and not out.exists()
+    without = [o for o in options(start, real, out) if "anchor.dataset" not in o]
+    assert main(without) == 2 and "--anchor.weight=0" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
+    """Two iterations at once, and one, kill -9, a line that was written without its checkpoint, and one more."""
+    more = {"ppo.privileged_critic": True}
+    assert main(options(start, real, tmp_path / "once", iterations=2, **more)) == 0
+    out = tmp_path / "twice"
+    command = [sys.executable, "-m", "taccorl.cli.main", *options(start, real, out, iterations=2, **more)]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (out / "checkpoints" / "last").exists() and running.poll() is None:
+        time.sleep(0.01)
+    running.kill()
+    running.wait()
+    assert [row["iteration"] for row in progress(out)][:1] == [1]
+    with (out / "progress.jsonl").open("a") as file:
+        file.write('{"iteration": 2}\n')
+    assert main(options(start, real, out, iterations=2, resume=True, **{**more, "ppo.clip": 0.3})) == 2
+    assert "ppo.clip" in capsys.readouterr().err
+    assert main(options(start, real, out, iterations=2, resume=True, **more)) == 0
+    once, twice = weights(tmp_path / "once"), weights(out)
+    assert all(torch.equal(value, twice[name]) for name, value in once.items())
+    rows = [[{k: v for k, v in row.items() if k != "seconds"} for row in progress(p)] for p in (tmp_path / "once", out)]
+    assert rows[0] == rows[1] and len(rows[0]) == 2
+
+
+def run(start: Path, out: Path, lines: list[str], **changes: Any) -> Any:
+    from taccorl.rl.post_train import PostTraining
+    from taccorl.rl.settings import AnchorSettings, EnvSettings, PolicySettings, PostTrainSettings
+
+    settings = PostTrainSettings(
+        policy=PolicySettings(path=start),
+        env=EnvSettings(task="assembly_2", num_envs=2, decisions=2, episode_length=12, stagger=False),
+        anchor=AnchorSettings(weight=0),
+        out=out,
+        **changes,
+    )
+    return PostTraining(settings, lines.append)
+
+
+def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path) -> None:
+    lines: list[str] = []
+    made = run(start, tmp_path / "out", lines, noise_check=False, keep_checkpoints=1)
+    bias = made._actor.model.action_out_proj.bias
+    for iteration, success in ((10, 0.6), (20, 0.8), (30, 0.5)):
+        with torch.no_grad():
+            bias.fill_(iteration)
+        made._iteration, made._recent = iteration, [success] * 5
+        made._guard_collapse()
+        made._save()
+    assert sorted(p.name for p in (tmp_path / "out" / "checkpoints").iterdir()) == ["000020", "000030", "best", "last"]
+    assert bias.unique().tolist() == [30]  # 0.5 is no collapse
+    made._recent = [0.39, 0.0, 0.1, 0.2, 0.41]
+    made._guard_collapse()
+    assert bias.unique().tolist() == [30] and not any("warning" in line for line in lines)
+    made._recent = [0.39, 0.0, 0.1, 0.2, 0.3]
+    made._guard_collapse()
+    assert bias.unique().tolist() == [20] and "000020" in lines[-1]
+    assert made._ppo.actor_optimizer.param_groups[0]["lr"] == pytest.approx(2.5e-6)
+    made.world.envs.close()
+
+
+def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    from taccorl.rl import post_train
+
+    lines: list[str] = []
+    made = run(start, tmp_path / "out", lines, noise_check=False)
+    for with_noise, warned in (("timeout", True), ("success", False)):
+        found = iter([["success", "success"], ["timeout", with_noise]])
+        monkeypatch.setattr(post_train, "first_episodes", lambda *_, found=found: next(found))
+        lines.clear()
+        made._check_noise()
+        assert any("--noise.level" in line for line in lines) is warned
+        assert "100.0% without" in "".join(lines)
+    made.world.envs.close()
+
+
+def test_noise_at_the_hand_is_that_of_the_kinematics() -> None:
+    """2e-4 rad at one joint of the left arm, in every step of the chunk: as far as the hand moves by it."""
+    from taccorl.demos.experts.kinematics import ArmKinematics
+    from taccorl.rl.exploration import hand_shift_m
+    from taccorl.sim.robot import RobotConfig
+
+    arm, targets, noise = ArmKinematics("left", RobotConfig()), np.zeros((1, 3, 14)), np.zeros((1, 3, 14))
+    targets[:, :, :6] = [0.3, 1.2, -1.0, 0.1, 0.4, 0.2]
+    noise[:, :, 1] = 2e-4
+    moved = arm.pose(targets[0, 0, :6] + noise[0, 0, :6])[:3, 3] - arm.pose(targets[0, 0, :6])[:3, 3]
+    assert hand_shift_m(arm, targets, noise, 0) == pytest.approx([np.linalg.norm(moved)], rel=1e-3)
+    assert hand_shift_m(arm, targets, np.roll(noise, 7, axis=2), 0) == pytest.approx([0.0])
+
+
+def test_every_configuration_of_post_training_is_read() -> None:
+    from taccorl.cli.parse import parse
+    from taccorl.cli.post_train import PostTrainConfig
+
+    files = sorted((Path(__file__).parents[2] / "configs" / "post_train").glob("*.yaml"))
+    assert {f.stem for f in files} >= {"paper", "small", "tiny"}
+    found = {f.stem: parse(PostTrainConfig, [f"--config_path={f}"]) for f in files}
+    assert found["paper"] == PostTrainConfig()

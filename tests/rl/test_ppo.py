@@ -1,0 +1,251 @@
+"""PPO on the smallest policy and world: what one update may and may not do, and that many of them learn."""
+
+import math
+
+import pytest
+import torch
+from reaching import DemoAnchor, LinePolicy, LineWorld, imitated
+
+from taccorl.errors import TaccorlError
+from taccorl.rl.critic import Critic
+from taccorl.rl.flow_sde import FlowSDE
+from taccorl.rl.ppo import PPO, Decisions, policy_loss
+from taccorl.rl.rollout import SUCCESS, Clock, collect, first_episodes, stagger
+from taccorl.rl.settings import FlowSDESettings, PPOSettings
+
+SETTINGS = PPOSettings(actor_lr=3e-4, critic_lr=1e-3, batch_size=64)
+
+
+def ppo(policy: LinePolicy, settings: PPOSettings = SETTINGS, beta: float | None = None, steps: str = "one") -> PPO:
+    torch.manual_seed(1)
+    sde = FlowSDE(FlowSDESettings(stochastic_steps=steps))
+    anchor = None if beta is None else DemoAnchor(policy, beta)
+    return PPO(policy, Critic(64, hidden=(64, 64)), sde, settings, anchor)
+
+
+def rollout(learner: PPO, num_envs: int = 16, decisions: int = 12, seed: int = 0) -> Decisions:
+    generator = torch.Generator().manual_seed(seed)
+    world = LineWorld(num_envs, seed)
+    return collect(
+        world, learner.actor, learner.critic, learner.sde, decisions, learner.settings, generator, Clock()
+    ).decisions
+
+
+def weights(policy: LinePolicy) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in policy.trained_parameters()])
+
+
+def gradient(beta: float | None, micro_batch: int = 128) -> torch.Tensor:
+    """Of one optimiser step, before clipping."""
+    settings = PPOSettings(batch_size=192, micro_batch=micro_batch, max_grad_norm=math.inf)
+    learner = ppo(LinePolicy(), settings, beta)
+    found = rollout(learner)
+    advantage = torch.randn(len(found), generator=torch.Generator().manual_seed(5))
+    learner._actor_gradient(found, advantage, torch.Generator().manual_seed(6), True)
+    return torch.cat([p.grad.flatten() for p in learner.actor.trained_parameters() if p.grad is not None])
+
+
+def test_clipped_loss_by_hand() -> None:
+    """Ratios 1.5, 0.5, 1.5, 0.5 with advantages 1, 1, −1, −1 and ε = 0.2: min(1.5, 1.2), min(0.5, 0.8), min(−1.5, −1.2),
+    min(−0.5, −0.8): mean of 1.2, 0.5, −1.5, −0.8 is −0.15; the loss is its negative."""
+    log_ratio = torch.tensor([1.5, 0.5, 1.5, 0.5]).log()
+    assert policy_loss(log_ratio, torch.tensor([1.0, 1.0, -1.0, -1.0]), 0.2).item() == pytest.approx(0.15)
+
+
+def test_clipped_decisions_have_no_gradient() -> None:
+    log_ratio = torch.tensor([1.5, 0.5, 1.5, 0.5]).log().requires_grad_()
+    policy_loss(log_ratio, torch.tensor([1.0, 1.0, -1.0, -1.0]), 0.2).backward()
+    assert log_ratio.grad is not None
+    assert log_ratio.grad.tolist() == pytest.approx([0.0, -0.125, 0.375, 0.0])  # −ratio · A / 4, where not clipped
+
+
+@pytest.mark.parametrize("steps", ["one", "all"])
+def test_first_ratio_is_one(steps: str) -> None:
+    learner = ppo(LinePolicy(), steps=steps)
+    facts = learner.update(rollout(learner), torch.Generator())
+    assert facts["first_ratio_error"] < 1e-5
+
+
+def test_another_policy_than_the_one_that_acted_is_refused() -> None:
+    learner = ppo(LinePolicy())
+    found = rollout(learner)
+    with torch.no_grad():
+        learner.actor.trained_parameters()[0].add_(0.05)
+    with pytest.raises(TaccorlError, match=r"ratio of probabilities is off 1"):
+        learner.update(found, torch.Generator())
+
+
+def test_gradient_is_linear_in_beta_and_the_anchor_is_in_it() -> None:
+    without, g0, g1, g2 = gradient(None), gradient(0.0), gradient(1.0), gradient(2.0)
+    torch.testing.assert_close(g0, without)
+    assert (g1 - g0).norm() > 0.1 * g0.norm()  # a dead anchor: 0
+    torch.testing.assert_close(g2 - g0, 2 * (g1 - g0), atol=1e-6, rtol=1e-4)
+
+
+def test_gradient_does_not_depend_on_micro_batches() -> None:
+    torch.testing.assert_close(gradient(1.0, 192), gradient(1.0, 50), atol=1e-6, rtol=1e-4)
+
+
+def test_critic_and_actor_do_not_reach_each_other() -> None:
+    learner = ppo(LinePolicy())
+    found = rollout(learner)
+    learner._critic_step(found, torch.arange(32))
+    assert all(p.grad is None for p in learner.actor.trained_parameters())
+    learner.critic_optimizer.zero_grad()
+    learner._actor_gradient(found, found.advantage_M, torch.Generator(), True)
+    assert all(p.grad is None for p in learner.critic.parameters())
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in learner.actor.trained_parameters())
+
+
+def test_a_large_critic_gradient_leaves_the_actors_step() -> None:
+    """Norms are clipped separately."""
+    moved = []
+    for scale in (1.0, 1e4):
+        learner = ppo(LinePolicy())
+        found = rollout(learner)
+        found = Decisions(**{**vars(found), "return_M": scale * found.return_M})
+        learner.update(found, torch.Generator().manual_seed(2))
+        moved.append(weights(learner.actor))  # pyright: ignore
+    assert torch.equal(*moved)
+
+
+def test_learning_rate_zero_moves_nothing() -> None:
+    settings = PPOSettings(actor_lr=0.0, critic_lr=1e-3, batch_size=64, epochs=2)
+    learner = ppo(LinePolicy(), settings)
+    before = weights(learner.actor)  # pyright: ignore
+    facts = learner.update(rollout(learner), torch.Generator())
+    assert torch.equal(before, weights(learner.actor))  # pyright: ignore
+    assert abs(facts["kl"]) < 1e-9 and facts["clip_fraction"] == 0 and facts["actor_steps"] == 6
+
+
+def test_every_decision_is_used_once_in_an_epoch() -> None:
+    learner = ppo(LinePolicy(), PPOSettings(batch_size=50))
+    parts = learner._minibatches(192, torch.Generator())
+    assert [len(p) for p in parts] == [50, 50, 50, 42] and sorted(torch.cat(list(parts)).tolist()) == list(range(192))
+    assert len(ppo(LinePolicy(), PPOSettings())._minibatches(128 * 36, torch.Generator())) == 9  # the paper's numbers
+
+
+def test_the_anchor_has_its_rows_in_every_step() -> None:
+    learner = ppo(LinePolicy(), PPOSettings(batch_size=64, micro_batch=10), beta=1.0)
+    learner.update(rollout(learner), torch.Generator())
+    assert learner.anchor.rows_seen == [32, 32, 32]  # pyright: ignore
+
+
+def test_warm_up_trains_the_critic_only() -> None:
+    learner = ppo(LinePolicy(), PPOSettings(batch_size=64, critic_warmup=1))
+    before = weights(learner.actor)  # pyright: ignore
+    facts = learner.update(rollout(learner), torch.Generator())
+    assert torch.equal(before, weights(learner.actor)) and facts["actor_steps"] == 0  # pyright: ignore
+    learner.update(rollout(learner), torch.Generator())
+    assert not torch.equal(before, weights(learner.actor))  # pyright: ignore
+
+
+def test_gradients_that_are_not_finite_are_skipped_and_counted() -> None:
+    learner = ppo(LinePolicy(), PPOSettings(batch_size=192))
+    found = rollout(learner)
+    found.advantage_M[0] = torch.nan
+    before = weights(learner.actor)  # pyright: ignore
+    facts = learner.update(found, torch.Generator())
+    assert facts["skipped_steps"] == 1 and facts["actor_steps"] == 0
+    assert torch.equal(before, weights(learner.actor))  # pyright: ignore
+
+
+def test_updates_stop_when_the_policy_has_moved_too_far() -> None:
+    learner = ppo(LinePolicy(), PPOSettings(actor_lr=0.05, batch_size=16, epochs=5, kl_stop=0.02))
+    facts = learner.update(rollout(learner), torch.Generator())
+    assert facts["kl_stopped"] == 1 and 1 <= facts["actor_steps"] < 20
+
+
+def test_value_of_the_last_observation_counts_where_time_ran_out() -> None:
+    """A critic that always says 7: V' = 7 after a time limit, 0 after success, so R = r + γ V' at λ = 0."""
+    learner = ppo(imitated(steps=50), PPOSettings(gae_lambda=0.0))
+    torch.nn.init.zeros_(learner.critic.head[-1].weight)  # pyright: ignore
+    torch.nn.init.constant_(learner.critic.head[-1].bias, 7.0)  # pyright: ignore
+    world = LineWorld(32)
+    clock, generator = Clock(), torch.Generator().manual_seed(0)
+    found = collect(world, learner.actor, learner.critic, learner.sde, 20, learner.settings, generator, clock)
+    assert found.outcomes[SUCCESS] > 0 and found.outcomes["timeout"] > 0
+    returns = found.decisions.return_M
+    wins = (returns - 1.0).abs() < 1e-5
+    assert int(wins.sum()) == found.outcomes[SUCCESS]
+    torch.testing.assert_close(returns[~wins], torch.full((int((~wins).sum()),), 0.99 * 7))
+
+
+def test_float32_weights_keep_a_small_learning_rate() -> None:
+    """At the paper's 5e-6 nearly all weights move in a few steps; in bfloat16 most would not."""
+    learner = ppo(LinePolicy(), PPOSettings(batch_size=16))
+    before = weights(learner.actor)  # pyright: ignore
+    learner.update(rollout(learner), torch.Generator())
+    assert (before != weights(learner.actor)).float().mean() > 0.99  # pyright: ignore
+
+
+def test_stopped_and_resumed_learner_is_the_same_bit_for_bit() -> None:
+    """After a warm-up, which does not begin again, and a step, whose moments count."""
+    settings = PPOSettings(actor_lr=3e-4, batch_size=64, critic_warmup=1)
+
+    def after(resumed: bool) -> torch.Tensor:
+        learner, generator = ppo(LinePolicy(), settings), torch.Generator().manual_seed(9)
+        for _ in range(2):
+            learner.update(rollout(learner), generator)
+        if resumed:
+            state, own = learner.state_dict(), [p.detach().clone() for p in learner.actor.trained_parameters()]
+            learner = ppo(LinePolicy(seed=8), settings)
+            for p, value in zip(learner.actor.trained_parameters(), own, strict=True):
+                p.data.copy_(value)
+            learner.load_state_dict(state)
+        learner.update(rollout(learner, seed=1), generator)
+        return weights(learner.actor)  # pyright: ignore
+
+    assert torch.equal(after(False), after(True))
+
+
+def test_running_normalisation_of_privileged_numbers() -> None:
+    x = torch.randn(100, 3) * torch.tensor([1.0, 5.0, 0.1]) + torch.tensor([0.0, 3.0, -2.0])
+    critic = Critic(2, 3)
+    for part in x.split(17):
+        critic.observe(part)
+    torch.testing.assert_close(critic.mean_P, x.mean(0), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(critic.square_P / 100, x.var(0, correction=0), atol=1e-4, rtol=1e-4)
+
+
+def test_staggered_environments_are_in_different_phases() -> None:
+    """A policy that stands still never succeeds: without staggering all ages are equal. Reset at a random one of 8 decisions,
+    ages at the end are 1 … 8, where a full episode's 8 has begun anew: 0 … 7."""
+    policy, world = LinePolicy(), LineWorld(200)
+    policy.actions = lambda chunk_BHD: 0 * chunk_BHD  # pyright: ignore
+    world.distance[:] = 1.0
+    sde = FlowSDE(FlowSDESettings())
+    stagger(world, policy, sde, torch.Generator().manual_seed(0), 8)
+    counts = world.age[world.distance.abs() > 0.05].bincount(minlength=8)
+    assert len(counts) == 8 and counts.min() > 10
+
+
+def train(iterations: int, beta: float | None = None) -> tuple[float, float, float]:
+    """Success without noise before and after, and the flow loss on the demonstrations after."""
+    policy = imitated()
+    learner = ppo(policy, PPOSettings(actor_lr=5e-4, critic_lr=1e-3, batch_size=512, critic_warmup=2), beta)
+    quiet = FlowSDE(FlowSDESettings(level=0.0))
+
+    def success() -> float:
+        found = first_episodes(LineWorld(512, seed=99), policy, quiet, torch.Generator().manual_seed(0), 10)
+        return found.count(SUCCESS) / 512
+
+    before, world, generator = success(), LineWorld(128), torch.Generator().manual_seed(0)
+    for _ in range(iterations):
+        found = collect(world, policy, learner.critic, learner.sde, 16, learner.settings, generator, Clock())
+        learner.update(found.decisions, generator)
+    return before, success(), DemoAnchor(policy, 1.0).measure(torch.Generator().manual_seed(3), 2000)
+
+
+def test_ppo_learns_to_reach() -> None:
+    before, after, _ = train(8)
+    assert before < 0.3 and after > 0.8
+
+
+@pytest.mark.slow
+def test_the_anchor_holds_the_policy_to_the_demonstrations() -> None:
+    """Flow loss on the demonstrations after 120 updates: the larger β, the smaller; success stays."""
+    found = [train(120, beta) for beta in (None, 0.1, 1.0)]
+    assert all(before < 0.3 and after > 0.8 for before, after, _ in found)
+    free, loose, held = (drift for _, _, drift in found)
+    assert held < loose < 0.5 * free

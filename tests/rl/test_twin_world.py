@@ -1,0 +1,173 @@
+"""Rollouts beside evaluation: the same input, the same actions without noise, the same touch; and exact resuming."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from tiny_checkpoint import write_checkpoint
+
+from taccorl.evaluation.policy_actor import open_checkpoint, policy_batch
+from taccorl.rl.flow_policy import TactileFlowPolicy
+from taccorl.rl.flow_sde import FlowSDE
+from taccorl.rl.rollout import Clock
+from taccorl.rl.settings import FlowSDESettings, PolicySettings
+from taccorl.rl.twin_world import TwinWorld
+from taccorl.sim.episode_seeds import episode_seed
+from taccorl.sim.vector_env import TaccorlVectorEnv
+
+N = 2
+TOUCH = "observation.tactile"
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return open_checkpoint(write_checkpoint(tmp_path_factory.mktemp("checkpoint")), "cpu")
+
+
+@pytest.fixture(scope="module")
+def envs() -> Iterator[TaccorlVectorEnv]:
+    made = TaccorlVectorEnv(
+        "assembly_2", N, images="on_request", autoreset=AutoresetMode.DISABLED, max_episode_steps=12, num_threads=1
+    )
+    yield made
+    made.close()
+
+
+def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True) -> TwinWorld:
+    made = TwinWorld(
+        envs, opened.config, opened.preprocessor, opened.postprocessor, privileged=privileged, clock=Clock()
+    )
+    made.restart(seed)
+    return made
+
+
+def home(world: TwinWorld, n: int = 5) -> torch.Tensor:
+    """Chunks that the postprocessor turns into the state: both are normalised by the same limits."""
+    return world.observe().batch["observation.state"][:, None].expand(-1, n, -1)
+
+
+def test_the_policys_input_is_that_of_evaluation(envs: TaccorlVectorEnv, opened: Any) -> None:
+    world = make_world(envs, opened)
+    found = world.observe().batch
+    observation = envs.observe(images=True)
+    observation[TOUCH] = np.repeat(observation[TOUCH][:, None], 10, axis=1)
+    expected = policy_batch(opened.preprocessor, observation, [envs.task_description] * N)
+    for key, value in found.items():
+        own = value.to(torch.float32) / 255 if value.dtype == torch.uint8 else value
+        assert torch.equal(own, expected[key]), key  # pyright: ignore
+    assert set(opened.config.input_features) <= set(found)
+
+
+def test_without_noise_actions_are_those_of_evaluation(envs: TaccorlVectorEnv, opened: Any) -> None:
+    """Two chunks of five steps through ``select_action`` and through a rollout, from the same noise."""
+    actor = opened.load(0)
+    noise = [torch.randn(N, 10, 32, generator=torch.Generator().manual_seed(k)) for k in range(2)]
+    world = make_world(envs, opened)
+    given = iter(noise)
+    actor.policy.model.sample_noise = lambda shape, device: next(given)
+    actor.begin(envs)
+    observation, expected, windows = envs.observe(images=True), [], []
+    for _ in range(10):
+        pictures = envs.observe(images=True)
+        expected.append(actor.act({**pictures, **observation}).actions)
+        windows.append(torch.stack(list(actor.policy._felt)))
+        observation = envs.step(expected[-1].astype(np.float32))[0]
+
+    policy = TactileFlowPolicy(actor.policy, PolicySettings(), num_steps=4)
+    world.restart(5)
+    executed: list[np.ndarray] = []
+    step = envs.step_chunk
+    envs.step_chunk = lambda actions: (executed.append(actions.copy()), step(actions))[1]  # pyright: ignore
+    quiet = FlowSDE(FlowSDESettings(level=0.0))
+    for k in range(2):
+        seen = world.observe().batch
+        filled = torch.cat([windows[5 * k][:1]] * (10 - len(windows[5 * k])) + [windows[5 * k]]).transpose(0, 1)
+        assert torch.equal(seen[TOUCH], filled)
+        draws = quiet.draw(N, (10, 32), torch.Generator())._replace(initial_BHD=noise[k])
+        world.act(policy.actions(policy.sample(seen, quiet, draws)[0].chunk_BHD))
+    envs.step_chunk = step  # pyright: ignore
+    np.testing.assert_allclose(np.concatenate(executed, 1), np.stack(expected, 1), atol=2e-6)
+
+
+def test_time_limit_gives_the_last_observation_before_the_reset(envs: TaccorlVectorEnv, opened: Any) -> None:
+    """12 control steps, 5 a chunk: the third chunk ends after two."""
+    world = make_world(envs, opened)
+    first = world.observe()
+    for _ in range(2):
+        acted = world.act(home(world))
+        assert acted.last is None and acted.outcomes == [None, None] and not acted.truncated_N.any()
+    acted = world.act(home(world) + 0.3)
+    assert acted.truncated_N.all() and not acted.terminated_N.any() and acted.outcomes == ["timeout", "timeout"]
+    assert acted.last is not None and acted.reward_N.tolist() == [0, 0]
+    now = world.observe()
+    assert not torch.equal(acted.last.batch["observation.state"], now.batch["observation.state"])
+    assert (
+        not torch.equal(acted.last.privileged_NP, now.privileged_NP)
+        and now.privileged_NP.shape == first.privileged_NP.shape
+    )
+    assert envs.facts()["seed"].tolist() == [episode_seed(5, i, 1) for i in range(N)]
+    assert torch.equal(now.batch[TOUCH][:, :1].expand(-1, 10, -1), now.batch[TOUCH])  # the past is forgotten
+
+
+def test_readings_after_the_end_are_not_in_the_last_window(envs: TaccorlVectorEnv, opened: Any) -> None:
+    world = make_world(envs, opened)
+    readings = [envs.observe()[TOUCH]]
+    step = envs.step_chunk
+
+    def keep(actions: np.ndarray) -> Any:
+        chunk = step(actions)
+        readings.extend(chunk.tactile[:, k] for k in range(int(chunk.num_steps[0])))
+        return chunk
+
+    envs.step_chunk = keep  # pyright: ignore
+    acted = [world.act(home(world)) for _ in range(3)][-1]
+    envs.step_chunk = step  # pyright: ignore
+    assert acted.last is not None and len(readings) == 13
+    expected = np.stack(readings[-10:], axis=1) / 75
+    np.testing.assert_allclose(acted.last.batch[TOUCH].numpy(), expected, atol=1e-5)
+
+
+def test_an_action_that_is_no_action_ends_the_episode_as_a_failure(envs: TaccorlVectorEnv, opened: Any) -> None:
+    world = make_world(envs, opened)
+    chunk = home(world).clone()
+    chunk[1, 3, 2] = torch.nan
+    acted = world.act(chunk)
+    assert acted.outcomes == [None, "bad_action"] and acted.terminated_N.tolist() == [False, True]
+    assert acted.reward_N.tolist() == [0, 0]
+    assert envs.facts()["seed"].tolist() == [episode_seed(5, 0, 0), episode_seed(5, 1, 1)]
+
+
+def test_a_reset_is_of_its_rows_only(envs: TaccorlVectorEnv, opened: Any) -> None:
+    world = make_world(envs, opened)
+    world.act(home(world))
+    before = world.observe()
+    world.reset(torch.tensor([False, True]))
+    after = world.observe()
+    assert envs.facts()["steps"].tolist() == [5, 0]
+    assert envs.facts()["seed"].tolist() == [episode_seed(5, 0, 0), episode_seed(5, 1, 1)]
+    for key, value in before.batch.items():
+        assert torch.equal(value[0], after.batch[key][0]), key
+
+
+def test_a_stopped_world_goes_on_bit_for_bit(envs: TaccorlVectorEnv, opened: Any, tmp_path: Path) -> None:
+    world = make_world(envs, opened)
+    moves = [0.2 * torch.randn(N, 5, 14, generator=torch.Generator().manual_seed(k)) for k in range(4)]
+    world.observe()
+    world.act(moves[0])
+    torch.save(world.state_dict(), tmp_path / "state.pt")
+
+    def go_on(world: TwinWorld) -> list[torch.Tensor]:
+        found = []
+        for move in moves[1:]:  # over a reset
+            seen = world.observe()
+            found += [*seen.batch.values(), seen.privileged_NP, world.act(move).truncated_N]
+        return found
+
+    expected = go_on(world)
+    again = make_world(envs, opened, seed=77)
+    again.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=False))
+    assert all(torch.equal(a, b) for a, b in zip(go_on(again), expected, strict=True))
