@@ -16,7 +16,6 @@ from lerobot.policies.pi05.modeling_pi05 import make_att_2d_masks, prepare_atten
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor, nn
 
-from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.rl.flow_sde import Draws, FlowSDE, Sampled, Velocity
 from taccorl.rl.settings import PolicySettings
@@ -84,15 +83,7 @@ class TactileFlowPolicy(FlowPolicy):
         Args:
             policy: in evaluation mode, so that weights that acted, possibly an exponential mean, are those that are trained.
             num_steps: K_denoise, also of the checkpoints that are written.
-
-        Raises:
-            TaccorlError: the policy was trained by regression and has no flow.
         """
-        if policy.config.is_regression:
-            raise TaccorlError(
-                f"--policy.path={settings.path}: was trained by --policy.objective=regression, which has no probability of "
-                "actions; post-training needs --policy.objective=flow_matching"
-            )
         policy.eval()
         policy.averaged, policy.config.average_decay = None, 0.0
         policy.config.num_inference_steps = num_steps

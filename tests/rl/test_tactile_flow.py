@@ -138,11 +138,6 @@ def test_an_exponential_mean_of_weights_is_what_goes_on() -> None:
     assert torch.equal(policy.model.action_out_proj.bias, acting) and policy.policy.config.average_decay == 0
 
 
-def test_regression_is_refused() -> None:
-    with pytest.raises(TaccorlError, match=r"--policy\.objective=regression"):
-        actor(objective="regression")
-
-
 @pytest.fixture(scope="module")
 def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_dataset import write_tiny
