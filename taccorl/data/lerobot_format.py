@@ -26,6 +26,7 @@ import pyarrow.parquet as pq
 
 from taccorl.data.dataset import BOOKKEEPING, Dataset
 from taccorl.data.episode import Episode
+from taccorl.data.joining import has_videos, join_numbers
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
@@ -340,7 +341,8 @@ def _wait_for_room(dataset: Any) -> None:
 
 
 def merge(roots: Sequence[Path], destination: Path) -> None:
-    """Datasets into one, by LeRobot's ``aggregate_datasets``; a single one is copied. Proved like a written one.
+    """Datasets into one; a single one is copied. With videos by LeRobot's ``aggregate_datasets``, else by ``joining``. Proved
+    like a written one.
 
     Statistics of joints and actions are those of all rows: LeRobot 0.6.1 takes the mean of the datasets' quantiles, which is no
     quantile of theirs together.
@@ -351,19 +353,30 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
     for path in (*roots, destination):
         check_path(path)
     for root in roots:
-        if unstored := Dataset(root).unstored:
-            raise DatasetError(
-                f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training, so it cannot be merged: "
-                "make it with taccorl execute --pictures=video"
-            )
+        require_videos(root)
     if len(roots) == 1:
         shutil.copytree(roots[0], destination, dirs_exist_ok=True)
     else:
-        _aggregate(roots, destination)
+        if any(has_videos(root) for root in roots):
+            _aggregate(roots, destination)
+        else:
+            _join(roots, destination)
         write_exact_statistics(destination, smaller_than=LARGE_FEATURE)
     problems = Dataset(destination).video_problems()
     if problems:
         raise DatasetError(f"{destination}: {len(problems)} problems after merging, first: {problems[0]}")
+
+
+def require_videos(root: Path) -> None:
+    """
+    Raises:
+        DatasetError: pictures of the dataset are in the cache of training frames alone.
+    """
+    if unstored := Dataset(root).unstored:
+        raise DatasetError(
+            f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training, so it cannot be merged: "
+            "make it with taccorl execute --pictures=video"
+        )
 
 
 def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> None:
@@ -393,6 +406,14 @@ def _all_rows(root: Path, key: str) -> np.ndarray:
             flat = chunk.flatten() if hasattr(chunk, "flatten") and chunk.type.num_fields else chunk
             pieces.append(flat.to_numpy(zero_copy_only=False).reshape(len(chunk), -1))
     return np.concatenate(pieces)
+
+
+def _join(roots: Sequence[Path], destination: Path) -> None:
+    with quiet_lerobot():
+        try:
+            join_numbers(roots, destination)
+        except ValueError as error:
+            raise DatasetError(f"these datasets do not merge: {error}") from error
 
 
 def _aggregate(roots: Sequence[Path], destination: Path) -> None:

@@ -16,11 +16,10 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import Tensor
 
 from taccorl.errors import TaccorlError
-from taccorl.evaluation.episodes import BAD_ACTION
 from taccorl.evaluation.policy_actor import Processor, policy_batch
+from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.rl.flow_policy import Batch
 from taccorl.rl.rollout import SUCCESS, Acted, Clock, Seen
-from taccorl.sim.actions import check_actions
 from taccorl.sim.episode_seeds import episode_seed
 from taccorl.sim.simulation import Snapshot
 from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
@@ -62,6 +61,7 @@ class TwinWorld:
         self._cameras = [IMAGE_KEYS[name] for name in CAMERAS if IMAGE_KEYS[name] in inputs]
         self.needs_images = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
         self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK}
+        self._kept |= {HAND_POSES} if config.knows_hands else set()
         self._root = 0
         self._episode_N = np.zeros(envs.num_envs, dtype=np.int64)
         self._observation: Observation = {}
@@ -86,14 +86,11 @@ class TwinWorld:
         with self._clock.part("policy"):
             actions = self._postprocessor(actions_NHA).to("cpu").numpy().astype(np.float32)
         with self._clock.part("physics"):
-            bad = np.array([_is_bad(own) for own in actions])
-            actions[bad] = self._observation[STATE_KEY][bad][:, None]  # stands still until the reset below
             chunk = self.envs.step_chunk(actions)
             facts = self.envs.facts()
-        truncated = chunk.truncated & ~bad
-        terminated = chunk.terminated | bad
+        truncated, terminated = chunk.truncated, chunk.terminated
         outcome = np.where(facts["is_success"], SUCCESS, facts["failure"])
-        outcomes = [BAD_ACTION if b else str(o) or None for b, o in zip(bad, outcome, strict=True)]
+        outcomes = [str(o) or None for o in outcome]
         windows = np.concatenate([self._window_NLK, chunk.tactile], axis=1)
         ends = self._history + chunk.num_steps  # readings after the end of an episode do not count
         self._window_NLK = np.stack([w[end - self._history : end] for w, end in zip(windows, ends, strict=True)])
@@ -102,9 +99,8 @@ class TwinWorld:
         if (over := truncated | terminated).any():
             with self._clock.part("physics"):
                 self.reset(torch.from_numpy(over))
-        reward = np.where(bad, 0.0, chunk.reward)
         return Acted(
-            reward_N=torch.from_numpy(reward).float(),
+            reward_N=torch.from_numpy(chunk.reward).float(),
             terminated_N=torch.from_numpy(terminated),
             truncated_N=torch.from_numpy(truncated),
             last=last,
@@ -171,12 +167,3 @@ class TwinWorld:
         self._window_NLK = state["window"].copy()
         options = {"state": Snapshot(**state["snapshot"])}
         self._observation, _ = self.envs.reset(seed=self._seeds(), options=options)
-
-
-def _is_bad(actions_HA: np.ndarray) -> bool:
-    """Whether the environment would refuse them: not finite, or far beyond the limits."""
-    try:
-        check_actions(actions_HA.astype(float))
-    except TaccorlError:
-        return True
-    return False

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.dataset import PROVENANCE, Dataset, dataset_spec_to_json, episode_record
-from taccorl.data.lerobot_format import merge, quiet_lerobot, write_exact_statistics
+from taccorl.data.lerobot_format import merge, quiet_lerobot, require_videos, write_exact_statistics
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.demos.recorder import ORIGIN
 from taccorl.errors import DatasetError, InTheWayError
@@ -49,6 +49,8 @@ def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) 
         InTheWayError: ``out`` holds something else.
     """
     check_domains(real, sim)
+    for root in (*real, *sim):
+        require_videos(root)
 
     def build(_: Any, inputs: list[Path], folder: Path) -> None:
         folder.rmdir()  # LeRobot wants to make it

@@ -184,7 +184,7 @@ def test_after_the_grasp_the_takeover_is_drawn_up_to_the_policys_end(
         share = np.random.default_rng([seed, 1]).uniform()
         assert (done.takeover_step, done.cause) == (6 + int(4 * share), "drawn")
         found.add(done.takeover_step)
-    assert len(found) > 2
+    assert len(found) > 1
 
 
 def test_the_first_row_is_the_policys_state_at_the_takeover(sim: Simulation, stub: None) -> None:

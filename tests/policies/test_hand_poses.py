@@ -15,11 +15,12 @@ from taccorl.policies.tactile_pi05.hand_poses import (
     WORLD_M,
     HandPosesStep,
     arm_chains,
+    arm_names,
     hand_poses,
     tcp_poses,
 )
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import make_tactile_pi05_pre_post_processors
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.robot import RobotConfig
 
 
@@ -76,12 +77,13 @@ def test_the_step_takes_any_leading_shape_keeps_the_rest_and_comes_back_from_its
 
 
 def test_another_robot_is_refused_with_the_way_out():
-    with pytest.raises(TaccorlError, match=r"6 numbers.*left_joint1.*--policy.hand_poses=false"):
+    with pytest.raises(TaccorlError, match=r"6 numbers.*left_joint_1.*--policy.hand_poses=false"):
         HandPosesStep().observation({"observation.state": torch.zeros(2, 6)})
 
 
 def test_a_policy_is_told_of_hands_that_it_knows():
-    names = list(ACTION_NAMES)
+    names = list(arm_names())
+    assert names[0] == "left_joint_1.pos" and names[13] == "right_gripper.pos"  # as datasets have them
     assert TactilePI05Config(backbone="small", action_feature_names=names).knows_hands
     assert not TactilePI05Config(backbone="small", action_feature_names=["elbow"]).knows_hands
     assert not TactilePI05Config(backbone="full", action_feature_names=names).knows_hands
@@ -91,7 +93,7 @@ def test_a_policy_is_told_of_hands_that_it_knows():
 
 
 def test_poses_are_of_the_state_before_it_is_normalised(states):
-    settings = {"discrete_state_input": False, "action_feature_names": list(ACTION_NAMES)}
+    settings = {"discrete_state_input": False, "action_feature_names": list(arm_names())}
     config = tiny_config(**settings, use_relative_actions=True)
     half = torch.ones(14)
     statistics = {key: {"q01": -half, "q99": half} for key in ("observation.state", "action")}

@@ -15,9 +15,8 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
-from taccorl.policies.tactile_pi05.hand_poses import NUM_HAND_POSES
+from taccorl.policies.tactile_pi05.hand_poses import NUM_HAND_POSES, arm_names
 from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
-from taccorl.sim.actions import ACTION_NAMES
 
 TACTILE = "observation.tactile"
 RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
@@ -244,7 +243,7 @@ class TactilePI05Config(PI05Config):
     def knows_hands(self) -> bool:
         """``hand_poses`` as it is meant."""
         if self.hand_poses is None:
-            return not self.has_discrete_state and tuple(self.action_feature_names or ()) == ACTION_NAMES
+            return not self.has_discrete_state and tuple(self.action_feature_names or ()) == arm_names()
         return self.hand_poses
 
     @property

@@ -8,6 +8,7 @@ the arms' geometry to that, so it is told (S features):
 The six numbers of a rotation are those of Zhou et al. 2019, On the Continuity of Rotation Representations in Neural Networks.
 """
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,8 +20,8 @@ from lerobot.processor import ObservationProcessorStep
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
+from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.robot import ARMS, JOINTS, RobotConfig, add_arm
 
 HAND_POSES = "observation.hand_poses"
@@ -33,6 +34,14 @@ HAND_TO_HAND_M = 0.1
 _PER_ARM = len(JOINTS) + 1  # and a gripper
 
 # B batch, J joints
+
+
+@functools.cache
+def arm_names() -> tuple[str, ...]:
+    """Names of the state's and the action's numbers in datasets of the robot whose geometry is known."""
+    names = load_dataset_spec(find_spec("taccorl_bimanual")).features["action"].names
+    assert names is not None, "the data spec names its joints"
+    return tuple(names)
 
 
 def arm_chains(robot: RobotConfig | None = None) -> list[list[list[list[float]]]]:
@@ -121,10 +130,10 @@ class HandPosesStep(ObservationProcessorStep):
             TaccorlError: the state has other joints than the arms.
         """
         state_BS = torch.as_tensor(observation[OBS_STATE])
-        if state_BS.shape[-1] != len(ACTION_NAMES):
+        if state_BS.shape[-1] != len(arm_names()):
             raise TaccorlError(
-                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, hand poses follow from the {len(ACTION_NAMES)} of "
-                f"{', '.join(ACTION_NAMES)}: another robot needs --policy.hand_poses=false"
+                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, hand poses follow from the {len(arm_names())} of "
+                f"{', '.join(arm_names())}: another robot needs --policy.hand_poses=false"
             )
         chains = self._chains.get(state_BS.device)
         if chains is None:

@@ -1,9 +1,12 @@
 """What the figures of MimicGen are made of: attempts in a twin of another stiffness, and what is kept done a third time."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from taccorl.demos.benchmarks import mimicgen_cells
+from taccorl.demos.mimicgen.attempt import Attempted, state_digest
 from taccorl.demos.mimicgen.from_dataset import read_sources
 from taccorl.demos.mimicgen.scoring import Score, _holds, score_generation, stiffened
 from taccorl.demos.mimicgen.spec import load_mimic_spec
@@ -44,9 +47,9 @@ def test_what_is_not_in_place_or_ends_elsewhere_does_not_hold():
     still = np.tile(sim.arrays["ctrl"][0, sim.action_actuators].astype(np.float32), (3, 1))
     for action in still:
         sim.step(action[None].astype(float))
-    end = sim.state_rows()[0]
-    assert not _holds(sim, 5, still, end)  # the same state, but the plug stands on the table
-    assert not _holds(sim, 5, still[:2], end)
+    done = Attempted(0, 5, "success", actions=still, last_state=state_digest(sim))
+    assert not _holds(sim, done)  # the same state, but the plug stands on the table
+    assert not _holds(sim, dataclasses.replace(done, actions=still[:2]))
 
 
 @pytest.mark.slow

@@ -1,0 +1,120 @@
+"""Datasets without videos, joined, beside what LeRobot's own ``aggregate_datasets`` makes of them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from taccorl.data.dataset import Dataset
+from taccorl.data.episode import Episode
+from taccorl.data.joining import has_videos, join_numbers
+from taccorl.data.lerobot_format import _aggregate, merge, write_episodes
+from taccorl.data.spec import DatasetSpec, load_dataset_spec
+from taccorl.errors import DatasetError
+
+SPEC = """
+spec_version: 1
+name: numbers
+fps: 30
+robot_type: two joints
+action_time: next_row
+features:
+  observation.state: {dtype: float32, shape: [2], names: [a, b], unit: rad, frame: joint, rate_hz: 30, range: [-4, 4]}
+  action: {dtype: float32, shape: [2], names: [a, b], unit: rad, frame: joint, rate_hz: 30, range: [-4, 4]}
+"""
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory: pytest.TempPathFactory) -> DatasetSpec:
+    path = tmp_path_factory.mktemp("spec") / "numbers.yaml"
+    path.write_text(SPEC, encoding="utf-8")
+    return load_dataset_spec(path)
+
+
+def episode(spec: DatasetSpec, seed: int, rows: int, instruction: str) -> Episode:
+    rng = np.random.default_rng(seed)
+    arrays = {key: rng.normal(size=(rows, 2)).astype(np.float32) for key in spec.features}
+    return Episode(
+        name=f"made up {seed}", spec=spec, start_ns=0, arrays=arrays, picture_keys=(), pictures=lambda: iter([{}] * rows),
+        instruction=instruction, origin="made up",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def parts(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Tasks are numbered otherwise in each: push 0 and pull 1; pull 0; lift 0 and push 1."""
+    folder = tmp_path_factory.mktemp("parts")
+    told = {"x": ["push", "pull", "push"], "y": ["pull"], "z": ["lift", "push"]}
+    for k, (name, instructions) in enumerate(told.items()):
+        episodes = [episode(spec, 10 * k + i, 7 + 3 * i + k, text) for i, text in enumerate(instructions)]
+        write_episodes(episodes, folder / name)
+    return [folder / name for name in told]
+
+
+def table(root: Path, kind: str) -> pd.DataFrame:
+    pieces = [pq.read_table(path) for path in sorted((root / kind).glob("chunk-*/file-*.parquet"))]
+    return pa.concat_tables(pieces).to_pandas()
+
+
+def test_it_is_what_lerobot_makes_of_them(parts: list[Path], tmp_path: Path) -> None:
+    join_numbers(parts, tmp_path / "ours")
+    _aggregate(parts, tmp_path / "theirs")
+    for kind in ("data", "meta/episodes"):
+        pd.testing.assert_frame_equal(table(tmp_path / "ours", kind), table(tmp_path / "theirs", kind))
+    ours, theirs = (pd.read_parquet(tmp_path / name / "meta/tasks.parquet") for name in ("ours", "theirs"))
+    pd.testing.assert_frame_equal(ours, theirs)
+    for name in ("info", "stats"):
+        found, wanted = (json.loads((tmp_path / of / f"meta/{name}.json").read_text()) for of in ("ours", "theirs"))
+        wanted.pop("video_path", None)  # LeRobot forgets where videos would be
+        assert found.items() >= wanted.items()
+    # LeRobot's own goes through pandas, which forgets how many numbers a cell has.
+    schemas = [pq.read_schema(root / "data/chunk-000/file-000.parquet") for root in (tmp_path / "ours", parts[0])]
+    assert schemas[0].equals(schemas[1])
+
+
+@pytest.mark.parametrize(("limit_mb", "per_chunk", "files"), [(1, 2, 3), (100, 1000, 1)])
+def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
+    parts: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit_mb: int, per_chunk: int, files: int
+) -> None:
+    from taccorl.data import joining
+
+    read = joining._info
+    small = {"data_files_size_in_mb": limit_mb, "chunks_size": per_chunk}
+    monkeypatch.setattr(joining, "_MB", 1024 if limit_mb == 1 else 1024 * 1024)  # no file is smaller than 1 kB
+    monkeypatch.setattr(joining, "_info", lambda root: read(root) | small)
+    join_numbers(parts, tmp_path / "all")
+    for kind in ("data", "meta/episodes"):
+        assert len(list((tmp_path / "all" / kind).glob("chunk-*/file-*.parquet"))) == files
+        assert len(list((tmp_path / "all" / kind).glob("chunk-*"))) == -(-files // per_chunk)
+    joined = LeRobotDataset("local/all", root=tmp_path / "all")
+    place = 0
+    sources = [(part, k) for part in parts for k in range(Dataset(part).num_episodes)]
+    for number, (root, k) in enumerate(sources):
+        source = Dataset(root).values(k, ["action"])["action"]
+        begin, end = (int(joined.meta.episodes[number][f"dataset_{edge}_index"]) for edge in ("from", "to"))
+        assert (begin, end) == (place, place + len(source))
+        for row in (begin, end - 1):
+            item = joined[row]
+            assert item["episode_index"] == number and item["index"] == row
+            np.testing.assert_array_equal(item["action"].numpy(), source[row - begin])
+            original = LeRobotDataset("local/x", root=root)
+            assert item["task"] == original.meta.episodes[k]["tasks"][0]
+        place = end
+    assert joined.meta.total_frames == place
+
+
+def test_merge_joins_them_and_says_what_differs(spec: DatasetSpec, parts: list[Path], tmp_path: Path) -> None:
+    assert not has_videos(parts[0])
+    merge(parts, tmp_path / "all")
+    assert Dataset(tmp_path / "all").num_episodes == 6
+    other = json.loads((parts[1] / "meta/info.json").read_text())
+    shutil.copytree(parts[1], tmp_path / "slow")
+    (tmp_path / "slow/meta/info.json").write_text(json.dumps(other | {"fps": 15}))
+    with pytest.raises(DatasetError, match=r"do not merge: fps of slow is 15, that of x 30"):
+        merge([parts[0], tmp_path / "slow"], tmp_path / "both")
