@@ -26,7 +26,7 @@ def has_videos(root: Path) -> bool:
 
 
 def join_numbers(roots: Sequence[Path], destination: Path) -> None:
-    """Write the dataset that holds the episodes of ``roots``, in their order.
+    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``.
 
     Args:
         roots: datasets without videos.
@@ -72,7 +72,6 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
     (destination / "meta/info.json").write_text(
         json.dumps(infos[0] | totals | {"splits": splits}, indent=4, ensure_ascii=False), encoding="utf-8"
     )
-    _write_statistics(roots, destination)
 
 
 class _Files:
@@ -127,14 +126,6 @@ class _Tasks:
 
         frame = pd.DataFrame({"task_index": range(len(self.names))}, index=pd.Index(self.names, name="task"))
         frame.to_parquet(root / "meta/tasks.parquet")
-
-
-def _write_statistics(roots: Sequence[Path], destination: Path) -> None:
-    from lerobot.datasets.compute_stats import aggregate_stats
-    from lerobot.datasets.io_utils import load_stats, write_stats
-
-    found = [stats for root in roots if (stats := load_stats(root)) is not None]
-    write_stats(aggregate_stats(found), destination)
 
 
 def _with_own_statistics(table: pa.Table, first_row: int, first_episode: int, tasks: _Tasks) -> pa.Table:

@@ -409,11 +409,17 @@ def _all_rows(root: Path, key: str) -> np.ndarray:
 
 
 def _join(roots: Sequence[Path], destination: Path) -> None:
+    try:
+        join_numbers(roots, destination)
+    except ValueError as error:
+        raise DatasetError(f"these datasets do not merge: {error}") from error
     with quiet_lerobot():
-        try:
-            join_numbers(roots, destination)
-        except ValueError as error:
-            raise DatasetError(f"these datasets do not merge: {error}") from error
+        from lerobot.datasets import compute_stats
+        from lerobot.datasets.io_utils import load_stats, write_stats
+
+        found = [stats for root in roots if (stats := load_stats(root)) is not None]
+        with _statistics_in_order(compute_stats):
+            write_stats(compute_stats.aggregate_stats(found), destination)
 
 
 def _aggregate(roots: Sequence[Path], destination: Path) -> None:

@@ -190,7 +190,9 @@ def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, ep
     """Execute the policy's episode up to the takeover and let the expert complete the task; it gets the task's full time."""
     if episode.outcome == "success" and plan.takeover == "failures":
         return Correction(KEPT_OUT)
+    limit_steps = sim.judge.limit_steps
     takeover = _execute_until_takeover(sim, episode)
+    sim.judge.limit_steps = limit_steps
     if takeover is None:
         return Correction("not reproduced", "the policy's actions lead to another state than the policy was in")
     step, cause = takeover
@@ -224,6 +226,8 @@ def _execute_until_takeover(sim: Simulation, episode: PolicyEpisode) -> tuple[in
     drawn, early, subtasks = None, int(share * num), []
     sim.reset([episode.seed])
     snapshot = sim.snapshot()
+    # The policy may have had more time than the task's own (--episode_length); the expert has the task's again.
+    sim.judge.limit_steps = max(sim.judge.limit_steps, num + 1)
     for t in range(num):
         if sim.judge.outcome.over[0]:
             return None
@@ -301,9 +305,13 @@ def correct(
             "--takeover=all if the policy succeeds by itself"
         )
     stage = dataclasses.replace(_CORRECTIONS, fn=lambda _, inputs, folder: assemble(spec, report, inputs, folder))
-    config = {"task": plan.task, "policy": plan.policy, "policy_digest": plan.policy_digest, "seed": plan.seed}
-    store.run(stage, config | {"episodes": plan.episodes, "takeover": plan.takeover}, kept, destination=out)
+    store.run(stage, _dataset_config(plan), kept, destination=out)
     return report
+
+
+def _dataset_config(plan: CorrectionPlan) -> dict[str, Any]:
+    own = {"task": plan.task, "policy": plan.policy, "policy_digest": plan.policy_digest, "seed": plan.seed}
+    return canonical(own | {"episodes": plan.episodes, "takeover": plan.takeover})
 
 
 def check_out(plan: CorrectionPlan, out: Path) -> None:
@@ -313,7 +321,8 @@ def check_out(plan: CorrectionPlan, out: Path) -> None:
         InTheWayError: says what is there.
     """
     manifest = read_manifest(out) if out.is_dir() else None
-    if os.path.lexists(out) and (not manifest or manifest["stage"] != _CORRECTIONS.name):
+    is_ours = manifest and manifest["stage"] == _CORRECTIONS.name and manifest["config"] == _dataset_config(plan)
+    if os.path.lexists(out) and not is_ours:
         raise in_the_way(out, _CORRECTIONS, plan.task)
 
 

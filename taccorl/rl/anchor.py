@@ -75,6 +75,7 @@ class RealAnchor:
             self.rows = torch.nonzero(is_sim.reshape(-1) < 0.5)[:, 0]
             if not len(self.rows):
                 raise TaccorlError(f"--anchor.dataset={root}: all of its rows are simulated ({IS_SIM})")
+        self._batch(self.rows[:1])  # frames that are missing are noticed now, not after hours of rollouts
         _log.info("anchor: %d rows of %d episodes of %s", len(self.rows), meta.total_episodes, root)
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
@@ -100,13 +101,16 @@ class RealAnchor:
     def _draw(self, num_rows: int, generator: torch.Generator) -> Tensor:
         return self.rows[torch.randint(len(self.rows), (num_rows,), generator=generator)]
 
-    def _loss(self, rows: Tensor) -> Tensor:
+    def _batch(self, rows: Tensor) -> dict[str, Any]:
         items = self._dataset.__getitems__(rows.tolist())
         batch = items[0] if isinstance(items[0], reading.WholeBatch) else default_collate(items)
         for key in self._dataset.meta.camera_keys:
             if key in batch and batch[key].dtype == torch.uint8:
                 batch[key] = batch[key].to(torch.float32) / 255.0
-        return self._policy.forward(self._preprocessor(batch))[0]
+        return batch
+
+    def _loss(self, rows: Tensor) -> Tensor:
+        return self._policy.forward(self._preprocessor(self._batch(rows)))[0]
 
 
 def _refuse_simulated(root: Path) -> None:

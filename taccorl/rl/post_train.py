@@ -21,6 +21,7 @@ from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
+from taccorl.lineage.digest import digest_file
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.rl import checkpoint
 from taccorl.rl.anchor import RealAnchor
@@ -304,11 +305,11 @@ def _check_folder(settings: PostTrainSettings) -> None:
         TaccorlError: ``out`` is in use, or what is to be resumed had other settings, or an anchor has no dataset.
     """
     out = settings.out
-    if settings.anchor.weight > 0 and settings.anchor.dataset is None:
-        raise TaccorlError(
-            "missing --anchor.dataset=…, a dataset of real demonstrations; without one: --anchor.weight=0"
-        )
     if not settings.resume:
+        if settings.anchor.weight > 0 and settings.anchor.dataset is None:
+            raise TaccorlError(
+                "missing --anchor.dataset=…, a dataset of real demonstrations; without one: --anchor.weight=0"
+            )
         if out.exists() and not (out.is_dir() and not any(out.iterdir())):
             raise TaccorlError(
                 f"--out={out}: holds files already; nothing was touched: give another folder, or --resume=true to go on there"
@@ -320,7 +321,9 @@ def _check_folder(settings: PostTrainSettings) -> None:
     if changed := [
         f"--{name} {before.get(name)} there, {now[name]} here" for name in now if before.get(name) != now[name]
     ]:
-        raise TaccorlError(f"--resume=true: {out} was begun with other settings: {'; '.join(changed)}")
+        raise TaccorlError(
+            f"--resume=true: {out} was begun with other settings: {'; '.join(changed)}. Give those that it was begun with"
+        )
 
 
 def _to_json(settings: PostTrainSettings) -> dict[str, Any]:
@@ -332,7 +335,8 @@ def _to_json(settings: PostTrainSettings) -> dict[str, Any]:
         elif name not in _MAY_CHANGE:
             values[name] = value
     values.pop("policy.device")
-    return {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
+    values["env.twin_sha256"] = digest_file(settings.env.twin) if settings.env.twin else None
+    return {name: str(v.resolve()) if isinstance(v, Path) else v for name, v in values.items()}
 
 
 def _line(row: dict[str, Any]) -> str:

@@ -161,7 +161,7 @@ class PPO:
         return found
 
     def _guard(self, error: float) -> None:
-        if error > self.ratio_guard:
+        if not error <= self.ratio_guard:  # nor NaN
             raise TaccorlError(
                 f"post-training: before the first update of an iteration the ratio of probabilities is off 1 by {error:.2g}, "
                 f"allowed is {self.ratio_guard:g}: sampling and scoring do not compute the same policy. Check that its weights "

@@ -13,8 +13,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode
-from taccorl.data.joining import has_videos, join_numbers
-from taccorl.data.lerobot_format import _aggregate, merge, write_episodes
+from taccorl.data.joining import has_videos
+from taccorl.data.lerobot_format import _aggregate, _join, merge, write_episodes
 from taccorl.data.spec import DatasetSpec, load_dataset_spec
 from taccorl.errors import DatasetError
 
@@ -63,7 +63,7 @@ def table(root: Path, kind: str) -> pd.DataFrame:
 
 
 def test_it_is_what_lerobot_makes_of_them(parts: list[Path], tmp_path: Path) -> None:
-    join_numbers(parts, tmp_path / "ours")
+    _join(parts, tmp_path / "ours")
     _aggregate(parts, tmp_path / "theirs")
     for kind in ("data", "meta/episodes"):
         pd.testing.assert_frame_equal(table(tmp_path / "ours", kind), table(tmp_path / "theirs", kind))
@@ -88,7 +88,7 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
     small = {"data_files_size_in_mb": limit_mb, "chunks_size": per_chunk}
     monkeypatch.setattr(joining, "_MB", 1024 if limit_mb == 1 else 1024 * 1024)  # no file is smaller than 1 kB
     monkeypatch.setattr(joining, "_info", lambda root: read(root) | small)
-    join_numbers(parts, tmp_path / "all")
+    _join(parts, tmp_path / "all")
     for kind in ("data", "meta/episodes"):
         assert len(list((tmp_path / "all" / kind).glob("chunk-*/file-*.parquet"))) == files
         assert len(list((tmp_path / "all" / kind).glob("chunk-*"))) == -(-files // per_chunk)
