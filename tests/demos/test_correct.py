@@ -1,5 +1,6 @@
 """Corrections: where the expert takes over, from which states, and what becomes of each of the policy's episodes."""
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
+from taccorl.demos import correct as module
 from taccorl.demos.correct import (
     CorrectionPlan,
     PolicyEpisode,
@@ -161,6 +163,18 @@ def test_without_a_grasp_the_takeover_is_drawn_over_all_steps(sim: Simulation, s
         assert len(done.actions) == done.takeover_step + 3
         steps.append(done.takeover_step)
     assert len(set(steps)) > 2
+
+
+def test_a_policy_with_more_time_than_the_task_s_own_is_taken_over_beyond_it(
+    sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seed 0 draws step 8 of 10; the limit is 4 steps, also of the expert, which acts for 3 here."""
+    episode = held_still(sim, 0, 10)
+    monkeypatch.setattr(sim.judge, "limit_steps", 4)
+    done = correct_episode(plan(episode_length=10), sim, plan().rows(sim), episode)
+    assert done.cause == "drawn before the grasp" and done.takeover_step == 8
+    assert done.recorder is not None and len(done.recorder.rows) == 3
+    assert sim.judge.limit_steps == 4
 
 
 def test_a_policy_that_holds_still_has_stalled_after_a_second(sim: Simulation, stub: None) -> None:
@@ -360,3 +374,13 @@ def test_another_folder_is_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "out" / "mine").touch()
     with pytest.raises(InTheWayError, match="out is in the way"):
         check_out(plan(), tmp_path / "out")
+
+
+def test_a_dataset_of_other_corrections_is_in_the_way_before_the_policy_acts(tmp_path: Path) -> None:
+    store, out = Store(tmp_path / "store"), tmp_path / "out"
+    (tmp_path / "in").write_text("x", encoding="utf-8")
+    stage = dataclasses.replace(module._CORRECTIONS, fn=lambda _, inputs, folder: (folder / "x").write_text("x"))
+    store.run(stage, module._dataset_config(plan()), [store.source(tmp_path / "in")], destination=out)
+    module.check_out(plan(), out)
+    with pytest.raises(InTheWayError, match="out is in the way"):
+        module.check_out(plan(episodes=3), out)

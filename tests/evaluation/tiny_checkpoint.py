@@ -17,13 +17,16 @@ def write_checkpoint(folder: Path) -> Path:
     from tiny_policies import tiny_policy
 
     import taccorl.lerobot_plugin  # noqa: F401
+    from taccorl.policies.tactile_pi05.hand_poses import arm_names
 
     inputs = {
         "observation.state": PolicyFeature(FeatureType.STATE, (14,)),
         "observation.tactile": PolicyFeature(FeatureType.STATE, (1536,)),
         **{key: PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for key in IMAGE_KEYS.values()},
     }
-    policy = tiny_policy(fps=30, discrete_state_input=None, input_features=inputs)
+    policy = tiny_policy(
+        fps=30, discrete_state_input=None, action_feature_names=list(arm_names()), input_features=inputs
+    )
     middle = torch.tensor((ACTION_LOW + ACTION_HIGH) / 2, dtype=torch.float32)
     statistics = {
         name: {"q01": middle - 0.05, "q99": middle + 0.05, "min": middle - 0.05, "max": middle + 0.05}

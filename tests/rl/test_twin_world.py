@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from tiny_checkpoint import write_checkpoint
 
 from taccorl.evaluation.policy_actor import open_checkpoint, policy_batch
+from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.rollout import Clock
@@ -59,7 +60,7 @@ def test_the_policys_input_is_that_of_evaluation(envs: TaccorlVectorEnv, opened:
     for key, value in found.items():
         own = value.to(torch.float32) / 255 if value.dtype == torch.uint8 else value
         assert torch.equal(own, expected[key]), key  # pyright: ignore
-    assert set(opened.config.input_features) <= set(found)
+    assert {*opened.config.input_features, HAND_POSES} <= set(found)
 
 
 def test_without_noise_actions_are_those_of_evaluation(envs: TaccorlVectorEnv, opened: Any) -> None:
