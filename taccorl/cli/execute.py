@@ -8,6 +8,7 @@ them, at the policy's resolution. Only with that option can such a dataset be tr
 """
 
 import re
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,11 +45,15 @@ def main(argv: list[str]) -> int:
     plan = ExecutePlan(source=config.source, pictures=config.pictures)  # pyright: ignore[reportArgumentType]  # checked there
     _check_places(config)
     store = Store(config.store)
+    began_s = time.monotonic()
     report, seconds = execute_stored(plan, config.out, store, config.engine)
+    print(f"dataset made in {time.monotonic() - began_s:.0f} s")
     if plan.pictures == "cache":
         from taccorl.training.rendered_frames import render_frames
 
+        began_s = time.monotonic()
         frames, of_frames = render_frames(config.out, resolution, store, config.engine)
+        print(f"frames rendered and stored in {time.monotonic() - began_s:.0f} s")
         seconds |= of_frames
     print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
     print(

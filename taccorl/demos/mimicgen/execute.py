@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import mujoco
+import numpy as np
 
 import taccorl
 from taccorl.data.dataset import PROVENANCE
@@ -26,7 +27,7 @@ from taccorl.demos.mimicgen.augment import write_execution
 from taccorl.demos.mimicgen.execution import execute
 from taccorl.demos.mimicgen.from_dataset import simulation_told
 from taccorl.demos.mimicgen.stored_actions import StoredActions, read_stored
-from taccorl.demos.recorder import with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, with_simulator
 from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
@@ -86,6 +87,9 @@ def execute_stored(
         raise in_the_way(out, _DATASET, stored.meta["task"])
     sim = _stored(plan.source, source.digest)[1]
     spec = plan.contract(stored, sim, pictures=plan.pictures != "none")
+    # Touch is compiled once here and found by the workers; else each of them compiles it, a minute on sixteen cores.
+    sim.reset([0])
+    EpisodeRecorder(sim, spec, np.random.default_rng(0)).step(sim.targets[0])
     made: list[Executed] = (engine or LocalEngine()).map(
         functools.partial(_run, plan, source, store),
         range(num),
