@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 import yaml
 
+from taccorl.cli.parse import parse
+from taccorl.cli.post_train import PostTrainConfig
 from taccorl.diagnosis.axis_problem import load_axis
 from taccorl.sim.twin_file import load_twin
 
@@ -38,6 +40,7 @@ def test_every_file_is_loaded_by_what_reads_it(name: str, monkeypatch: pytest.Mo
         "twin.yaml": load_twin,
         "diagnose": load_axis,
         "cotrain": lambda path: lerobot_train(path, monkeypatch),
+        "post_train": lambda path: parse(PostTrainConfig, [f"--config_path={path}"]),
         "learn": lambda path: lerobot_train(path, monkeypatch),
     }
     assert readers[name.split("/")[0]](CONFIGS / name) is not None

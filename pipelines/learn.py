@@ -1,0 +1,83 @@
+"""``python -m pipelines.learn --task=assembly_2 [--small]``: a policy from scratch on one GPU, from sources to its score::
+
+    collect ── augment --rows=actions ── execute --pictures=cache ── lerobot-train --dataset.cache=gpu ── evaluate
+
+All of it is simulated: no robot is near. Everything lands in outputs/learn; a stopped run goes on where it was. It wants a GPU
+(docs/learning.md). ``--small`` shows the chain on a CPU in minutes and learns nothing.
+"""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+from pipelines.cotrain import run
+from taccorl.cli.parse import parse
+from taccorl.errors import TaccorlError
+from taccorl.training.lerobot_commands import Training
+
+SMALL = ("--sources=1", "--episodes=1", "--scored=2", "--episode_length=12", "--workers=1")
+SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]", "--cache=host")
+HOW = {"contact_mode": "closed_loop_expert", "disturbance": {"joint_rad": 0.02}}
+PX = 112
+
+
+@dataclass(kw_only=True)
+class LearnConfig:
+    """Demonstrations of the twin → policy → score."""
+
+    task: str = "assembly_2"
+    """assembly_1, assembly_2, puzzle, test_tube."""
+    sources: int = 10
+    """Episodes of the scripted expert …"""
+    episodes: int = 1000
+    """… and made of them, disturbed in transport and closed-loop in contact."""
+    workers: int = 16
+    """Processes that make demonstrations."""
+    train: Path = Path("configs/learn/small.yaml")
+    """Config of lerobot-train."""
+    train_options: list[str] = field(default_factory=list)
+    """Further words for lerobot-train, such as [--seed=1,--steps=8000]."""
+    cache: str = "gpu"
+    """Where frames are held: gpu, host, disk."""
+    scored: int = 512
+    """Scenes of the score, seeds 50000 and on: nothing is chosen by them."""
+    episode_length: int | None = None
+    """Control steps after which a scored episode is cut off; the task's own limit if not given."""
+    out: Path = Path("outputs/learn")
+
+
+def main(words: list[str]) -> None:
+    chosen = [*(SMALL if "--small" in words else ()), *(word for word in words if word != "--small")]
+    try:
+        config = parse(LearnConfig, chosen, prog="python -m pipelines.learn")
+    except TaccorlError as error:
+        raise SystemExit(str(error)) from None
+    if not config.train.is_file():  # before hours of demonstrations
+        raise SystemExit(f"--train={config.train}: no such file")
+    out, task, store = config.out / config.task, f"--task={config.task}", config.out / "store"
+    sources, actions, rows = out / "sources", out / f"actions_{config.episodes}", out / f"rows_{config.episodes}"
+    spec, kept, engine = out / "mimicgen.yaml", f"--store={store}", f"--engine.workers={config.workers}"
+    out.mkdir(parents=True, exist_ok=True)
+    told = yaml.safe_load(Path(f"data_specs/mimicgen/{config.task}.yaml").read_text(encoding="utf-8"))
+    spec.write_text(yaml.safe_dump(told | {"datagen_config": told.get("datagen_config", {}) | HOW}), encoding="utf-8")
+    run("taccorl", "collect", task, f"--episodes={config.sources}", "--images=false", f"--out={sources}", kept)
+    made = ("--rows=actions", f"--spec={spec}", f"--episodes={config.episodes}")
+    run("taccorl", "augment", task, f"--source={sources}", *made, f"--out={actions}", engine, kept)
+    frames = ("--pictures=cache", f"--resolution={PX}x{PX}")
+    run("taccorl", "execute", f"--source={actions}", f"--out={rows}", *frames, engine, kept)
+    cached = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}"]
+    training = Training(config.train, rows, [*cached, *config.train_options], out)
+    if command := training.command():
+        run(*command)
+    limit = [f"--episode_length={config.episode_length}"] if config.episode_length else []
+    score = out / f"score_{training.folder.name}"
+    if not score.exists():
+        scenes = (f"--episodes={config.scored}", "--seed=50000", *limit)
+        run("taccorl", "evaluate", f"--policy.path={training.policy}", task, *scenes, f"--out={score}")
+    print(f"\nscore: {score / 'report.html'}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
