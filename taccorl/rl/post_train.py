@@ -253,6 +253,8 @@ class PostTraining:
         if not count or len(last) < count or self._best == 0 or max(last) >= 0.5 * self._best:
             return
         folder = checkpoint.policy_folder(self.settings.out, checkpoint.BEST)
+        if not folder.is_dir():  # killed after the checkpoint was written and before it was linked
+            return
         best = TactilePI05Policy.from_pretrained(folder, config=self._actor.policy.config)
         self._actor.policy.load_state_dict(best.state_dict())
         lr = 0.5 * self._ppo.actor_optimizer.param_groups[0]["lr"]
