@@ -84,9 +84,9 @@ def main(argv: list[str]) -> int:
     check_path(out)
     if out.resolve().is_relative_to(config.store.resolve()) or config.store.resolve().is_relative_to(out.resolve()):
         raise DatasetError(f"--out={out} and --store={config.store} lie in one another: choose another --out")
-    check_out(plan, out)
     opened = open_policy(config.policy, plan.twin_config())
     plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
+    check_out(plan, out)  # before the policy acts
     store = Store(config.store)
     acted = policy_episodes(plan, lambda: opened.load(config.seed), config.num_envs, store, TextProgress())
     report = correct(plan, acted, out, store, config.engine)
