@@ -125,7 +125,7 @@ def _plan(config: AugmentConfig) -> "AugmentPlan":
 
 
 def _check_places(config: AugmentConfig, out: Path) -> None:
-    """Places that lie in one another would change while they are read."""
+    """Refuse an output folder inside an input folder or the store, or around it: writing would change what is being read."""
     from taccorl.data.lerobot_format import check_path
 
     check_path(out)

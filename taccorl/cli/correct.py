@@ -48,7 +48,8 @@ class CorrectConfig:
     episode_length: int | None = None
     """Control steps until the policy is cut off; the task's own limit if not given."""
     images: bool = True
-    """Render the dataset's cameras (needs OpenGL). A policy with cameras needs OpenGL anyway."""
+    """Render the dataset's cameras (needs OpenGL). A policy with camera inputs needs OpenGL even if
+    this is false."""
     store: Path = Path("outputs/store")
     """Finished episodes are kept here."""
     engine: Engine = field(default_factory=LocalEngine)

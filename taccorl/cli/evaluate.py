@@ -70,7 +70,8 @@ class EvaluateConfig:
     failures: int = 4
     """Failed episodes with pictures and a Rerun file; 0: none."""
     images: bool = True
-    """Render the cameras for these (needs OpenGL). A policy with cameras needs OpenGL anyway."""
+    """Render the cameras for these (needs OpenGL). A policy with camera inputs needs OpenGL even if this is
+    false."""
 
 
 def main(argv: list[str]) -> int:

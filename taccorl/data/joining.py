@@ -1,8 +1,8 @@
-"""LeRobot datasets without videos into one: their tables one behind the other.
+"""Merge LeRobot datasets that have no videos, by concatenating their Parquet tables.
 
-LeRobot 0.6.1's ``aggregate_datasets`` spends 3.7 CPU-s on each dataset that it appends (it reads the statistics of an episode as
-138 typed columns, several times), 18 minutes for 300 demonstrations. What is written here is the same but for the division into
-files; a test compares.
+LeRobot 0.6.1's ``aggregate_datasets`` took 90 CPU-s for 24 demonstrations (one run, under a profiler), as it reads the statistics of
+each episode as 138 typed columns, several times. The result here is the same except for how rows are divided into files; a test
+compares both.
 """
 
 import functools

@@ -124,7 +124,7 @@ class Stored:
     """The episodes of an earlier evaluation, as its folder holds them."""
 
     policy: str
-    """Name of its first policy, and the folder."""
+    """Label: name of the first policy in that evaluation, followed by the folder in brackets."""
     rows: list[EpisodeRow]
     """Of that policy."""
 

@@ -105,7 +105,7 @@ class PairedComparison:
 
     @property
     def n(self) -> int:
-        """Scenes."""
+        """Number of scenes that both policies were scored on."""
         return self.both + self.only_first + self.only_second + self.neither
 
     @property

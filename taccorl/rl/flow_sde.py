@@ -57,7 +57,7 @@ class FlowSDE:
     def __init__(self, settings: FlowSDESettings) -> None:
         self.num_steps, self.level = settings.num_steps, settings.level
         self.num_stochastic = settings.num_steps if settings.stochastic_steps == "all" else 1
-        # As lerobot.policies.common.flow_matching.euler_integrate computes them, for the same bits.
+        # Same operations, in the same order, as lerobot.policies.common.flow_matching.euler_integrate: results are bit-identical.
         self.dt = -1.0 / self.num_steps
         self.times = [1.0 + k * self.dt for k in range(self.num_steps)]
 

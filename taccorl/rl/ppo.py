@@ -1,4 +1,5 @@
-"""Clipped PPO over chunks (Schulman et al., arXiv 1707.06347), with the real-data anchor in every optimiser step of the actor.
+"""Clipped PPO over chunks (Schulman et al., arXiv 1707.06347), where each optimiser step of the actor also
+minimises the flow loss on real data (``anchor``).
 
     ratio = exp(log π(chunk) − log π_old(chunk))
     L_PPO = −E[min(ratio · A, clip(ratio, 1 − ε, 1 + ε) · A)]        L = L_PPO + β · ℓ_flow(real)

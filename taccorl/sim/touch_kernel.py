@@ -130,7 +130,7 @@ def shape_tables(shapes: Sequence[Shapes]) -> dict[str, np.ndarray]:
     surfaces: list[Surface] = []
     num_faces = num_seams = 0
     for one in shapes:
-        # Among geoms of equal depth the first counts: by kind, then by id.
+        # If several geoms have the same depth, the first is kept, ordered by kind, then by id.
         for k in np.argsort(one.geoms, kind="stable"):
             rows["geom"].append(one.geoms[k])
             solid = isinstance(one, Polyhedra)
@@ -279,7 +279,7 @@ def _place(geoms, pads, fields, n, p, g, position, velocity):
     site_pos, site_mat = fields.site_xpos[n, pads.site[p]], fields.site_xmat[n, pads.site[p]]
     away = _difference(fields.geom_xpos[n, geom], site_pos)
     mat = fields.geom_xmat[n, geom]
-    # Columns of the pad's axes in the geom's frame, and the pad's origin there.
+    # The pad's axes as columns, and the pad's origin [m], both in the geom's frame.
     x = _row_times((site_mat[0], site_mat[3], site_mat[6]), mat)
     y = _row_times((site_mat[1], site_mat[4], site_mat[7]), mat)
     z = _row_times((site_mat[2], site_mat[5], site_mat[8]), mat)

@@ -16,7 +16,7 @@ from taccorl.demos.recorder import EpisodeRecorder
 from taccorl.sim.simulation import Simulation
 
 DIFFERS = "last_state_differs"
-"""In the provenance of an episode: its execution ended in another state than its attempt."""
+"""Key in an episode's provenance: true if executing its stored actions ended in a different simulator state than the attempt."""
 _PAD_NOISE = 2  # with the scene's seed
 
 

@@ -94,7 +94,7 @@ class FullBackbone(CompiledBackbone):
 
 
 class SmallBackbone(CompiledBackbone):
-    """LeRobot's PaliGemma with its action expert, in another size and without language heads.
+    """LeRobot's PaliGemma and action expert with the widths and depth of a ``Size``, without the output layers for text.
 
     Its weights are float32 whatever ``--policy.dtype`` says: with bfloat16, LeRobot's trainer computes in it (autocast), and
     small changes of weights are not lost.

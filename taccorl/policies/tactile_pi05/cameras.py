@@ -93,7 +93,7 @@ def encode_pictures(camera: nn.Module, images_B3RC: Tensor) -> Tensor:
 
 
 class CameraTower(nn.Module):
-    """A ``CameraEncoder`` for each camera, as a wrist looks for other things than a camera above the table."""
+    """One ``CameraEncoder`` per camera, without shared weights: wrist cameras and the fixed camera show different views."""
 
     def __init__(
         self, num_cameras: int, channels: tuple[int, ...], num_points: int, num_tokens: int, width: int

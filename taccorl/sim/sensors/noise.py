@@ -26,7 +26,7 @@ _HALF, _LOW = np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
 class ScanNoise(NamedTuple):
-    """Normal numbers of N simulations; those of simulation i are the first of ``default_rng((seeds[i], steps[i]))``."""
+    """Standard normal noise of N simulations. Row i equals the first draws of ``np.random.default_rng((seeds[i], steps[i]))``."""
 
     seeds: np.ndarray
     """(N,) 0 … 2⁶³ − 1."""
