@@ -1,8 +1,8 @@
 """Merge LeRobot datasets that have no videos, by concatenating their Parquet tables.
 
-LeRobot 0.6.1's ``aggregate_datasets`` took 90 CPU-s for 24 demonstrations (one run, under a profiler), as it reads the statistics of
-each episode as 138 typed columns, several times. The result here is the same except for how rows are divided into files; a test
-compares both.
+LeRobot 0.6.1's ``aggregate_datasets`` took 90 CPU-s for 24 demonstrations (one run, under a profiler): it reads the statistics
+of each episode as 138 typed columns, several times. The result here is the same except for how rows are divided into files; a
+test compares both.
 """
 
 import functools
