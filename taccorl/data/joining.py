@@ -7,7 +7,10 @@ test compares both.
 
 import functools
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,8 @@ import pyarrow.parquet as pq
 
 _MB = 1024 * 1024
 _DATA, _EPISODES = "data", "meta/episodes"
+_Place = tuple[int, int]  # chunk and file
+_Source = tuple[_Place, Path, Callable[[Path, Any], pa.Table]]  # where to, from where, and how it is read
 
 
 def has_videos(root: Path) -> bool:
@@ -41,37 +46,49 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
             if info[key] != infos[0][key]:
                 raise ValueError(f"{key} of {root.name} is {info[key]}, that of {roots[0].name} {infos[0][key]}")
     tasks = _Tasks(roots)
-    data = _Files(destination, _DATA, infos[0])
-    episodes = _Files(destination, _EPISODES, infos[0])
-    first_row = first_episode = 0
-    for root, info in zip(roots, infos, strict=True):
-        place: dict[tuple[int, int], tuple[int, int]] = {}
-        for path in _files(root, _DATA):
-            table = pq.read_table(path)
-            table = _plus(table, "index", first_row)
-            table = _plus(table, "episode_index", first_episode)
-            table = _set(table, "task_index", tasks.renumbered(root, table["task_index"]))
-            place[_numbers(path)] = data.append(table, path.stat().st_size)
-        for path in _files(root, _EPISODES):
-            table = pq.read_table(path)
-            table = _plus(table, "episode_index", first_episode)
-            for key in ("dataset_from_index", "dataset_to_index"):
-                table = _plus(table, key, first_row)
-            table = _with_own_statistics(table, first_row, first_episode, tasks)
-            was = zip(*(table[f"data/{kind}_index"].to_pylist() for kind in ("chunk", "file")), strict=True)
-            table = _placed(table, "data", [place[numbers] for numbers in was])
-            here = episodes.place_of(path.stat().st_size)
-            episodes.append(_placed(table, "meta/episodes", [here] * len(table)), path.stat().st_size)
-        first_row += info["total_frames"]
-        first_episode += info["total_episodes"]
-    data.close()
-    episodes.close()
+    rows = np.cumsum([0, *(info["total_frames"] for info in infos)])
+    episodes = np.cumsum([0, *(info["total_episodes"] for info in infos)])
+    parts = [_Part(root, int(rows[k]), int(episodes[k])) for k, root in enumerate(roots)]
+    data, meta = _Files(destination, _DATA, infos[0]), _Files(destination, _EPISODES, infos[0])
+    for part in parts:
+        part.data = {path: data.place_of(path.stat().st_size) for path in _files(part.root, _DATA)}
+        part.episodes = {path: meta.place_of(path.stat().st_size) for path in _files(part.root, _EPISODES)}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # pyarrow works outside of Python's lock
+        data.write(pool, [(place, path, part.rows_table) for part in parts for path, place in part.data.items()], tasks)
+        sources = [(place, path, part.episodes_table) for part in parts for path, place in part.episodes.items()]
+        meta.write(pool, sources, tasks, at_once=True)
     tasks.write(destination)
-    totals = {"total_episodes": first_episode, "total_frames": first_row, "total_tasks": len(tasks.names)}
-    splits = {"train": f"0:{first_episode}"}
+    totals = {"total_episodes": int(episodes[-1]), "total_frames": int(rows[-1]), "total_tasks": len(tasks.names)}
+    splits = {"train": f"0:{episodes[-1]}"}
     (destination / "meta/info.json").write_text(
         json.dumps(infos[0] | totals | {"splits": splits}, indent=4, ensure_ascii=False), encoding="utf-8"
     )
+
+
+@dataclass(eq=False)
+class _Part:
+    """A dataset that goes in: from which row and episode on, and into which chunk and file each of its files goes."""
+
+    root: Path
+    first_row: int
+    first_episode: int
+    data: dict[Path, _Place] = field(default_factory=dict)
+    episodes: dict[Path, _Place] = field(default_factory=dict)
+
+    def rows_table(self, path: Path, tasks: "_Tasks") -> pa.Table:
+        table = _plus(pq.read_table(path), "index", self.first_row)
+        table = _plus(table, "episode_index", self.first_episode)
+        return _set(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
+
+    def episodes_table(self, path: Path, tasks: "_Tasks") -> pa.Table:
+        table = _plus(pq.read_table(path), "episode_index", self.first_episode)
+        for key in ("dataset_from_index", "dataset_to_index"):
+            table = _plus(table, key, self.first_row)
+        table = _with_own_statistics(table, self.first_row, self.first_episode, tasks)
+        was = zip(*(table[f"data/{kind}_index"].to_pylist() for kind in ("chunk", "file")), strict=True)
+        into = {_numbers(own): place for own, place in self.data.items()}
+        table = _placed(table, "data", [into[numbers] for numbers in was])
+        return _placed(table, "meta/episodes", [self.episodes[path]] * len(table))
 
 
 class _Files:
@@ -80,30 +97,43 @@ class _Files:
     def __init__(self, root: Path, kind: str, info: dict[str, Any]) -> None:
         self._root, self._kind = root, kind
         self._limit, self._per_chunk = info["data_files_size_in_mb"] * _MB, info["chunks_size"]
-        self._writer: pq.ParquetWriter | None = None
-        self._number, self._size = -1, 0
+        self._number, self._size = 0, 0
 
-    def place_of(self, size: int) -> tuple[int, int]:
-        """Chunk and file that a table of ``size`` bytes will be appended to."""
-        full = self._writer is None or (self._size > 0 and self._size + size > self._limit)
-        return divmod(self._number + full, self._per_chunk)
-
-    def append(self, table: pa.Table, size: int) -> tuple[int, int]:
-        """Chunk and file that it came into."""
-        chunk, number = place = self.place_of(size)
-        if self._writer is None or chunk * self._per_chunk + number != self._number:
-            self.close()
-            path = self._root / self._kind / f"chunk-{chunk:03d}" / f"file-{number:03d}.parquet"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = pq.ParquetWriter(path, table.schema, compression="snappy", use_dictionary=True)
-            self._number, self._size = chunk * self._per_chunk + number, 0
-        self._writer.write_table(table)
+    def place_of(self, size: int) -> _Place:
+        """Chunk and file of the next table, of ``size`` bytes."""
+        if self._size > 0 and self._size + size > self._limit:
+            self._number, self._size = self._number + 1, 0
         self._size += size
-        return place
+        return divmod(self._number, self._per_chunk)
 
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
+    def write(
+        self, pool: ThreadPoolExecutor, sources: Sequence[_Source], tasks: "_Tasks", *, at_once: bool = False
+    ) -> None:
+        """Each file by a thread of its own.
+
+        Args:
+            sources: in the order of their rows.
+            at_once: a file's tables as one, for small ones.
+        """
+        by_file: dict[_Place, list[_Source]] = {}
+        for source in sources:
+            by_file.setdefault(source[0], []).append(source)
+
+        def tables(own: list[_Source]) -> Iterator[pa.Table]:
+            made = (table(path, tasks) for _, path, table in own)
+            yield from [pa.concat_tables(made)] if at_once else made
+
+        def one(place: _Place) -> None:
+            path = self._root / self._kind / f"chunk-{place[0]:03d}" / f"file-{place[1]:03d}.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            writer: pq.ParquetWriter | None = None
+            for table in tables(by_file[place]):
+                writer = writer or pq.ParquetWriter(path, table.schema, compression="snappy", use_dictionary=True)
+                writer.write_table(table)
+            if writer is not None:
+                writer.close()
+
+        list(pool.map(one, by_file))
 
 
 class _Tasks:

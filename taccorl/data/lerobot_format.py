@@ -372,7 +372,7 @@ def require_videos(root: Path) -> None:
     Raises:
         DatasetError: pictures of the dataset are in the cache of training frames alone.
     """
-    if unstored := Dataset(root).unstored:
+    if has_videos(root) and (unstored := Dataset(root).unstored):
         raise DatasetError(
             f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training, so it cannot be merged: "
             "make it with taccorl execute --pictures=video"
