@@ -50,6 +50,8 @@ class CorrectConfig:
     images: bool = True
     """Render the dataset's cameras (needs OpenGL). A policy with camera inputs needs OpenGL even if
     this is false."""
+    part_poses: bool = False
+    """Write the poses of the task's parts into every row, as taccorl execute --part_poses=true."""
     store: Path = Path("outputs/store")
     """Finished episodes are kept here."""
     engine: Engine = field(default_factory=LocalEngine)
@@ -77,6 +79,7 @@ def main(argv: list[str]) -> int:
         episode_length=config.episode_length,
         takeover=config.takeover,
         images=config.images,
+        part_poses=config.part_poses,
         seed=config.seed,
     )
     if config.num_envs < 1:

@@ -1,4 +1,5 @@
-"""``taccorl execute --source=outputs/many_actions --out=outputs/many [--pictures=video|cache|none] [--resolution=112x112]``
+"""``taccorl execute --source=outputs/many_actions --out=outputs/many [--pictures=video|cache|none] [--resolution=112x112]
+[--part_poses=true]``
 
 Stored actions (``taccorl augment --rows=actions``) into a LeRobot dataset, on the machine where it is needed: every demonstration
 is executed once, by as many workers as --engine.workers says. Demonstrations that are no success here are left out and counted.
@@ -29,6 +30,9 @@ class ExecuteConfig:
     """Finished episodes and rendered frames are kept here; lerobot-train finds frames by --dataset.cache_store."""
     pictures: str = "video"
     """video; cache: frames for lerobot-train --dataset.cache alone; none."""
+    part_poses: bool = False
+    """Write the poses of the task's parts into every row (observation.environment_state), for
+    --policy.part_poses and --policy.pose_loss."""
     resolution: str | None = None
     """Of frames in the cache, rows x columns: 112x112, as --policy.image_resolution; the cameras' own 224x224 if not given."""
     engine: Engine = field(default_factory=LocalEngine)
@@ -42,7 +46,11 @@ def main(argv: list[str]) -> int:
     from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
     from taccorl.lineage.store import Store
 
-    plan = ExecutePlan(source=config.source, pictures=config.pictures)  # pyright: ignore[reportArgumentType]  # checked there
+    plan = ExecutePlan(
+        source=config.source,
+        pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
+        part_poses=config.part_poses,
+    )
     _check_places(config)
     store = Store(config.store)
     began_s = time.monotonic()

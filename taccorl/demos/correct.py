@@ -89,6 +89,8 @@ class CorrectionPlan:
     takeover: str = "failures"
     """``failures``: episodes in which the policy succeeds by itself are kept out; ``all``: they are corrected, too."""
     images: bool = True
+    part_poses: bool = False
+    """Rows have the poses of the task's parts (``observation.environment_state``)."""
     seed: int = 0
     """Of scenes, takeovers and experts."""
 
@@ -129,7 +131,8 @@ class CorrectionPlan:
 
     def rows(self, sim: Simulation) -> DatasetSpec:
         """What a row of the dataset holds."""
-        return with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=self.images)
+        spec = load_dataset_spec(find_spec("taccorl_bimanual"))
+        return with_simulator(spec, sim, pictures=self.images, parts=self.part_poses)
 
     def scene_config(self) -> dict[str, Any]:
         """What the policy's episodes depend on besides the policy and their seeds."""
@@ -146,6 +149,7 @@ class CorrectionPlan:
     def config(self, k: int) -> dict[str, Any]:
         """What the correction of episode ``k`` depends on besides the policy's episodes."""
         own = {"policy_digest": self.policy_digest, "takeover": self.takeover, "images": self.images, "origin": ORIGIN}
+        own |= {"part_poses": True} if self.part_poses else {}
         return canonical(self.scene_config() | own | {"root_seed": self.seed, "episode": k})
 
 
@@ -311,6 +315,7 @@ def correct(
 
 def _dataset_config(plan: CorrectionPlan) -> dict[str, Any]:
     own = {"task": plan.task, "policy": plan.policy, "policy_digest": plan.policy_digest, "seed": plan.seed}
+    own |= {"part_poses": True} if plan.part_poses else {}
     return canonical(own | {"episodes": plan.episodes, "takeover": plan.takeover})
 
 

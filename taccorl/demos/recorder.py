@@ -15,20 +15,28 @@ import numpy as np
 
 from taccorl.data.episode import EXECUTED, Episode, Pictures
 from taccorl.data.spec import DatasetSpec, FeatureSpec
+from taccorl.sim.part_poses import POSE_UNITS, part_pose_names, part_poses, posed_bodies
 from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation, Watch
+from taccorl.sim.spaces import PARTS_KEY
 from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
 ORIGIN = "MuJoCo twin, not a robot"
 _ANY = (-1e12, 1e12)
+_REACH = (-10.0, 10.0)  # [m] a part that fell off the table is still within it
 PICTURE = "observation.images."
 
 
-def with_simulator(spec: DatasetSpec, sim: Simulation, *, pictures: bool, executed: bool = False) -> DatasetSpec:
+def with_simulator(
+    spec: DatasetSpec, sim: Simulation, *, pictures: bool, executed: bool = False, parts: bool = False
+) -> DatasetSpec:
     """The dataset contract with the simulator's own features: state, seed, subtask of each arm, success; and what was executed,
     where ``action`` is what was intended.
 
     ``sim.state`` has the size of the task's scene, so datasets of different tasks merge only without it.
+
+    Args:
+        parts: rows have the poses of the task's parts (``part_poses``), too.
     """
     own = {"unit": "1", "frame": "simulator", "rate_hz": float(spec.fps)}
     features = {
@@ -44,6 +52,18 @@ def with_simulator(spec: DatasetSpec, sim: Simulation, *, pictures: bool, execut
         "sim.subtask": FeatureSpec(dtype="int16", shape=(len(ARMS),), range=(0, 99), names=ARMS, **own),
         "sim.success": FeatureSpec(dtype="int16", shape=(1,), range=(0, 1), **own),
     }
+    if parts:
+        names = part_pose_names(sim.task)
+        features[PARTS_KEY] = FeatureSpec(
+            dtype="float32",
+            shape=(len(names),),
+            unit=POSE_UNITS * len(posed_bodies(sim.task)),
+            frame="world",
+            rate_hz=float(spec.fps),
+            range=_REACH,
+            names=names,
+            optional=True,
+        )
     if executed:
         features[EXECUTED] = spec.features["action"]
     return dataclasses.replace(spec, features=features)
@@ -88,6 +108,8 @@ class EpisodeRecorder:
             "sim.seed": sim.seeds[:1].copy(),
             "sim.subtask": sim.judge.subtask[0].astype(np.int16),
         }
+        if PARTS_KEY in self.spec.features:
+            row[PARTS_KEY] = part_poses(sim)[0]
         began_s = time.perf_counter()
         sim.step(action[None].astype(np.float64), watch=self._dense.watch() if self._dense else watch)
         self.physics_s += time.perf_counter() - began_s

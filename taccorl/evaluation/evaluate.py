@@ -71,7 +71,7 @@ class Scenes:
         """
         return load_twin(self.twin) if self.twin else TwinConfig()
 
-    def environments(self, task: str, num_envs: int, *, images: bool) -> TaccorlVectorEnv:
+    def environments(self, task: str, num_envs: int, *, images: bool, part_poses: bool = False) -> TaccorlVectorEnv:
         """That stand still once their episode is over.
 
         Raises:
@@ -87,6 +87,7 @@ class Scenes:
             num_threads=min(num_envs, len(os.sched_getaffinity(0))),
             autoreset=AutoresetMode.DISABLED,
             max_episode_steps=self.episode_length,
+            part_poses=part_poses,
         )
 
 
@@ -100,13 +101,14 @@ def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> lis
     for task in scenes.tasks:
         actor.restart()
         size = min(scenes.batch_size or scenes.episodes, actor.max_batch or scenes.episodes, scenes.episodes)
-        envs = scenes.environments(task, size, images=actor.needs_images)
+        seen = {"images": actor.needs_images, "part_poses": actor.needs_part_poses}
+        envs = scenes.environments(task, size, **seen)
         try:
             for first in range(0, scenes.episodes, size):
                 seeds = scenes.seeds[first : first + size]
                 if len(seeds) < size:
                     envs.close()
-                    envs = scenes.environments(task, len(seeds), images=actor.needs_images)
+                    envs = scenes.environments(task, len(seeds), **seen)
                 found += roll_out(
                     envs, actor, seeds, _with_prefix(progress, f"{task}, seeds {seeds[0]} … {seeds[-1]}: ")
                 )

@@ -19,6 +19,7 @@ class ExpertActor:
 
     name = EXPERT
     needs_images = False
+    needs_part_poses = False
     max_batch: int | None = 1
     """An expert drives one simulation."""
 

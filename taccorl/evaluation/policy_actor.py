@@ -25,10 +25,24 @@ from taccorl.evaluation.preflight import PolicyFacts
 from taccorl.evaluation.rollouts import Acted
 from taccorl.lineage.digest import digest_file, digest_files
 from taccorl.sim.lerobot_env import raw_names
-from taccorl.sim.spaces import STATE_KEY, Observation
+from taccorl.sim.part_poses import part_pose_names
+from taccorl.sim.spaces import PARTS_KEY, STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 Processor = Callable[[Any], Any]
+
+
+def require_same_parts(config: Any, envs: TaccorlVectorEnv) -> None:
+    """
+    Raises:
+        TaccorlError: the policy that is told the poses of the parts was trained with those of another task.
+    """
+    own, there = tuple(config.part_names or ()), part_pose_names(envs.sim.task)
+    if own != there:
+        raise TaccorlError(
+            f"--task={envs.task}: its part poses are {', '.join(there[::9])} …, the policy was trained with "
+            f"{', '.join(own[::9])} …: another task"
+        )
 
 
 def policy_batch(
@@ -197,6 +211,11 @@ class PolicyActor:
         features = getattr(self._config, "input_features", None)
         return features is None or any(feature.type is FeatureType.VISUAL for feature in features.values())
 
+    @property
+    def needs_part_poses(self) -> bool:
+        """Whether the poses of the task's parts are among the policy's inputs."""
+        return PARTS_KEY in (getattr(self._config, "input_features", None) or {})
+
     def looks_now(self) -> bool:
         """Whether a picture is used in this step: not while a policy without a history of observations (``n_obs_steps`` = 1)
         still has actions of a chunk in LeRobot's ``_action_queue``. Rendering is most of the time of a rollout."""
@@ -208,7 +227,13 @@ class PolicyActor:
         set_rng_state(self._random_state)
 
     def begin(self, envs: TaccorlVectorEnv) -> None:
-        """Forget the last episode."""
+        """Forget the last episode.
+
+        Raises:
+            TaccorlError: the policy was trained on the poses of other parts.
+        """
+        if self.needs_part_poses:
+            require_same_parts(self._config, envs)
         self.policy.reset()
         self._instructions = [envs.task_description] * envs.num_envs
 

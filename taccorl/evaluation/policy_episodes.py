@@ -57,7 +57,7 @@ def _act(plan: CorrectionPlan, actor: Actor, num_envs: int, progress: Progress |
     actor.restart()
     for first in range(0, plan.episodes, size):
         seeds = plan.scene_seeds[first : first + size]
-        envs = scenes.environments(plan.task, len(seeds), images=actor.needs_images)
+        envs = scenes.environments(plan.task, len(seeds), images=actor.needs_images, part_poses=actor.needs_part_poses)
         try:
             rollouts = roll_out(envs, actor, seeds, progress)
         finally:

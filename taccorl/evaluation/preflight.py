@@ -12,7 +12,7 @@ import numpy as np
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, check_actions
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, IMAGE_SHAPE, STATE_KEY, TACTILE_KEY
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, IMAGE_SHAPE, PARTS_KEY, STATE_KEY, TACTILE_KEY
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 
 NOT_STATED = "not stated"
@@ -56,6 +56,7 @@ def preflight(policy: PolicyFacts, twin: TwinConfig) -> list[Check]:
         _cameras(policy, twin),
         _same("state", _shape(policy.inputs.get(STATE_KEY)), _shape(ACTION_LOW.shape), optional=True),
         *_touch(policy),
+        *_parts(policy),
         *_other_inputs(policy),
         _same("action", _shape(policy.action_shape), _shape(ACTION_LOW.shape)),
         *_names(policy),
@@ -116,8 +117,15 @@ def _touch(policy: PolicyFacts) -> list[Check]:
     return checks
 
 
+def _parts(policy: PolicyFacts) -> list[Check]:
+    """Which parts there are, each task says; the policy compares names when its episodes begin."""
+    if PARTS_KEY not in policy.inputs:
+        return []
+    return [Check("poses of the parts", _shape(policy.inputs[PARTS_KEY]), "those of each task", "same")]
+
+
 def _other_inputs(policy: PolicyFacts) -> list[Check]:
-    known = {STATE_KEY, TACTILE_KEY, *IMAGE_KEYS.values()}
+    known = {STATE_KEY, TACTILE_KEY, PARTS_KEY, *IMAGE_KEYS.values()}
     others = [k for k in policy.inputs if k not in known and not k.startswith(_IMAGES)]
     return [Check("other inputs", ", ".join(others), "none", "differs")] if others else []
 

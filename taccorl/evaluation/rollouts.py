@@ -43,6 +43,11 @@ class Actor(Protocol):
         """Whether the actor uses camera pictures at all; if not, nothing is rendered."""
         ...
 
+    @property
+    def needs_part_poses(self) -> bool:
+        """Whether observations must have the poses of the task's parts."""
+        ...
+
     def looks_now(self) -> bool:
         """Whether ``act`` uses the newest pictures; else it gets those of the last time, and nothing is rendered."""
         ...

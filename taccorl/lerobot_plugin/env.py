@@ -29,6 +29,7 @@ _FEATURES_MAP = {
     "tactile": "observation.tactile",
     **{key: key for key in _IMAGES},
 }
+_PARTS = "environment_state"
 _FPS = 30
 
 
@@ -54,9 +55,19 @@ class TaccorlEnvConfig(EnvConfig):
     episode_length: int | None = None
     """Control steps until an episode is cut off; None: the task's own time limit."""
 
+    part_poses: bool = False
+    """Observe the poses of the task's parts, too (``observation.environment_state``), for policies with --policy.part_poses."""
+
     def __post_init__(self) -> None:
         if self.fps != _FPS:
             raise TaccorlError(f"env.fps: {self.fps}; the twin is controlled at {_FPS} steps a second")
+        if self.part_poses:
+            from taccorl.sim.part_poses import part_pose_names
+            from taccorl.sim.tasks import tasks
+
+            numbers = len(part_pose_names(tasks.get(str(self.task))))
+            self.features[_PARTS] = PolicyFeature(FeatureType.ENV, (numbers,))
+            self.features_map[_PARTS] = f"observation.{_PARTS}"
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -67,6 +78,7 @@ class TaccorlEnvConfig(EnvConfig):
             "randomization": self.randomization,
             "max_episode_steps": self.episode_length,
             "render_mode": "rgb_array",
+            "part_poses": self.part_poses,
         }
 
     def create_envs(

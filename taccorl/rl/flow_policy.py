@@ -17,6 +17,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import Tensor, nn
 
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_sde import Draws, FlowSDE, Sampled, Velocity
 from taccorl.rl.settings import PolicySettings
 
@@ -117,7 +118,8 @@ class TactileFlowPolicy(FlowPolicy):
             prefix = self._prefix(*seen, *(x[rows] for x in prompt))
             features_BF = prefix.mean_BF
             if not policy.config.has_discrete_state:  # else the prompt has it
-                features_BF = torch.cat([features_BF, batch[OBS_STATE][rows].to(torch.float32)], dim=1)
+                numbers = [OBS_STATE] + [PART_POSES] * policy.config.part_poses
+                features_BF = torch.cat([features_BF, *(batch[key][rows].to(torch.float32) for key in numbers)], dim=1)
 
             def velocity(x_BHD: Tensor, t_B: Tensor) -> Tensor:
                 return self.model.denoise_step(prefix.valid_BT, prefix.cache, x_BHD, t_B)

@@ -84,7 +84,7 @@ class PostTraining:
         self._sde, self._clock = FlowSDE(settings.noise), Clock(device)
         self._generator = torch.Generator().manual_seed(settings.seed)
         needs_images = bool(policy.config.image_features)
-        envs = _environments(settings, twin, images=needs_images)
+        envs = _environments(settings, twin, images=needs_images, part_poses=policy.config.part_poses)
         self.world = TwinWorld(
             envs,
             policy.config,
@@ -284,7 +284,7 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
     return opened
 
 
-def _environments(settings: PostTrainSettings, twin: TwinConfig, *, images: bool) -> TaccorlVectorEnv:
+def _environments(settings: PostTrainSettings, twin: TwinConfig, *, images: bool, part_poses: bool) -> TaccorlVectorEnv:
     env = settings.env
     if env.task is None:
         raise TaccorlError("missing --env.task=…, such as assembly_2")
@@ -298,6 +298,7 @@ def _environments(settings: PostTrainSettings, twin: TwinConfig, *, images: bool
         num_threads=min(env.num_envs, len(os.sched_getaffinity(0))),
         autoreset=AutoresetMode.DISABLED,
         max_episode_steps=env.episode_length,
+        part_poses=part_poses,
     )
 
 

@@ -16,13 +16,14 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import Tensor
 
 from taccorl.errors import TaccorlError
-from taccorl.evaluation.policy_actor import Processor, policy_batch
+from taccorl.evaluation.policy_actor import Processor, policy_batch, require_same_parts
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
+from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
 from taccorl.rl.rollout import SUCCESS, Acted, Clock, Seen
 from taccorl.sim.episode_seeds import episode_seed
 from taccorl.sim.simulation import Snapshot
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 
@@ -41,12 +42,14 @@ class TwinWorld:
     ) -> None:
         """
         Args:
-            envs: with ``AutoresetMode.DISABLED``, and pictures on request if the policy has cameras.
+            envs: with ``AutoresetMode.DISABLED``, pictures on request if the policy has cameras, and poses of the parts if it is
+                told them.
             config: ``TactilePI05Config`` of the policy.
             privileged: give the critic the simulator's state.
 
         Raises:
-            TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor.
+            TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor; or the policy was trained
+                on the poses of other parts.
         """
         assert envs.autoreset is AutoresetMode.DISABLED
         if config.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY) is not NormalizationMode.IDENTITY:
@@ -55,6 +58,8 @@ class TwinWorld:
             )
         self.envs, self._config, self._clock, self._privileged = envs, config, clock, privileged
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
+        if config.part_poses:
+            require_same_parts(config, envs)
         self._device = torch.device(config.device)
         self._history = config.tactile_history
         inputs = config.input_features
@@ -62,6 +67,7 @@ class TwinWorld:
         self.needs_images = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
         self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK}
         self._kept |= {HAND_POSES} if config.knows_hands else set()
+        self._kept |= {PART_POSES} if config.part_poses else set()
         self._root = 0
         self._episode_N = np.zeros(envs.num_envs, dtype=np.int64)
         self._observation: Observation = {}
@@ -129,6 +135,8 @@ class TwinWorld:
     def _seen(self, observation: Observation, window_NLK: np.ndarray, ids: np.ndarray) -> Seen:
         with self._clock.part("policy"):
             numbers = {STATE_KEY: observation[STATE_KEY], TACTILE_KEY: window_NLK}
+            if PARTS_KEY in observation:
+                numbers[PARTS_KEY] = observation[PARTS_KEY]
             instructions = [self.envs.task_description] * len(ids)
             found = policy_batch(self._preprocessor, numbers, instructions)
             batch: Batch = {k: x.to(self._device) for k, x in found.items() if k in self._kept}

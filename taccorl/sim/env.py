@@ -39,6 +39,7 @@ class TaccorlEnv(gymnasium.Env):
         seed: int | None = None,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        part_poses: bool = False,
     ) -> None:
         """Arguments and errors: ``TaccorlVectorEnv``."""
         self._envs = TaccorlVectorEnv(
@@ -52,6 +53,7 @@ class TaccorlEnv(gymnasium.Env):
             autoreset=AutoresetMode.DISABLED,
             max_episode_steps=max_episode_steps,
             render_mode=render_mode,
+            part_poses=part_poses,
         )
         self.task, self.task_description, self.render_mode = task, self._envs.task_description, render_mode
         self.observation_space = self._envs.single_observation_space

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from taccorl.sim.env import TaccorlEnv
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 
@@ -20,6 +20,7 @@ def raw_names(observation: Observation) -> dict[str, Any]:
     pixels = {name: observation[IMAGE_KEYS[name]] for name in CAMERAS if IMAGE_KEYS[name] in observation}
     return {
         **({"pixels": pixels} if pixels else {}),
+        **({"environment_state": observation[PARTS_KEY]} if PARTS_KEY in observation else {}),
         "agent_pos": observation[STATE_KEY],
         "tactile": observation[TACTILE_KEY].astype(np.float32),
     }
@@ -31,7 +32,8 @@ def _raw_space(space: gymnasium.Space) -> gymnasium.spaces.Dict:
     assert isinstance(counts, gymnasium.spaces.Box)
     tactile = gymnasium.spaces.Box(counts.low.astype(np.float32), counts.high.astype(np.float32))
     pixels = gymnasium.spaces.Dict({name: space[IMAGE_KEYS[name]] for name in CAMERAS})
-    return gymnasium.spaces.Dict({"pixels": pixels, "agent_pos": space[STATE_KEY], "tactile": tactile})
+    parts = {"environment_state": space[PARTS_KEY]} if PARTS_KEY in space.spaces else {}
+    return gymnasium.spaces.Dict({"pixels": pixels, "agent_pos": space[STATE_KEY], "tactile": tactile, **parts})
 
 
 class LeRobotEnv(TaccorlEnv):

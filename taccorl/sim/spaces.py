@@ -12,18 +12,25 @@ CAMERAS = ("front", "left_wrist", "right_wrist")
 IMAGE_SHAPE = (224, 224, 3)  # rows, columns, rgb: what π0.5 looks at
 NUM_TAXELS = len(PADS) * math.prod(PAD_TAXELS)  # K = 1536
 STATE_KEY, TACTILE_KEY = "observation.state", "observation.tactile"
+PARTS_KEY = "observation.environment_state"  # LeRobot's name; see ``part_poses``
 IMAGE_KEYS = {name: f"observation.images.{name}" for name in CAMERAS}
 
 Observation = dict[str, np.ndarray]
 
 
-def observation_space(images: bool) -> Dict:
-    """Of one environment: joints [rad] and openings [m], counts above baseline, rgb8 pictures."""
+def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
+    """Of one environment: joints [rad] and openings [m], counts above baseline, rgb8 pictures.
+
+    Args:
+        part_numbers: of the parts' poses; None: they are not observed.
+    """
     counts = np.iinfo(np.int16)
     spaces = {
         STATE_KEY: Box(-np.inf, np.inf, (len(ACTION_NAMES),), np.float32),
         TACTILE_KEY: Box(counts.min, counts.max, (NUM_TAXELS,), np.int16),
     }
+    if part_numbers is not None:
+        spaces[PARTS_KEY] = Box(-np.inf, np.inf, (part_numbers,), np.float32)
     if images:
         spaces |= {key: Box(0, 255, IMAGE_SHAPE, np.uint8) for key in IMAGE_KEYS.values()}
     return Dict(spaces)

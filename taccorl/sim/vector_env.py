@@ -23,6 +23,7 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.actions import ACTION_NAMES, beyond_reason, why_bad
 from taccorl.sim.episode_seeds import EpisodeSeeds
 from taccorl.sim.outcome import BAD_ACTION
+from taccorl.sim.part_poses import part_pose_names, part_poses
 from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.simulation import Simulation, Snapshot, checked_seeds
 from taccorl.sim.spaces import (
@@ -30,6 +31,7 @@ from taccorl.sim.spaces import (
     IMAGE_KEYS,
     IMAGE_SHAPE,
     NUM_TAXELS,
+    PARTS_KEY,
     STATE_KEY,
     TACTILE_KEY,
     Observation,
@@ -110,6 +112,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        part_poses: bool = False,
     ) -> None:
         """The task's scene is compiled here; nothing is placed before ``reset``.
 
@@ -119,6 +122,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             num_threads: of the physics; 0: all CPUs. Results do not depend on it.
             autoreset: ``SAME_STEP`` or ``DISABLED`` (over means frozen, until ``reset(options={"reset_mask": (N,) bool})``).
             max_episode_steps: None: the task's own time limit.
+            part_poses: observations have the parts' poses (``observation.environment_state``), which are privileged.
 
         Raises:
             TaccorlError: unknown task or difficulty, unreadable twin, one without a camera that is asked for, a setting that
@@ -143,7 +147,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self.num_envs, self.task, self.task_description = num_envs, task, self.sim.task.instruction
         self.images, self.autoreset, self.render_mode = images, autoreset, render_mode
         self.metadata = {"autoreset_mode": autoreset, "render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
-        self.single_observation_space = observation_space(images == "always")
+        self.single_observation_space = observation_space(
+            images == "always", len(part_pose_names(self.sim.task)) if part_poses else None
+        )
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -152,6 +158,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self._over, self._clipped = np.zeros(num_envs, dtype=bool), np.zeros(num_envs, dtype=bool)
         self._state = np.zeros((num_envs, len(ACTION_NAMES)), dtype=np.float32)
         self._tactile = np.zeros((num_envs, NUM_TAXELS), dtype=np.int16)
+        self._parts = (
+            np.zeros((num_envs, len(part_pose_names(self.sim.task))), dtype=np.float32) if part_poses else None
+        )
         self._pictures = {
             name: np.zeros((num_envs, *IMAGE_SHAPE), dtype=np.uint8) for name in CAMERAS if images != "never"
         }
@@ -283,6 +292,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             )
         self._check_open("observe")
         observation = {STATE_KEY: self._state.copy(), TACTILE_KEY: self._tactile.copy()}
+        if self._parts is not None:
+            observation[PARTS_KEY] = self._parts.copy()
         if images:
             self._look()
             observation |= {IMAGE_KEYS[name]: pictures for name, pictures in self._pictures.items()}
@@ -351,6 +362,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         """
         valid = rows & ~self.sim.diverged
         self._state = np.where(valid[:, None], self.sim.proprioception(), self._state).astype(np.float32)
+        if self._parts is not None:
+            self._parts = np.where(valid[:, None], part_poses(self.sim), self._parts)
         tactile = self.sim.touch(ScanNoise(self.sim.seeds, self.sim.judge.steps))
         self._tactile = tactile if valid.all() else np.where(valid[:, None], tactile, self._tactile)
         self._unseen |= valid

@@ -96,12 +96,17 @@ _requested: CacheRequest | None = None
 """Of the training that is being made: LeRobot hands its readers nothing of its dataset's options."""
 
 
+_reads_pictures = True
+"""Likewise: False: the policy has no cameras (``--policy.pictures=false``), so that no frame is decoded or cached."""
+
+
 def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """LeRobot's ``make_dataset``, whose reader knows what ``--dataset.cache`` asks for."""
 
     def make_with_cache(cfg: Any) -> Any:
-        global _requested
+        global _requested, _reads_pictures
         _requested = cache_request(cfg)
+        _reads_pictures = getattr(cfg.trainable_config, "pictures", True)
         if _requested is not None and cfg.num_workers:
             _log.info("--dataset.cache=%s: batches are gathered by the training's own process", _requested.place)
             cfg.num_workers = 0
@@ -245,10 +250,12 @@ class FastReader(DatasetReader):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._cache = _requested
+        self.cameras: list[str] = self._meta.video_keys if _reads_pictures else []
+        """Whose pictures are read."""
         cameras = self._meta.video_keys
         self._has_videos = all(f"videos/{key}/file_index" in self._meta.episodes.column_names for key in cameras)  # pyright: ignore
         if not self._has_videos:
-            if self._cache is None:
+            if self._cache is None and self.cameras:
                 raise DatasetError(
                     f"{self.root}: has no videos of {', '.join(cameras)}; its frames are in the cache of training alone: "
                     "--dataset.cache=gpu (host, disk), or taccorl execute --pictures=video makes a dataset with videos"
@@ -359,15 +366,15 @@ class FastReader(DatasetReader):
             windows, padding = self._get_query_indices(index, episode)
         item: dict[str, Any] = {k: column.rows([row])[0] for k, column in columns.items() if k not in windows}
         item |= padding | self._query_hf_dataset(windows)
-        if self._meta.video_keys and not self._has_videos:
+        if self.cameras and not self._has_videos:
             gathered: Any = self.batch([row])
-            for key in self._meta.video_keys:
+            for key in self.cameras:
                 item[key] = gathered[key][0] if self._return_uint8 else gathered[key][0].to(torch.float32) / 255
-        elif self._meta.video_keys:
+        elif self.cameras:
             times_s = self._get_query_timestamps(item["timestamp"].item(), windows)
             item = self._query_videos(times_s, episode) | item
         if self._image_transforms is not None:
-            for camera in self._meta.camera_keys:
+            for camera in self.cameras:
                 item[camera] = self._image_transforms(item[camera])
         assert self._meta.tasks is not None, "LeRobot loads tasks with the metadata"
         item["task"] = self._meta.tasks.iloc[item["task_index"].item()].name
@@ -412,7 +419,7 @@ class Gathered:
         everything = list(range(len(reader.hf_dataset)))
         numbers = {key: column.stored(everything) for key, column in columns.items()}
         self.frames: Frames = open_frames(
-            request, reader.root, meta.video_keys, meta.total_frames, sum(x.nbytes for x in numbers.values())
+            request, reader.root, reader.cameras, meta.total_frames, sum(x.nbytes for x in numbers.values())
         )
         device = self.frames.device
         self.numbers = {key: x.to(device) for key, x in numbers.items()}

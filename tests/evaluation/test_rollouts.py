@@ -21,7 +21,7 @@ STEPS = 6
 class StandIn:
     """Holds still, but for what ``change(step, actions, envs)`` does to its actions."""
 
-    name, needs_images, max_batch = "stand-in", False, None
+    name, needs_images, needs_part_poses, max_batch = "stand-in", False, False, None
 
     def __init__(self, change: Callable[[int, np.ndarray, TaccorlVectorEnv], None] | None = None) -> None:
         self.change, self.step, self.restarts = change, 0, 0

@@ -55,6 +55,8 @@ class ExecutePlan:
 
     source: Path
     pictures: PicturesAs = "video"
+    part_poses: bool = False
+    """Rows have the poses of the task's parts (``observation.environment_state``)."""
 
     def __post_init__(self) -> None:
         if self.pictures not in get_args(PicturesAs):
@@ -63,12 +65,17 @@ class ExecutePlan:
     def contract(self, stored: StoredActions, sim: Simulation, *, pictures: bool) -> DatasetSpec:
         """What a row holds."""
         spec = load_dataset_spec(find_spec("taccorl_bimanual"))
-        return with_simulator(spec, sim, pictures=pictures, executed=stored.is_disturbed)
+        return with_simulator(spec, sim, pictures=pictures, executed=stored.is_disturbed, parts=self.part_poses)
 
     @property
     def config(self) -> dict[str, Any]:
         """What an execution depends on besides the stored actions."""
-        return {"videos": self.pictures == "video", "mujoco": mujoco.__version__, "taccorl": taccorl.__version__}
+        parts = {"part_poses": True} if self.part_poses else {}  # executions of before there was a choice remain valid
+        return parts | {
+            "videos": self.pictures == "video",
+            "mujoco": mujoco.__version__,
+            "taccorl": taccorl.__version__,
+        }
 
 
 def execute_stored(
@@ -148,7 +155,7 @@ def _may_be_of(plan: ExecutePlan, source: Artefact, num: int, out: Path, store: 
 
 
 def _dataset_config(plan: ExecutePlan) -> dict[str, Any]:
-    return {"pictures": plan.pictures}
+    return {"pictures": plan.pictures} | ({"part_poses": True} if plan.part_poses else {})
 
 
 def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:

@@ -17,6 +17,8 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
 from taccorl.policies.tactile_pi05.hand_poses import NUM_HAND_POSES, arm_names
 from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
+from taccorl.policies.tactile_pi05.part_poses import bodies_of, num_part_numbers
+from taccorl.sim.spaces import PARTS_KEY
 
 TACTILE = "observation.tactile"
 RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
@@ -117,6 +119,16 @@ class TactilePI05Config(PI05Config):
     hand_poses: bool | None = None
     """Tell the state's token where both hands are, too (see ``hand_poses``). None: True where the state is a token and the
     names of the actions are those of the two arms whose geometry is known."""
+    part_poses: bool = False
+    """Tell the state's token the poses of the task's parts (see ``part_poses``), which only a simulator knows: of datasets made
+    with taccorl execute --part_poses=true."""
+    part_names: list[str] | None = None
+    """Names of the poses' numbers. None: read from the dataset when training starts, then kept in the checkpoint."""
+    pictures: bool = True
+    """False: without cameras, whatever the dataset has; its frames are not read."""
+    pose_loss: float = 0.0
+    """Weight of an auxiliary loss, in training only: from the cameras' tokens and the robot's state, predict where the parts are
+    relative to each other and to both hands (see ``PoseHead``). Needs a dataset as for ``part_poses``. 0: none."""
     tactile: bool = True
     """False: vision only. The same policy without touch: with flow matching, LeRobot's pi05."""
     tactile_history: int = 10
@@ -197,6 +209,19 @@ class TactilePI05Config(PI05Config):
                 "--policy.hand_poses=true: the poses are part of the state's token; --policy.discrete_state_input=true puts the "
                 "state into the prompt"
             )
+        if self.part_poses and self.has_discrete_state:
+            raise TaccorlError(
+                "--policy.part_poses=true: the poses are part of the state's token; --policy.discrete_state_input=true puts the "
+                "state into the prompt"
+            )
+        if not 0 <= self.pose_loss < math.inf:
+            raise TaccorlError(f"--policy.pose_loss={self.pose_loss}: 0 or more")
+        if self.pose_loss and (self.backbone == "full" or not self.pictures):
+            other = "--policy.pictures=false" if not self.pictures else "--policy.backbone=full"
+            raise TaccorlError(
+                f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from the cameras' tokens of the backbones small and "
+                f"tiny; not with {other}"
+            )
         if self.average_decay is not None and not 0 <= self.average_decay < 1:
             raise TaccorlError(f"--policy.average_decay={self.average_decay}: 0 or more, and below 1")
         if not 0 <= self.contact_threshold < math.inf:
@@ -248,9 +273,31 @@ class TactilePI05Config(PI05Config):
 
     @property
     def state_dim(self) -> int:
-        """S: numbers that the state's token is made of: the robot's state and, where it is told, its hands' poses."""
+        """S: numbers that the state's token is made of: the robot's state and, where they are told, poses of hands and parts."""
+        return self.robot_state_dim + (num_part_numbers(self.num_bodies) if self.part_poses else 0)
+
+    @property
+    def robot_state_dim(self) -> int:
+        """Numbers of the robot's state and, where it is told, its hands' poses."""
         assert self.input_features is not None, "the policy's __init__ has made sure of features"
         return self.input_features[OBS_STATE].shape[0] + NUM_HAND_POSES * self.knows_hands
+
+    @property
+    def num_bodies(self) -> int:
+        """P: parts whose poses are known."""
+        return len(bodies_of(self.require_part_names()))
+
+    def require_part_names(self) -> list[str]:
+        """
+        Raises:
+            TaccorlError: neither a dataset nor a checkpoint has them.
+        """
+        if self.part_names is None:
+            raise TaccorlError(
+                "tactile_pi05 does not know which parts there are: make the policy from a dataset (taccorl execute "
+                "--part_poses=true) or a checkpoint, or set --policy.part_names"
+            )
+        return self.part_names
 
     @property
     def window_delta_indices(self) -> dict[str, list[int]]:
@@ -269,14 +316,16 @@ class TactilePI05Config(PI05Config):
         )
 
     def validate_features(self) -> None:
-        """Keeps what the policy looks at: state, pictures and, unless it is vision only, touch.
+        """Keeps what the policy looks at: state, pictures, the parts' poses and, unless it is vision only, touch.
 
         Touch becomes ``ENV``, a kind that LeRobot's normaliser leaves as it is. The rest (a flag, the touch of faster clocks)
         would be normalised for nothing.
         """
         super().validate_features()
         given = self.input_features or {}
-        kept = {k: f for k, f in given.items() if f.type is FeatureType.VISUAL or k == OBS_STATE}
+        kept = {k: f for k, f in given.items() if (f.type is FeatureType.VISUAL and self.pictures) or k == OBS_STATE}
+        if self.part_poses and self.part_names is not None:
+            kept[PARTS_KEY] = PolicyFeature(FeatureType.ENV, (len(self.part_names),))
         if self.tactile and TACTILE in given:
             kept[TACTILE] = PolicyFeature(FeatureType.ENV, given[TACTILE].shape)
         self.input_features = kept
@@ -309,6 +358,7 @@ class TactilePI05Config(PI05Config):
                 f"another length. Ingest the recordings at {self.fps}, or train anew"
             )
         self.fps = int(meta.fps)
+        self._match_parts(meta, where)
         if not self.tactile:
             return
         if TACTILE not in meta.features:
@@ -331,3 +381,27 @@ class TactilePI05Config(PI05Config):
                 f"{where}: episode {shortest} has {min(lengths)} rows, the window of touch {self.tactile_history}: leave it out "
                 "(lerobot-edit-dataset, --operation.type=delete_episodes), or give a shorter --policy.tactile_history"
             )
+
+    def _match_parts(self, meta: Any, where: str) -> None:
+        """Take the names of the parts' poses from the dataset, or compare with those known already.
+
+        Raises:
+            TaccorlError: no poses, or those of other parts.
+        """
+        if not self.part_poses and not self.pose_loss:
+            return
+        if PARTS_KEY not in meta.features:
+            if not self.part_poses and self.part_names is not None:
+                return  # a checkpoint goes on without its pose loss
+            option = "--policy.part_poses=true" if self.part_poses else f"--policy.pose_loss={self.pose_loss:g}"
+            raise TaccorlError(
+                f"{option}: {where} has no {PARTS_KEY}: make it with taccorl execute --part_poses=true. It has: "
+                f"{', '.join(k for k in meta.features if k.startswith('observation.'))}"
+            )
+        names = list(meta.features[PARTS_KEY]["names"])
+        if self.part_names is not None and self.part_names != names:
+            raise TaccorlError(
+                f"{where}: its {PARTS_KEY} is of {', '.join(bodies_of(names))}, that of the checkpoint of "
+                f"{', '.join(bodies_of(self.part_names))}: another task"
+            )
+        self.part_names = names

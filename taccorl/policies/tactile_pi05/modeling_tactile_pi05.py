@@ -30,6 +30,7 @@ from taccorl.policies.tactile_pi05.graphed import GraphedCall
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
 from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
+from taccorl.policies.tactile_pi05.part_poses import PART_POSES, PoseHead
 from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkpoint
 
 # B batch, S state, L history, K taxels, P pads, R rows, C columns, H horizon, A action
@@ -96,6 +97,7 @@ class TactilePI05Policy(PI05Policy):
             load_base_weights(self, config.base_checkpoint)
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
+        self.pose_head = PoseHead(self._num_seen, config.num_bodies) if config.pose_loss else None
         self.steps = (
             ChunkSteps.of_statistics(dataset_stats, config, self._num_actions) if config.normalizes_steps else None
         )
@@ -140,7 +142,7 @@ class TactilePI05Policy(PI05Policy):
         Args:
             reduction: "mean", or "none" for the rows, (B,), of which it is the mean.
         """
-        losses_BHA, contact_B = self.action_losses(batch)
+        losses_BHA, contact_B, tokens = self._losses_and_tokens(batch)
         rows, horizon = losses_BHA.shape[:2]
         counts_BH = losses_BHA.new_ones(rows, horizon)
         if ACTION_IS_PAD in batch:
@@ -155,6 +157,10 @@ class TactilePI05Policy(PI05Policy):
             losses_BHA = losses_BHA * self.mixture.weights(is_sim_B)[:, None, None]
         losses_BHA = losses_BHA[:, :, :num_actions]
         loss = losses_BHA.mean(dim=(1, 2)) if reduction == "none" else losses_BHA.mean()
+        if self.pose_head is not None and self.training and PART_POSES in batch:
+            pose_B, told["pose_error_mm"] = self.pose_head.errors(tokens, self._robot_state(batch), batch[PART_POSES])
+            loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
+            told["pose_loss"] = pose_B.detach().mean()
         told["loss"] = loss.detach().mean()
         if contact_B is not None:
             told["contact_rate"] = contact_B.float().mean()
@@ -166,6 +172,11 @@ class TactilePI05Policy(PI05Policy):
 
         Draws noise and time from torch's generator as LeRobot's pi05 does; in training, first what changes the images.
         """
+        losses_BHA, contact_B, _ = self._losses_and_tokens(batch)
+        return losses_BHA, contact_B
+
+    def _losses_and_tokens(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, list[Tensor]]:
+        """``action_losses``, and each camera's tokens (B, M, D), where cameras have weights of their own."""
         if self.training and self._change_images is not None:
             batch = {**batch, **{k: self._change_images(batch[k]) for k in self.config.image_features if k in batch}}
         images, image_masks = self._preprocess_images(batch)
@@ -179,7 +190,16 @@ class TactilePI05Policy(PI05Policy):
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
             return self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
 
-        return self._by_contact(batch, compute)
+        return *self._by_contact(batch, compute), images
+
+    @property
+    def _num_seen(self) -> int:
+        """Numbers that the pose head sees: tokens of all cameras, and the robot's state."""
+        tower: Any = self.model.paligemma_with_expert.paligemma.model.vision_tower
+        return (
+            sum(camera.num_tokens * camera.hidden.out_features for camera in tower.cameras)
+            + self.config.robot_state_dim
+        )
 
     @property
     def _num_actions(self) -> int:
@@ -342,16 +362,23 @@ class TactilePI05Policy(PI05Policy):
     def _tokens(self, images: list[Tensor]) -> list[Tensor]:
         """Key points' tokens of all rows at once: few rows are rounded elsewhere. Pictures for patches remain pictures."""
         backbone = self.model.paligemma_with_expert
-        return backbone.embed_images(images) if backbone.tells_cameras_apart else images
+        return backbone.embed_images(images) if images and backbone.tells_cameras_apart else images
 
     def _state(self, batch: dict[str, Tensor]) -> Tensor | None:
         """(B, 1, D) the state's token, of all rows at once: few rows are rounded elsewhere. None where the prompt has it."""
         if self.config.has_discrete_state:
             return None
+        state_BS = self._robot_state(batch)
+        if self.config.part_poses:
+            state_BS = torch.cat([state_BS, batch[PART_POSES].to(torch.float32)], dim=1)
+        return self.model.state_token(state_BS)
+
+    def _robot_state(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, S) normalised state and, where they are told, hand poses."""
         state_BS = batch[OBS_STATE].to(torch.float32)
         if self.config.knows_hands:
             state_BS = torch.cat([state_BS, batch[HAND_POSES].to(torch.float32)], dim=1)
-        return self.model.state_token(state_BS)
+        return state_BS
 
     def _readings(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
         """(B, L, P, R, C) readings and (B,) contact; None and None for vision only.
@@ -383,6 +410,8 @@ class TactilePI05Policy(PI05Policy):
         Raises:
             TaccorlError: a camera is missing, and each has weights of its own: LeRobot puts black pictures behind the others.
         """
+        if not self.config.image_features:
+            return [], []
         missing = [k for k in self.config.image_features if k not in batch and not k.startswith(_EMPTY_CAMERA)]
         if missing and self.model.paligemma_with_expert.tells_cameras_apart:
             raise TaccorlError(

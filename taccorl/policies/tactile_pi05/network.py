@@ -112,7 +112,7 @@ class TactilePI05Pytorch(PI05Pytorch):
         self, images: list[Tensor], image_masks: list[Tensor], tokens: Tensor, token_mask: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         backbone = self.paligemma_with_expert
-        are_tokens = images[0].ndim == 3
+        are_tokens = not images or images[0].ndim == 3  # none: a policy without cameras
         if not are_tokens and (backbone.tells_cameras_apart or backbone.fuses(tokens.device)):
             images = backbone.embed_images(images)
         context_BTD, valid_BT, starts_block_BT = super().embed_prefix(images, image_masks, tokens, token_mask)

@@ -28,6 +28,7 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     TactilePI05Config,
 )
 from taccorl.policies.tactile_pi05.hand_poses import HandPosesStep
+from taccorl.policies.tactile_pi05.part_poses import PartPosesStep
 from taccorl.policies.tactile_pi05.tokenizer import PromptTokenizerStep
 
 SCHEME = "fixed_scale"
@@ -150,6 +151,8 @@ def make_tactile_pi05_pre_post_processors(
         before.append(RawStateStep())
     if config.knows_hands:
         before.append(HandPosesStep())
+    if config.part_poses or config.pose_loss:
+        before.append(PartPosesStep(names=config.require_part_names(), required=config.part_poses))
     before.append(common.normalize)
     if config.tactile:
         told = config.require_tactile_format()

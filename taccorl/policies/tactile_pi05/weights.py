@@ -15,6 +15,7 @@ from taccorl.errors import TaccorlError
 WEIGHTS = "model.safetensors"
 _TACTILE = "model.tactile."
 _UNUSED = "lm_head.weight"
+_POSE_HEAD = "pose_head."
 
 
 def load_base_weights(policy: PI05Policy, source: str) -> None:
@@ -35,12 +36,15 @@ def load_base_weights(policy: PI05Policy, source: str) -> None:
 
 
 def load_checkpoint(policy: PI05Policy, source: str, **hub: Any) -> None:
-    """The policy's own weights, all of them and no others.
+    """The policy's own weights, all of them and no others; but for the pose head, which actions do not need.
 
     Raises:
         TaccorlError: they cannot be read, or do not match; nothing was loaded then.
     """
-    _load(policy, _read(source, f"checkpoint {source}", **hub), f"checkpoint {source}", may_miss=None)
+    weights = _read(source, f"checkpoint {source}", **hub)
+    if not any(key.startswith(_POSE_HEAD) for key in policy.state_dict()):
+        weights = {key: value for key, value in weights.items() if not key.startswith(_POSE_HEAD)}
+    _load(policy, weights, f"checkpoint {source}", may_miss=_POSE_HEAD)
 
 
 def _read(source: str, said: str, **hub: Any) -> dict[str, Tensor]:

@@ -1,0 +1,182 @@
+"""Poses of the task's parts for the state's token: absolute, between parts and relative to both hands. The preprocessor's part.
+
+Of each body (P of them) the observation has its pose in the world, ``observation.environment_state``. The policy gets
+
+    each body in the world                       p / 0.25 m and six numbers of the rotation                                  9 · P
+    body i in the frame of body j, all i < j     d / 0.1 m, tanh(d / 10 mm), tanh(d / 2 mm) and six numbers   15 · P (P − 1) / 2
+    each body in the frame of each TCP           p / 0.1 m and six numbers                                                  18 · P
+
+The six numbers of a rotation are its first two columns (see ``hand_poses``). The two tanh keep fractions of a millimetre visible
+where parts mate.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import ObservationProcessorStep
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.hand_poses import HAND_TO_HAND_M, WORLD_M, arm_chains, arm_names, tcp_poses
+from taccorl.sim.part_poses import POSE_NAMES
+from taccorl.sim.spaces import PARTS_KEY
+
+PART_POSES = "observation.part_poses"
+"""(B, ``num_part_numbers``), see above."""
+PART_TO_PART_M = HAND_TO_HAND_M
+"""Unit of positions in the frame of a body or a TCP."""
+FINE_M = (0.01, 0.002)
+"""Units within tanh, of positions between bodies."""
+TARGET_M = 0.01
+"""Unit of the positions that ``PoseHead`` predicts."""
+_POSE = len(POSE_NAMES)
+_PAIR = _POSE + 3 * len(FINE_M)
+_ARMS = 2
+_HIDDEN = 512
+
+# B batch, S state, P bodies, Q pairs of bodies, D of a token, V vectors
+
+
+def num_pairs(num_bodies: int) -> int:
+    """Q."""
+    return num_bodies * (num_bodies - 1) // 2
+
+
+def num_part_numbers(num_bodies: int) -> int:
+    """Numbers of ``PART_POSES``."""
+    return (1 + _ARMS) * _POSE * num_bodies + _PAIR * num_pairs(num_bodies)
+
+
+def part_poses(poses_BN: Tensor, tcps: list[Tensor]) -> Tensor:
+    """(B, ``num_part_numbers``) float32.
+
+    Args:
+        poses_BN: (B, 9 P) as ``taccorl.sim.part_poses`` gives them.
+        tcps: world-from-TCP (B, 4, 4) of each arm.
+    """
+    poses_BP9 = poses_BN.to(torch.float32).unflatten(-1, (-1, _POSE))
+    position_BP3 = poses_BP9[..., :3]
+    x_BP3, y_BP3 = poses_BP9[..., 3:6], poses_BP9[..., 6:9]
+    rotation_BP33 = torch.stack([x_BP3, y_BP3, torch.linalg.cross(x_BP3, y_BP3)], dim=-1)
+    numbers = [torch.cat([position_BP3 / WORLD_M, x_BP3, y_BP3], dim=-1).flatten(1)]
+
+    i_Q, j_Q = torch.triu_indices(poses_BP9.shape[1], poses_BP9.shape[1], 1, device=poses_BP9.device)
+    frame_BQ33 = rotation_BP33[:, j_Q]
+    offset_BQ3 = _turned_back(frame_BQ33, position_BP3[:, i_Q] - position_BP3[:, j_Q])
+    turn = [_turned_back(frame_BQ33, axis_BP3[:, i_Q]) for axis_BP3 in (x_BP3, y_BP3)]
+    fine = [(offset_BQ3 / unit_m).tanh() for unit_m in FINE_M]
+    numbers.append(torch.cat([offset_BQ3 / PART_TO_PART_M, *fine, *turn], dim=-1).flatten(1))
+
+    for tcp_B44 in tcps:
+        frame_B133 = tcp_B44[:, None, :3, :3]
+        offset_BP3 = _turned_back(frame_B133, position_BP3 - tcp_B44[:, None, :3, 3])
+        turn = [_turned_back(frame_B133, axis_BP3) for axis_BP3 in (x_BP3, y_BP3)]
+        numbers.append(torch.cat([offset_BP3 / PART_TO_PART_M, *turn], dim=-1).flatten(1))
+    return torch.cat(numbers, dim=1)
+
+
+def _turned_back(rotation: Tensor, vector: Tensor) -> Tensor:
+    """Rᵀ v. Products and sums, no matmul: a GPU's may round to ten bits (TF32), half a millimetre of half a metre."""
+    return (rotation * vector[..., :, None]).sum(-2)
+
+
+def relative_positions_m(part_poses_BN: Tensor, num_bodies: int) -> Tensor:
+    """(B, V, 3) [m] out of ``PART_POSES``: body i in the frame of body j, then the bodies in the frame of each TCP."""
+    first, pairs = _POSE * num_bodies, num_pairs(num_bodies)
+    between_BQ3 = (
+        part_poses_BN[:, first : first + _PAIR * pairs].unflatten(-1, (pairs, _PAIR))[..., :3] if pairs else None
+    )
+    in_hands_BV3 = part_poses_BN[:, first + _PAIR * pairs :].unflatten(-1, (-1, _POSE))[..., :3]
+    parts = [in_hands_BV3] if between_BQ3 is None else [between_BQ3, in_hands_BV3]
+    return PART_TO_PART_M * torch.cat(parts, dim=1)
+
+
+@dataclass
+class PartPosesStep(ObservationProcessorStep):
+    """Adds ``PART_POSES`` to an observation whose state is not normalised yet. A checkpoint holds the arms' geometry."""
+
+    names: list[str]
+    """Of the numbers of ``observation.environment_state``."""
+    required: bool = True
+    """False: only training looks at the poses (the pose loss); without them nothing is added."""
+    chains: list[list[list[list[float]]]] = field(default_factory=arm_chains)
+
+    def __post_init__(self) -> None:
+        self._chains: dict[torch.device, Tensor] = {}
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """
+        Raises:
+            TaccorlError: no poses of the parts, those of other parts, or another robot.
+        """
+        if PARTS_KEY not in observation and not self.required:
+            return observation
+        if PARTS_KEY not in observation:
+            raise TaccorlError(
+                f"--policy.part_poses=true: the observation has no {PARTS_KEY}. Datasets have it by taccorl execute "
+                "--part_poses=true, environments by part_poses=True (LeRobot's: --env.part_poses=true)"
+            )
+        poses, state_BS = torch.as_tensor(observation[PARTS_KEY]), torch.as_tensor(observation[OBS_STATE])
+        if poses.shape[-1] != len(self.names):
+            raise TaccorlError(
+                f"{PARTS_KEY} has {poses.shape[-1]} numbers, the policy was trained with the {len(self.names)} of "
+                f"{', '.join(bodies_of(self.names))}: the task is another one"
+            )
+        if state_BS.shape[-1] != len(arm_names()):
+            raise TaccorlError(
+                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, --policy.part_poses=true needs the {len(arm_names())} of "
+                f"{', '.join(arm_names())}"
+            )
+        chains = self._chains.get(state_BS.device)
+        if chains is None:
+            chains = self._chains[state_BS.device] = torch.tensor(self.chains, device=state_BS.device)
+        leading = state_BS.shape[:-1]
+        tcps = tcp_poses(state_BS.reshape(-1, state_BS.shape[-1]).to(torch.float32), chains)
+        numbers_BN = part_poses(poses.reshape(-1, poses.shape[-1]), tcps)
+        return {**observation, PART_POSES: numbers_BN.reshape(*leading, -1)}
+
+    def get_config(self) -> dict[str, Any]:
+        return {"names": self.names, "required": self.required, "chains": self.chains}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
+def bodies_of(names: list[str]) -> list[str]:
+    """Bodies of the features' names, such as ``plug`` of ``plug.x``."""
+    return [name.rpartition(".")[0] for name in names[::_POSE]]
+
+
+class PoseHead(nn.Module):
+    """Predicts ``relative_positions_m`` from pictures and the robot's state; used in training only."""
+
+    def __init__(self, num_inputs: int, num_bodies: int) -> None:
+        super().__init__()
+        self.num_vectors = num_pairs(num_bodies) + _ARMS * num_bodies
+        self.num_bodies = num_bodies
+        self.hidden = nn.Linear(num_inputs, _HIDDEN)
+        self.out = nn.Linear(_HIDDEN, 3 * self.num_vectors)
+
+    def forward(self, cameras: list[Tensor], state_BS: Tensor) -> Tensor:
+        """(B, V, 3) [``TARGET_M``].
+
+        Args:
+            cameras: tokens (B, M, D) of each camera.
+            state_BS: normalised state and, if the policy knows them, hand poses.
+        """
+        inputs = torch.cat([*(tokens_BMD.flatten(1) for tokens_BMD in cameras), state_BS], dim=1)
+        return self.out(F.gelu(self.hidden(inputs))).unflatten(-1, (self.num_vectors, 3))
+
+    def errors(self, cameras: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
+        """(B,) Huber loss, quadratic within ``TARGET_M``, and the root mean square of the vectors' errors [mm]."""
+        target_BV3 = relative_positions_m(part_poses_BN, self.num_bodies) / TARGET_M
+        predicted_BV3 = self(cameras, state_BS).to(torch.float32)
+        loss_B = F.huber_loss(predicted_BV3, target_BV3, reduction="none").mean(dim=(1, 2))
+        off_BV3 = (predicted_BV3 - target_BV3).detach()
+        return loss_B, 1e3 * TARGET_M * off_BV3.square().sum(-1).mean().sqrt()

@@ -1,0 +1,45 @@
+"""Poses of a task's parts in the world as numbers, privileged: the ``observation.environment_state`` of rows and environments.
+
+    x, y, z [m]; r00, r10, r20, r01, r11, r21        position, and the first two columns of the rotation, of each body
+
+Bodies are the task's movable parts in their order, then those that are clamped where the reset draws them.
+"""
+
+from typing import Protocol
+
+import numpy as np
+
+from taccorl.sim.tasks.task import Task
+
+POSE_NAMES = ("x", "y", "z", "r00", "r10", "r20", "r01", "r11", "r21")
+POSE_UNITS = ("m",) * 3 + ("1",) * 6
+
+
+class _Posed(Protocol):
+    """A simulation, as far as its bodies' poses go."""
+
+    task: Task
+    num_sims: int
+
+    def poses(self, body: str) -> np.ndarray:
+        """World-from-body (N, 4, 4)."""
+        ...
+
+
+def posed_bodies(task: Task | type[Task]) -> tuple[str, ...]:
+    """Bodies whose poses are given, in order."""
+    return (*task.parts, *task.clamped)
+
+
+def part_pose_names(task: Task | type[Task]) -> tuple[str, ...]:
+    """(9 · bodies) names such as ``plug.x``."""
+    return tuple(f"{body}.{name}" for body in posed_bodies(task) for name in POSE_NAMES)
+
+
+def part_poses(sim: _Posed) -> np.ndarray:
+    """(N, 9 · bodies) float32 poses now."""
+    numbers = []
+    for body in posed_bodies(sim.task):
+        pose = sim.poses(body)
+        numbers += [pose[:, :3, 3], pose[:, :3, 0], pose[:, :3, 1]]
+    return np.concatenate([np.zeros((sim.num_sims, 0)), *numbers], axis=1).astype(np.float32)
