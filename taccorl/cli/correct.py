@@ -6,6 +6,7 @@ demonstrations (taccorl merge) and trained on (lerobot-train). Give every round 
 
     --takeover=failures       keep out episodes in which the policy succeeds by itself (all: correct them, too)
     --engine.workers=8        experts in so many processes
+    --rows=actions            seeds and actions alone: taccorl execute makes one dataset of demonstrations and corrections
 
 The policy's episodes and each correction lie in the store: a run that was stopped goes on.
 """
@@ -47,6 +48,9 @@ class CorrectConfig:
     """Share of the paper's reset ranges, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
     """Control steps until the policy is cut off; the task's own limit if not given."""
+    rows: str = "dataset"
+    """dataset; actions: seeds and actions alone, for taccorl execute --source=DEMONSTRATIONS --source=OUT, which makes one dataset
+    of demonstrations and corrections with frames for a GPU."""
     images: bool = True
     """Render the dataset's cameras (needs OpenGL). A policy with camera inputs needs OpenGL even if
     this is false."""
@@ -78,6 +82,7 @@ def main(argv: list[str]) -> int:
         randomization=config.randomization,
         episode_length=config.episode_length,
         takeover=config.takeover,
+        rows=config.rows,
         images=config.images,
         part_poses=config.part_poses,
         seed=config.seed,
@@ -103,6 +108,7 @@ def main(argv: list[str]) -> int:
     print(f"expert:    {successes} of {over} succeeded ({100 * successes / over:.1f} %, 95 %: {low:.1f} … {high:.1f})")
     for outcome, count in report["outcomes"].items():
         print(f"           {outcome} {count}")
-    print(f"dataset:   {out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
-    print(f"next:      taccorl merge --sim=DEMONSTRATIONS --sim={out} --out=…, then lerobot-train")
+    print(f"{plan.rows + ':':11s}{out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
+    join = "merge --sim=DEMONSTRATIONS --sim" if plan.rows == "dataset" else "execute --source=DEMONSTRATIONS --source"
+    print(f"next:      taccorl {join}={out} --out=…, then lerobot-train")
     return 0

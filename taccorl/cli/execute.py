@@ -1,8 +1,9 @@
 """``taccorl execute --source=outputs/many_actions --out=outputs/many [--pictures=video|cache|none] [--resolution=112x112]
 [--part_poses=true]``
 
-Stored actions (``taccorl augment --rows=actions``) into a LeRobot dataset, on the machine where it is needed: every demonstration
-is executed once, by as many workers as --engine.workers says. Demonstrations that are no success here are left out and counted.
+Stored actions (``taccorl augment --rows=actions``, ``taccorl correct --rows=actions``; --source as often as there are some) into
+one LeRobot dataset, on the machine where it is needed: every demonstration is executed once, by as many workers as
+--engine.workers says. Demonstrations that are no success here are left out and counted.
 
 --pictures=cache encodes no video: frames are rendered into the cache from which lerobot-train --dataset.cache=gpu|host|disk reads
 them, at the policy's resolution. Only with that option can such a dataset be trained on.
@@ -22,8 +23,8 @@ from taccorl.lineage.engines import Engine, LocalEngine
 class ExecuteConfig:
     """A dataset out of stored actions."""
 
-    source: Path
-    """Folder of stored actions: taccorl augment --rows=actions."""
+    source: list[Path]
+    """Folder of stored actions: taccorl augment --rows=actions, taccorl correct --rows=actions; once for each."""
     out: Path
     """The dataset's folder. It must not hold anything else."""
     store: Path = Path("outputs/store")
@@ -47,7 +48,7 @@ def main(argv: list[str]) -> int:
     from taccorl.lineage.store import Store
 
     plan = ExecutePlan(
-        source=config.source,
+        sources=tuple(config.source),
         pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
         part_poses=config.part_poses,
     )
@@ -108,6 +109,7 @@ def _check_places(config: ExecuteConfig) -> None:
 
     check_path(config.out)
     out = config.out.resolve()
-    for option, place in {"--source": config.source.resolve(), "--store": config.store.resolve()}.items():
+    for option, place in [*(("--source", source) for source in config.source), ("--store", config.store)]:
+        place = place.resolve()
         if out.is_relative_to(place) or place.is_relative_to(out):
             raise DatasetError(f"--out={config.out} and {option}={place} lie in one another: choose another --out")

@@ -27,6 +27,10 @@ from taccorl.data.dataset import PROVENANCE, episode_record
 from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
 from taccorl.demos.collect import AFTER_S, assemble, in_the_way, outcome_of
 from taccorl.demos.experts import experts
+from taccorl.demos.mimicgen.attempt import state_digest
+from taccorl.demos.mimicgen.execution import Demonstration
+from taccorl.demos.mimicgen.spec import GatesSpec
+from taccorl.demos.mimicgen.stored_actions import CORRECTION, write_stored
 from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.errors import LostError, TaccorlError, UnreachableError, nearest
 from taccorl.lineage.canonical import canonical
@@ -43,6 +47,7 @@ from taccorl.sim.twin_file import load_twin, twin_text
 VERSION = 1  # of an episode's correction
 CORRECTIONS_VERSION = 1  # of the dataset
 TAKEOVERS = ("failures", "all")
+ROWS = ("dataset", "actions")
 KEPT_OUT = "policy succeeded"
 _WORD = "correct"  # apart from the scenes of other commands with the same seed
 _DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of an episode: ``default_rng([scene seed, which])``
@@ -88,6 +93,8 @@ class CorrectionPlan:
     """Control steps after which the policy is cut off; None: the task's own limit."""
     takeover: str = "failures"
     """``failures``: episodes in which the policy succeeds by itself are kept out; ``all``: they are corrected, too."""
+    rows: str = "dataset"
+    """``dataset``; or ``actions``: seeds and actions, which ``taccorl execute`` makes a dataset of, together with others."""
     images: bool = True
     part_poses: bool = False
     """Rows have the poses of the task's parts (``observation.environment_state``)."""
@@ -104,6 +111,10 @@ class CorrectionPlan:
             raise TaccorlError(f"--task={self.task}: its expert can only begin at the beginning; write its remaining()")
         if self.takeover not in TAKEOVERS:
             raise TaccorlError(f"--takeover={self.takeover}: {nearest(self.takeover, TAKEOVERS)}")
+        if self.rows not in ROWS:
+            raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, ROWS)}")
+        if self.rows == "actions" and self.part_poses:
+            raise TaccorlError("--part_poses=true has no effect with --rows=actions: give it to taccorl execute")
         for name, least in (("episodes", 1), ("seed", 0), ("episode_length", 1)):
             value = getattr(self, name)
             if value is not None and value < least:
@@ -129,7 +140,7 @@ class CorrectionPlan:
         """Its simulation."""
         return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
 
-    def rows(self, sim: Simulation) -> DatasetSpec:
+    def contract(self, sim: Simulation) -> DatasetSpec:
         """What a row of the dataset holds."""
         spec = load_dataset_spec(find_spec("taccorl_bimanual"))
         return with_simulator(spec, sim, pictures=self.images, parts=self.part_poses)
@@ -150,6 +161,7 @@ class CorrectionPlan:
         """What the correction of episode ``k`` depends on besides the policy's episodes."""
         own = {"policy_digest": self.policy_digest, "takeover": self.takeover, "images": self.images, "origin": ORIGIN}
         own |= {"part_poses": True} if self.part_poses else {}
+        own |= {"rows": self.rows} if self.rows == "actions" else {}
         return canonical(self.scene_config() | own | {"root_seed": self.seed, "episode": k})
 
 
@@ -184,6 +196,8 @@ class Correction:
     """Of the takeover: ``drawn``, ``stall``, or ``drawn before the grasp``: the parts were never in the hands."""
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 14), np.float32))
     """(S, 14) float32 all that were executed since the reset: the policy's, then the expert's."""
+    last_state: str = ""
+    """``state_digest`` after the last of them."""
     felt: list[tuple[int, str]] = field(default_factory=list)
     """(control step since the takeover, what the expert felt and corrected)."""
     recorder: EpisodeRecorder | None = None
@@ -195,7 +209,7 @@ def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, ep
     if episode.outcome == "success" and plan.takeover == "failures":
         return Correction(KEPT_OUT)
     limit_steps = sim.judge.limit_steps
-    takeover = _execute_until_takeover(sim, episode)
+    takeover = _execute_until_takeover(sim, episode)  # as ``execution.act_out`` does, which executes it again
     sim.judge.limit_steps = limit_steps
     if takeover is None:
         return Correction("not reproduced", "the policy's actions lead to another state than the policy was in")
@@ -217,6 +231,7 @@ def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, ep
         done.outcome, done.reason = "unreachable", str(error)
     own = np.array([row["action"] for row in done.recorder.rows], np.float32).reshape(-1, 14)
     done.actions, done.felt = np.concatenate([episode.actions[:step], own]), expert.events
+    done.last_state = state_digest(sim)
     return done
 
 
@@ -285,7 +300,7 @@ def correct(
         TaccorlError: no takeover succeeded, nothing is written.
     """
     sim = plan.make()
-    spec = plan.rows(sim)
+    spec = plan.contract(sim)
     sim.close()
 
     def show(k: int, artefact: Artefact) -> None:
@@ -308,9 +323,35 @@ def correct(
             f"{plan.task}: no episode was corrected, nothing was written to {out}: {report['outcomes']}. More episodes, or "
             "--takeover=all if the policy succeeds by itself"
         )
-    stage = dataclasses.replace(_CORRECTIONS, fn=lambda _, inputs, folder: assemble(spec, report, inputs, folder))
-    store.run(stage, _dataset_config(plan), kept, destination=out)
+
+    def write(_: Any, inputs: list[Path], folder: Path) -> None:
+        if plan.rows == "dataset":
+            assemble(spec, report, inputs, folder)
+        else:
+            simulation = plan.config(0) | {"sources": ""}
+            gates = {"gates": dataclasses.asdict(GatesSpec())}
+            write_stored(folder, simulation, gates, report, [_demonstration(path) for path in inputs], CORRECTION)
+
+    store.run(dataclasses.replace(_stage(plan), fn=write), _dataset_config(plan), kept, destination=out)
     return report
+
+
+def _demonstration(folder: Path) -> Demonstration:
+    """A success as it is stored."""
+    entry = _entry(folder)
+    return Demonstration(
+        attempt=entry["episode"],
+        scene_seed=entry["scene_seed"],
+        actions=np.load(folder / "actions.npy"),
+        intended=None,
+        last_state=entry["last_state"],
+        provenance=entry["correction"],
+        first_row=entry["takeover_step"],
+    )
+
+
+def _stage(plan: CorrectionPlan) -> Stage:
+    return _CORRECTIONS if plan.rows == "dataset" else _CORRECTION_ACTIONS
 
 
 def _dataset_config(plan: CorrectionPlan) -> dict[str, Any]:
@@ -326,9 +367,9 @@ def check_out(plan: CorrectionPlan, out: Path) -> None:
         InTheWayError: says what is there.
     """
     manifest = read_manifest(out) if out.is_dir() else None
-    is_ours = manifest and manifest["stage"] == _CORRECTIONS.name and manifest["config"] == _dataset_config(plan)
+    is_ours = manifest and manifest["stage"] == _stage(plan).name and manifest["config"] == _dataset_config(plan)
     if os.path.lexists(out) and not is_ours:
-        raise in_the_way(out, _CORRECTIONS, plan.task)
+        raise in_the_way(out, _stage(plan), plan.task)
 
 
 def run_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int) -> Artefact:
@@ -355,6 +396,7 @@ def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
 
 _CORRECTION = Stage("correction", _not_yet, VERSION)
 _CORRECTIONS = Stage("corrections", _not_yet, CORRECTIONS_VERSION, manifest=f"{PROVENANCE}/manifest.json")
+_CORRECTION_ACTIONS = Stage("correction_actions", _not_yet, CORRECTIONS_VERSION)
 
 
 def _build(plan: CorrectionPlan, k: int, config: dict[str, Any], acted: Path, folder: Path) -> None:
@@ -362,24 +404,26 @@ def _build(plan: CorrectionPlan, k: int, config: dict[str, Any], acted: Path, fo
 
     episode, (sim, spec) = read_policy_episode(acted, k), _simulation(plan)
     done = correct_episode(plan, sim, spec, episode)
-    if done.outcome == "success" and done.recorder is not None:
-        correction = {
-            "scene_seed": episode.seed,
-            "takeover_step": done.takeover_step,
-            "cause": done.cause,
-            "policy": plan.policy,
-            "policy_digest": plan.policy_digest,
-            "policy_outcome": episode.outcome,
-            "felt": [list(event) for event in done.felt],
-        }
+    correction = {
+        "scene_seed": episode.seed,
+        "takeover_step": done.takeover_step,
+        "cause": done.cause,
+        "policy": plan.policy,
+        "policy_digest": plan.policy_digest,
+        "policy_outcome": episode.outcome,
+        "felt": [list(event) for event in done.felt],
+    }
+    if done.outcome == "success" and done.recorder is not None and plan.rows == "dataset":
         name = f"{plan.task} seed {episode.seed}, from step {done.takeover_step}"
         made = done.recorder.episode(name, config | {"correction": correction})
         write_episodes([made], folder / "dataset")
         _dump(folder / "episodes.json", [episode_record(made, "")])
-    _write(done, episode, k, folder)
+    _write(done, episode, k, folder, correction)
 
 
-def _write(done: Correction, episode: PolicyEpisode, k: int, folder: Path) -> None:
+def _write(
+    done: Correction, episode: PolicyEpisode, k: int, folder: Path, correction: dict[str, Any] | None = None
+) -> None:
     """What every correction leaves."""
     rows = len(done.recorder.rows) if done.recorder else 0
     entry = {
@@ -392,6 +436,8 @@ def _write(done: Correction, episode: PolicyEpisode, k: int, folder: Path) -> No
         "takeover_step": done.takeover_step,
         "cause": done.cause,
         "rows": rows,
+        "last_state": done.last_state,
+        "correction": correction,
     }
     np.save(folder / "actions.npy", done.actions)
     _dump(folder / "entry.json", entry)
@@ -406,7 +452,7 @@ def _simulation(plan: CorrectionPlan) -> tuple[Simulation, DatasetSpec]:
     if key not in _made:
         _made.clear()
         sim = plan.make()
-        _made[key] = sim, plan.rows(sim)
+        _made[key] = sim, plan.contract(sim)
     return _made[key]
 
 
@@ -431,7 +477,9 @@ def correction_report(plan: CorrectionPlan, entries: Sequence[dict[str, Any]]) -
         "outcomes": count([e["outcome"] + (f": {e['reason']}" * (e["outcome"] == "not taken over")) for e in entries]),
         "episodes": sum(e["outcome"] == "success" for e in entries),
         "rows": sum(e["rows"] for e in entries if e["outcome"] == "success"),
-        "entries": list(entries),
+        "entries": [
+            {key: value for key, value in e.items() if key not in ("correction", "last_state")} for e in entries
+        ],
     }
 
 

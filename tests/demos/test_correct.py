@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
+from taccorl.data.episode import EXECUTED
 from taccorl.demos import correct as module
 from taccorl.demos.correct import (
     CorrectionPlan,
@@ -21,7 +22,9 @@ from taccorl.demos.correct import (
 )
 from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import EXACT
-from taccorl.errors import InTheWayError, LostError, TaccorlError
+from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
+from taccorl.demos.mimicgen.stored_actions import CORRECTION, read_stored, write_stored
+from taccorl.errors import DatasetError, InTheWayError, LostError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
@@ -155,7 +158,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_without_a_grasp_the_takeover_is_drawn_over_all_steps(sim: Simulation, stub: None) -> None:
     steps = []
     for seed in range(4):
-        done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, seed, 10))
+        done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, seed, 10))
         share = np.random.default_rng([seed, 1]).uniform()
         assert (done.takeover_step, done.cause) == (int(10 * share), "drawn before the grasp")
         assert done.takeover_step is not None
@@ -171,14 +174,14 @@ def test_a_policy_with_more_time_than_the_task_s_own_is_taken_over_beyond_it(
     """Seed 0 draws step 8 of 10; the limit is 4 steps, also of the expert, which acts for 3 here."""
     episode = held_still(sim, 0, 10)
     monkeypatch.setattr(sim.judge, "limit_steps", 4)
-    done = correct_episode(plan(episode_length=10), sim, plan().rows(sim), episode)
+    done = correct_episode(plan(episode_length=10), sim, plan().contract(sim), episode)
     assert done.cause == "drawn before the grasp" and done.takeover_step == 8
     assert done.recorder is not None and len(done.recorder.rows) == 3
     assert sim.judge.limit_steps == 4
 
 
 def test_a_policy_that_holds_still_has_stalled_after_a_second(sim: Simulation, stub: None) -> None:
-    done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, 1, 40))
+    done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, 1, 40))
     assert (done.takeover_step, done.cause) == (30, "stall")
 
 
@@ -194,7 +197,7 @@ def test_after_the_grasp_the_takeover_is_drawn_up_to_the_policys_end(
     monkeypatch.setattr(type(sim.judge), "update", lifted_at_6)
     found = set()
     for seed in range(5):
-        done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, seed, 10))
+        done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, seed, 10))
         share = np.random.default_rng([seed, 1]).uniform()
         assert (done.takeover_step, done.cause) == (6 + int(4 * share), "drawn")
         found.add(done.takeover_step)
@@ -203,7 +206,7 @@ def test_after_the_grasp_the_takeover_is_drawn_up_to_the_policys_end(
 
 def test_the_first_row_is_the_policys_state_at_the_takeover(sim: Simulation, stub: None) -> None:
     episode = held_still(sim, 3, 10)
-    done = correct_episode(plan(), sim, plan().rows(sim), episode)
+    done = correct_episode(plan(), sim, plan().contract(sim), episode)
     assert done.recorder is not None and done.takeover_step is not None
     first = done.recorder.rows[0]["observation.state"]
     assert np.array_equal(first, episode.states[done.takeover_step])
@@ -213,20 +216,20 @@ def test_the_first_row_is_the_policys_state_at_the_takeover(sim: Simulation, stu
 def test_a_state_that_is_off_by_one_bit_is_not_corrected(sim: Simulation, stub: None) -> None:
     episode = held_still(sim, 3, 10)
     episode.states[:, 4] = np.nextafter(episode.states[:, 4], np.float32(9))
-    done = correct_episode(plan(), sim, plan().rows(sim), episode)
+    done = correct_episode(plan(), sim, plan().contract(sim), episode)
     assert done.outcome == "not reproduced" and done.takeover_step is None and not len(done.actions)
 
 
 def test_what_the_policy_completes_by_itself_is_kept_out_unless_all_is_asked_for(sim: Simulation, stub: None) -> None:
     episode = held_still(sim, 3, 10)
     episode = PolicyEpisode(episode.seed, "success", episode.actions, episode.states)
-    assert correct_episode(plan(), sim, plan().rows(sim), episode).outcome == "policy succeeded"
-    assert correct_episode(plan(takeover="all"), sim, plan().rows(sim), episode).takeover_step is not None
+    assert correct_episode(plan(), sim, plan().contract(sim), episode).outcome == "policy succeeded"
+    assert correct_episode(plan(takeover="all"), sim, plan().contract(sim), episode).takeover_step is not None
 
 
 def test_the_expert_has_the_tasks_full_time(sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sim.judge, "limit_steps", 10)
-    done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, 0, 10))
+    done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, 0, 10))
     assert len(done.actions) > 8 and done.outcome == "unfinished"
 
 
@@ -258,7 +261,7 @@ def test_a_lost_state_is_counted(sim: Simulation, monkeypatch: pytest.MonkeyPatc
         raise LostError("plug is lost")
 
     monkeypatch.setattr(experts.get(TASK), "remaining", lost)
-    done = correct_episode(plan(), sim, plan().rows(sim), held_still(sim, 3, 4))
+    done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, 3, 4))
     assert (done.outcome, done.reason) == ("not taken over", "plug is lost")
 
 
@@ -354,6 +357,48 @@ def test_again_nothing_is_made_and_any_number_of_workers_gives_the_same(correcte
     assert correct(its, acted, tmp_path / "out", other, LocalEngine(workers=2), lambda _: None) == report
     one, two = (next((place / "out/data").rglob("*.parquet")) for place in (folder, tmp_path))
     assert one.read_bytes() == two.read_bytes()
+
+
+@pytest.mark.slow
+def test_stored_as_actions_they_execute_to_the_same_rows_alone_and_beside_disturbed_ones(
+    corrected: tuple, tmp_path: Path
+) -> None:
+    folder, its, _ = corrected
+    store = Store(tmp_path / "store")
+    correct(dataclasses.replace(its, rows="actions"), store.source(folder / "acted"), tmp_path / "a", store)
+    stored = read_stored(tmp_path / "a")
+    assert stored.kind == CORRECTION and all(d.first_row > 0 for d in stored.demonstrations)
+    execute_stored(ExecutePlan(sources=(tmp_path / "a",), pictures="none"), tmp_path / "rows", store)
+    one, two = Dataset(folder / "out"), Dataset(tmp_path / "rows")
+    assert two.num_episodes == one.num_episodes == 2
+    for i in range(2):
+        for key, values in one.episode(i).arrays.items():
+            np.testing.assert_array_equal(two.episode(i).arrays[key], values, err_msg=key)
+        made = [each.told(i)["provenance"]["simulation"]["correction"] for each in (one, two)]
+        assert made[0] == made[1]
+
+    # As if the arms of a generated one had been disturbed: what was executed is another column then, of all.
+    (generated,) = [dataclasses.replace(d, first_row=0) for d in stored.demonstrations[:1]]
+    wished = dataclasses.replace(generated, intended=generated.actions + np.float32(1e-3))
+    (tmp_path / "b").mkdir()
+    write_stored(tmp_path / "b", stored.simulation, stored.meta["spec"], {}, [wished])
+    sources = (tmp_path / "b", tmp_path / "a")
+    report, _ = execute_stored(ExecutePlan(sources=sources, pictures="none"), tmp_path / "both", store)
+    both = Dataset(tmp_path / "both")
+    assert report["episodes"] == both.num_episodes == 3
+    whole, part = both.episode(0), both.episode(1)
+    assert len(whole.arrays["action"]) == len(generated.actions)
+    np.testing.assert_array_equal(whole.arrays["action"], wished.intended)
+    np.testing.assert_array_equal(whole.arrays[EXECUTED], generated.actions)
+    np.testing.assert_array_equal(part.arrays["action"], one.episode(0).arrays["action"])
+    np.testing.assert_array_equal(part.arrays[EXECUTED], part.arrays["action"])
+    with pytest.raises(DatasetError, match="given twice"):
+        execute_stored(ExecutePlan(sources=(tmp_path / "a",) * 2, pictures="none"), tmp_path / "c", store)
+    other = stored.simulation | {"difficulty": "easy"}
+    (tmp_path / "easy").mkdir()
+    write_stored(tmp_path / "easy", other, stored.meta["spec"], {}, [generated])
+    with pytest.raises(DatasetError, match="difficulty"):
+        execute_stored(ExecutePlan(sources=(tmp_path / "a", tmp_path / "easy"), pictures="none"), tmp_path / "c", store)
 
 
 def test_nothing_is_written_where_nothing_was_corrected(tmp_path: Path) -> None:

@@ -94,10 +94,10 @@ def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected
     store, quiet = Store(tmp_path / "store"), lambda _: None
     plan = AugmentPlan(spec=load_mimic_spec("assembly_2"), episodes=1, rows="actions")
     augment(plan, collected, tmp_path / "actions", store, progress=quiet)
-    execute_stored(ExecutePlan(source=tmp_path / "actions"), tmp_path / "video", store, progress=quiet)
+    execute_stored(ExecutePlan(sources=(tmp_path / "actions",)), tmp_path / "video", store, progress=quiet)
     with monkeypatch.context() as patch:
         patch.setattr(av, "open", lambda *_, **__: pytest.fail("PyAV is not needed"))
-        cached = ExecutePlan(source=tmp_path / "actions", pictures="cache")
+        cached = ExecutePlan(sources=(tmp_path / "actions",), pictures="cache")
         execute_stored(cached, tmp_path / "cache", store, progress=quiet)
         artefact, seconds = render_frames(tmp_path / "cache", (28, 28), store, LocalEngine(), quiet)
     assert set(seconds) == {"rendering", "resizing and writing"}

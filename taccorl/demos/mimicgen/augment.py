@@ -31,7 +31,7 @@ from taccorl.demos.mimicgen.execution import DIFFERS, Demonstration, Execution, 
 from taccorl.demos.mimicgen.from_dataset import read_sources, simulation_told
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, MimicSpec, check_task
-from taccorl.demos.mimicgen.stored_actions import META, write_stored
+from taccorl.demos.mimicgen.stored_actions import META, MIMICGEN, write_stored
 from taccorl.demos.mimicgen.stratify import ResetSpace, first_attempts, next_round
 from taccorl.demos.recorder import ORIGIN, with_simulator
 from taccorl.errors import TaccorlError, nearest
@@ -396,16 +396,20 @@ def _build_rows(plan: AugmentPlan, sources: Artefact, attempt: Path, config: dic
     _dump_entry(entry, folder)
 
 
-def write_execution(done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path) -> None:
+def write_execution(
+    done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path, kind: str = MIMICGEN
+) -> None:
     """Rows of an execution as dataset/ with one episode, and its record, episodes.json.
 
     Args:
         told: what the simulation was, for the episode's provenance.
+        kind: of stored actions; where the provenance says how the episode was made.
     """
     from taccorl.data.lerobot_format import write_episodes
 
     made = stored.provenance if done.is_same else stored.provenance | {DIFFERS: True}
-    episode = done.recorder.episode(f"{told['task']} attempt {stored.attempt}", told | {"mimicgen": made})
+    since = f", from step {stored.first_row}" if stored.first_row else ""
+    episode = done.recorder.episode(f"{told['task']} attempt {stored.attempt}{since}", told | {kind: made})
     episode = dataclasses.replace(episode, origin=told["origin"])
     write_episodes([episode], folder / "dataset")
     (folder / "episodes.json").write_text(json.dumps([episode_record(episode, told["sources"])]), encoding="utf-8")

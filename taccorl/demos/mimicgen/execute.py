@@ -37,6 +37,7 @@ from taccorl.sim.simulation import Simulation
 
 PicturesAs = Literal["video", "cache", "none"]
 _SECONDS = ("physics", "touch", "writing")
+_SAME = ("task", "difficulty", "twin", "randomization")  # of all sources
 
 
 @dataclass(frozen=True)
@@ -53,19 +54,26 @@ class Executed:
 class ExecutePlan:
     """What to make of stored actions."""
 
-    source: Path
+    sources: tuple[Path, ...]
+    """Folders of stored actions of one task, difficulty, twin and randomisation."""
     pictures: PicturesAs = "video"
     part_poses: bool = False
     """Rows have the poses of the task's parts (``observation.environment_state``)."""
 
     def __post_init__(self) -> None:
+        if not self.sources:
+            raise TaccorlError("missing --source=…, a folder of stored actions: taccorl augment --rows=actions")
         if self.pictures not in get_args(PicturesAs):
             raise TaccorlError(f"--pictures={self.pictures}: {nearest(self.pictures, get_args(PicturesAs))}")
 
-    def contract(self, stored: StoredActions, sim: Simulation, *, pictures: bool) -> DatasetSpec:
-        """What a row holds."""
+    def contract(self, sim: Simulation, *, pictures: bool, executed: bool) -> DatasetSpec:
+        """What a row holds.
+
+        Args:
+            executed: what was executed beside the action: if the arms were disturbed in one of the sources.
+        """
         spec = load_dataset_spec(find_spec("taccorl_bimanual"))
-        return with_simulator(spec, sim, pictures=pictures, executed=stored.is_disturbed, parts=self.part_poses)
+        return with_simulator(spec, sim, pictures=pictures, executed=executed, parts=self.part_poses)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -87,29 +95,36 @@ def execute_stored(
         DatasetError: no stored actions, or changed since they were written; none of them is a success here.
         InTheWayError: something else is at ``out``.
     """
-    source = _source(plan.source, store)
-    stored = _stored(plan.source, source.digest)[0]
-    num = len(stored.demonstrations)
-    if os.path.lexists(out) and not _may_be_of(plan, source, num, out, store):
-        raise in_the_way(out, _DATASET, stored.meta["task"])
-    sim = _stored(plan.source, source.digest)[1]
-    spec = plan.contract(stored, sim, pictures=plan.pictures != "none")
+    sources = [_source(root, store) for root in plan.sources]
+    found = [_stored(source) for source in sources]
+    _check_alike(found)
+    executed = any(stored.is_disturbed for stored in found)
+    items = [
+        _Item(source, i, executed != stored.is_disturbed)
+        for source, stored in zip(sources, found, strict=True)
+        for i in range(len(stored.demonstrations))
+    ]
+    if os.path.lexists(out) and not _may_be_of(plan, items, out, store):
+        raise in_the_way(out, _DATASET, found[0].meta["task"])
+    sim = _simulation(found[0])
+    spec = plan.contract(sim, pictures=plan.pictures != "none", executed=executed)
     # Touch is compiled once here and found by the workers; else each of them compiles it, a minute on sixteen cores.
     sim.reset([0])
     EpisodeRecorder(sim, spec, np.random.default_rng(0)).step(sim.targets[0])
     made: list[Executed] = (engine or LocalEngine()).map(
-        functools.partial(_run, plan, source, store),
-        range(num),
-        on_done=lambda i, _: progress(f"demonstration {i} of {num}: executed"),
-        name=lambda i: f"demonstration {i}",
+        functools.partial(_run, plan, store),
+        items,
+        on_done=lambda item, _: progress(f"{item}: executed"),
+        name=str,
     )
     entries = [json.loads((each.artefact.path / "entry.json").read_text(encoding="utf-8")) for each in made]
     kept = [each.artefact for each, entry in zip(made, entries, strict=True) if entry["outcome"] == "success"]
-    report = _report(stored, entries)
+    report = _report(found[0], entries)
     if not kept:
+        names, meta = ", ".join(map(str, plan.sources)), found[0].meta
         raise DatasetError(
-            f"{plan.source}: none of its {num} demonstrations is a success here ({report['dropped']}); nothing was written to "
-            f"{out}. They were made with mujoco {stored.meta['mujoco']}, taccorl {stored.meta['taccorl']}; here are mujoco "
+            f"{names}: none of {len(items)} demonstrations is a success here ({report['dropped']}); nothing was written to "
+            f"{out}. They were made with mujoco {meta['mujoco']}, taccorl {meta['taccorl']}; here are mujoco "
             f"{mujoco.__version__}, taccorl {taccorl.__version__}: make them here, taccorl augment"
         )
 
@@ -145,12 +160,31 @@ def _source(root: Path, store: Store) -> Artefact:
     return source
 
 
-def _may_be_of(plan: ExecutePlan, source: Artefact, num: int, out: Path, store: Store) -> bool:
+def _check_alike(found: Sequence[StoredActions]) -> None:
+    """
+    Raises:
+        DatasetError: sources of several simulations, or one that is given twice.
+    """
+    first = found[0]
+    for other in found[1:]:
+        for key in _SAME:
+            if other.meta[key] != first.meta[key]:
+                there, here = (str(one.meta[key]).splitlines()[0][:80] for one in (other, first))
+                raise DatasetError(
+                    f"--source={other.root}: its {key} is another one than that of {first.root} ({there}; {here}): execute them "
+                    "into datasets of their own, taccorl merge joins those"
+                )
+    roots = [one.root.resolve() for one in found]
+    if twice := [one.root for one in found if roots.count(one.root.resolve()) > 1]:
+        raise DatasetError(f"--source={twice[0]} is given twice: each once")
+
+
+def _may_be_of(plan: ExecutePlan, items: Sequence["_Item"], out: Path, store: Store) -> bool:
     """Whether the dataset at ``out`` is made of executions of this very plan."""
     manifest = read_manifest(out)
     if not manifest or manifest["stage"] != _DATASET.name or manifest["config"] != _dataset_config(plan):
         return False
-    keys = {store.key(_EXECUTION, plan.config | {"demonstration": i}, [source]) for i in range(num)}
+    keys = {store.key(_EXECUTION, item.config(plan), [item.source]) for item in items}
     return {entry["key"] for entry in manifest["inputs"]} <= keys
 
 
@@ -166,27 +200,46 @@ _EXECUTION = Stage("execution", _not_yet, 1)
 _DATASET = Stage("executed", _not_yet, 1, manifest=f"{PROVENANCE}/manifest.json")
 
 
-def _run(plan: ExecutePlan, source: Artefact, store: Store, i: int) -> Executed:
-    """Demonstration ``i``, from the store if it has been executed."""
+@dataclass(frozen=True)
+class _Item:
+    """A demonstration of one of the sources."""
+
+    source: Artefact
+    index: int
+    adds_executed: bool
+    """Its rows say what was executed, though that is the action itself: other sources' arms were disturbed."""
+
+    def config(self, plan: ExecutePlan) -> dict[str, Any]:
+        """What its execution depends on besides the stored actions."""
+        executed = {"executed": True} if self.adds_executed else {}
+        return plan.config | executed | {"demonstration": self.index}
+
+    def __str__(self) -> str:
+        return f"{self.source.path.name}, demonstration {self.index}"
+
+
+def _run(plan: ExecutePlan, store: Store, item: _Item) -> Executed:
+    """One demonstration, from the store if it has been executed."""
     seconds: dict[str, float] = {}
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
-        stored, sim = _stored(source.path, source.digest)
-        demonstration = stored.demonstrations[i]
-        done = execute(sim, demonstration, plan.contract(stored, sim, pictures=config["videos"]), stored.gates)
+        stored = _stored(item.source)
+        sim, demonstration = _simulation(stored), stored.demonstrations[item.index]
+        executed = stored.is_disturbed or item.adds_executed
+        spec = plan.contract(sim, pictures=config["videos"], executed=executed)
+        done = execute(sim, demonstration, spec, stored.gates)
         began_s = time.perf_counter()
         if done.outcome == "success":
             told = stored.simulation | {"attempt": demonstration.attempt, "images": config["videos"]}
-            write_execution(done, demonstration, told, folder)
-        entry = {"attempt": demonstration.attempt, "rows": len(demonstration.actions), "outcome": done.outcome}
+            write_execution(done, demonstration, told, folder, stored.kind)
+        entry = {"attempt": demonstration.attempt, "rows": len(done.recorder.rows), "outcome": done.outcome}
         entry |= {"reason": done.reason, "differs": not done.is_same}
         (folder / "entry.json").write_text(json.dumps(entry), encoding="utf-8")
         written_s = time.perf_counter() - began_s
         found = (done.recorder.physics_s, done.recorder.touch_s, written_s)
         seconds.update(zip(_SECONDS, found, strict=True))
 
-    config = plan.config | {"demonstration": i}
-    return Executed(store.run(dataclasses.replace(_EXECUTION, fn=build), config, [source]), seconds)
+    return Executed(store.run(dataclasses.replace(_EXECUTION, fn=build), item.config(plan), [item.source]), seconds)
 
 
 def _report(stored: StoredActions, entries: list[dict[str, Any]]) -> dict[str, Any]:
@@ -203,13 +256,21 @@ def _report(stored: StoredActions, entries: list[dict[str, Any]]) -> dict[str, A
     }
 
 
-_read: dict[str, tuple[StoredActions, Simulation]] = {}
+_read: dict[str, StoredActions] = {}
+_open: dict[str, Simulation] = {}
 
 
-def _stored(root: Path, digest: str) -> tuple[StoredActions, Simulation]:
-    """Stored actions and their simulation, made once in a process."""
-    if digest not in _read:
-        _read.clear()
-        stored = read_stored(root)
-        _read[digest] = stored, simulation_told(stored.simulation)
-    return _read[digest]
+def _stored(source: Artefact) -> StoredActions:
+    """Stored actions, read once in a process."""
+    if source.digest not in _read:
+        _read[source.digest] = read_stored(source.path)
+    return _read[source.digest]
+
+
+def _simulation(stored: StoredActions) -> Simulation:
+    """Of stored actions, made once in a process."""
+    key = json.dumps([stored.meta[key] for key in _SAME])
+    if key not in _open:
+        _open.clear()
+        _open[key] = simulation_told(stored.simulation)
+    return _open[key]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from taccorl.data.episode import EXECUTED
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos.mimicgen.attempt import state_digest
 from taccorl.demos.mimicgen.gates import GateKeeper, foreign_contact
@@ -33,6 +34,8 @@ class Demonstration:
     last_state: str
     """``state_digest`` after the last action."""
     provenance: dict[str, object] = field(default_factory=dict)
+    first_row: int = 0
+    """First action that becomes a row: of a correction those before are the policy's."""
 
 
 @dataclass(kw_only=True)
@@ -55,10 +58,14 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
         gates: what an execution that differs must keep.
     """
     seed, intended = demonstration.scene_seed, demonstration.intended
+    if intended is None and EXECUTED in rows.features:
+        intended = demonstration.actions
     sim.reset([seed])
+    if demonstration.first_row:
+        act_out(sim, demonstration.actions[: demonstration.first_row])
     recorder, keeper = EpisodeRecorder(sim, rows, np.random.default_rng([seed, _PAD_NOISE])), GateKeeper(sim)
-    for t, action in enumerate(demonstration.actions):
-        recorder.step(action, keeper.watch(), None if intended is None else intended[t])
+    for t in range(demonstration.first_row, len(demonstration.actions)):
+        recorder.step(demonstration.actions[t], keeper.watch(), None if intended is None else intended[t])
     done = Execution(
         recorder=recorder, outcome="success", reason="", is_same=state_digest(sim) == demonstration.last_state
     )
@@ -69,7 +76,17 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
         done.outcome = str(outcome.failure[0]) or "not reproduced"
         done.reason = "executed again, the stored actions end in another state, without success"
     else:
-        keeper.see_actions(demonstration.actions)
+        keeper.see_actions(demonstration.actions[demonstration.first_row :])
         states = np.stack([row["sim.state"] for row in recorder.rows])
         done.outcome, done.reason = keeper.measured.refused(gates) or foreign_contact(sim, states) or ("success", "")
     return done
+
+
+def act_out(sim: Simulation, actions: np.ndarray) -> None:
+    """A policy's actions (T, 14) without rows; then whoever takes over has the task's full time."""
+    limit_steps = sim.judge.limit_steps
+    sim.judge.limit_steps = max(limit_steps, len(actions) + 1)  # the policy may have had more than the task's own
+    for action in actions:
+        sim.step(action[None].astype(np.float64))
+    sim.judge.limit_steps = limit_steps
+    sim.judge.restart_clock()

@@ -1,8 +1,10 @@
 """Demonstrations stored as seeds and float32 actions: a folder with ``meta.json``, ``actions.npy`` and, where the arms were
 disturbed, ``intended.npy``.
 
-    meta.json     format, task, difficulty, twin (a file's text), randomization, spec, origin, versions, action_time, report;
-                  of each episode: attempt, scene_seed, rows, last_state (SHA-256 of the last state row), provenance
+    meta.json     format, task, difficulty, twin (a file's text), randomization, spec, origin, versions, action_time, report,
+                  kind (mimicgen: generated; correction: an expert's after a policy's);
+                  of each episode: attempt, scene_seed, rows, first_row (of a correction: rows before it are the policy's and
+                  become no rows of a dataset), last_state (SHA-256 of the last state row), provenance
     actions.npy   (ΣT, 14) float32 joint targets [rad] and openings [m] as they were executed, episode after episode
     intended.npy  (ΣT, 14) float32 the dataset's ``action`` of these rows
 
@@ -22,10 +24,12 @@ from taccorl.demos.mimicgen.execution import Demonstration
 from taccorl.demos.mimicgen.spec import GatesSpec
 from taccorl.errors import DatasetError
 
-FORMAT = 1
+FORMAT = 2
+_FORMATS = (1, FORMAT)  # 1: without kind and first_row
 META, ACTIONS, INTENDED = "meta.json", "actions.npy", "intended.npy"
 SIMULATION = ("task", "difficulty", "twin", "randomization", "origin", "root_seed", "mujoco", "taccorl", "sources")
 """What the episodes of a folder have in common, as an episode's provenance has it."""
+MIMICGEN, CORRECTION = "mimicgen", "correction"
 _ACTION_SIZE = 14
 
 
@@ -40,6 +44,11 @@ class StoredActions:
     @property
     def is_disturbed(self) -> bool:
         return self.meta["disturbed"]
+
+    @property
+    def kind(self) -> str:
+        """``MIMICGEN`` or ``CORRECTION``: where an episode's provenance says how it was made."""
+        return self.meta.get("kind", MIMICGEN)
 
     @property
     def gates(self) -> GatesSpec:
@@ -57,19 +66,21 @@ def write_stored(
     spec: Mapping[str, Any],
     report: Mapping[str, Any],
     demonstrations: Sequence[Demonstration],
+    kind: str = MIMICGEN,
 ) -> None:
     """
     Args:
         simulation: what ``SIMULATION`` names.
-        spec: of the generation, as JSON values.
+        spec: of the generation, as JSON values; its ``gates`` are those that an execution must pass.
     """
     intended = [d.intended for d in demonstrations if d.intended is not None]
     episodes = [
         {"attempt": d.attempt, "scene_seed": d.scene_seed, "rows": len(d.actions), "last_state": d.last_state}
-        | {"provenance": d.provenance}
+        | {"first_row": d.first_row, "provenance": d.provenance}
         for d in demonstrations
     ]
-    meta = {"format": FORMAT, **{key: simulation[key] for key in SIMULATION}, "spec": spec, "disturbed": bool(intended)}
+    meta = {"format": FORMAT, "kind": kind, **{key: simulation[key] for key in SIMULATION}, "spec": spec}
+    meta |= {"disturbed": bool(intended)}
     meta |= {"action_time": action_time(), "report": report, "episodes": episodes}
     np.save(folder / ACTIONS, np.concatenate([d.actions for d in demonstrations]))
     if intended:
@@ -89,7 +100,7 @@ def read_stored(root: Path) -> StoredActions:
         meta = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise DatasetError(f"{path}: is not JSON ({error}): copy the folder again") from error
-    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+    if not isinstance(meta, dict) or meta.get("format") not in _FORMATS:
         found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
         raise DatasetError(
             f"{path}: format {found!r}, this taccorl reads {FORMAT}; make it again: taccorl augment --rows=actions"
@@ -114,6 +125,7 @@ def read_stored(root: Path) -> StoredActions:
                 intended=None if intended is None else intended[end - num : end],
                 last_state=episode["last_state"],
                 provenance=episode["provenance"],
+                first_row=episode.get("first_row", 0),
             )
             for episode, num, end in zip(meta["episodes"], rows, ends, strict=True)
         ],

@@ -81,7 +81,7 @@ def test_what_is_damaged_is_named(tmp_path):
     with pytest.raises(TaccorlError, match=r"--rows=action: .*actions"):
         AugmentPlan(spec=SPEC, rows="action")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TaccorlError, match=r"--pictures=vidio: .*video"):
-        ExecutePlan(source=tmp_path, pictures="vidio")  # pyright: ignore[reportArgumentType]
+        ExecutePlan(sources=(tmp_path,), pictures="vidio")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_both_forms_are_of_the_same_attempts_and_executing_gives_the_bytes_of_th
         np.testing.assert_array_equal(episode.arrays["sim.executed"], demonstration.actions)
         np.testing.assert_array_equal(episode.arrays["action"], demonstration.intended)
         assert episode.provenance["simulation"]["mimicgen"] == demonstration.provenance
-    plan, store = ExecutePlan(source=made / "actions", pictures="none"), Store(made / "elsewhere")
+    plan, store = ExecutePlan(sources=(made / "actions",), pictures="none"), Store(made / "elsewhere")
     report, seconds = execute_stored(plan, made / "again", store, progress=quiet)
     assert (report["episodes"], report["differs"], report["dropped"]) == (2, 0, {})
     assert set(seconds) == {"physics", "touch", "writing"}
@@ -137,7 +137,7 @@ def test_what_does_not_succeed_here_is_dropped_and_counted_and_a_bit_that_differ
     actions = np.load(changed / ACTIONS)
     actions[meta["episodes"][0]["rows"] :] = actions[meta["episodes"][0]["rows"]]  # the second one stands still
     np.save(changed / ACTIONS, actions)
-    plan = ExecutePlan(source=changed, pictures="none")
+    plan = ExecutePlan(sources=(changed,), pictures="none")
     report, _ = execute_stored(plan, tmp_path / "new", Store(tmp_path / "store"), progress=quiet)
     assert (report["demonstrations"], report["episodes"], report["differs"]) == (2, 1, 2)
     assert sum(report["dropped"].values()) == 1
@@ -145,10 +145,10 @@ def test_what_does_not_succeed_here_is_dropped_and_counted_and_a_bit_that_differ
     assert episode.provenance["simulation"]["mimicgen"]["last_state_differs"] is True
     with pytest.raises(InTheWayError):
         execute_stored(
-            ExecutePlan(source=made / "actions"), tmp_path / "new", Store(tmp_path / "store"), progress=quiet
+            ExecutePlan(sources=(made / "actions",)), tmp_path / "new", Store(tmp_path / "store"), progress=quiet
         )
     spoilt = shutil.copytree(made / "actions", tmp_path / "spoilt")
     (spoilt / ACTIONS).chmod(0o644)
     np.save(spoilt / ACTIONS, actions)
     with pytest.raises(DatasetError, match="its files are not as written"):
-        execute_stored(ExecutePlan(source=spoilt), tmp_path / "x", Store(tmp_path / "store"), progress=quiet)
+        execute_stored(ExecutePlan(sources=(spoilt,)), tmp_path / "x", Store(tmp_path / "store"), progress=quiet)
