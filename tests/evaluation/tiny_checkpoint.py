@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
 from taccorl.sim.spaces import IMAGE_KEYS
@@ -9,8 +10,12 @@ from taccorl.sim.spaces import IMAGE_KEYS
 sys.path.insert(0, str(Path(__file__).parents[1] / "policies"))
 
 
-def write_checkpoint(folder: Path) -> Path:
-    """``folder/pretrained_model`` with weights, configuration and both processors; returns it."""
+def write_checkpoint(folder: Path, **changes: Any) -> Path:
+    """``folder/pretrained_model`` with weights, configuration and both processors; returns it.
+
+    Args:
+        changes: of the policy's configuration.
+    """
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.policies.factory import make_pre_post_processors
@@ -25,7 +30,7 @@ def write_checkpoint(folder: Path) -> Path:
         **{key: PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for key in IMAGE_KEYS.values()},
     }
     policy = tiny_policy(
-        fps=30, discrete_state_input=None, action_feature_names=list(arm_names()), input_features=inputs
+        fps=30, discrete_state_input=None, action_feature_names=list(arm_names()), input_features=inputs, **changes
     )
     middle = torch.tensor((ACTION_LOW + ACTION_HIGH) / 2, dtype=torch.float32)
     statistics = {

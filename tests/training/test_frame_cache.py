@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -149,6 +150,19 @@ def test_what_does_not_fit_goes_to_the_next_place_and_says_what_would(monkeypatc
     assert Frames(arrays, "gpu", "cuda:0").place == "disk"
     assert "--dataset.cache=gpu" in caplog.text and "--dataset.cache=host" in caplog.text
     assert Frames(arrays, "gpu", "cpu").place == "disk"
+
+
+@pytest.mark.parametrize("cached", [True, False])
+def test_a_policy_without_cameras_reads_no_frames(root, tmp_path, monkeypatch, cached):
+    """Numbers are those of the plain reader; no video is opened, so they may be missing."""
+    plain = load(root, monkeypatch, None, delta_timestamps=WINDOWS)
+    numbers = {key: x for key, x in default_collate([plain[row] for row in ROWS]).items() if "images" not in key}
+    monkeypatch.setattr(reading, "_reads_pictures", False)
+    monkeypatch.setattr(av, "open", lambda *_, **__: pytest.fail("a video was opened"))
+    ours = load(root, monkeypatch, request(tmp_path) if cached else None, delta_timestamps=WINDOWS)
+    found = ours.__getitems__(ROWS)[0] if cached else default_collate([ours[row] for row in ROWS])
+    assert_same(found, numbers)
+    assert not (tmp_path / "store").exists()
 
 
 def test_options_that_go_with_no_cache_are_refused():

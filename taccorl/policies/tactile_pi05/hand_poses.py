@@ -92,24 +92,30 @@ def tcp_poses(state_BS: Tensor, chains: Tensor) -> list[Tensor]:
         turns_BJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(*joints_BJ.shape, 1, 1)
         turns_BJ44[..., 0, 0], turns_BJ44[..., 0, 1] = cos_BJ, -sin_BJ
         turns_BJ44[..., 1, 0], turns_BJ44[..., 1, 1] = sin_BJ, cos_BJ
-        steps_BJ44 = chain[:-1] @ turns_BJ44
+        steps_BJ44 = _product(chain[:-1], turns_BJ44)
         pose_B44 = steps_BJ44[:, 0]
         for j in range(1, len(JOINTS)):
-            pose_B44 = pose_B44 @ steps_BJ44[:, j]
-        poses.append(pose_B44 @ chain[-1])
+            pose_B44 = _product(pose_B44, steps_BJ44[:, j])
+        poses.append(_product(pose_B44, chain[-1]))
     return poses
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """a @ b. On a GPU as products and sums: LeRobot allows matmul to round to ten bits (TF32), half a millimetre of half a
+    metre."""
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2) if a.is_cuda else a @ b
 
 
 def hand_poses(state_BS: Tensor, chains: Tensor) -> Tensor:
     """(B, 27), see ``HAND_POSES``. Arguments as of ``tcp_poses``."""
     left_B44, right_B44 = tcp_poses(state_BS, chains)
     turn_B33 = left_B44[:, :3, :3].transpose(1, 2)
-    between_B3 = (turn_B33 @ (right_B44[:, :3, 3:] - left_B44[:, :3, 3:]))[:, :, 0]
+    between_B3 = _product(turn_B33, right_B44[:, :3, 3:] - left_B44[:, :3, 3:])[:, :, 0]
     told = []
     for position_B3, rotation_B33 in (
         (left_B44[:, :3, 3] / WORLD_M, left_B44[:, :3, :3]),
         (right_B44[:, :3, 3] / WORLD_M, right_B44[:, :3, :3]),
-        (between_B3 / HAND_TO_HAND_M, turn_B33 @ right_B44[:, :3, :3]),
+        (between_B3 / HAND_TO_HAND_M, _product(turn_B33, right_B44[:, :3, :3])),
     ):
         told += [position_B3, rotation_B33[:, :, 0], rotation_B33[:, :, 1]]
     return torch.cat(told, dim=1)

@@ -1,0 +1,231 @@
+"""Poses of the parts in the state's token, a policy without pictures, and the pose head."""
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from tiny_policies import batch_of, chunk, features, losses, tiny_config, tiny_policy
+
+from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES, arm_chains, arm_names, tcp_poses
+from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+from taccorl.policies.tactile_pi05.part_poses import (
+    PART_POSES,
+    PartPosesStep,
+    num_part_numbers,
+    part_poses,
+    relative_positions_m,
+)
+from taccorl.policies.tactile_pi05.processor_tactile_pi05 import make_tactile_pi05_pre_post_processors
+from taccorl.sim.part_poses import part_pose_names
+from taccorl.sim.spaces import PARTS_KEY
+from taccorl.sim.tasks import tasks
+
+NAMES = list(part_pose_names(tasks.get("assembly_2")))
+TOLD: dict[str, Any] = {
+    "discrete_state_input": None,
+    "action_feature_names": list(arm_names()),
+    "part_names": NAMES,
+}
+STATISTICS = {key: {"q01": -torch.ones(14), "q99": torch.ones(14)} for key in ("observation.state", "action")}
+
+
+def turn(axis: int, angle_rad: float) -> np.ndarray:
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    planes = {
+        0: [[1, 0, 0], [0, c, -s], [0, s, c]],
+        1: [[c, 0, s], [0, 1, 0], [-s, 0, c]],
+        2: [[c, -s, 0], [s, c, 0], [0, 0, 1]],
+    }
+    return np.array(planes[axis], dtype=float)
+
+
+def numbers(position_m: list[float], rotation: np.ndarray) -> np.ndarray:
+    return np.concatenate([position_m, rotation[:, 0], rotation[:, 1]])
+
+
+def test_relative_poses_written_out():
+    """The second body is turned by 90° about z: its x axis is the world's y, its y axis the world's −x. The first body lies
+    10 mm further in x and 2 mm in y, not turned: in the second's frame (2, −10, 0) mm, its axes (0, −1, 0) and (1, 0, 0)."""
+    poses = np.concatenate([numbers([0.51, 0.102, 0.05], np.eye(3)), numbers([0.5, 0.1, 0.05], turn(2, math.pi / 2))])
+    tcp = np.eye(4)
+    tcp[:3, 3] = [0.51, 0.102, 0.25]
+    tcp[:3, :3] = turn(0, math.pi)  # approaches downwards
+    found = part_poses(torch.tensor(poses[None]), [torch.tensor(tcp[None], dtype=torch.float32)] * 2)[0].numpy()
+    assert len(found) == num_part_numbers(2) == 2 * 9 + 15 + 4 * 9
+    np.testing.assert_allclose(found[:9], [2.04, 0.408, 0.2, 1, 0, 0, 0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(found[9:18], [2.0, 0.4, 0.2, 0, 1, 0, -1, 0, 0], atol=1e-6)
+    fine = [math.tanh(0.2), math.tanh(-1), 0, math.tanh(1), math.tanh(-5), 0]
+    np.testing.assert_allclose(found[18:33], [0.02, -0.1, 0, *fine, 0, -1, 0, 1, 0, 0], atol=2e-5)
+    # 200 mm below the TCP, whose z axis points downwards
+    np.testing.assert_allclose(found[33:42], [0, 0, 2, 1, 0, 0, 0, -1, 0], atol=1e-6)
+    assert np.array_equal(found[51:], found[33:51])
+    mm = 1e3 * relative_positions_m(torch.tensor(found[None]), 2)[0].numpy()
+    np.testing.assert_allclose(mm, [[2, -10, 0], *[[0, 0, 200], [-10, 2, 200]] * 2], atol=1e-3)
+
+
+def test_relative_poses_do_not_change_when_everything_moves():
+    rng = np.random.default_rng(0)
+    frames = [np.eye(4) for _ in range(5)]  # three bodies and two TCPs
+    for k, frame in enumerate(frames):
+        frame[:3, :3], frame[:3, 3] = (
+            turn(k % 3, rng.uniform(-3, 3)) @ turn((k + 1) % 3, 1.0),
+            rng.uniform(-0.3, 0.3, 3),
+        )
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = turn(1, 0.7), [0.1, -0.2, 0.3]
+
+    def told(frames: list[np.ndarray]) -> torch.Tensor:
+        poses = np.concatenate([numbers(frame[:3, 3], frame[:3, :3]) for frame in frames[:3]])
+        return part_poses(torch.tensor(poses[None]), [torch.tensor(f[None], dtype=torch.float32) for f in frames[3:]])
+
+    before, after = told(frames), told([motion @ frame for frame in frames])
+    assert before.shape == (1, num_part_numbers(3)) == (1, 3 * 9 + 3 * 15 + 6 * 9)
+    torch.testing.assert_close(before[:, 27:], after[:, 27:], atol=2e-4, rtol=0)  # tanh(d / 2 mm): 1e-7 m is 5e-5
+    between = np.linalg.inv(frames[2]) @ frames[1]  # the third pair: body 1 in the frame of body 2
+    np.testing.assert_allclose(before[0, 57:60].numpy() * 0.1, between[:3, 3], atol=1e-6)
+    np.testing.assert_allclose(before[0, 66:72].numpy(), np.r_[between[:3, 0], between[:3, 1]], atol=1e-6)
+
+
+def test_the_step_uses_the_state_as_it_is_and_comes_back_from_its_configuration():
+    state = torch.linspace(-0.5, 0.5, 42).reshape(3, 14)
+    poses = torch.tensor(np.tile(np.concatenate([numbers([0.4, 0, 0.1], np.eye(3))] * 2), (3, 1)))
+    before, _ = make_tactile_pi05_pre_post_processors(tiny_config(**TOLD, part_poses=True), STATISTICS)
+    given = {
+        "observation.state": state,
+        "observation.tactile": torch.zeros(3, 10, 1536),
+        PARTS_KEY: poses,
+        "task": ["a"] * 3,
+    }
+    expected = part_poses(poses, tcp_poses(state, torch.tensor(arm_chains())))
+    assert torch.equal(before(given)[PART_POSES], expected)
+    again = PartPosesStep(**PartPosesStep(names=NAMES).get_config())
+    one = again.observation({"observation.state": state[1], PARTS_KEY: poses[1]})
+    torch.testing.assert_close(one[PART_POSES], expected[1])
+
+
+def test_what_is_missing_or_of_another_task_is_named():
+    step, state = PartPosesStep(names=NAMES), torch.zeros(1, 14)
+    with pytest.raises(TaccorlError, match=r"no observation.environment_state.*execute --part_poses=true"):
+        step.observation({"observation.state": state})
+    with pytest.raises(TaccorlError, match=r"36 numbers.*the 18 of plug, cradle"):
+        step.observation({"observation.state": state, PARTS_KEY: torch.zeros(1, 36)})
+    with pytest.raises(TaccorlError, match="6 numbers"):
+        step.observation({"observation.state": torch.zeros(1, 6), PARTS_KEY: torch.zeros(1, 18)})
+    assert set(PartPosesStep(names=NAMES, required=False).observation({"observation.state": state})) == {
+        "observation.state"
+    }
+    with pytest.raises(TaccorlError, match="discrete_state_input"):
+        TactilePI05Config(backbone="full", part_poses=True)
+    with pytest.raises(TaccorlError, match=r"pose_loss.*pictures=false"):
+        TactilePI05Config(backbone="small", pose_loss=1.0, pictures=False)
+    with pytest.raises(TaccorlError, match="pose_loss=-1"):
+        TactilePI05Config(backbone="small", pose_loss=-1.0)
+
+
+def dataset_of(names: list[str] | None) -> Any:
+    known: dict[str, Any] = {"observation.state": {}, **({} if names is None else {PARTS_KEY: {"names": names}})}
+    return SimpleNamespace(repo_id="local/d", root="d", fps=30, features=known, episodes={"length": [20]})
+
+
+@pytest.mark.parametrize("option", [{"part_poses": True}, {"pose_loss": 1.0}])
+def test_a_dataset_without_poses_or_of_other_parts_is_refused_with_the_way_out(option):
+    config = TactilePI05Config(backbone="tiny", tactile=False, **option)
+    with pytest.raises(
+        TaccorlError, match=r"has no observation.environment_state: make it with taccorl execute --part_poses"
+    ):
+        config.match_dataset(dataset_of(None))
+    config.match_dataset(dataset_of(NAMES))
+    assert config.part_names == NAMES and config.num_bodies == 2
+    with pytest.raises(TaccorlError, match=r"of tube, rack, stand, that of the checkpoint of plug, cradle"):
+        config.match_dataset(dataset_of(list(part_pose_names(tasks.get("test_tube")))))
+    if config.pose_loss:
+        config.match_dataset(dataset_of(None))  # goes on with the flow loss alone
+
+
+def test_by_default_nothing_changes():
+    """A dataset with poses, a policy that is not told them: the same inputs, steps and weights."""
+    known = features()
+    known["input_features"][PARTS_KEY] = PolicyFeature(FeatureType.ENV, (18,))
+    plain, beside = tiny_policy(discrete_state_input=None), tiny_policy(**known, discrete_state_input=None)
+    assert list(plain.config.input_features) == list(beside.config.input_features)
+    ours, theirs = plain.state_dict(), beside.state_dict()
+    assert list(ours) == list(theirs) and all(torch.equal(ours[key], theirs[key]) for key in ours)
+    assert not any(key.startswith("pose_head") for key in ours)
+    before, _ = make_tactile_pi05_pre_post_processors(plain.config, STATISTICS)
+    assert not any(isinstance(step, PartPosesStep) for step in before.steps)
+    rows = batch_of(True, False)
+    told = {PARTS_KEY: torch.rand(2, 18), PART_POSES: torch.rand(2, 69)}
+    assert torch.equal(chunk(plain, rows), chunk(beside, {**rows, **told}))
+    assert torch.equal(losses(plain, rows), losses(beside, {**rows, **told}))
+
+
+def told_batch(*touched: bool) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    rows = len(touched)
+    told = {
+        HAND_POSES: torch.rand(rows, 27, generator=generator),
+        PART_POSES: torch.rand(rows, 69, generator=generator),
+    }
+    return {**batch_of(*touched), **told}
+
+
+@pytest.mark.parametrize("tactile", [True, False])
+def test_without_pictures_a_policy_is_told_the_poses(tactile):
+    policy = tiny_policy(**TOLD, part_poses=True, pictures=False, tactile=tactile)
+    assert set(policy.config.input_features) == {"observation.state", PARTS_KEY, *["observation.tactile"] * tactile}
+    assert policy.config.state_dim == 14 + 27 + 69
+    rows = {k: x for k, x in told_batch(True, False).items() if "images" not in k}
+    assert chunk(policy, rows).shape == (2, 10, 14)
+    moved = {**rows, PART_POSES: rows[PART_POSES] + torch.tensor([[0.1], [0.0]])}
+    differs = (chunk(policy, rows) != chunk(policy, moved)).any(dim=(1, 2))
+    assert differs.tolist() == [True, False]
+    policy.train()
+    loss, said = policy.forward(rows)
+    loss.backward()
+    assert torch.isfinite(loss) and "pose_loss" not in said
+
+
+def test_the_pose_loss_falls_and_acting_does_not_depend_on_its_head(tmp_path):
+    policy = tiny_policy(**TOLD, pose_loss=0.5, image_randomization=False, image_noise_std=0.0)
+    plain = tiny_policy(**TOLD, image_randomization=False, image_noise_std=0.0)
+    rows = told_batch(False, True, False, True)
+    assert {k for k in policy.state_dict() if k not in plain.state_dict()} == {
+        f"pose_head.{name}.{kind}" for name in ("hidden", "out") for kind in ("weight", "bias")
+    }
+    assert PARTS_KEY not in policy.config.input_features and policy.config.state_dim == 14 + 27
+    policy.train()
+    torch.manual_seed(0)
+    loss, said = policy.forward(rows)
+    flow = said["loss"] - 0.5 * said["pose_loss"]
+    torch.manual_seed(0)
+    each, _ = policy.forward(rows, "none")
+    torch.testing.assert_close(each.mean(), loss)
+    optimizer, errors = torch.optim.Adam(policy.parameters(), 1e-3), []
+    for _ in range(30):
+        loss, said = policy.forward(rows)
+        errors.append((said["pose_loss"], said["pose_error_mm"]))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert flow > 0 and errors[-1][0] < 0.3 * errors[0][0] and errors[-1][1] < 0.5 * errors[0][1]
+    camera: Any = policy.model.paligemma_with_expert.paligemma.model.vision_tower
+    assert camera.cameras[0].hidden.weight.grad is not None
+    policy.eval()
+    assert "pose_loss" not in policy.forward(rows)[1] and policy.pose_head is not None
+
+    policy.save_pretrained(tmp_path / "with")
+    without = {k: x for k, x in rows.items() if k != PART_POSES}
+    again = TactilePI05Policy.from_pretrained(tmp_path / "with")
+    assert torch.equal(chunk(again, without), chunk(policy, without))
+    again.config.pose_loss = 0.0
+    lighter = TactilePI05Policy.from_pretrained(tmp_path / "with", config=again.config)
+    assert lighter.pose_head is None and torch.equal(chunk(lighter, without), chunk(policy, without))
+    lighter.save_pretrained(tmp_path / "without")
+    lighter.config.pose_loss = 1.0
+    assert TactilePI05Policy.from_pretrained(tmp_path / "without", config=lighter.config).pose_head is not None
