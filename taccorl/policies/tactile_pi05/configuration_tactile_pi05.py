@@ -152,6 +152,8 @@ class TactilePI05Config(PI05Config):
 
     image_randomization: bool = True
     """In training, crop, turn and recolour every image by chance: the image rows of the paper's domain randomisation."""
+    image_rotation_deg: float = ImageRandomizationConfig.rotation_deg
+    """Of that: largest turn of an image about its middle [degrees]. 0: not turned."""
     image_noise_std: float = COTRAINING_NOISE_STD
     """σ_v: normal noise on training images in [0, 1], after that. 0: none."""
 
@@ -235,12 +237,12 @@ class TactilePI05Config(PI05Config):
         """What training does to images; None: nothing.
 
         Raises:
-            TaccorlError: the noise is negative.
+            TaccorlError: noise or rotation is out of its range.
         """
         if not self.image_randomization and not self.image_noise_std:
             return None
         if self.image_randomization:
-            return ImageRandomizationConfig(noise_std=self.image_noise_std)
+            return ImageRandomizationConfig(rotation_deg=self.image_rotation_deg, noise_std=self.image_noise_std)
         return ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
 
     @property
