@@ -53,7 +53,7 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
             table = _set(table, "task_index", tasks.renumbered(root, table["task_index"]))
             place[_numbers(path)] = data.append(table, path.stat().st_size)
         for path in _files(root, _EPISODES):
-            table = pq.read_table(path)
+            table = _without_lost_features(pq.read_table(path), infos[0]["features"])
             table = _plus(table, "episode_index", first_episode)
             for key in ("dataset_from_index", "dataset_to_index"):
                 table = _plus(table, key, first_row)
@@ -72,6 +72,15 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
     (destination / "meta/info.json").write_text(
         json.dumps(infos[0] | totals | {"splits": splits}, indent=4, ensure_ascii=False), encoding="utf-8"
     )
+
+
+def _without_lost_features(table: pa.Table, features: dict[str, Any]) -> pa.Table:
+    """Without statistics of features that LeRobot's ``modify_features`` has removed: it leaves them in the table of episodes."""
+
+    def is_there(column: str) -> bool:
+        return not column.startswith("stats/") or column.removeprefix("stats/").rpartition("/")[0] in features
+
+    return table.select([column for column in table.column_names if is_there(column)])
 
 
 class _Files:
