@@ -65,6 +65,15 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
     )
 
 
+def _without_lost_features(table: pa.Table, features: dict[str, Any]) -> pa.Table:
+    """Without statistics of features that LeRobot's ``modify_features`` has removed: it leaves them in the table of episodes."""
+
+    def is_there(column: str) -> bool:
+        return not column.startswith("stats/") or column.removeprefix("stats/").rpartition("/")[0] in features
+
+    return table.select([column for column in table.column_names if is_there(column)])
+
+
 @dataclass(eq=False)
 class _Part:
     """A dataset that goes in: from which row and episode on, and into which chunk and file each of its files goes."""
@@ -81,7 +90,8 @@ class _Part:
         return _set(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
 
     def episodes_table(self, path: Path, tasks: "_Tasks") -> pa.Table:
-        table = _plus(pq.read_table(path), "episode_index", self.first_episode)
+        table = _without_lost_features(pq.read_table(path), _info(self.root)["features"])
+        table = _plus(table, "episode_index", self.first_episode)
         for key in ("dataset_from_index", "dataset_to_index"):
             table = _plus(table, key, self.first_row)
         table = _with_own_statistics(table, self.first_row, self.first_episode, tasks)

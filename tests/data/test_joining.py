@@ -118,3 +118,16 @@ def test_merge_joins_them_and_says_what_differs(spec: DatasetSpec, parts: list[P
     (tmp_path / "slow/meta/info.json").write_text(json.dumps(other | {"fps": 15}))
     with pytest.raises(DatasetError, match=r"do not merge: fps of slow is 15, that of x 30"):
         merge([parts[0], tmp_path / "slow"], tmp_path / "both")
+
+
+def test_statistics_that_a_removed_feature_left_behind_do_not_matter(parts: list[Path], tmp_path: Path) -> None:
+    """LeRobot's ``modify_features`` removes a column, but not its statistics from the table of episodes."""
+    edited = tmp_path / "edited"
+    shutil.copytree(parts[0], edited)
+    path = edited / "meta/episodes/chunk-000/file-000.parquet"
+    episodes = pq.read_table(path)
+    pq.write_table(episodes.append_column("stats/sim.executed/min", episodes["stats/action/min"]), path)
+    merge([edited, *parts[1:]], tmp_path / "joined")
+    merge(parts, tmp_path / "plain")
+    joined, plain = (table(tmp_path / name, "meta/episodes") for name in ("joined", "plain"))
+    assert list(joined.columns) == list(plain.columns) and len(joined) == len(plain)

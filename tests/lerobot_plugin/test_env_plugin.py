@@ -141,3 +141,13 @@ def test_worker_processes_need_no_torch() -> None:
         "import sys, taccorl.sim.lerobot_env; assert not {'torch', 'lerobot'} & {m.split('.')[0] for m in sys.modules}"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env={**os.environ, "MUJOCO_GL": "egl"})
+
+
+def test_poses_of_the_parts_are_observed_on_request():
+    from taccorl.lerobot_plugin.env import TaccorlEnvConfig
+
+    plain, told = TaccorlEnvConfig(task="test_tube"), TaccorlEnvConfig(task="test_tube", part_poses=True)
+    assert "environment_state" not in plain.features and not plain.gym_kwargs["part_poses"]
+    assert told.features["environment_state"].shape == (27,)  # tube, rack and the stand, nine numbers each
+    assert told.features_map["environment_state"] == "observation.environment_state"
+    assert told.gym_kwargs["part_poses"]

@@ -159,6 +159,7 @@ class TactilePI05Policy(PI05Policy):
         loss = losses_BHA.mean(dim=(1, 2)) if reduction == "none" else losses_BHA.mean()
         if self.pose_head is not None and self.training and PART_POSES in batch:
             pose_B, told["pose_error_mm"] = self.pose_head.errors(tokens, self._robot_state(batch), batch[PART_POSES])
+            told["flow_loss"] = loss.detach().mean()
             loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
             told["pose_loss"] = pose_B.detach().mean()
         told["loss"] = loss.detach().mean()

@@ -32,7 +32,7 @@ PART_TO_PART_M = HAND_TO_HAND_M
 FINE_M = (0.01, 0.002)
 """Units within tanh, of positions between bodies."""
 TARGET_M = 0.01
-"""Unit of the positions that ``PoseHead`` predicts."""
+"""Unit of errors in the loss of ``PoseHead``: below it the loss is quadratic."""
 _POSE = len(POSE_NAMES)
 _PAIR = _POSE + 3 * len(FINE_M)
 _ARMS = 2
@@ -164,7 +164,7 @@ class PoseHead(nn.Module):
         self.out = nn.Linear(_HIDDEN, 3 * self.num_vectors)
 
     def forward(self, cameras: list[Tensor], state_BS: Tensor) -> Tensor:
-        """(B, V, 3) [``TARGET_M``].
+        """(B, V, 3) [``PART_TO_PART_M``].
 
         Args:
             cameras: tokens (B, M, D) of each camera.
@@ -176,7 +176,7 @@ class PoseHead(nn.Module):
     def errors(self, cameras: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
         """(B,) Huber loss, quadratic within ``TARGET_M``, and the root mean square of the vectors' errors [mm]."""
         target_BV3 = relative_positions_m(part_poses_BN, self.num_bodies) / TARGET_M
-        predicted_BV3 = self(cameras, state_BS).to(torch.float32)
+        predicted_BV3 = self(cameras, state_BS).to(torch.float32) * (PART_TO_PART_M / TARGET_M)
         loss_B = F.huber_loss(predicted_BV3, target_BV3, reduction="none").mean(dim=(1, 2))
         off_BV3 = (predicted_BV3 - target_BV3).detach()
         return loss_B, 1e3 * TARGET_M * off_BV3.square().sum(-1).mean().sqrt()
