@@ -32,6 +32,7 @@ from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, RATIO_GUARD
 from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
 from taccorl.rl.settings import PostTrainSettings
+from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
@@ -92,6 +93,7 @@ class PostTraining:
             self._opened.postprocessor,
             privileged=settings.ppo.privileged_critic,
             clock=self._clock,
+            starts=StartStates(settings.env.start_share, settings.env.start_states),
         )
         self.world.restart(settings.seed)
         seen = self.world.observe()

@@ -49,6 +49,11 @@ class EnvSettings:
     """Share of the paper's reset ranges, 0 … 1."""
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
+    start_share: float = 0.0
+    """Share of episodes that begin in a state of the policy's own earlier episodes, with a part in each hand, instead of a
+    reset. They do not count as successes or failures in progress.jsonl."""
+    start_states: int = 256
+    """States that are kept for that, the newest."""
     stagger: bool = True
     """Before the first iteration, act for an episode's length and begin episodes at random times in it, so that environments are
     in different phases of the task."""
@@ -58,7 +63,9 @@ class EnvSettings:
         Raises:
             TaccorlError: a number below 1.
         """
-        _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions)
+        _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions, start_states=self.start_states)
+        if not 0 <= self.start_share <= 1:
+            raise TaccorlError(f"--env.start_share={self.start_share:g}: a share of the episodes, 0 … 1")
 
 
 @dataclass(kw_only=True)

@@ -21,6 +21,7 @@ from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
 from taccorl.rl.rollout import SUCCESS, Acted, Clock, Seen
+from taccorl.rl.start_states import StartStates
 from taccorl.sim.episode_seeds import episode_seed
 from taccorl.sim.simulation import Snapshot
 from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY, Observation
@@ -39,6 +40,7 @@ class TwinWorld:
         *,
         privileged: bool,
         clock: Clock,
+        starts: StartStates | None = None,
     ) -> None:
         """
         Args:
@@ -46,6 +48,7 @@ class TwinWorld:
                 told them.
             config: ``TactilePI05Config`` of the policy.
             privileged: give the critic the simulator's state.
+            starts: states in which episodes may begin; None: all begin with a reset.
 
         Raises:
             TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor; or the policy was trained
@@ -68,6 +71,8 @@ class TwinWorld:
         self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK}
         self._kept |= {HAND_POSES} if config.knows_hands else set()
         self._kept |= {PART_POSES} if config.part_poses else set()
+        self._starts = StartStates(0.0, 1) if starts is None else starts
+        self._began_later_N = np.zeros(envs.num_envs, dtype=bool)
         self._root = 0
         self._episode_N = np.zeros(envs.num_envs, dtype=np.int64)
         self._observation: Observation = {}
@@ -79,7 +84,8 @@ class TwinWorld:
 
     def restart(self, seed: int) -> None:
         """Begin the stream of scenes ``seed``."""
-        self._root, self._episode_N[:] = seed, 0
+        self._root, self._episode_N[:], self._began_later_N[:] = seed, 0, False
+        self._starts.restart(seed)
         self._observation, _ = self.envs.reset(seed=self._seeds())
         self._window_NLK = self._repeated(self._observation[TACTILE_KEY])
 
@@ -97,12 +103,15 @@ class TwinWorld:
         truncated, terminated = chunk.truncated, chunk.terminated
         outcome = np.where(facts["is_success"], SUCCESS, facts["failure"])
         outcomes = [str(o) or None for o in outcome]
+        began_later = self._began_later_N.tolist()
         windows = np.concatenate([self._window_NLK, chunk.tactile], axis=1)
         ends = self._history + chunk.num_steps  # readings after the end of an episode do not count
         self._window_NLK = np.stack([w[end - self._history : end] for w, end in zip(windows, ends, strict=True)])
         self._observation = chunk.observation
+        over = truncated | terminated
+        self._starts.see(self.envs.sim, self._window_NLK, over)
         last = self._before_reset(truncated) if truncated.any() else None
-        if (over := truncated | terminated).any():
+        if over.any():
             with self._clock.part("physics"):
                 self.reset(torch.from_numpy(over))
         return Acted(
@@ -110,7 +119,8 @@ class TwinWorld:
             terminated_N=torch.from_numpy(terminated),
             truncated_N=torch.from_numpy(truncated),
             last=last,
-            outcomes=outcomes,
+            outcomes=[None if later else o for o, later in zip(outcomes, began_later, strict=True)],
+            later_outcomes=[o if later else None for o, later in zip(outcomes, began_later, strict=True)],
         )
 
     def _before_reset(self, rows: np.ndarray) -> Seen:
@@ -124,6 +134,13 @@ class TwinWorld:
         self._episode_N[over] += 1
         self._observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": over})
         self._window_NLK[over] = self._repeated(self._observation[TACTILE_KEY][over])
+        later_N, numbers = self._starts.draw(over)
+        self._began_later_N[over] = later_N[over]
+        if numbers:
+            snapshot, windows = self._starts.states(numbers)
+            options = {"reset_mask": later_N, "state": snapshot}
+            self._observation, _ = self.envs.reset(seed=self._seeds(), options=options)
+            self._window_NLK[later_N] = windows
 
     def _seeds(self) -> list[int]:
         return [episode_seed(self._root, i, int(k)) for i, k in enumerate(self._episode_N)]
@@ -159,7 +176,14 @@ class TwinWorld:
         """All that is needed to go on bit for bit; no episode is over between two calls of ``act``."""
         snapshot = self.envs.sim.snapshot()
         fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
-        return {"root": self._root, "episode": self._episode_N.copy(), "window": self._window_NLK, "snapshot": fields}
+        return {
+            "root": self._root,
+            "episode": self._episode_N.copy(),
+            "window": self._window_NLK,
+            "snapshot": fields,
+            "starts": self._starts.state_dict(),
+            "began_later": self._began_later_N.copy(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave.
@@ -173,5 +197,7 @@ class TwinWorld:
             )
         self._root, self._episode_N = state["root"], state["episode"].copy()
         self._window_NLK = state["window"].copy()
+        self._starts.load_state_dict(state["starts"])
+        self._began_later_N = state["began_later"].copy()
         options = {"state": Snapshot(**state["snapshot"])}
         self._observation, _ = self.envs.reset(seed=self._seeds(), options=options)
