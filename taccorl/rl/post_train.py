@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
@@ -32,7 +33,6 @@ from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, RATIO_GUARD
 from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
 from taccorl.rl.settings import PostTrainSettings
-from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
@@ -58,7 +58,7 @@ def post_train(settings: PostTrainSettings, report: Report = print) -> Path:
         try:
             run.run()
         finally:
-            run.world.envs.close()
+            run.world.close()
     except torch.OutOfMemoryError as error:
         raise TaccorlError(
             f"post-training: out of GPU memory: {str(error).splitlines()[0]} Lower --ppo.micro_batch={settings.ppo.micro_batch} "
@@ -93,7 +93,8 @@ class PostTraining:
             self._opened.postprocessor,
             privileged=settings.ppo.privileged_critic,
             clock=self._clock,
-            starts=StartStates(settings.env.start_share, settings.env.start_states),
+            start_share=settings.env.start_share,
+            start_states=settings.env.start_states,
         )
         self.world.restart(settings.seed)
         seen = self.world.observe()
@@ -286,22 +287,29 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
     return opened
 
 
-def _environments(settings: PostTrainSettings, twin: TwinConfig, *, images: bool, part_poses: bool) -> TaccorlVectorEnv:
+def _environments(
+    settings: PostTrainSettings, twin: TwinConfig, *, images: bool, part_poses: bool
+) -> list[TaccorlVectorEnv]:
+    """Of each shard, as equal in size as can be."""
     env = settings.env
     if env.task is None:
         raise TaccorlError("missing --env.task=…, such as assembly_2")
-    return TaccorlVectorEnv(
-        env.task,
-        env.num_envs,
-        difficulty=env.difficulty,
-        twin=twin,
-        images="on_request" if images else "never",
-        randomization=env.randomization,
-        num_threads=min(env.num_envs, len(os.sched_getaffinity(0))),
-        autoreset=AutoresetMode.DISABLED,
-        max_episode_steps=env.episode_length,
-        part_poses=part_poses,
-    )
+    sizes = [len(part) for part in np.array_split(np.arange(env.num_envs), env.shards)]
+    return [
+        TaccorlVectorEnv(
+            env.task,
+            size,
+            difficulty=env.difficulty,
+            twin=twin,
+            images="on_request" if images else "never",
+            randomization=env.randomization,
+            num_threads=min(size, len(os.sched_getaffinity(0))),
+            autoreset=AutoresetMode.DISABLED,
+            max_episode_steps=env.episode_length,
+            part_poses=part_poses,
+        )
+        for size in sizes
+    ]
 
 
 def _check_folder(settings: PostTrainSettings) -> None:

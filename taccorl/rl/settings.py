@@ -41,6 +41,9 @@ class EnvSettings:
     """A twin.yaml; the nominal twin if not given."""
     num_envs: int = 128
     """N_env: environments at once."""
+    shards: int = 1
+    """Groups of environments, each in a thread of its own: while one computes in Python, physics of the others runs. Scenes do
+    not depend on it."""
     decisions: int = 36
     """C: chunks of actions of each environment in an iteration. Episodes go on in the next one."""
     difficulty: str = "train"
@@ -64,6 +67,8 @@ class EnvSettings:
             TaccorlError: a number below 1.
         """
         _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions, start_states=self.start_states)
+        if not 1 <= self.shards <= self.num_envs:
+            raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
         if not 0 <= self.start_share <= 1:
             raise TaccorlError(f"--env.start_share={self.start_share:g}: a share of the episodes, 0 … 1")
 

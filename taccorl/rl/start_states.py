@@ -30,7 +30,7 @@ class StartStates:
         self._share, self._size = share, size
         self.restart(0)
 
-    def restart(self, seed: int) -> None:
+    def restart(self, seed: int | tuple[int, ...]) -> None:
         """Forget all states."""
         self._rng = np.random.default_rng(seed)
         self._kept: list[tuple[Snapshot, np.ndarray]] = []

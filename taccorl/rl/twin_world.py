@@ -1,16 +1,17 @@
 """The twin's environments for rollouts: a policy's own processors, its history of touch, pictures only where it looks.
 
-Scenes come from a stream of seeds: the k-th episode of environment i has ``episode_seed(seed, i, k)``.
+Several shards of environments compute side by side, each in a thread of its own: while one is in Python, physics of the others
+runs. What is rendered in a thread stays in it, as OpenGL wants.
 
 Letters in shapes: N environments, n executed actions of a chunk, A action, L history, K taxels, P privileged numbers.
 """
 
-import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
 from lerobot.configs import FeatureType, NormalizationMode
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
@@ -20,11 +21,10 @@ from taccorl.evaluation.policy_actor import Processor, policy_batch, require_sam
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
-from taccorl.rl.rollout import SUCCESS, Acted, Clock, Seen
+from taccorl.rl.rollout import Acted, Clock, Seen
 from taccorl.rl.start_states import StartStates
-from taccorl.sim.episode_seeds import episode_seed
-from taccorl.sim.simulation import Snapshot
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY, Observation
+from taccorl.rl.twin_shard import ShardSeen, TwinShard
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 
@@ -33,171 +33,143 @@ class TwinWorld:
 
     def __init__(
         self,
-        envs: TaccorlVectorEnv,
+        envs: TaccorlVectorEnv | Sequence[TaccorlVectorEnv],
         config: Any,
         preprocessor: Processor,
         postprocessor: Processor,
         *,
         privileged: bool,
         clock: Clock,
-        starts: StartStates | None = None,
+        start_share: float = 0.0,
+        start_states: int = 1,
     ) -> None:
         """
         Args:
-            envs: with ``AutoresetMode.DISABLED``, pictures on request if the policy has cameras, and poses of the parts if it is
-                told them.
+            envs: of each shard; with ``AutoresetMode.DISABLED``, and pictures on request if the policy has cameras.
             config: ``TactilePI05Config`` of the policy.
             privileged: give the critic the simulator's state.
-            starts: states in which episodes may begin; None: all begin with a reset.
+            start_share: of episodes that begin in states of earlier ones; see ``start_states``.
+            start_states: how many are kept in all shards together.
 
         Raises:
-            TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor; or the policy was trained
+            TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor. Or the policy was trained
                 on the poses of other parts.
         """
-        assert envs.autoreset is AutoresetMode.DISABLED
         if config.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY) is not NormalizationMode.IDENTITY:
             raise TaccorlError(
                 "post-training: --policy.normalization_mapping normalises pictures (VISUAL); only IDENTITY is known"
             )
-        self.envs, self._config, self._clock, self._privileged = envs, config, clock, privileged
+        self._all_envs = [envs] if isinstance(envs, TaccorlVectorEnv) else list(envs)
+        self._config, self._clock = config, clock
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
         if config.part_poses:
-            require_same_parts(config, envs)
+            require_same_parts(config, self.envs)
         self._device = torch.device(config.device)
-        self._history = config.tactile_history
         inputs = config.input_features
         self._cameras = [IMAGE_KEYS[name] for name in CAMERAS if IMAGE_KEYS[name] in inputs]
         self.needs_images = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
         self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK}
         self._kept |= {HAND_POSES} if config.knows_hands else set()
         self._kept |= {PART_POSES} if config.part_poses else set()
-        self._starts = StartStates(0.0, 1) if starts is None else starts
-        self._began_later_N = np.zeros(envs.num_envs, dtype=bool)
-        self._root = 0
-        self._episode_N = np.zeros(envs.num_envs, dtype=np.int64)
-        self._observation: Observation = {}
-        self._window_NLK = np.zeros((0,))
+        firsts = np.cumsum([0, *(each.num_envs for each in self._all_envs)])
+        self._bounds = list(zip(firsts[:-1].tolist(), firsts[1:].tolist(), strict=True))
+        self.shards = [
+            TwinShard(
+                each,
+                history=config.tactile_history,
+                images=self.needs_images,
+                privileged=privileged,
+                starts=StartStates(start_share, max(1, start_states // len(self._all_envs))),
+                first=first,
+            )
+            for each, (first, _) in zip(self._all_envs, self._bounds, strict=True)
+        ]
+        self._threads = [ThreadPoolExecutor(1) for _ in self.shards] if len(self.shards) > 1 else []
+
+    @property
+    def envs(self) -> TaccorlVectorEnv:
+        """Of the first shard; all are alike."""
+        return self._all_envs[0]
 
     @property
     def num_envs(self) -> int:
-        return self.envs.num_envs
+        return self._bounds[-1][1]
+
+    def _each(self, work: Callable[[TwinShard, int, int], Any]) -> list[Any]:
+        """``work(shard, first, end)`` of all shards, side by side."""
+        if not self._threads:
+            return [work(self.shards[0], *self._bounds[0])]
+        calls = zip(self._threads, self.shards, self._bounds, strict=True)
+        waiting = [thread.submit(work, shard, *bounds) for thread, shard, bounds in calls]
+        return [each.result() for each in waiting]
 
     def restart(self, seed: int) -> None:
         """Begin the stream of scenes ``seed``."""
-        self._root, self._episode_N[:], self._began_later_N[:] = seed, 0, False
-        self._starts.restart(seed)
-        self._observation, _ = self.envs.reset(seed=self._seeds())
-        self._window_NLK = self._repeated(self._observation[TACTILE_KEY])
+        self._each(lambda shard, *_: shard.restart(seed))
 
     def observe(self) -> Seen:
         with self._clock.part("pictures"):
-            observation = self.envs.observe(images=self.needs_images)
-        return self._seen(observation, self._window_NLK, np.arange(self.num_envs))
+            seen = self._each(lambda shard, *_: shard.observe())
+        return self._seen(seen)
 
     def act(self, actions_NHA: Tensor) -> Acted:
         with self._clock.part("policy"):
             actions = self._postprocessor(actions_NHA).to("cpu").numpy().astype(np.float32)
         with self._clock.part("physics"):
-            chunk = self.envs.step_chunk(actions)
-            facts = self.envs.facts()
-        truncated, terminated = chunk.truncated, chunk.terminated
-        outcome = np.where(facts["is_success"], SUCCESS, facts["failure"])
-        outcomes = [str(o) or None for o in outcome]
-        began_later = self._began_later_N.tolist()
-        windows = np.concatenate([self._window_NLK, chunk.tactile], axis=1)
-        ends = self._history + chunk.num_steps  # readings after the end of an episode do not count
-        self._window_NLK = np.stack([w[end - self._history : end] for w, end in zip(windows, ends, strict=True)])
-        self._observation = chunk.observation
-        over = truncated | terminated
-        self._starts.see(self.envs.sim, self._window_NLK, over)
-        last = self._before_reset(truncated) if truncated.any() else None
-        if over.any():
-            with self._clock.part("physics"):
-                self.reset(torch.from_numpy(over))
+            acted = self._each(lambda shard, first, end: shard.act(actions[first:end]))
+        last = [each.last for each in acted if each.last is not None]
+
+        def joined(name: str) -> Tensor:
+            return torch.from_numpy(np.concatenate([getattr(each, name) for each in acted]))
+
         return Acted(
-            reward_N=torch.from_numpy(chunk.reward).float(),
-            terminated_N=torch.from_numpy(terminated),
-            truncated_N=torch.from_numpy(truncated),
-            last=last,
-            outcomes=[None if later else o for o, later in zip(outcomes, began_later, strict=True)],
-            later_outcomes=[o if later else None for o, later in zip(outcomes, began_later, strict=True)],
+            reward_N=joined("reward_N").float(),
+            terminated_N=joined("terminated_N"),
+            truncated_N=joined("truncated_N"),
+            last=self._seen(last) if last else None,
+            outcomes=[o for each in acted for o in each.outcomes],
+            later_outcomes=[o for each in acted for o in each.later_outcomes],
         )
 
-    def _before_reset(self, rows: np.ndarray) -> Seen:
-        with self._clock.part("pictures"):
-            observation = self.envs.observe(images=self.needs_images)
-        ids = np.flatnonzero(rows)
-        return self._seen({key: x[ids] for key, x in observation.items()}, self._window_NLK[ids], ids)
-
     def reset(self, rows_N: Tensor) -> None:
-        over = rows_N.numpy()
-        self._episode_N[over] += 1
-        self._observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": over})
-        self._window_NLK[over] = self._repeated(self._observation[TACTILE_KEY][over])
-        later_N, numbers = self._starts.draw(over)
-        self._began_later_N[over] = later_N[over]
-        if numbers:
-            snapshot, windows = self._starts.states(numbers)
-            options = {"reset_mask": later_N, "state": snapshot}
-            self._observation, _ = self.envs.reset(seed=self._seeds(), options=options)
-            self._window_NLK[later_N] = windows
+        rows = rows_N.numpy()
+        self._each(lambda shard, first, end: shard.reset(rows[first:end]) if rows[first:end].any() else None)
 
-    def _seeds(self) -> list[int]:
-        return [episode_seed(self._root, i, int(k)) for i, k in enumerate(self._episode_N)]
-
-    def _repeated(self, reading_NK: np.ndarray) -> np.ndarray:
-        """(N, L, K): before an episode's first reading there were none; it is repeated, as in datasets."""
-        return np.repeat(reading_NK[:, None], self._history, axis=1)
-
-    def _seen(self, observation: Observation, window_NLK: np.ndarray, ids: np.ndarray) -> Seen:
+    def _seen(self, parts: Sequence[ShardSeen]) -> Seen:
+        observation = {key: np.concatenate([p.observation[key] for p in parts]) for key in parts[0].observation}
+        window_NLK = np.concatenate([p.window_NLK for p in parts])
         with self._clock.part("policy"):
             numbers = {STATE_KEY: observation[STATE_KEY], TACTILE_KEY: window_NLK}
             if PARTS_KEY in observation:
                 numbers[PARTS_KEY] = observation[PARTS_KEY]
-            instructions = [self.envs.task_description] * len(ids)
+            instructions = [self.envs.task_description] * len(window_NLK)
             found = policy_batch(self._preprocessor, numbers, instructions)
             batch: Batch = {k: x.to(self._device) for k, x in found.items() if k in self._kept}
             for key in self._cameras:  # (N, 3, rows, columns) uint8, a quarter of float32
                 batch[key] = torch.from_numpy(observation[key]).to(self._device).permute(0, 3, 1, 2).contiguous()
-        return Seen(batch, torch.from_numpy(self._privileged_numbers(ids)).float().to(self._device))
-
-    def _privileged_numbers(self, ids: np.ndarray) -> np.ndarray:
-        """(n, P) positions and velocities of all joints, subtasks, goals, elapsed share of the time, the task's measures."""
-        if not self._privileged:
-            return np.zeros((len(ids), 0))
-        sim, facts = self.envs.sim, self.envs.facts()
-        elapsed = facts["steps"] / sim.judge.limit_steps
-        columns = [sim.arrays["qpos"], sim.arrays["qvel"], facts["subtask"], facts["partial"], elapsed]
-        columns += list(facts["measures"].values())
-        numbers = np.concatenate([np.asarray(x, dtype=np.float64).reshape(self.num_envs, -1) for x in columns], axis=1)
-        return np.nan_to_num(numbers[ids], nan=0.0, posinf=0.0, neginf=0.0)  # of a diverged simulation
+        privileged_NP = np.concatenate([p.privileged_NP for p in parts])
+        return Seen(batch, torch.from_numpy(privileged_NP).float().to(self._device))
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on bit for bit; no episode is over between two calls of ``act``."""
-        snapshot = self.envs.sim.snapshot()
-        fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
-        return {
-            "root": self._root,
-            "episode": self._episode_N.copy(),
-            "window": self._window_NLK,
-            "snapshot": fields,
-            "starts": self._starts.state_dict(),
-            "began_later": self._began_later_N.copy(),
-        }
+        return {"shards": self._each(lambda shard, *_: shard.state_dict())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave.
 
         Raises:
-            TaccorlError: of another number of environments, task, difficulty, twin or randomisation.
+            TaccorlError: of another number of environments or shards, task, difficulty, twin or randomisation.
         """
-        if len(state["episode"]) != self.num_envs:
+        states = state["shards"]
+        if len(states) != len(self.shards):
             raise TaccorlError(
-                f"--env.num_envs={self.num_envs}: the run was stopped with {len(state['episode'])}; resume with the same"
+                f"--env.shards={len(self.shards)}: the run was stopped with {len(states)}; resume with the same"
             )
-        self._root, self._episode_N = state["root"], state["episode"].copy()
-        self._window_NLK = state["window"].copy()
-        self._starts.load_state_dict(state["starts"])
-        self._began_later_N = state["began_later"].copy()
-        options = {"state": Snapshot(**state["snapshot"])}
-        self._observation, _ = self.envs.reset(seed=self._seeds(), options=options)
+        own = dict(zip((first for first, _ in self._bounds), states, strict=True))
+        self._each(lambda shard, first, _: shard.load_state_dict(own[first]))
+
+    def close(self) -> None:
+        """Of all environments, each in its thread."""
+        self._each(lambda shard, *_: shard.close())
+        for thread in self._threads:
+            thread.shutdown()

@@ -150,7 +150,7 @@ def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path
     made._guard_collapse()
     assert bias.unique().tolist() == [20] and "000020" in lines[-1]
     assert made._ppo.actor_optimizer.param_groups[0]["lr"] == pytest.approx(2.5e-6)
-    made.world.envs.close()
+    made.world.close()
 
 
 def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, monkeypatch: Any) -> None:
@@ -165,7 +165,7 @@ def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, mo
         made._check_noise()
         assert any("--noise.level" in line for line in lines) is warned
         assert "100.0% without" in "".join(lines)
-    made.world.envs.close()
+    made.world.close()
 
 
 def test_noise_at_the_hand_is_that_of_the_kinematics() -> None:

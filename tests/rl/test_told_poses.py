@@ -56,7 +56,7 @@ def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -
     actor = TactileFlowPolicy(opened.load(0).policy, PolicySettings(), num_steps=4)
     features = actor.features(world.observe().batch)
     assert features.shape == (2, 96 + 14 + 69)  # mean token of the prefix, state, poses of the parts
-    world.envs.close()
+    world.close()
 
 
 def test_evaluation_switches_the_poses_on(opened: Any) -> None:

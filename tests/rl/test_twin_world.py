@@ -18,7 +18,6 @@ from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.rollout import Clock
 from taccorl.rl.settings import EnvSettings, FlowSDESettings, PolicySettings
-from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.episode_seeds import episode_seed
 from taccorl.sim.vector_env import TaccorlVectorEnv
@@ -188,7 +187,8 @@ def later_world(envs: TaccorlVectorEnv, opened: Any, share: float = 1.0, size: i
         opened.postprocessor,
         privileged=True,
         clock=Clock(),
-        starts=StartStates(share, size),
+        start_share=share,
+        start_states=size,
     )
     made.restart(5)
     return made
@@ -202,11 +202,11 @@ def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_count
     world = later_world(envs, opened)
     envs.sim.judge.subtask[1] = 1  # environment 1 holds its parts, says the judge; environment 0 does not
     world.act(home(world) + 0.1)
-    assert len(world._starts) == 1
+    assert len(world.shards[0].starts) == 1
     kept = envs.sim.snapshot(np.array([1]))
     felt = world.observe().batch[TOUCH][1]
     world.act(home(world))
-    assert len(world._starts) == 1, "too late"
+    assert len(world.shards[0].starts) == 1, "too late"
     acted = world.act(home(world))
     assert acted.outcomes == ["timeout", "timeout"] and acted.later_outcomes == [None, None]
     for i in range(N):
@@ -234,7 +234,7 @@ def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(
         return found
 
     steps(8)
-    assert len(world._starts) == 2, "the ring is full"
+    assert len(world.shards[0].starts) == 2, "the ring is full"
     state = world.state_dict()
     expected = steps(9)
     world = later_world(envs, opened, share=0.5, size=2)
@@ -245,3 +245,56 @@ def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(
 def test_a_share_beyond_one_is_refused() -> None:
     with pytest.raises(TaccorlError, match=r"start_share=1\.5"):
         EnvSettings(start_share=1.5)
+
+
+# shards ---------------------------------------------------------------------------------------------------------------
+
+
+def test_shards_give_what_one_gives(opened: Any) -> None:
+    """Three environments at once, and as two and one in threads of their own: scenes, touch, outcomes, last observations."""
+
+    def made(*sizes: int) -> TwinWorld:
+        envs = [
+            TaccorlVectorEnv(
+                "assembly_2",
+                size,
+                images="on_request",
+                autoreset=AutoresetMode.DISABLED,
+                max_episode_steps=8,
+                num_threads=1,
+            )
+            for size in sizes
+        ]
+        return TwinWorld(envs, opened.config, opened.preprocessor, opened.postprocessor, privileged=True, clock=Clock())
+
+    one, two = made(3), made(2, 1)
+    assert one.num_envs == two.num_envs == 3
+    for world in (one, two):
+        world.restart(7)
+    one.reset(torch.tensor([False, True, False]))
+    two.reset(torch.tensor([False, True, False]))
+    shift = 0.05 * torch.arange(3)[:, None, None]
+    resumed = None
+    for step in range(4):
+        seen, other = one.observe(), two.observe()
+        assert torch.equal(seen.privileged_NP, other.privileged_NP)
+        for key, value in seen.batch.items():
+            assert torch.equal(value, other.batch[key]), key
+        chunk = home(one) + shift
+        found = [world.act(chunk) for world in (one, two)]
+        assert found[0].outcomes == found[1].outcomes and torch.equal(found[0].truncated_N, found[1].truncated_N)
+        assert (found[0].last is None) == (found[1].last is None) == (step in (0, 2))
+        if found[0].last is not None and found[1].last is not None:
+            assert torch.equal(found[0].last.batch[TOUCH], found[1].last.batch[TOUCH])
+            assert torch.equal(found[0].last.privileged_NP, found[1].last.privileged_NP)
+        if step == 2:
+            resumed = two.state_dict()
+    now = two.observe()
+    assert resumed is not None
+    with pytest.raises(TaccorlError, match=r"shards=1"):
+        one.load_state_dict(resumed)
+    two.load_state_dict(resumed)
+    two.act(chunk)
+    assert torch.equal(two.observe().privileged_NP, now.privileged_NP)
+    one.close()
+    two.close()
