@@ -1,7 +1,7 @@
 """Post-training: rollouts in the twin and updates by turns, with checkpoints that go on bit for bit on a CPU.
 
 ``progress.jsonl`` in the run's folder has one line an iteration: success and outcomes of the episodes that ended in it, losses,
-KL divergence, gradient norms, explained variance, seconds of each part.
+KL divergence, undone steps, learning rate, gradient norms, explained variance, seconds of each part.
 """
 
 import dataclasses
@@ -206,6 +206,11 @@ class PostTraining:
             with (settings.out / PROGRESS).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             self._report(_line(row))
+            if row["undone_steps"] and row["actor_steps"] == 1 and not settings.ppo.adapt_lr:
+                self._report(
+                    f"warning: the first step at --ppo.actor_lr={row['actor_lr']:g} moved the policy by KL > --ppo.kl_stop="
+                    f"{settings.ppo.kl_stop:g} and was undone: it does not learn. Lower it, or begin with --ppo.adapt_lr=true"
+                )
             if row["episodes"]:
                 longest = max(settings.save_freq, settings.collapse_iterations)
                 self._recent = [*self._recent, row["success"]][-longest:]
@@ -223,7 +228,6 @@ class PostTraining:
             "outcomes": dict(rollout.outcomes),
             **rollout.facts,
             **facts,
-            "actor_lr": self._ppo.actor_optimizer.param_groups[0]["lr"],
             "seconds": {name: round(s, 3) for name, s in self._clock.restart().items()},
         }
 
@@ -257,9 +261,9 @@ class PostTraining:
             return
         best = TactilePI05Policy.from_pretrained(folder, config=self._actor.policy.config)
         self._actor.policy.load_state_dict(best.state_dict())
-        lr = 0.5 * self._ppo.actor_optimizer.param_groups[0]["lr"]
+        lr = 0.5 * self._ppo.actor_lr
         self._ppo.load_state_dict({**checkpoint.load_state(folder)["ppo"], "num_updates": self._ppo.num_updates})
-        self._ppo.actor_optimizer.param_groups[0]["lr"] = lr
+        self._ppo.actor_lr = lr
         self._recent = []
         self._report(
             f"warning: success was below half of the best ({self._best:.1%}) for {count} iterations: back to "
@@ -345,7 +349,10 @@ def _to_json(settings: PostTrainSettings) -> dict[str, Any]:
 def _line(row: dict[str, Any]) -> str:
     seconds = ", ".join(f"{name} {s:.1f}" for name, s in row["seconds"].items())
     anchor = f", anchor {row['anchor_loss']:.4f}" if "anchor_loss" in row else ""
-    actor = f", KL {row['kl']:.4f}, clipped {row['clip_fraction']:.1%}" if "kl" in row else ""
+    actor = f", KL {row['last_kl']:.4f}, clipped {row['clip_fraction']:.1%}" if "kl" in row else ""
+    actor += (
+        f", {row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}" if row["undone_steps"] else ""
+    )
     return (
         f"iteration {row['iteration']}: success {row['success']:.1%} of {row['episodes']} episodes, explained variance "
         f"{row['explained_variance']:.2f}{actor}{anchor}; seconds: {seconds}"

@@ -135,7 +135,10 @@ class PPOSettings:
     max_grad_norm: float = 1.0
     """Gradients of actor and critic are clipped to this norm separately."""
     kl_stop: float = 0.05
-    """The actor's remaining updates of an iteration are left out once KL(old ‖ new) is larger."""
+    """A step of the actor after which KL(old ‖ new) is larger is undone, and the remaining ones of the iteration are left out."""
+    adapt_lr: bool = False
+    """Adapt the actor's learning rate: × 0.5 after an iteration whose first step was undone, × 0.7 where a later one was, × 1.2
+    where none was and the last KL is below kl_stop / 5, up to 10 × actor_lr. false: fixed (paper)."""
     critic_epochs: int = 1
     """Epochs of the critic alone: its inputs are stored, so they cost little."""
     critic_warmup: int = 0

@@ -96,7 +96,7 @@ def test_input_that_does_not_fit_is_refused_before_anything_is_written(
 @pytest.mark.slow
 def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
     """Two iterations at once, and one, kill -9, a line that was written without its checkpoint, and one more."""
-    more = {"ppo.privileged_critic": True}
+    more = {"ppo.privileged_critic": True, "ppo.adapt_lr": True}
     assert main(options(start, real, tmp_path / "once", iterations=2, **more)) == 0
     out = tmp_path / "twice"
     command = [sys.executable, "-m", "taccorl.cli.main", *options(start, real, out, iterations=2, **more)]
@@ -115,6 +115,7 @@ def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp
     assert all(torch.equal(value, twice[name]) for name, value in once.items())
     rows = [[{k: v for k, v in row.items() if k != "seconds"} for row in progress(p)] for p in (tmp_path / "once", out)]
     assert rows[0] == rows[1] and len(rows[0]) == 2
+    assert rows[0][0]["actor_lr"] != rows[0][1]["actor_lr"]  # adapted, and resumed with it
 
 
 def run(start: Path, out: Path, lines: list[str], **changes: Any) -> Any:
@@ -151,6 +152,25 @@ def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path
     assert bias.unique().tolist() == [20] and "000020" in lines[-1]
     assert made._ppo.actor_optimizer.param_groups[0]["lr"] == pytest.approx(2.5e-6)
     made.world.envs.close()
+
+
+def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(start: Path, tmp_path: Path) -> None:
+    from taccorl.rl.settings import PPOSettings
+
+    lines: list[str] = []
+    for adapt_lr in (True, False):
+        out = tmp_path / str(adapt_lr)
+        made = run(
+            start, out, lines, noise_check=False, iterations=1, ppo=PPOSettings(actor_lr=1e-2, adapt_lr=adapt_lr)
+        )
+        before = {name: value.clone() for name, value in made._actor.policy.state_dict().items()}
+        made.run()
+        assert all(torch.equal(value, before[name]) for name, value in made._actor.policy.state_dict().items())
+        (row,) = progress(out)
+        assert row["undone_steps"] == 1 and row["actor_lr"] == 1e-2 and row["last_kl"] < 1e-6
+        assert made._ppo.actor_lr == (5e-3 if adapt_lr else 1e-2)
+        assert ("--ppo.adapt_lr=true" in lines[-1]) is not adapt_lr and "1 step undone" in "".join(lines)
+        made.world.envs.close()
 
 
 def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, monkeypatch: Any) -> None:
