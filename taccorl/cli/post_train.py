@@ -4,7 +4,8 @@ PPO in the twin from a co-trained policy, held to real demonstrations by a super
 
     --anchor.weight=1         β; 0: no anchor
     --out=FOLDER              checkpoints/last/pretrained_model is a LeRobot policy; progress.jsonl has a line an iteration
-    --resume=true             go on from the last checkpoint in --out
+    --out=FOLDER --resume=true   go on from the last checkpoint there, with the settings that the run was begun with;
+                              --iterations=N, --save_freq and --keep_checkpoints may be others
     --config_path=FILE        settings from a file, such as configs/post_train/small.yaml
 
 Defaults are the paper's table of post-training parameters.
@@ -12,7 +13,7 @@ Defaults are the paper's table of post-training parameters.
 
 from dataclasses import dataclass
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import given_names, parse
 from taccorl.rl.settings import PostTrainSettings
 
 
@@ -24,6 +25,10 @@ class PostTrainConfig(PostTrainSettings):
 def main(argv: list[str]) -> int:
     """0: all iterations are done."""
     config = parse(PostTrainConfig, argv, positional=None, prog="taccorl post-train")
+    if config.resume:
+        from taccorl.rl import run_settings
+
+        config = run_settings.complete(config, given_names(argv))
     import logging
 
     from lerobot.utils.import_utils import register_third_party_plugins

@@ -21,9 +21,8 @@ from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
-from taccorl.lineage.digest import digest_file
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
-from taccorl.rl import checkpoint
+from taccorl.rl import checkpoint, run_settings
 from taccorl.rl.anchor import RealAnchor
 from taccorl.rl.critic import Critic
 from taccorl.rl.exploration import measure_noise
@@ -37,8 +36,7 @@ from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
-PROGRESS, SETTINGS = "progress.jsonl", "settings.json"
-_MAY_CHANGE = ("iterations", "resume", "save_freq", "keep_checkpoints", "noise_check", "out")
+PROGRESS = "progress.jsonl"
 _CHECK_SEED = 1_000_000_007  # added to the run's: scenes of the noise check are not those of training
 _DRIFT_BATCHES = 4  # of the anchor's rows, for the drift in progress.jsonl
 _log = logging.getLogger(__name__)
@@ -126,7 +124,7 @@ class PostTraining:
     def _begin(self, twin: TwinConfig) -> None:
         out = self.settings.out
         out.mkdir(parents=True, exist_ok=True)
-        (out / SETTINGS).write_text(json.dumps(_to_json(self.settings), indent=1) + "\n", encoding="utf-8")
+        run_settings.write(self.settings)
         (out / PROGRESS).write_text("")
         num = sum(p.numel() for p in self._actor.trained_parameters())
         self._report(f"post-training {self.settings.policy.path}: {num / 1e6:.2f} million weights are trained")
@@ -178,6 +176,7 @@ class PostTraining:
         progress = self.settings.out / PROGRESS
         lines = progress.read_text(encoding="utf-8").splitlines()
         progress.write_text("".join(f"{line}\n" for line in lines[: self._iteration]), encoding="utf-8")
+        run_settings.write(self.settings)  # with other iterations, perhaps
         self._report(f"resumed at iteration {self._iteration} of {self.settings.iterations}")
         set_rng_state(state["random"])
 
@@ -322,28 +321,7 @@ def _check_folder(settings: PostTrainSettings) -> None:
                 f"--out={out}: holds files already; nothing was touched: give another folder, or --resume=true to go on there"
             )
         return
-    if not (out / SETTINGS).is_file():
-        raise TaccorlError(f"--resume=true: {out} holds no post-training ({SETTINGS}); leave --resume away to begin")
-    before, now = json.loads((out / SETTINGS).read_text(encoding="utf-8")), _to_json(settings)
-    if changed := [
-        f"--{name} {before.get(name)} there, {now[name]} here" for name in now if before.get(name) != now[name]
-    ]:
-        raise TaccorlError(
-            f"--resume=true: {out} was begun with other settings: {'; '.join(changed)}. Give those that it was begun with"
-        )
-
-
-def _to_json(settings: PostTrainSettings) -> dict[str, Any]:
-    """Name, such as ``ppo.clip``, → value, of what a resumed run must have in common."""
-    values: dict[str, Any] = {}
-    for name, value in dataclasses.asdict(settings).items():
-        if isinstance(value, dict):
-            values |= {f"{name}.{inner}": v for inner, v in value.items()}
-        elif name not in _MAY_CHANGE:
-            values[name] = value
-    values.pop("policy.device")
-    values["env.twin_sha256"] = digest_file(settings.env.twin) if settings.env.twin else None
-    return {name: str(v.resolve()) if isinstance(v, Path) else v for name, v in values.items()}
+    run_settings.refuse_changes(settings)
 
 
 def _line(row: dict[str, Any]) -> str:
