@@ -17,8 +17,11 @@ from typing import Any
 import torch
 from gymnasium.vector import AutoresetMode
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
+from torch import Tensor
 
+from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
+from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
@@ -32,26 +35,31 @@ from taccorl.rl.ppo import PPO, RATIO_GUARD
 from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
 from taccorl.rl.settings import PostTrainSettings
 from taccorl.rl.twin_world import TwinWorld
+from taccorl.rl.watched_episode import executed_again
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
-PROGRESS = "progress.jsonl"
+PROGRESS, ROLLOUTS = "progress.jsonl", "rollouts"
 _CHECK_SEED = 1_000_000_007  # added to the run's: scenes of the noise check are not those of training
 _DRIFT_BATCHES = 4  # of the anchor's rows, for the drift in progress.jsonl
 _log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
+SaveEpisode = Callable[[Episode, Path], None]
 
 
-def post_train(settings: PostTrainSettings, report: Report = print) -> Path:
+def post_train(settings: PostTrainSettings, report: Report = print, save_episode: SaveEpisode | None = None) -> Path:
     """Run all iterations; returns the policy's folder of the last checkpoint.
+
+    Args:
+        save_episode: writes an episode of the rollouts as a file, such as ``views.episode.save_episode``.
 
     Raises:
         TaccorlError: a policy, dataset, twin or folder that does not fit; out of GPU memory.
     """
     try:
-        run = PostTraining(settings, report)
+        run = PostTraining(settings, report, save_episode)
         try:
             run.run()
         finally:
@@ -67,12 +75,12 @@ def post_train(settings: PostTrainSettings, report: Report = print) -> Path:
 class PostTraining:
     """One run: everything that is made once, and the loop."""
 
-    def __init__(self, settings: PostTrainSettings, report: Report) -> None:
+    def __init__(self, settings: PostTrainSettings, report: Report, save_episode: SaveEpisode | None = None) -> None:
         """
         Raises:
             TaccorlError: as ``post_train``.
         """
-        self.settings, self._report = settings, report
+        self.settings, self._report, self._save_episode = settings, report, save_episode
         _check_folder(settings)
         twin = load_twin(settings.env.twin) if settings.env.twin else TwinConfig()
         self._opened = _open(settings, twin)
@@ -108,6 +116,7 @@ class PostTraining:
         )
         self._iteration, self._best = 0, 0.0
         self._recent: list[float] = []
+        self._wants_rerun = True
         if settings.resume:
             self._resume(checkpoint.load_state(self._opened.path))
         else:
@@ -193,6 +202,7 @@ class PostTraining:
                 settings.ppo,
                 self._generator,
                 self._clock,
+                self._note_value,
             )
             with self._clock.part("update"):
                 facts = self._ppo.update(rollout.decisions, self._generator)
@@ -214,8 +224,36 @@ class PostTraining:
                 longest = max(settings.save_freq, settings.collapse_iterations)
                 self._recent = [*self._recent, row["success"]][-longest:]
             self._guard_collapse()
+            self._write_rerun()
             if is_due:
                 self._save()
+
+    def _note_value(self, value_N: Tensor) -> None:
+        self.world.watch.value = float(value_N[0])
+
+    def _write_rerun(self) -> None:
+        """The first episode of environment 0 that ended after a checkpoint, or after the start."""
+        if (watched := self.world.watch.take()) is None or not self._wants_rerun or self._save_episode is None:
+            return
+        settings, env = self.settings, self.settings.env
+        rrd = settings.out / ROLLOUTS / f"iteration_{self._iteration:04d}.rrd"
+        scenes = Scenes(
+            tasks=(str(env.task),),
+            episodes=1,
+            seed=watched.seed,
+            difficulty=env.difficulty,
+            twin=env.twin,
+            randomization=env.randomization,
+            episode_length=env.episode_length,
+        )
+        name = f"{settings.out.name}, iteration {self._iteration}, with noise"
+        try:
+            with self._clock.part("rerun"):
+                rrd.parent.mkdir(exist_ok=True)
+                self._save_episode(executed_again(watched, scenes, name, images=self.world.needs_images), rrd)
+        except TaccorlError as error:  # a run goes on without a file to look at
+            self._report(f"warning: no {rrd}: {error}")
+        self._wants_rerun = False
 
     def _row(self, rollout: Rollout, facts: dict[str, float]) -> dict[str, Any]:
         episodes = sum(rollout.outcomes.values())
@@ -231,6 +269,7 @@ class PostTraining:
         }
 
     def _save(self) -> None:
+        self._wants_rerun = True
         score = fmean(self._recent[-self.settings.save_freq :] or [0.0])
         is_best = score > self._best
         self._best = max(score, self._best)

@@ -13,7 +13,7 @@ from taccorl.rl.settings import PostTrainSettings
 
 SETTINGS = "settings.json"
 _NOT_STORED = ("out", "resume", "policy.device")
-_MAY_CHANGE = ("iterations", "save_freq", "keep_checkpoints", "noise_check")
+_MAY_CHANGE = ("iterations", "save_freq", "keep_checkpoints", "rerun", "noise_check")
 _TWIN_DIGEST = "env.twin_sha256"
 
 
@@ -43,7 +43,7 @@ def _replaced[T](target: T, stored: dict[str, Any], prefix: str = "") -> T:
         elif name in stored:
             is_path = Path in (hints[f.name], *typing.get_args(hints[f.name]))
             new[f.name] = Path(stored[name]) if is_path and stored[name] is not None else stored[name]
-    return dataclasses.replace(target, **new)  # pyright: ignore[reportType]
+    return dataclasses.replace(target, **new)  # pyright: ignore[reportArgumentType]
 
 
 def refuse_changes(settings: PostTrainSettings) -> None:

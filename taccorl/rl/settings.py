@@ -182,6 +182,8 @@ class PostTrainSettings:
     """Iterations between checkpoints."""
     keep_checkpoints: int = 3
     """The newest that are kept, beside the best; 0: all."""
+    rerun: bool = True
+    """After each checkpoint, write the first episode that ends in environment 0 to rollouts/iteration_NNNN.rrd."""
     noise_check: bool = True
     """Before the first iteration, compare success with and without noise, one episode in each environment."""
     collapse_iterations: int = 5

@@ -5,6 +5,7 @@ Scenes come from a stream of seeds: the k-th episode of environment i has ``epis
 Letters in shapes: N environments, n executed actions of a chunk, A action, L history, K taxels, P privileged numbers.
 """
 
+import copy
 import dataclasses
 from typing import Any
 
@@ -21,6 +22,7 @@ from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
 from taccorl.rl.rollout import SUCCESS, Acted, Clock, Seen
+from taccorl.rl.watched_episode import EpisodeWatch
 from taccorl.sim.episode_seeds import episode_seed
 from taccorl.sim.simulation import Snapshot
 from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY, Observation
@@ -72,6 +74,7 @@ class TwinWorld:
         self._episode_N = np.zeros(envs.num_envs, dtype=np.int64)
         self._observation: Observation = {}
         self._window_NLK = np.zeros((0,))
+        self.watch = EpisodeWatch()
 
     @property
     def num_envs(self) -> int:
@@ -82,6 +85,7 @@ class TwinWorld:
         self._root, self._episode_N[:] = seed, 0
         self._observation, _ = self.envs.reset(seed=self._seeds())
         self._window_NLK = self._repeated(self._observation[TACTILE_KEY])
+        self.watch.reset()
 
     def observe(self) -> Seen:
         with self._clock.part("pictures"):
@@ -101,6 +105,9 @@ class TwinWorld:
         ends = self._history + chunk.num_steps  # readings after the end of an episode do not count
         self._window_NLK = np.stack([w[end - self._history : end] for w, end in zip(windows, ends, strict=True)])
         self._observation = chunk.observation
+        self.watch.stepped(actions[0, : chunk.num_steps[0]])
+        if outcomes[0]:
+            self.watch.end(self._seeds()[0], outcomes[0], int(facts["partial"][0]))
         last = self._before_reset(truncated) if truncated.any() else None
         if (over := truncated | terminated).any():
             with self._clock.part("physics"):
@@ -124,6 +131,8 @@ class TwinWorld:
         self._episode_N[over] += 1
         self._observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": over})
         self._window_NLK[over] = self._repeated(self._observation[TACTILE_KEY][over])
+        if over[0]:
+            self.watch.reset()
 
     def _seeds(self) -> list[int]:
         return [episode_seed(self._root, i, int(k)) for i, k in enumerate(self._episode_N)]
@@ -159,7 +168,8 @@ class TwinWorld:
         """All that is needed to go on bit for bit; no episode is over between two calls of ``act``."""
         snapshot = self.envs.sim.snapshot()
         fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
-        return {"root": self._root, "episode": self._episode_N.copy(), "window": self._window_NLK, "snapshot": fields}
+        state = {"root": self._root, "episode": self._episode_N.copy(), "window": self._window_NLK, "snapshot": fields}
+        return state | {"watch": copy.deepcopy(vars(self.watch))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave.
@@ -173,5 +183,6 @@ class TwinWorld:
             )
         self._root, self._episode_N = state["root"], state["episode"].copy()
         self._window_NLK = state["window"].copy()
+        self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
         options = {"state": Snapshot(**state["snapshot"])}
         self._observation, _ = self.envs.reset(seed=self._seeds(), options=options)

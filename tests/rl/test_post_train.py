@@ -118,7 +118,36 @@ def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp
     assert rows[0][0]["actor_lr"] != rows[0][1]["actor_lr"]  # adapted, and resumed with it
 
 
-def run(start: Path, out: Path, lines: list[str], **changes: Any) -> Any:
+def test_rerun_files_of_rollouts_change_nothing(start: Path, tmp_path: Path) -> None:
+    """Two iterations of two decisions of 5 steps, episodes of 12 steps: the first ends in the second iteration."""
+    from taccorl.views.episode import save_episode
+
+    shown: list[Any] = []
+
+    def save(episode: Any, rrd: Path) -> None:
+        shown.append(episode)
+        save_episode(episode, rrd)
+
+    found = []
+    for name, saver in (("with", save), ("without", None)):
+        made = run(start, tmp_path / name, [], saver, noise_check=False, iterations=2)
+        made.run()
+        rows = [{k: v for k, v in row.items() if k != "seconds"} for row in progress(tmp_path / name)]
+        found.append((rows, made._actor.policy.state_dict(), made._generator.get_state()))
+        made.world.envs.close()
+    (rows, policy, state), (other_rows, other_policy, other_state) = found
+    assert rows == other_rows and torch.equal(state, other_state)
+    assert all(torch.equal(value, other_policy[name]) for name, value in policy.items())
+    assert [p.name for p in (tmp_path / "with" / "rollouts").iterdir()] == ["iteration_0002.rrd"]
+    (episode,) = shown
+    assert episode.num_rows == 12 and len(episode.picture_keys) == 3
+    values = episode.arrays["rl.value"][:, 0]
+    assert np.isfinite(values).all() and len(np.unique(values)) == 3  # of three decisions
+    assert len(np.unique(values[:5])) == len(np.unique(values[5:10])) == 1
+    assert not (tmp_path / "without" / "rollouts").exists()
+
+
+def run(start: Path, out: Path, lines: list[str], save: Any = None, **changes: Any) -> Any:
     from taccorl.rl.post_train import PostTraining
     from taccorl.rl.settings import AnchorSettings, EnvSettings, PolicySettings, PostTrainSettings
 
@@ -129,7 +158,7 @@ def run(start: Path, out: Path, lines: list[str], **changes: Any) -> Any:
         out=out,
         **changes,
     )
-    return PostTraining(settings, lines.append)
+    return PostTraining(settings, lines.append, save)
 
 
 def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path) -> None:
