@@ -62,6 +62,27 @@ def parse[ConfigT](
     return dataclasses.replace(_draccus(config_class, rest), **texts)  # pyright: ignore[reportArgumentType]
 
 
+def given_names(argv: Sequence[str]) -> set[str]:
+    """Names of the options in ``argv`` and in its --config_path, after ``parse`` has accepted them: ``out``, ``ppo.clip``."""
+    import yaml
+
+    names: set[str] = set()
+    for option in argv:
+        name, _, value = option.removeprefix("--").partition("=")
+        if name == "config_path":
+            names |= set(_flat(yaml.safe_load(_path(value).read_text(encoding="utf-8"))))
+        elif option.startswith("--"):
+            names.add(name)
+    return names
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> list[str]:
+    names = []
+    for key, value in values.items():
+        names += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
+    return names
+
+
 def _required(config_class: type) -> list[str]:
     """Fields without a default."""
     nothing = dataclasses.MISSING

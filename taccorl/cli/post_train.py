@@ -3,16 +3,20 @@
 PPO in the twin from a co-trained policy, held to real demonstrations by a supervised term (paper §3.4).
 
     --anchor.weight=1         β; 0: no anchor
-    --out=FOLDER              checkpoints/last/pretrained_model is a LeRobot policy; progress.jsonl has a line an iteration
-    --resume=true             go on from the last checkpoint in --out
+    --out=FOLDER              checkpoints/last/pretrained_model is a LeRobot policy; progress.jsonl has a line an iteration;
+                              rollouts/*.rrd show an episode after each checkpoint (--rerun=false: none)
+    --out=FOLDER --resume=true   go on from the last checkpoint there, with the settings that the run was begun with;
+                              --iterations=N, --save_freq and --keep_checkpoints may be others
     --config_path=FILE        settings from a file, such as configs/post_train/small.yaml
 
 Defaults are the paper's table of post-training parameters.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import given_names, parse
 from taccorl.rl.settings import PostTrainSettings
 
 
@@ -24,15 +28,24 @@ class PostTrainConfig(PostTrainSettings):
 def main(argv: list[str]) -> int:
     """0: all iterations are done."""
     config = parse(PostTrainConfig, argv, positional=None, prog="taccorl post-train")
+    if config.resume:
+        from taccorl.rl import run_settings
+
+        config = run_settings.complete(config, given_names(argv))
     import logging
 
     from lerobot.utils.import_utils import register_third_party_plugins
 
     import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
     from taccorl.rl.post_train import post_train
+    from taccorl.views.episode import save_episode
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     register_third_party_plugins()
-    folder = post_train(config, lambda text: print(text, flush=True))
+
+    def save(episode: Any, rrd: Path) -> None:
+        save_episode(episode, rrd, native=True)
+
+    folder = post_train(config, lambda text: print(text, flush=True), save if config.rerun else None)
     print(f"wrote {folder}")
     return 0

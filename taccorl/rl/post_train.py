@@ -1,7 +1,7 @@
 """Post-training: rollouts in the twin and updates by turns, with checkpoints that go on bit for bit on a CPU.
 
 ``progress.jsonl`` in the run's folder has one line an iteration: success and outcomes of the episodes that ended in it, losses,
-KL divergence, gradient norms, explained variance, seconds of each part.
+KL divergence, undone steps, learning rate, gradient norms, explained variance, seconds of each part.
 """
 
 import dataclasses
@@ -18,13 +18,15 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
+from torch import Tensor
 
+from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
+from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
-from taccorl.lineage.digest import digest_file
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
-from taccorl.rl import checkpoint
+from taccorl.rl import checkpoint, run_settings
 from taccorl.rl.anchor import RealAnchor
 from taccorl.rl.critic import Critic
 from taccorl.rl.exploration import measure_noise
@@ -34,27 +36,31 @@ from taccorl.rl.ppo import PPO, RATIO_GUARD
 from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
 from taccorl.rl.settings import PostTrainSettings
 from taccorl.rl.twin_world import TwinWorld
+from taccorl.rl.watched_episode import executed_again
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
-PROGRESS, SETTINGS = "progress.jsonl", "settings.json"
-_MAY_CHANGE = ("iterations", "resume", "save_freq", "keep_checkpoints", "noise_check", "out")
+PROGRESS, ROLLOUTS = "progress.jsonl", "rollouts"
 _CHECK_SEED = 1_000_000_007  # added to the run's: scenes of the noise check are not those of training
 _DRIFT_BATCHES = 4  # of the anchor's rows, for the drift in progress.jsonl
 _log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
+SaveEpisode = Callable[[Episode, Path], None]
 
 
-def post_train(settings: PostTrainSettings, report: Report = print) -> Path:
+def post_train(settings: PostTrainSettings, report: Report = print, save_episode: SaveEpisode | None = None) -> Path:
     """Run all iterations; returns the policy's folder of the last checkpoint.
+
+    Args:
+        save_episode: writes an episode of the rollouts as a file, such as ``views.episode.save_episode``.
 
     Raises:
         TaccorlError: a policy, dataset, twin or folder that does not fit; out of GPU memory.
     """
     try:
-        run = PostTraining(settings, report)
+        run = PostTraining(settings, report, save_episode)
         try:
             run.run()
         finally:
@@ -70,12 +76,12 @@ def post_train(settings: PostTrainSettings, report: Report = print) -> Path:
 class PostTraining:
     """One run: everything that is made once, and the loop."""
 
-    def __init__(self, settings: PostTrainSettings, report: Report) -> None:
+    def __init__(self, settings: PostTrainSettings, report: Report, save_episode: SaveEpisode | None = None) -> None:
         """
         Raises:
             TaccorlError: as ``post_train``.
         """
-        self.settings, self._report = settings, report
+        self.settings, self._report, self._save_episode = settings, report, save_episode
         _check_folder(settings)
         twin = load_twin(settings.env.twin) if settings.env.twin else TwinConfig()
         self._opened = _open(settings, twin)
@@ -113,6 +119,7 @@ class PostTraining:
         )
         self._iteration, self._best = 0, 0.0
         self._recent: list[float] = []
+        self._wants_rerun = True
         if settings.resume:
             self._resume(checkpoint.load_state(self._opened.path))
         else:
@@ -129,7 +136,7 @@ class PostTraining:
     def _begin(self, twin: TwinConfig) -> None:
         out = self.settings.out
         out.mkdir(parents=True, exist_ok=True)
-        (out / SETTINGS).write_text(json.dumps(_to_json(self.settings), indent=1) + "\n", encoding="utf-8")
+        run_settings.write(self.settings)
         (out / PROGRESS).write_text("")
         num = sum(p.numel() for p in self._actor.trained_parameters())
         self._report(f"post-training {self.settings.policy.path}: {num / 1e6:.2f} million weights are trained")
@@ -181,6 +188,7 @@ class PostTraining:
         progress = self.settings.out / PROGRESS
         lines = progress.read_text(encoding="utf-8").splitlines()
         progress.write_text("".join(f"{line}\n" for line in lines[: self._iteration]), encoding="utf-8")
+        run_settings.write(self.settings)  # with other iterations, perhaps
         self._report(f"resumed at iteration {self._iteration} of {self.settings.iterations}")
         set_rng_state(state["random"])
 
@@ -197,6 +205,7 @@ class PostTraining:
                 settings.ppo,
                 self._generator,
                 self._clock,
+                self._note_value,
             )
             with self._clock.part("update"):
                 facts = self._ppo.update(rollout.decisions, self._generator)
@@ -209,12 +218,45 @@ class PostTraining:
             with (settings.out / PROGRESS).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             self._report(_line(row))
+            if row["undone_steps"] and row["actor_steps"] == 1 and not settings.ppo.adapt_lr:
+                self._report(
+                    f"warning: the first step at --ppo.actor_lr={row['actor_lr']:g} moved the policy by KL > --ppo.kl_stop="
+                    f"{settings.ppo.kl_stop:g} and was undone: it does not learn. Lower it, or begin with --ppo.adapt_lr=true"
+                )
             if row["episodes"]:
                 longest = max(settings.save_freq, settings.collapse_iterations)
                 self._recent = [*self._recent, row["success"]][-longest:]
             self._guard_collapse()
+            self._write_rerun()
             if is_due:
                 self._save()
+
+    def _note_value(self, value_N: Tensor) -> None:
+        self.world.watch.value = float(value_N[0])
+
+    def _write_rerun(self) -> None:
+        """The first episode of environment 0 that ended after a checkpoint, or after the start."""
+        if (watched := self.world.watch.take()) is None or not self._wants_rerun or self._save_episode is None:
+            return
+        settings, env = self.settings, self.settings.env
+        rrd = settings.out / ROLLOUTS / f"iteration_{self._iteration:04d}.rrd"
+        scenes = Scenes(
+            tasks=(str(env.task),),
+            episodes=1,
+            seed=watched.seed,
+            difficulty=env.difficulty,
+            twin=env.twin,
+            randomization=env.randomization,
+            episode_length=env.episode_length,
+        )
+        name = f"{settings.out.name}, iteration {self._iteration}, with noise"
+        try:
+            with self._clock.part("rerun"):
+                rrd.parent.mkdir(exist_ok=True)
+                self._save_episode(executed_again(watched, scenes, name, images=self.world.needs_images), rrd)
+        except TaccorlError as error:  # a run goes on without a file to look at
+            self._report(f"warning: no {rrd}: {error}")
+        self._wants_rerun = False
 
     def _row(self, rollout: Rollout, facts: dict[str, float]) -> dict[str, Any]:
         episodes = sum(rollout.outcomes.values())
@@ -226,11 +268,11 @@ class PostTraining:
             "outcomes": dict(rollout.outcomes),
             **rollout.facts,
             **facts,
-            "actor_lr": self._ppo.actor_optimizer.param_groups[0]["lr"],
             "seconds": {name: round(s, 3) for name, s in self._clock.restart().items()},
         }
 
     def _save(self) -> None:
+        self._wants_rerun = True
         score = fmean(self._recent[-self.settings.save_freq :] or [0.0])
         is_best = score > self._best
         self._best = max(score, self._best)
@@ -260,9 +302,9 @@ class PostTraining:
             return
         best = TactilePI05Policy.from_pretrained(folder, config=self._actor.policy.config)
         self._actor.policy.load_state_dict(best.state_dict())
-        lr = 0.5 * self._ppo.actor_optimizer.param_groups[0]["lr"]
+        lr = 0.5 * self._ppo.actor_lr
         self._ppo.load_state_dict({**checkpoint.load_state(folder)["ppo"], "num_updates": self._ppo.num_updates})
-        self._ppo.actor_optimizer.param_groups[0]["lr"] = lr
+        self._ppo.actor_lr = lr
         self._recent = []
         self._report(
             f"warning: success was below half of the best ({self._best:.1%}) for {count} iterations: back to "
@@ -328,34 +370,16 @@ def _check_folder(settings: PostTrainSettings) -> None:
                 f"--out={out}: holds files already; nothing was touched: give another folder, or --resume=true to go on there"
             )
         return
-    if not (out / SETTINGS).is_file():
-        raise TaccorlError(f"--resume=true: {out} holds no post-training ({SETTINGS}); leave --resume away to begin")
-    before, now = json.loads((out / SETTINGS).read_text(encoding="utf-8")), _to_json(settings)
-    if changed := [
-        f"--{name} {before.get(name)} there, {now[name]} here" for name in now if before.get(name) != now[name]
-    ]:
-        raise TaccorlError(
-            f"--resume=true: {out} was begun with other settings: {'; '.join(changed)}. Give those that it was begun with"
-        )
-
-
-def _to_json(settings: PostTrainSettings) -> dict[str, Any]:
-    """Name, such as ``ppo.clip``, → value, of what a resumed run must have in common."""
-    values: dict[str, Any] = {}
-    for name, value in dataclasses.asdict(settings).items():
-        if isinstance(value, dict):
-            values |= {f"{name}.{inner}": v for inner, v in value.items()}
-        elif name not in _MAY_CHANGE:
-            values[name] = value
-    values.pop("policy.device")
-    values["env.twin_sha256"] = digest_file(settings.env.twin) if settings.env.twin else None
-    return {name: str(v.resolve()) if isinstance(v, Path) else v for name, v in values.items()}
+    run_settings.refuse_changes(settings)
 
 
 def _line(row: dict[str, Any]) -> str:
     seconds = ", ".join(f"{name} {s:.1f}" for name, s in row["seconds"].items())
     anchor = f", anchor {row['anchor_loss']:.4f}" if "anchor_loss" in row else ""
-    actor = f", KL {row['kl']:.4f}, clipped {row['clip_fraction']:.1%}" if "kl" in row else ""
+    actor = f", KL {row['last_kl']:.4f}, clipped {row['clip_fraction']:.1%}" if "kl" in row else ""
+    actor += (
+        f", {row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}" if row["undone_steps"] else ""
+    )
     return (
         f"iteration {row['iteration']}: success {row['success']:.1%} of {row['episodes']} episodes, explained variance "
         f"{row['explained_variance']:.2f}{actor}{anchor}; seconds: {seconds}"

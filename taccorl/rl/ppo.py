@@ -7,6 +7,9 @@ minimises the flow loss on real data (``anchor``).
 Log-probabilities are summed over the executed numbers of a chunk: one ratio for each decision. The critic has an optimiser and a
 gradient norm of its own, and learns from stored features: it costs no pass through the policy.
 
+Clipping does not bound a step: the gradient is that of before it. So KL(π_old ‖ π) is measured after each step of the actor; a
+step after which it is above ``kl_stop`` is undone, weights and moments, and ends the updates of the iteration.
+
 Letters in shapes: M decisions of a rollout, S stochastic steps, H horizon, D padded action, F features, P privileged numbers.
 """
 
@@ -25,9 +28,16 @@ from taccorl.rl.critic import Critic
 from taccorl.rl.flow_policy import Batch, FlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.settings import PPOSettings
+from taccorl.rl.step_undo import StepUndo
 
 RATIO_GUARD = 1e-3
 """|ratio − 1| at the first minibatch of an iteration, above which sampling and scoring are not the same policy."""
+FIRST_STEP_UNDONE, LATER_STEP_UNDONE, SMALL_STEPS = 0.5, 0.7, 1.2
+"""Factors on the actor's learning rate (``adapt_lr``)."""
+SMALL_KL = 0.2
+"""Share of ``kl_stop`` below which the steps of an iteration are small."""
+MOST_LR = 10.0
+"""Largest learning rate of ``adapt_lr``, in multiples of the first one."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +84,18 @@ class PPO:
         self.ratio_guard = ratio_guard
         self.actor_optimizer = self._adam(actor.trained_parameters(), settings.actor_lr)
         self.critic_optimizer = self._adam(list(critic.parameters()), settings.critic_lr)
+        self._undo = StepUndo(self.actor_optimizer)
         self.num_updates = 0
         """Calls of ``update``."""
+
+    @property
+    def actor_lr(self) -> float:
+        """Of the next steps."""
+        return self.actor_optimizer.param_groups[0]["lr"]
+
+    @actor_lr.setter
+    def actor_lr(self, value: float) -> None:
+        self.actor_optimizer.param_groups[0]["lr"] = value
 
     def _adam(self, parameters: Sequence[nn.Parameter], lr: float) -> torch.optim.AdamW:
         return torch.optim.AdamW(parameters, lr, betas=(0.9, 0.95), weight_decay=self.settings.weight_decay)
@@ -87,7 +107,8 @@ class PPO:
             generator: on the CPU; draws the order, and the anchor's rows.
 
         Returns:
-            Means over the optimiser steps, and counts.
+            Means over the optimiser steps; counts, where ``actor_steps`` includes ``undone_steps``; ``last_kl`` of the policy
+            that remains; ``actor_lr`` of these steps.
 
         Raises:
             TaccorlError: the first ratios are not 1.
@@ -98,23 +119,67 @@ class PPO:
         for _ in range(settings.critic_epochs):
             for rows in self._minibatches(len(decisions), generator):
                 _append(facts, self._critic_step(decisions, rows))
-        counts = {"actor_steps": 0, "skipped_steps": 0, "kl_stopped": 0}
+        actor_lr = self.actor_lr
+        counts = {"actor_steps": 0, "skipped_steps": 0, "kl_stopped": 0, "undone_steps": 0}
         if self.num_updates >= settings.critic_warmup:
-            for epoch in range(settings.epochs):
-                for k, rows in enumerate(self._minibatches(len(decisions), generator)):
-                    is_first = epoch == k == 0
-                    found = self._actor_gradient(decisions.rows(rows), advantage_M[rows], generator, is_first)
-                    _append(facts, found)
-                    if found["kl"] > settings.kl_stop:
-                        counts["kl_stopped"] = 1
-                        break
-                    stepped = self._step(self.actor_optimizer, facts["actor_grad_norm"][-1])
-                    counts["actor_steps" if stepped else "skipped_steps"] += 1
-                if counts["kl_stopped"]:
-                    break
+            last_kl = self._train_actor(decisions, advantage_M, generator, facts, counts)
+            facts["last_kl"] = [last_kl]
+            if settings.adapt_lr:
+                self._adapt_lr(last_kl, counts)
         counts["skipped_steps"] += sum(not math.isfinite(x) for x in facts["critic_grad_norm"])
         self.num_updates += 1
-        return {name: sum(values) / len(values) for name, values in facts.items()} | counts
+        return {name: sum(values) / len(values) for name, values in facts.items()} | counts | {"actor_lr": actor_lr}
+
+    def _train_actor(
+        self,
+        decisions: Decisions,
+        advantage_M: Tensor,
+        generator: torch.Generator,
+        facts: dict[str, list[float]],
+        counts: dict[str, int],
+    ) -> float:
+        """All epochs, or up to the first step that goes too far; KL of the policy that remains, as last measured."""
+        settings, kept_kl, is_measured, probe = self.settings, 0.0, True, torch.arange(0)
+        for epoch in range(settings.epochs):
+            for k, rows in enumerate(self._minibatches(len(decisions), generator)):
+                is_first = epoch == k == 0
+                probe = rows[: settings.micro_batch] if k == 0 else probe
+                found = self._actor_gradient(decisions.rows(rows), advantage_M[rows], generator, is_first)
+                _append(facts, found)
+                if self._goes_too_far(found["kl"], counts, is_measured):
+                    return kept_kl
+                kept_kl, is_measured = found["kl"], True
+                self._undo.keep()
+                if self._step(self.actor_optimizer, facts["actor_grad_norm"][-1]):
+                    counts["actor_steps"] += 1
+                    is_measured = False
+                else:
+                    counts["skipped_steps"] += 1
+        if not is_measured:  # no minibatch came after the last step
+            kl = self._measure_kl(decisions.rows(probe))
+            kept_kl = kept_kl if self._goes_too_far(kl, counts, is_measured) else kl
+        return kept_kl
+
+    def _goes_too_far(self, kl: float, counts: dict[str, int], is_measured: bool) -> bool:
+        """Whether updates end here; the last step is undone unless a smaller KL was measured after it."""
+        if kl <= self.settings.kl_stop:  # false for NaN
+            return False
+        counts["kl_stopped"] = 1
+        if not is_measured:
+            self._undo.restore()
+            counts["undone_steps"] += 1
+        return True
+
+    @torch.no_grad()
+    def _measure_kl(self, rows: Decisions) -> float:
+        return kl_divergence(self._log_ratios(rows))
+
+    def _adapt_lr(self, last_kl: float, counts: dict[str, int]) -> None:
+        """Smaller after a step that was undone, larger after an iteration of small ones."""
+        if counts["undone_steps"]:
+            self.actor_lr *= FIRST_STEP_UNDONE if counts["actor_steps"] == 1 else LATER_STEP_UNDONE
+        elif counts["actor_steps"] and not counts["kl_stopped"] and last_kl < SMALL_KL * self.settings.kl_stop:
+            self.actor_lr = max(self.actor_lr, min(SMALL_STEPS * self.actor_lr, MOST_LR * self.settings.actor_lr))
 
     def _minibatches(self, num: int, generator: torch.Generator) -> Sequence[Tensor]:
         order = torch.randperm(num, generator=generator).to(self.actor.scored_HD.device)
@@ -138,9 +203,7 @@ class PPO:
         parts = torch.arange(len(rows), device=advantage_M.device).split(self.settings.micro_batch)
         for part in parts:
             own = rows.rows(part)
-            log_ratio_M = (
-                self.actor.log_prob(own.batch, self.sde, own.before_MSHD, own.after_MSHD, own.step_MS) - own.log_prob_M
-            )
+            log_ratio_M = self._log_ratios(own)
             loss = policy_loss(log_ratio_M, advantage_M[part], self.settings.clip) * (len(part) / len(rows))
             loss.backward()
             log_ratios.append(log_ratio_M.detach())
@@ -149,7 +212,7 @@ class PPO:
         ratio_M = log_ratio_M.exp()
         found = {
             "actor_loss": float(torch.stack(losses).sum()),
-            "kl": float((ratio_M - 1 - log_ratio_M).mean()),
+            "kl": kl_divergence(log_ratio_M),
             "clip_fraction": float(((ratio_M - 1).abs() > self.settings.clip).float().mean()),
         }
         if is_first:
@@ -160,6 +223,11 @@ class PPO:
         parameters = self.actor.trained_parameters()
         found["actor_grad_norm"] = float(nn.utils.clip_grad_norm_(parameters, self.settings.max_grad_norm))
         return found
+
+    def _log_ratios(self, rows: Decisions) -> Tensor:
+        """(M,) log π − log π_old."""
+        now_M = self.actor.log_prob(rows.batch, self.sde, rows.before_MSHD, rows.after_MSHD, rows.step_MS)
+        return now_M - rows.log_prob_M
 
     def _guard(self, error: float) -> None:
         if not error <= self.ratio_guard:  # nor NaN
@@ -198,6 +266,11 @@ def policy_loss(log_ratio_M: Tensor, advantage_M: Tensor, clip: float) -> Tensor
     """L_PPO, a scalar."""
     ratio_M = log_ratio_M.exp()
     return -torch.minimum(ratio_M * advantage_M, ratio_M.clamp(1 - clip, 1 + clip) * advantage_M).mean()
+
+
+def kl_divergence(log_ratio_M: Tensor) -> float:
+    """Estimate of KL(π_old ‖ π): mean of ratio − 1 − log ratio, which is never negative (k3 of Schulman's note)."""
+    return float((log_ratio_M.exp() - 1 - log_ratio_M).mean())
 
 
 def _append(facts: dict[str, list[float]], found: dict[str, float]) -> None:

@@ -7,7 +7,7 @@ Letters in shapes: T decisions, N environments, H horizon, D padded action, A ac
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -116,11 +116,13 @@ def collect(
     settings: PPOSettings,
     generator: torch.Generator,
     clock: Clock,
+    on_values: Callable[[Tensor], None] | None = None,
 ) -> Rollout:
     """T decisions in every environment, with their advantages.
 
     Args:
         generator: on the CPU; draws the noise.
+        on_values: called with the values (N,) of each decision before it is executed.
     """
     kept: list[dict[str, Tensor]] = []
     batches: list[Batch] = []
@@ -137,6 +139,8 @@ def collect(
             sampled, features_NF = actor.sample(seen.batch, sde, draws)
             value_N = _values(critic, features_NF, seen.privileged_NP)
             actions_NHA = actor.actions(sampled.chunk_BHD)
+        if on_values is not None:
+            on_values(value_N)
         acted = world.act(actions_NHA)
         kept.append(
             {

@@ -147,7 +147,10 @@ class PPOSettings:
     max_grad_norm: float = 1.0
     """Gradients of actor and critic are clipped to this norm separately."""
     kl_stop: float = 0.05
-    """The actor's remaining updates of an iteration are left out once KL(old ‖ new) is larger."""
+    """A step of the actor after which KL(old ‖ new) is larger is undone, and the remaining ones of the iteration are left out."""
+    adapt_lr: bool = False
+    """Adapt the actor's learning rate: × 0.5 after an iteration whose first step was undone, × 0.7 where a later one was, × 1.2
+    where none was and the last KL is below kl_stop / 5, up to 10 × actor_lr. false: fixed (paper)."""
     critic_epochs: int = 1
     """Epochs of the critic alone: its inputs are stored, so they cost little."""
     critic_warmup: int = 0
@@ -191,6 +194,8 @@ class PostTrainSettings:
     """Iterations between checkpoints."""
     keep_checkpoints: int = 3
     """The newest that are kept, beside the best; 0: all."""
+    rerun: bool = True
+    """After each checkpoint, write the first episode that ends in environment 0 to rollouts/iteration_NNNN.rrd."""
     noise_check: bool = True
     """Before the first iteration, compare success with and without noise, one episode in each environment."""
     collapse_iterations: int = 5

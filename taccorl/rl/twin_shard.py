@@ -41,6 +41,12 @@ class ShardActed:
     last: ShardSeen | None
     outcomes: list[str | None]
     later_outcomes: list[str | None]
+    num_steps_N: np.ndarray
+    """Control steps that were executed: fewer than n where the episode ended."""
+    seed_N: np.ndarray
+    """Of the scenes of these episodes."""
+    partial_N: np.ndarray
+    """Goals in place after the chunk."""
 
 
 class TwinShard:
@@ -100,7 +106,7 @@ class TwinShard:
         facts = self.envs.facts()
         truncated, terminated = chunk.truncated, chunk.terminated
         outcomes = [str(o) or None for o in np.where(facts["is_success"], SUCCESS, facts["failure"])]
-        began_later = self._began_later_N.tolist()
+        began_later, seeds, partial = self._began_later_N.tolist(), self._seeds(), facts["partial"].copy()
         windows = np.concatenate([self._window_NLK, chunk.tactile], axis=1)
         ends = self._history + chunk.num_steps  # readings after the end of an episode do not count
         self._window_NLK = np.stack([w[end - self._history : end] for w, end in zip(windows, ends, strict=True)])
@@ -116,6 +122,9 @@ class TwinShard:
             last=last,
             outcomes=[None if later else o for o, later in zip(outcomes, began_later, strict=True)],
             later_outcomes=[o if later else None for o, later in zip(outcomes, began_later, strict=True)],
+            num_steps_N=chunk.num_steps,
+            seed_N=np.array(seeds),
+            partial_N=partial,
         )
 
     def reset(self, rows_N: np.ndarray) -> None:

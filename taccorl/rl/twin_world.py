@@ -6,6 +6,7 @@ runs. What is rendered in a thread stays in it, as OpenGL wants.
 Letters in shapes: N environments, n executed actions of a chunk, A action, L history, K taxels, P privileged numbers.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -23,7 +24,8 @@ from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
 from taccorl.rl.rollout import Acted, Clock, Seen
 from taccorl.rl.start_states import StartStates
-from taccorl.rl.twin_shard import ShardSeen, TwinShard
+from taccorl.rl.twin_shard import ShardActed, ShardSeen, TwinShard
+from taccorl.rl.watched_episode import EpisodeWatch
 from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
@@ -85,6 +87,7 @@ class TwinWorld:
             for each, (first, _) in zip(self._all_envs, self._bounds, strict=True)
         ]
         self._threads = [ThreadPoolExecutor(1) for _ in self.shards] if len(self.shards) > 1 else []
+        self.watch = EpisodeWatch()
 
     @property
     def envs(self) -> TaccorlVectorEnv:
@@ -106,6 +109,7 @@ class TwinWorld:
     def restart(self, seed: int) -> None:
         """Begin the stream of scenes ``seed``."""
         self._each(lambda shard, *_: shard.restart(seed))
+        self.watch.reset()
 
     def observe(self) -> Seen:
         with self._clock.part("pictures"):
@@ -118,6 +122,7 @@ class TwinWorld:
         with self._clock.part("physics"):
             acted = self._each(lambda shard, first, end: shard.act(actions[first:end]))
         last = [each.last for each in acted if each.last is not None]
+        self._watch(actions, acted[0])
 
         def joined(name: str) -> Tensor:
             return torch.from_numpy(np.concatenate([getattr(each, name) for each in acted]))
@@ -131,8 +136,18 @@ class TwinWorld:
             later_outcomes=[o for each in acted for o in each.later_outcomes],
         )
 
+    def _watch(self, actions_NHA: np.ndarray, acted: ShardActed) -> None:
+        """Environment 0. Episodes that began in a state of an earlier one cannot be executed again from their seed."""
+        self.watch.stepped(actions_NHA[0, : acted.num_steps_N[0]])
+        if outcome := acted.outcomes[0]:
+            self.watch.end(int(acted.seed_N[0]), outcome, int(acted.partial_N[0]))
+        if outcome or acted.later_outcomes[0]:
+            self.watch.reset()
+
     def reset(self, rows_N: Tensor) -> None:
         rows = rows_N.numpy()
+        if rows[0]:
+            self.watch.reset()
         self._each(lambda shard, first, end: shard.reset(rows[first:end]) if rows[first:end].any() else None)
 
     def _seen(self, parts: Sequence[ShardSeen]) -> Seen:
@@ -152,7 +167,7 @@ class TwinWorld:
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on bit for bit; no episode is over between two calls of ``act``."""
-        return {"shards": self._each(lambda shard, *_: shard.state_dict())}
+        return {"shards": self._each(lambda shard, *_: shard.state_dict()), "watch": copy.deepcopy(vars(self.watch))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave.
@@ -167,6 +182,7 @@ class TwinWorld:
             )
         own = dict(zip((first for first, _ in self._bounds), states, strict=True))
         self._each(lambda shard, first, _: shard.load_state_dict(own[first]))
+        self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
 
     def close(self) -> None:
         """Of all environments, each in its thread."""

@@ -42,7 +42,7 @@ def options(start: Path, real: Path, out: Path, **changes: Any) -> list[str]:
         "env.stagger": False,
         "anchor.dataset": real,
         "anchor.batch_size": 2,
-        "ppo.actor_lr": 1e-4,
+        "ppo.actor_lr": 1e-5,
         "noise_check": False,
         "iterations": 1,
         "save_freq": 1,
@@ -96,7 +96,7 @@ def test_input_that_does_not_fit_is_refused_before_anything_is_written(
 @pytest.mark.slow
 def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
     """Two iterations at once, and one, kill -9, a line that was written without its checkpoint, and one more."""
-    more = {"ppo.privileged_critic": True}
+    more = {"ppo.privileged_critic": True, "ppo.adapt_lr": True}
     assert main(options(start, real, tmp_path / "once", iterations=2, **more)) == 0
     out = tmp_path / "twice"
     command = [sys.executable, "-m", "taccorl.cli.main", *options(start, real, out, iterations=2, **more)]
@@ -110,14 +110,44 @@ def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp
         file.write('{"iteration": 2}\n')
     assert main(options(start, real, out, iterations=2, resume=True, **{**more, "ppo.clip": 0.3})) == 2
     assert "ppo.clip" in capsys.readouterr().err
-    assert main(options(start, real, out, iterations=2, resume=True, **more)) == 0
+    assert main(["post-train", f"--out={out}", "--resume=true"]) == 0  # the rest is in settings.json
     once, twice = weights(tmp_path / "once"), weights(out)
     assert all(torch.equal(value, twice[name]) for name, value in once.items())
     rows = [[{k: v for k, v in row.items() if k != "seconds"} for row in progress(p)] for p in (tmp_path / "once", out)]
     assert rows[0] == rows[1] and len(rows[0]) == 2
+    assert rows[0][0]["actor_lr"] != rows[0][1]["actor_lr"]  # adapted, and resumed with it
 
 
-def run(start: Path, out: Path, lines: list[str], **changes: Any) -> Any:
+def test_rerun_files_of_rollouts_change_nothing(start: Path, tmp_path: Path) -> None:
+    """Two iterations of two decisions of 5 steps, episodes of 12 steps: the first ends in the second iteration."""
+    from taccorl.views.episode import save_episode
+
+    shown: list[Any] = []
+
+    def save(episode: Any, rrd: Path) -> None:
+        shown.append(episode)
+        save_episode(episode, rrd)
+
+    found = []
+    for name, saver in (("with", save), ("without", None)):
+        made = run(start, tmp_path / name, [], saver, noise_check=False, iterations=2)
+        made.run()
+        rows = [{k: v for k, v in row.items() if k != "seconds"} for row in progress(tmp_path / name)]
+        found.append((rows, made._actor.policy.state_dict(), made._generator.get_state()))
+        made.world.envs.close()
+    (rows, policy, state), (other_rows, other_policy, other_state) = found
+    assert rows == other_rows and torch.equal(state, other_state)
+    assert all(torch.equal(value, other_policy[name]) for name, value in policy.items())
+    assert [p.name for p in (tmp_path / "with" / "rollouts").iterdir()] == ["iteration_0002.rrd"]
+    (episode,) = shown
+    assert episode.num_rows == 12 and len(episode.picture_keys) == 3
+    values = episode.arrays["rl.value"][:, 0]
+    assert np.isfinite(values).all() and len(np.unique(values)) == 3  # of three decisions
+    assert len(np.unique(values[:5])) == len(np.unique(values[5:10])) == 1
+    assert not (tmp_path / "without" / "rollouts").exists()
+
+
+def run(start: Path, out: Path, lines: list[str], save: Any = None, **changes: Any) -> Any:
     from taccorl.rl.post_train import PostTraining
     from taccorl.rl.settings import AnchorSettings, EnvSettings, PolicySettings, PostTrainSettings
 
@@ -128,7 +158,7 @@ def run(start: Path, out: Path, lines: list[str], **changes: Any) -> Any:
         out=out,
         **changes,
     )
-    return PostTraining(settings, lines.append)
+    return PostTraining(settings, lines.append, save)
 
 
 def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path) -> None:
@@ -151,6 +181,25 @@ def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path
     assert bias.unique().tolist() == [20] and "000020" in lines[-1]
     assert made._ppo.actor_optimizer.param_groups[0]["lr"] == pytest.approx(2.5e-6)
     made.world.close()
+
+
+def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(start: Path, tmp_path: Path) -> None:
+    from taccorl.rl.settings import PPOSettings
+
+    lines: list[str] = []
+    for adapt_lr in (True, False):
+        out = tmp_path / str(adapt_lr)
+        made = run(
+            start, out, lines, noise_check=False, iterations=1, ppo=PPOSettings(actor_lr=1e-2, adapt_lr=adapt_lr)
+        )
+        before = {name: value.clone() for name, value in made._actor.policy.state_dict().items()}
+        made.run()
+        assert all(torch.equal(value, before[name]) for name, value in made._actor.policy.state_dict().items())
+        (row,) = progress(out)
+        assert row["undone_steps"] == 1 and row["actor_lr"] == 1e-2 and row["last_kl"] < 1e-6
+        assert made._ppo.actor_lr == (5e-3 if adapt_lr else 1e-2)
+        assert ("--ppo.adapt_lr=true" in lines[-1]) is not adapt_lr and "1 step undone" in "".join(lines)
+        made.world.envs.close()
 
 
 def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, monkeypatch: Any) -> None:

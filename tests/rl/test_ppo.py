@@ -153,7 +153,54 @@ def test_gradients_that_are_not_finite_are_skipped_and_counted() -> None:
 def test_updates_stop_when_the_policy_has_moved_too_far() -> None:
     learner = ppo(LinePolicy(), PPOSettings(actor_lr=0.05, batch_size=16, epochs=5, kl_stop=0.02))
     facts = learner.update(rollout(learner), torch.Generator())
-    assert facts["kl_stopped"] == 1 and 1 <= facts["actor_steps"] < 20
+    assert facts["kl_stopped"] == 1 and 1 <= facts["actor_steps"] < 60
+
+
+@pytest.mark.parametrize("batch_size", [64, 192])
+def test_a_step_that_goes_too_far_is_undone(batch_size: int) -> None:
+    """The first of three steps, which the next minibatch sees, and the only one, which is measured after it."""
+    learner = ppo(LinePolicy(), PPOSettings(actor_lr=0.05, batch_size=batch_size, adapt_lr=True))
+    before, state = weights(learner.actor), learner.state_dict()["actor_optimizer"]["state"]  # pyright: ignore
+    facts = learner.update(rollout(learner), torch.Generator())
+    assert torch.equal(before, weights(learner.actor)) and not state  # pyright: ignore
+    assert not learner.actor_optimizer.state  # moments are those of before, too
+    assert facts["undone_steps"] == facts["actor_steps"] == facts["kl_stopped"] == 1
+    assert facts["actor_lr"] == 0.05 and learner.actor_lr == 0.025 and facts["last_kl"] < 1e-9
+
+
+def test_only_the_last_step_is_undone() -> None:
+    """The same order and one step less, with a limit that is never reached, gives the same policy."""
+    found = rollout(ppo(LinePolicy()))
+    learner = ppo(LinePolicy(), PPOSettings(actor_lr=2e-3, batch_size=16, adapt_lr=True, kl_stop=0.01))
+    facts = learner.update(found, torch.Generator().manual_seed(2))
+    kept = int(facts["actor_steps"]) - 1
+    assert facts["undone_steps"] == 1 and 0 < kept < 11 and 0 < facts["last_kl"] <= 0.01
+    assert learner.actor_lr == pytest.approx(0.7 * 2e-3)
+    other = ppo(LinePolicy(), PPOSettings(actor_lr=2e-3, batch_size=16, kl_stop=math.inf))
+    order = other._minibatches  # the critic has one epoch of its own
+    calls = []
+
+    def minibatches(num: int, generator: torch.Generator) -> list[torch.Tensor]:
+        calls.append(num)
+        return list(order(num, generator))[: kept if len(calls) == 2 else None]
+
+    other._minibatches = minibatches  # pyright: ignore
+    other.update(found, torch.Generator().manual_seed(2))
+    assert torch.equal(weights(learner.actor), weights(other.actor))  # pyright: ignore
+    ours, theirs = (x.actor_optimizer.state_dict()["state"] for x in (learner, other))
+    assert all(torch.equal(ours[k][name], theirs[k][name]) for k in theirs for name in theirs[k])
+
+
+def test_the_learning_rate_grows_while_steps_are_small_up_to_ten_times() -> None:
+    learner, generator = ppo(LinePolicy(), PPOSettings(actor_lr=1e-7, batch_size=192, adapt_lr=True)), torch.Generator()
+    found = rollout(learner)
+    rates = [learner.update(found, generator)["actor_lr"] for _ in range(15)]
+    assert rates[:3] == pytest.approx([1e-7, 1.2e-7, 1.44e-7]) and rates[-1] == pytest.approx(1e-6)
+    learner = ppo(LinePolicy(), PPOSettings(actor_lr=1e-7, critic_warmup=9, adapt_lr=True))
+    assert learner.update(found, generator)["actor_lr"] == learner.actor_lr == 1e-7
+    fixed = ppo(LinePolicy(), PPOSettings(actor_lr=1e-7))
+    fixed.update(found, generator)
+    assert fixed.actor_lr == 1e-7  # the paper's
 
 
 def test_value_of_the_last_observation_counts_where_time_ran_out() -> None:
@@ -181,7 +228,7 @@ def test_float32_weights_keep_a_small_learning_rate() -> None:
 
 def test_stopped_and_resumed_learner_is_the_same_bit_for_bit() -> None:
     """After a warm-up, which does not begin again, and a step, whose moments count."""
-    settings = PPOSettings(actor_lr=3e-4, batch_size=64, critic_warmup=1)
+    settings = PPOSettings(actor_lr=3e-4, batch_size=64, critic_warmup=1, adapt_lr=True, kl_stop=1.0)
 
     def after(resumed: bool) -> torch.Tensor:
         learner, generator = ppo(LinePolicy(), settings), torch.Generator().manual_seed(9)
@@ -193,6 +240,7 @@ def test_stopped_and_resumed_learner_is_the_same_bit_for_bit() -> None:
             for p, value in zip(learner.actor.trained_parameters(), own, strict=True):
                 p.data.copy_(value)
             learner.load_state_dict(state)
+        assert learner.actor_lr == pytest.approx(1.2 * 3e-4)
         learner.update(rollout(learner, seed=1), generator)
         return weights(learner.actor)  # pyright: ignore
 

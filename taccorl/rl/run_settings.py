@@ -1,0 +1,85 @@
+"""``settings.json`` in a run's folder: what a run of post-training was begun with, and what resuming it takes from there."""
+
+import dataclasses
+import json
+import typing
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from taccorl.errors import TaccorlError
+from taccorl.lineage.digest import digest_file
+from taccorl.rl.settings import PostTrainSettings
+
+SETTINGS = "settings.json"
+_NOT_STORED = ("out", "resume", "policy.device")
+_MAY_CHANGE = ("iterations", "save_freq", "keep_checkpoints", "rerun", "noise_check")
+_TWIN_DIGEST = "env.twin_sha256"
+
+
+def write(settings: PostTrainSettings) -> None:
+    """In one step: a full disk leaves the file of before."""
+    new = settings.out / f".{SETTINGS}.new"
+    new.write_text(json.dumps(_to_json(settings), indent=1) + "\n", encoding="utf-8")
+    new.replace(settings.out / SETTINGS)
+
+
+def complete[SettingsT: PostTrainSettings](settings: SettingsT, given: Collection[str]) -> SettingsT:
+    """Settings of the run in ``settings.out``, where ``given`` does not name them: ``ppo.clip``, ``iterations``.
+
+    Raises:
+        TaccorlError: there is no run.
+    """
+    stored = {name: value for name, value in _read(settings.out).items() if name not in given}
+    return _replaced(settings, stored)
+
+
+def _replaced[T](target: T, stored: dict[str, Any], prefix: str = "") -> T:
+    hints, new = typing.get_type_hints(type(target)), {}
+    for f in dataclasses.fields(target):  # pyright: ignore[reportArgumentType]
+        name, value = f"{prefix}{f.name}", getattr(target, f.name)
+        if dataclasses.is_dataclass(value):
+            new[f.name] = _replaced(value, stored, f"{name}.")
+        elif name in stored:
+            is_path = Path in (hints[f.name], *typing.get_args(hints[f.name]))
+            new[f.name] = Path(stored[name]) if is_path and stored[name] is not None else stored[name]
+    return dataclasses.replace(target, **new)  # pyright: ignore[reportArgumentType]
+
+
+def refuse_changes(settings: PostTrainSettings) -> None:
+    """
+    Raises:
+        TaccorlError: there is no run in ``settings.out``, or it has other settings, or its twin is another now.
+    """
+    before, now = _to_json(PostTrainSettings()) | _read(settings.out), _to_json(settings)
+    fixed = [name for name in now if name not in _MAY_CHANGE]
+    if changed := [f"--{name} {before[name]} there, {now[name]} here" for name in fixed if before[name] != now[name]]:
+        raise TaccorlError(
+            f"--resume=true: {settings.out} was begun with other settings: {'; '.join(changed)}. "
+            "Give those that it was begun with, or none"
+        )
+
+
+def _read(out: Path) -> dict[str, Any]:
+    """
+    Raises:
+        TaccorlError: there is no such file, or it is not JSON.
+    """
+    try:
+        return json.loads((out / SETTINGS).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise TaccorlError(
+            f"--resume=true: {out} holds no post-training ({SETTINGS}); leave --resume away to begin"
+        ) from None
+    except ValueError as error:
+        raise TaccorlError(f"--resume=true: {out / SETTINGS}: is not JSON: {error}") from error
+
+
+def _to_json(settings: PostTrainSettings) -> dict[str, Any]:
+    """Name, such as ``ppo.clip``, → value; paths are absolute."""
+    values: dict[str, Any] = {}
+    for name, value in dataclasses.asdict(settings).items():
+        values |= {f"{name}.{inner}": v for inner, v in value.items()} if isinstance(value, dict) else {name: value}
+    values = {name: value for name, value in values.items() if name not in _NOT_STORED}
+    values[_TWIN_DIGEST] = digest_file(settings.env.twin) if settings.env.twin else None
+    return {name: str(v.resolve()) if isinstance(v, Path) else v for name, v in values.items()}

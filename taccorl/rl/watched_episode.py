@@ -1,0 +1,99 @@
+"""Episodes of environment 0 of the rollouts, to look at: as ``taccorl evaluate`` shows failures, and with the critic's values.
+
+A rollout keeps only seed, actions and values. They are executed again apart from it, bit for bit, so that it costs the rollout
+nothing and changes none of its random numbers.
+
+Letters in shapes: n executed actions of a decision, A action, T control steps.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taccorl.data.episode import Episode
+from taccorl.data.spec import FeatureSpec
+from taccorl.evaluation.episodes import EpisodeRow
+from taccorl.evaluation.evaluate import Scenes
+from taccorl.evaluation.failed_episodes import execute_again
+from taccorl.evaluation.rollouts import Rollout
+from taccorl.sim.actions import ACTION_NAMES
+from taccorl.sim.twin import CONTROL_HZ
+
+VALUE = "rl.value"
+
+
+@dataclass(frozen=True)
+class WatchedEpisode:
+    """One episode from its reset to its end."""
+
+    seed: int
+    """Of the scene."""
+    outcome: str
+    partial: int
+    """Goals in place at the end."""
+    actions_TA: np.ndarray
+    values_T: np.ndarray
+    """V of the decision that a control step belongs to; NaN where no rollout was collected (``env.stagger``)."""
+
+
+@dataclass
+class EpisodeWatch:
+    """The episode that environment 0 is in, and the first one that ended since ``take``."""
+
+    chunks: list[np.ndarray] = field(default_factory=list)
+    values: list[np.ndarray] = field(default_factory=list)
+    value: float = math.nan
+    ended: WatchedEpisode | None = None
+
+    def reset(self) -> None:
+        """Another episode begins."""
+        self.chunks, self.values, self.value = [], [], math.nan
+
+    def stepped(self, actions_nA: np.ndarray) -> None:
+        """Actions that were executed, of one decision."""
+        self.chunks.append(actions_nA.copy())
+        self.values.append(np.full(len(actions_nA), self.value, dtype=np.float32))
+        self.value = math.nan
+
+    def end(self, seed: int, outcome: str, partial: int) -> None:
+        """The episode is over."""
+        if self.ended is None and self.chunks:
+            actions_TA, values_T = np.concatenate(self.chunks), np.concatenate(self.values)
+            self.ended = WatchedEpisode(seed, outcome, partial, actions_TA, values_T)
+
+    def take(self) -> WatchedEpisode | None:
+        """The first episode that ended since the last call."""
+        ended, self.ended = self.ended, None
+        return ended
+
+
+def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, images: bool) -> Episode:
+    """Its rows, with the feature ``rl.value``.
+
+    Args:
+        scenes: of the rollout; those with another seed than the episode's do not matter.
+        policy: its name in the episode.
+        images: render the cameras.
+
+    Raises:
+        TaccorlError: executed again the episode ends otherwise.
+    """
+    row = EpisodeRow(
+        policy=policy,
+        task=scenes.tasks[0],
+        seed=watched.seed,
+        outcome=watched.outcome,
+        partial=watched.partial,
+        max_partial=0,
+        steps=len(watched.actions_TA),
+        time_s=len(watched.actions_TA) / CONTROL_HZ,
+        subtask_end_s={},
+        clipped_steps=0,
+    )
+    again = execute_again(scenes, Rollout(row, watched.actions_TA, np.zeros((0, len(ACTION_NAMES)))), images=images)
+    value = FeatureSpec(dtype="float32", shape=(1,), unit="1", frame="critic", rate_hz=CONTROL_HZ, range=(-1e12, 1e12))
+    spec = dataclasses.replace(again.episode.spec, features=again.episode.spec.features | {VALUE: value})
+    arrays = again.episode.arrays | {VALUE: watched.values_T[:, None]}
+    return dataclasses.replace(again.episode, spec=spec, arrays=arrays)
