@@ -154,6 +154,8 @@ def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again
     told = numbers(some, read_attempts(some, collected, store, 2), None)
     assert told["failures"] == {"crashed": 1}
     assert told["failed"][0]["command"] is None
+    with pytest.raises(TaccorlError, match="3 attempts are asked for, but 1 successes were reached after 2"):
+        made_attempts(some, collected, store, 3)
 
 
 @pytest.mark.slow
