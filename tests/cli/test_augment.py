@@ -29,20 +29,6 @@ def place(collected: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def said(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs a verb there; (exit code, all that was said)."""
-    monkeypatch.chdir(place)
-
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(list(map(str, words)))
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
-
-
 def report(folder: Path, name: str = "new") -> dict[str, Any]:
     return json.loads((folder / f"{name}.augment_report.json").read_text())
 
