@@ -212,7 +212,7 @@ def test_a_run_that_is_killed_goes_on_and_gives_the_same_bytes(augmented, collec
         f"Path({str(collected)!r}), Path({str(tmp_path / 'new')!r}), Store(Path({str(tmp_path / 'store')!r})))\n"
     )
     rng = np.random.default_rng(0)
-    for _ in range(10):
+    for _ in range(4):
         with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.DEVNULL) as process:
             time.sleep(float(rng.uniform(4, 12)))
             os.kill(process.pid, signal.SIGKILL)
