@@ -145,7 +145,7 @@ def _json_schema(ros_type: str) -> bytes:
 
 
 def joint_state_cdr(message: Message) -> bytes:
-    """The bytes of ``serialize_dynamic``, in a tenth of its time: more than half of a recording's messages are joint states.
+    """The bytes of ``serialize_dynamic``, in a sixth of its time: more than half of a recording's messages are joint states.
 
     Numbers lie at multiples of their size, counted from behind the four bytes that say little-endian CDR.
     """
