@@ -132,11 +132,10 @@ class TactileFlowPolicy(FlowPolicy):
 
     def _prefix(self, images: list[Tensor], masks: list[Tensor], tokens: Tensor, token_mask: Tensor) -> _Prefix:
         """As LeRobot's ``sample_actions`` computes it."""
-        # Any: what its forward returns is nowhere stated, and to infer it takes pyright half a minute.
-        backbone: Any = self.model.paligemma_with_expert
+        backbone = self.model.paligemma_with_expert
         embedded_BTD, valid_BT, starts_block_BT = self.model.embed_prefix(images, masks, tokens, token_mask)
         mask = prepare_attention_masks_4d(make_att_2d_masks(valid_BT, starts_block_BT))
-        backbone.paligemma.model.language_model.config._attn_implementation = "eager"
+        backbone.paligemma.model.language_model.config._attn_implementation = "eager"  # pyright: ignore
         (hidden_BTD, _), cache = backbone.forward(
             attention_mask=mask,
             position_ids=torch.cumsum(valid_BT, dim=1) - 1,
