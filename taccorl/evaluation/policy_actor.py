@@ -25,8 +25,8 @@ from taccorl.evaluation.preflight import PolicyFacts
 from taccorl.evaluation.rollouts import Acted
 from taccorl.lineage.digest import digest_file, digest_files
 from taccorl.sim.lerobot_env import raw_names
-from taccorl.sim.part_poses import part_pose_names
-from taccorl.sim.spaces import PARTS_KEY, STATE_KEY, Observation
+from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
+from taccorl.sim.spaces import STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 Processor = Callable[[Any], Any]

@@ -26,7 +26,8 @@ from taccorl.rl.rollout import Acted, Clock, Seen
 from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_shard import ShardActed, ShardSeen, TwinShard
 from taccorl.rl.watched_episode import EpisodeWatch
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY
+from taccorl.sim.part_poses import PARTS_KEY
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 

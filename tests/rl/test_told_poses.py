@@ -17,8 +17,7 @@ from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.rollout import Clock
 from taccorl.rl.settings import PolicySettings
 from taccorl.rl.twin_world import TwinWorld
-from taccorl.sim.part_poses import part_pose_names
-from taccorl.sim.spaces import PARTS_KEY
+from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
 from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv

@@ -18,7 +18,7 @@ from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
 from taccorl.policies.tactile_pi05.hand_poses import NUM_HAND_POSES, arm_names
 from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
 from taccorl.policies.tactile_pi05.part_poses import bodies_of, num_part_numbers
-from taccorl.sim.spaces import PARTS_KEY
+from taccorl.sim.part_poses import PARTS_KEY
 
 TACTILE = "observation.tactile"
 RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
