@@ -44,6 +44,10 @@ class EnvSettings:
     shards: int = 1
     """Groups of environments, each in a thread of its own: while one computes in Python, physics of the others runs. Scenes do
     not depend on it."""
+    threads: int | None = None
+    """Of each shard; as many as there are CPUs if not given."""
+    ray: bool = False
+    """Shards are Ray actors: on this machine, or on those of the cluster that RAY_ADDRESS names. Needs the extra ray."""
     decisions: int = 36
     """C: chunks of actions of each environment in an iteration. Episodes go on in the next one."""
     difficulty: str = "train"
@@ -67,6 +71,8 @@ class EnvSettings:
             TaccorlError: a number below 1.
         """
         _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions, start_states=self.start_states)
+        if self.threads is not None:
+            _at_least("env", 1, threads=self.threads)
         if not 1 <= self.shards <= self.num_envs:
             raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
         if not 0 <= self.start_share <= 1:

@@ -8,7 +8,7 @@ Letters in shapes: N environments, n executed actions of a chunk, A action, L hi
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -17,6 +17,7 @@ from taccorl.errors import TaccorlError
 from taccorl.rl.rollout import SUCCESS
 from taccorl.rl.start_states import StartStates
 from taccorl.sim.episode_seeds import episode_seed
+from taccorl.sim.part_poses import part_pose_names
 from taccorl.sim.simulation import Snapshot
 from taccorl.sim.spaces import TACTILE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
@@ -47,6 +48,24 @@ class ShardActed:
     """Of the scenes of these episodes."""
     partial_N: np.ndarray
     """Goals in place after the chunk."""
+
+
+class Shard(Protocol):
+    """N environments, here or elsewhere; see ``TwinShard``."""
+
+    num_envs: int
+    task: str
+    instruction: str
+    part_names: tuple[str, ...]
+    limit_steps: int
+
+    def restart(self, seed: int) -> None: ...
+    def observe(self) -> ShardSeen: ...
+    def act(self, actions_NHA: np.ndarray) -> ShardActed: ...
+    def reset(self, rows_N: np.ndarray) -> None: ...
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def close(self) -> None: ...
 
 
 class TwinShard:
@@ -83,6 +102,24 @@ class TwinShard:
     @property
     def num_envs(self) -> int:
         return self.envs.num_envs
+
+    @property
+    def task(self) -> str:
+        return self.envs.task
+
+    @property
+    def instruction(self) -> str:
+        return self.envs.task_description
+
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """Of the poses of the task's parts."""
+        return part_pose_names(self.envs.sim.task)
+
+    @property
+    def limit_steps(self) -> int:
+        """Control steps until an episode is cut off."""
+        return self.envs.sim.judge.limit_steps
 
     def restart(self, seed: int) -> None:
         """Begin the stream of scenes ``seed``."""

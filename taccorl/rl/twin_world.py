@@ -23,12 +23,15 @@ from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
 from taccorl.rl.rollout import Acted, Clock, Seen
-from taccorl.rl.start_states import StartStates
-from taccorl.rl.twin_shard import ShardActed, ShardSeen, TwinShard
+from taccorl.rl.twin_shard import Shard, ShardActed, ShardSeen
 from taccorl.rl.watched_episode import EpisodeWatch
 from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY
-from taccorl.sim.vector_env import TaccorlVectorEnv
+
+
+def needs_images(config: Any) -> bool:
+    """Whether the policy has cameras."""
+    return any(feature.type is FeatureType.VISUAL for feature in config.input_features.values())
 
 
 class TwinWorld:
@@ -36,23 +39,17 @@ class TwinWorld:
 
     def __init__(
         self,
-        envs: TaccorlVectorEnv | Sequence[TaccorlVectorEnv],
+        shards: Sequence[Shard],
         config: Any,
         preprocessor: Processor,
         postprocessor: Processor,
         *,
-        privileged: bool,
         clock: Clock,
-        start_share: float = 0.0,
-        start_states: int = 1,
     ) -> None:
         """
         Args:
-            envs: of each shard; with ``AutoresetMode.DISABLED``, and pictures on request if the policy has cameras.
+            shards: alike but for their sizes, numbered through; with pictures if the policy has cameras.
             config: ``TactilePI05Config`` of the policy.
-            privileged: give the critic the simulator's state.
-            start_share: of episodes that begin in states of earlier ones; see ``start_states``.
-            start_states: how many are kept in all shards together.
 
         Raises:
             TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor. Or the policy was trained
@@ -62,44 +59,32 @@ class TwinWorld:
             raise TaccorlError(
                 "post-training: --policy.normalization_mapping normalises pictures (VISUAL); only IDENTITY is known"
             )
-        self._all_envs = [envs] if isinstance(envs, TaccorlVectorEnv) else list(envs)
-        self._config, self._clock = config, clock
+        self.shards, self._config, self._clock = list(shards), config, clock
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
         if config.part_poses:
-            require_same_parts(config, self.envs)
+            require_same_parts(config, self.shards[0].task, self.shards[0].part_names)
         self._device = torch.device(config.device)
         inputs = config.input_features
         self._cameras = [IMAGE_KEYS[name] for name in CAMERAS if IMAGE_KEYS[name] in inputs]
-        self.needs_images = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
+        self.needs_images = needs_images(config)
         self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK}
         self._kept |= {HAND_POSES} if config.knows_hands else set()
         self._kept |= {PART_POSES} if config.part_poses else set()
-        firsts = np.cumsum([0, *(each.num_envs for each in self._all_envs)])
+        firsts = np.cumsum([0, *(shard.num_envs for shard in self.shards)])
         self._bounds = list(zip(firsts[:-1].tolist(), firsts[1:].tolist(), strict=True))
-        self.shards = [
-            TwinShard(
-                each,
-                history=config.tactile_history,
-                images=self.needs_images,
-                privileged=privileged,
-                starts=StartStates(start_share, max(1, start_states // len(self._all_envs))),
-                first=first,
-            )
-            for each, (first, _) in zip(self._all_envs, self._bounds, strict=True)
-        ]
         self._threads = [ThreadPoolExecutor(1) for _ in self.shards] if len(self.shards) > 1 else []
         self.watch = EpisodeWatch()
 
     @property
-    def envs(self) -> TaccorlVectorEnv:
-        """Of the first shard; all are alike."""
-        return self._all_envs[0]
+    def limit_steps(self) -> int:
+        """Control steps until an episode is cut off."""
+        return self.shards[0].limit_steps
 
     @property
     def num_envs(self) -> int:
         return self._bounds[-1][1]
 
-    def _each(self, work: Callable[[TwinShard, int, int], Any]) -> list[Any]:
+    def _each(self, work: Callable[[Shard, int, int], Any]) -> list[Any]:
         """``work(shard, first, end)`` of all shards, side by side."""
         if not self._threads:
             return [work(self.shards[0], *self._bounds[0])]
@@ -158,7 +143,7 @@ class TwinWorld:
             numbers = {STATE_KEY: observation[STATE_KEY], TACTILE_KEY: window_NLK}
             if PARTS_KEY in observation:
                 numbers[PARTS_KEY] = observation[PARTS_KEY]
-            instructions = [self.envs.task_description] * len(window_NLK)
+            instructions = [self.shards[0].instruction] * len(window_NLK)
             found = policy_batch(self._preprocessor, numbers, instructions)
             batch: Batch = {k: x.to(self._device) for k, x in found.items() if k in self._kept}
             for key in self._cameras:  # (N, 3, rows, columns) uint8, a quarter of float32

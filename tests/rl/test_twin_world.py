@@ -18,6 +18,8 @@ from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.rollout import Clock
 from taccorl.rl.settings import EnvSettings, FlowSDESettings, PolicySettings
+from taccorl.rl.start_states import StartStates
+from taccorl.rl.twin_shard import TwinShard
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.episode_seeds import episode_seed
 from taccorl.sim.vector_env import TaccorlVectorEnv
@@ -41,9 +43,24 @@ def envs() -> Iterator[TaccorlVectorEnv]:
 
 
 def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True) -> TwinWorld:
-    made = TwinWorld(
-        envs, opened.config, opened.preprocessor, opened.postprocessor, privileged=privileged, clock=Clock()
-    )
+    return world_of([envs], opened, seed, privileged=privileged)
+
+
+def world_of(
+    all_envs: list[TaccorlVectorEnv],
+    opened: Any,
+    seed: int = 5,
+    *,
+    privileged: bool = True,
+    share: float = 0.0,
+    size: int = 1,
+) -> TwinWorld:
+    history, first, shards = opened.config.tactile_history, 0, []
+    for envs in all_envs:
+        starts = StartStates(share, size)
+        shards.append(TwinShard(envs, history=history, images=True, privileged=privileged, starts=starts, first=first))
+        first += envs.num_envs
+    made = TwinWorld(shards, opened.config, opened.preprocessor, opened.postprocessor, clock=Clock())
     made.restart(seed)
     return made
 
@@ -180,18 +197,7 @@ def test_a_stopped_world_goes_on_bit_for_bit(envs: TaccorlVectorEnv, opened: Any
 
 
 def later_world(envs: TaccorlVectorEnv, opened: Any, share: float = 1.0, size: int = 3) -> TwinWorld:
-    made = TwinWorld(
-        envs,
-        opened.config,
-        opened.preprocessor,
-        opened.postprocessor,
-        privileged=True,
-        clock=Clock(),
-        start_share=share,
-        start_states=size,
-    )
-    made.restart(5)
-    return made
+    return world_of([envs], opened, share=share, size=size)
 
 
 def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_counted_apart(
@@ -265,12 +271,10 @@ def test_shards_give_what_one_gives(opened: Any) -> None:
             )
             for size in sizes
         ]
-        return TwinWorld(envs, opened.config, opened.preprocessor, opened.postprocessor, privileged=True, clock=Clock())
+        return world_of(envs, opened, 7)
 
     one, two = made(3), made(2, 1)
     assert one.num_envs == two.num_envs == 3
-    for world in (one, two):
-        world.restart(7)
     one.reset(torch.tensor([False, True, False]))
     two.reset(torch.tensor([False, True, False]))
     shift = 0.05 * torch.arange(3)[:, None, None]
