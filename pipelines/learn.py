@@ -9,6 +9,7 @@ All of it is simulated: no robot is near. Everything lands in outputs/learn; a s
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import yaml
 
@@ -49,7 +50,17 @@ class LearnConfig:
     out: Path = Path("outputs/learn")
 
 
-def main(words: list[str]) -> None:
+class Learned(NamedTuple):
+    """What a run made."""
+
+    policy: Path
+    """Folder pretrained_model."""
+    dataset: Path
+    store: Path
+    """Of frames, too."""
+
+
+def main(words: list[str]) -> Learned:
     chosen = [*(SMALL if "--small" in words else ()), *(word for word in words if word != "--small")]
     try:
         config = parse(LearnConfig, chosen, prog="python -m pipelines.learn")
@@ -78,6 +89,7 @@ def main(words: list[str]) -> None:
         scenes = (f"--episodes={config.scored}", "--seed=50000", *limit)
         run("taccorl", "evaluate", f"--policy.path={training.policy}", task, *scenes, f"--out={score}")
     print(f"\nscore: {score / 'report.html'}")
+    return Learned(training.policy, rows, store)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import Tensor, nn
 
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
-from taccorl.policies.tactile_pi05.part_poses import PART_POSES
+from taccorl.policies.tactile_pi05.part_poses import PART_POSES, bodies_of, num_part_numbers
 from taccorl.rl.flow_sde import Draws, FlowSDE, Sampled, Velocity
 from taccorl.rl.settings import PolicySettings
 
@@ -97,6 +97,16 @@ class TactileFlowPolicy(FlowPolicy):
         scored_HD = torch.zeros(config.chunk_size, config.max_action_dim, dtype=torch.bool, device=config.device)
         scored_HD[: config.n_action_steps, : config.output_features["action"].shape[0]] = True
         self.scored_HD = scored_HD
+
+    @property
+    def num_features(self) -> int:
+        """F."""
+        config = self.policy.config
+        width = self.model.paligemma_with_expert.paligemma.model.language_model.config.hidden_size
+        if config.has_discrete_state:
+            return width
+        num_poses = num_part_numbers(len(bodies_of(config.part_names or []))) if config.part_poses else 0
+        return width + (config.input_features or {})[OBS_STATE].shape[0] + num_poses
 
     def trained_parameters(self) -> list[nn.Parameter]:
         return [p for p in self.policy.parameters() if p.requires_grad]

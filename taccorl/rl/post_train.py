@@ -102,8 +102,7 @@ class PostTraining:
         )
         self.world.restart(settings.seed)
         seen = self.world.observe()
-        num_features = self._actor.features({k: x[:1] for k, x in seen.batch.items()}).shape[1]
-        critic = Critic(num_features, seen.privileged_NP.shape[1]).to(device)
+        critic = Critic(self._actor.num_features, seen.privileged_NP.shape[1]).to(device)
         self._anchor = (
             RealAnchor(settings.anchor, policy, self._opened.preprocessor) if settings.anchor.dataset else None
         )

@@ -58,7 +58,8 @@ def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -
     assert acted.truncated_N.all() and acted.last is not None and PART_POSES in acted.last.batch
     actor = TactileFlowPolicy(opened.load(0).policy, PolicySettings(), num_steps=4)
     features = actor.features(world.observe().batch)
-    assert features.shape == (2, 96 + 14 + 69)  # mean token of the prefix, state, poses of the parts
+    width = 96 + 14 + 69  # mean token of the prefix, state, poses of the parts
+    assert features.shape == (2, width) and actor.num_features == width
     world.close()
 
 
