@@ -22,6 +22,7 @@ SMALL = ("--sources=1", "--episodes=1", "--scored=2", "--episode_length=12", "--
 SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]", "--cache=host")
 HOW = {"contact_mode": "closed_loop_expert", "disturbance": {"joint_rad": 0.02}}
 PX = 112
+POSE_LOSS = 0.1  # docs/learning.md
 
 
 @dataclass(kw_only=True)
@@ -76,10 +77,10 @@ def main(words: list[str]) -> Learned:
     run("taccorl", "collect", task, f"--episodes={config.sources}", "--images=false", f"--out={sources}", kept)
     made = ("--rows=actions", f"--spec={spec}", f"--episodes={config.episodes}")
     run("taccorl", "augment", task, f"--source={sources}", *made, f"--out={actions}", engine, kept)
-    frames = ("--pictures=cache", f"--resolution={PX}x{PX}")
+    frames = ("--pictures=cache", f"--resolution={PX}x{PX}", "--part_poses=true")
     run("taccorl", "execute", f"--source={actions}", f"--out={rows}", *frames, engine, kept)
     cached = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}"]
-    training = Training(config.train, rows, [*cached, *config.train_options], out)
+    training = Training(config.train, rows, [*cached, f"--policy.pose_loss={POSE_LOSS}", *config.train_options], out)
     if command := training.command():
         run(*command)
     limit = [f"--episode_length={config.episode_length}"] if config.episode_length else []

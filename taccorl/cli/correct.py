@@ -49,8 +49,8 @@ class CorrectConfig:
     episode_length: int | None = None
     """Control steps until the policy is cut off; the task's own limit if not given."""
     rows: str = "dataset"
-    """dataset; actions: seeds and actions alone, for taccorl execute --source=DEMONSTRATIONS --source=OUT, which makes one dataset
-    of demonstrations and corrections with frames for a GPU."""
+    """dataset; actions: seeds and actions alone, for taccorl execute --source=DEMONSTRATIONS --source=OUT, which makes
+    one dataset of both with frames for a GPU."""
     images: bool = True
     """Render the dataset's cameras (needs OpenGL). A policy with camera inputs needs OpenGL even if
     this is false."""

@@ -15,10 +15,9 @@ import numpy as np
 
 from taccorl.data.episode import EXECUTED, Episode, Pictures
 from taccorl.data.spec import DatasetSpec, FeatureSpec
-from taccorl.sim.part_poses import POSE_UNITS, part_pose_names, part_poses, posed_bodies
+from taccorl.sim.part_poses import PARTS_KEY, POSE_UNITS, part_pose_names, part_poses, posed_bodies
 from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation, Watch
-from taccorl.sim.spaces import PARTS_KEY
 from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
 ORIGIN = "MuJoCo twin, not a robot"

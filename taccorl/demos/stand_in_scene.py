@@ -52,10 +52,11 @@ class Scene:
             capsule_polygons(frames, view, hidden_arm=own_arm),
             hole_polygons(frames, view),
         )
+        drawn = tuple(layer.visible & view.on_screen(layer.outline_px) for layer in layers)
         shadows = shadow_outlines_px(frames, view)
         for n, frame_id in enumerate(frame_ids):
             picture = self._table_and_shadows(camera, view, n, shadows[n])
-            _paint(picture, view, layers, n)
+            _paint(picture, layers, drawn, n)
             self._add_noise(camera, picture)
             draw_frame_id(picture, int(frame_id))
             yield picture
@@ -111,15 +112,15 @@ class Scene:
         cv2.add(picture, sensor_noise(self.rows, self.columns)[y : y + self.rows, x : x + self.columns], dst=picture)
 
 
-def _paint(picture: np.ndarray, view: View, layers: tuple[Polygons, ...], n: int) -> None:
+def _paint(picture: np.ndarray, layers: tuple[Polygons, ...], drawn: tuple[np.ndarray, ...], n: int) -> None:
+    """Picture n's polygons, those of ``drawn`` (N, P) of each layer, the farthest first."""
     chosen = []
-    for polygons in layers:
-        outlines = polygons.outline_px[n]
-        for p in np.flatnonzero(polygons.visible[n] & view.on_screen(outlines)):
-            chosen.append((polygons.depth_m[n, p], outlines[p], polygons.colour_bgr[n, p]))
+    for polygons, seen in zip(layers, drawn, strict=True):
+        p = np.flatnonzero(seen[n])
+        outlines, colours = _fixed_point(polygons.outline_px[n, p]), np.minimum(polygons.colour_bgr[n, p], 255).tolist()
+        chosen += zip(polygons.depth_m[n, p].tolist(), outlines, colours, strict=True)
     for _, outline, colour in sorted(chosen, key=lambda polygon: -polygon[0]):
-        shade = np.minimum(colour, 255).tolist()
-        cv2.fillConvexPoly(picture, _fixed_point(outline), shade, cv2.LINE_AA, _SUBPIXEL_BITS)
+        cv2.fillConvexPoly(picture, outline, colour, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _fixed_point(pixels: np.ndarray) -> np.ndarray:

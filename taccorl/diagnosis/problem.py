@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect, Parameter
 
 _MOST = 700.0  # exp of it is the largest number there is
@@ -164,5 +165,10 @@ def chosen(problem: Problem, names: Sequence[str]) -> list[Candidate]:
     """
     for name in names:
         if name not in problem.candidates:
+            if name in effects and not effects.get(name).fitted:
+                raise TaccorlError(
+                    f"{name}: no search fits it, so no recording is planned that tells it from others; leave it out. It shows "
+                    f"in: {effects.get(name).to_record}"
+                )
             raise TaccorlError(f"no effect {name!r} for this part; {nearest(name, problem.candidates)}")
     return [problem.candidates[name] for name in names]

@@ -25,22 +25,25 @@ from taccorl.evaluation.preflight import PolicyFacts
 from taccorl.evaluation.rollouts import Acted
 from taccorl.lineage.digest import digest_file, digest_files
 from taccorl.sim.lerobot_env import raw_names
-from taccorl.sim.part_poses import part_pose_names
-from taccorl.sim.spaces import PARTS_KEY, STATE_KEY, Observation
+from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
+from taccorl.sim.spaces import STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 Processor = Callable[[Any], Any]
 
 
-def require_same_parts(config: Any, envs: TaccorlVectorEnv) -> None:
+def require_same_parts(config: Any, task: str, there: tuple[str, ...]) -> None:
     """
+    Args:
+        there: names of the poses of the task's parts.
+
     Raises:
         TaccorlError: the policy that is told the poses of the parts was trained with those of another task.
     """
-    own, there = tuple(config.part_names or ()), part_pose_names(envs.sim.task)
+    own = tuple(config.part_names or ())
     if own != there:
         raise TaccorlError(
-            f"--task={envs.task}: its part poses are {', '.join(there[::9])} …, the policy was trained with "
+            f"--task={task}: its part poses are {', '.join(there[::9])} …, the policy was trained with "
             f"{', '.join(own[::9])} …: another task"
         )
 
@@ -233,7 +236,7 @@ class PolicyActor:
             TaccorlError: the policy was trained on the poses of other parts.
         """
         if self.needs_part_poses:
-            require_same_parts(self._config, envs)
+            require_same_parts(self._config, envs.task, part_pose_names(envs.sim.task))
         self.policy.reset()
         self._instructions = [envs.task_description] * envs.num_envs
 

@@ -12,7 +12,8 @@ import numpy as np
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, check_actions
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, IMAGE_SHAPE, PARTS_KEY, STATE_KEY, TACTILE_KEY
+from taccorl.sim.part_poses import PARTS_KEY
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, IMAGE_SHAPE, STATE_KEY, TACTILE_KEY
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 
 NOT_STATED = "not stated"

@@ -5,7 +5,7 @@ Nothing else lives here.
 
 import taccorl.lerobot_plugin.env
 import taccorl.policies.tactile_pi05.configuration_tactile_pi05
-import taccorl.rl.lerobot_algorithm
+import taccorl.rl.flow_ppo_config
 import taccorl.training.reading
 
 taccorl.training.reading.install()

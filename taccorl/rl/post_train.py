@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
@@ -32,9 +33,12 @@ from taccorl.rl.exploration import measure_noise
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, RATIO_GUARD
+from taccorl.rl.ray_shards import RayShard, start_ray
 from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
 from taccorl.rl.settings import PostTrainSettings
-from taccorl.rl.twin_world import TwinWorld
+from taccorl.rl.start_states import StartStates
+from taccorl.rl.twin_shard import Shard, TwinShard
+from taccorl.rl.twin_world import TwinWorld, needs_images
 from taccorl.rl.watched_episode import executed_again
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
@@ -63,7 +67,7 @@ def post_train(settings: PostTrainSettings, report: Report = print, save_episode
         try:
             run.run()
         finally:
-            run.world.envs.close()
+            run.world.close()
     except torch.OutOfMemoryError as error:
         raise TaccorlError(
             f"post-training: out of GPU memory: {str(error).splitlines()[0]} Lower --ppo.micro_batch={settings.ppo.micro_batch} "
@@ -89,14 +93,11 @@ class PostTraining:
         self._actor = TactileFlowPolicy(policy, settings.policy, settings.noise.num_steps)
         self._sde, self._clock = FlowSDE(settings.noise), Clock(device)
         self._generator = torch.Generator().manual_seed(settings.seed)
-        needs_images = bool(policy.config.image_features)
-        envs = _environments(settings, twin, images=needs_images, part_poses=policy.config.part_poses)
         self.world = TwinWorld(
-            envs,
+            _shards(settings, twin, policy.config),
             policy.config,
             self._opened.preprocessor,
             self._opened.postprocessor,
-            privileged=settings.ppo.privileged_critic,
             clock=self._clock,
         )
         self.world.restart(settings.seed)
@@ -146,7 +147,7 @@ class PostTraining:
 
     def _decisions_of_an_episode(self) -> int:
         """At the time limit."""
-        return math.ceil(self.world.envs.sim.judge.limit_steps / self._actor.policy.config.n_action_steps)
+        return math.ceil(self.world.limit_steps / self._actor.policy.config.n_action_steps)
 
     def _report_noise(self, twin: TwinConfig) -> None:
         batch, generator = self.world.observe().batch, torch.Generator().manual_seed(self.settings.seed)
@@ -325,22 +326,38 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
     return opened
 
 
-def _environments(settings: PostTrainSettings, twin: TwinConfig, *, images: bool, part_poses: bool) -> TaccorlVectorEnv:
-    env = settings.env
+def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[Shard]:
+    """As equal in size as can be."""
+    env, images = settings.env, needs_images(config)
     if env.task is None:
         raise TaccorlError("missing --env.task=…, such as assembly_2")
-    return TaccorlVectorEnv(
-        env.task,
-        env.num_envs,
-        difficulty=env.difficulty,
-        twin=twin,
-        images="on_request" if images else "never",
-        randomization=env.randomization,
-        num_threads=min(env.num_envs, len(os.sched_getaffinity(0))),
-        autoreset=AutoresetMode.DISABLED,
-        max_episode_steps=env.episode_length,
-        part_poses=part_poses,
-    )
+    ray = start_ray() if env.ray else None
+    starts = env.start_share, max(1, env.start_states // env.shards)
+    made: list[Shard] = []
+    for numbers in np.array_split(np.arange(env.num_envs), env.shards):
+        arguments: dict[str, Any] = {
+            "task": env.task,
+            "num_envs": len(numbers),
+            "difficulty": env.difficulty,
+            "twin": twin,
+            "images": "on_request" if images else "never",
+            "randomization": env.randomization,
+            "num_threads": min(len(numbers), env.threads or len(os.sched_getaffinity(0))),
+            "autoreset": AutoresetMode.DISABLED,
+            "max_episode_steps": env.episode_length,
+            "part_poses": config.part_poses,
+        }
+        shard: dict[str, Any] = {
+            "history": config.tactile_history,
+            "images": images,
+            "privileged": settings.ppo.privileged_critic,
+            "first": int(numbers[0]),
+        }
+        if ray is not None:
+            made.append(RayShard(ray, arguments, shard, starts))
+        else:
+            made.append(TwinShard(TaccorlVectorEnv(**arguments), **shard, starts=StartStates(*starts)))
+    return made
 
 
 def _check_folder(settings: PostTrainSettings) -> None:

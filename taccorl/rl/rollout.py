@@ -72,7 +72,9 @@ class Acted:
     last: Seen | None
     """Of the environments that ran out of time, in their order: the observation before the reset. None: there is none."""
     outcomes: list[str | None]
-    """(N,) ``success``, ``timeout`` or the failure, of episodes that ended."""
+    """(N,) ``success``, ``timeout`` or the failure, of episodes that ended and had begun with a reset."""
+    later_outcomes: list[str | None] = field(default_factory=list)
+    """(N,) the same of episodes that had begun in a state of an earlier one (``start_states``)."""
 
 
 class World(Protocol):
@@ -125,6 +127,7 @@ def collect(
     kept: list[dict[str, Tensor]] = []
     batches: list[Batch] = []
     outcomes: Counter[str] = Counter()
+    later: Counter[str] = Counter()
     won_by_step = torch.zeros(2, sde.num_steps)  # successes, ends
     shape: tuple[int, int] = tuple(actor.scored_HD.shape)  # pyright: ignore[reportAssignmentType]
     for _ in range(num_decisions):
@@ -156,6 +159,7 @@ def collect(
         batches.append(seen.batch)
         ended = [name for name in acted.outcomes if name is not None]
         outcomes.update(ended)
+        later.update(name for name in acted.later_outcomes if name is not None)
         for name, k in zip(acted.outcomes, draws.step_BS[:, 0].tolist(), strict=True):
             if name is not None and k >= 0:
                 won_by_step[:, k] += torch.tensor([float(name == SUCCESS), 1.0])
@@ -184,6 +188,8 @@ def collect(
         "return": float(return_TN.mean()),
         "advantage_std": float(advantage_TN.std(correction=0)),
     }
+    if later:
+        facts |= {"later_episodes": float(later.total()), "later_success": later[SUCCESS] / later.total()}
     for k in range(sde.num_steps):
         if sde.num_stochastic == 1 and won_by_step[1, k]:
             facts[f"success_step_{k}"] = float(won_by_step[0, k] / won_by_step[1, k])

@@ -41,6 +41,13 @@ class EnvSettings:
     """A twin.yaml; the nominal twin if not given."""
     num_envs: int = 128
     """N_env: environments at once."""
+    shards: int = 1
+    """Groups of environments, each in a thread of its own: while one computes in Python, physics of the others runs. Scenes do
+    not depend on it."""
+    threads: int | None = None
+    """Of each shard; as many as there are CPUs if not given."""
+    ray: bool = False
+    """Shards are Ray actors: on this machine, or on those of the cluster that RAY_ADDRESS names. Needs the extra ray."""
     decisions: int = 36
     """C: chunks of actions of each environment in an iteration. Episodes go on in the next one."""
     difficulty: str = "train"
@@ -49,6 +56,11 @@ class EnvSettings:
     """Share of the paper's reset ranges, 0 … 1."""
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
+    start_share: float = 0.0
+    """Share of episodes that begin in a state of the policy's own earlier episodes, with a part in each hand, instead of a
+    reset. They do not count as successes or failures in progress.jsonl."""
+    start_states: int = 256
+    """States that are kept for that, the newest."""
     stagger: bool = True
     """Before the first iteration, act for an episode's length and begin episodes at random times in it, so that environments are
     in different phases of the task."""
@@ -58,7 +70,13 @@ class EnvSettings:
         Raises:
             TaccorlError: a number below 1.
         """
-        _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions)
+        _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions, start_states=self.start_states)
+        if self.threads is not None:
+            _at_least("env", 1, threads=self.threads)
+        if not 1 <= self.shards <= self.num_envs:
+            raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
+        if not 0 <= self.start_share <= 1:
+            raise TaccorlError(f"--env.start_share={self.start_share:g}: a share of the episodes, 0 … 1")
 
 
 @dataclass(kw_only=True)

@@ -1,17 +1,18 @@
 """The twin's environments for rollouts: a policy's own processors, its history of touch, pictures only where it looks.
 
-Scenes come from a stream of seeds: the k-th episode of environment i has ``episode_seed(seed, i, k)``.
+Several shards of environments compute side by side, each in a thread of its own: while one is in Python, physics of the others
+runs. What is rendered in a thread stays in it, as OpenGL wants.
 
 Letters in shapes: N environments, n executed actions of a chunk, A action, L history, K taxels, P privileged numbers.
 """
 
 import copy
-import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
 from lerobot.configs import FeatureType, NormalizationMode
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
@@ -21,12 +22,16 @@ from taccorl.evaluation.policy_actor import Processor, policy_batch, require_sam
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
-from taccorl.rl.rollout import SUCCESS, Acted, Clock, Seen
+from taccorl.rl.rollout import Acted, Clock, Seen
+from taccorl.rl.twin_shard import Shard, ShardActed, ShardSeen
 from taccorl.rl.watched_episode import EpisodeWatch
-from taccorl.sim.episode_seeds import episode_seed
-from taccorl.sim.simulation import Snapshot
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY, Observation
-from taccorl.sim.vector_env import TaccorlVectorEnv
+from taccorl.sim.part_poses import PARTS_KEY
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY
+
+
+def needs_images(config: Any) -> bool:
+    """Whether the policy has cameras."""
+    return any(feature.type is FeatureType.VISUAL for feature in config.input_features.values())
 
 
 class TwinWorld:
@@ -34,155 +39,139 @@ class TwinWorld:
 
     def __init__(
         self,
-        envs: TaccorlVectorEnv,
+        shards: Sequence[Shard],
         config: Any,
         preprocessor: Processor,
         postprocessor: Processor,
         *,
-        privileged: bool,
         clock: Clock,
     ) -> None:
         """
         Args:
-            envs: with ``AutoresetMode.DISABLED``, pictures on request if the policy has cameras, and poses of the parts if it is
-                told them.
+            shards: alike but for their sizes, numbered through; with pictures if the policy has cameras.
             config: ``TactilePI05Config`` of the policy.
-            privileged: give the critic the simulator's state.
 
         Raises:
-            TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor; or the policy was trained
+            TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor. Or the policy was trained
                 on the poses of other parts.
         """
-        assert envs.autoreset is AutoresetMode.DISABLED
         if config.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY) is not NormalizationMode.IDENTITY:
             raise TaccorlError(
                 "post-training: --policy.normalization_mapping normalises pictures (VISUAL); only IDENTITY is known"
             )
-        self.envs, self._config, self._clock, self._privileged = envs, config, clock, privileged
+        self.shards, self._config, self._clock = list(shards), config, clock
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
         if config.part_poses:
-            require_same_parts(config, envs)
+            require_same_parts(config, self.shards[0].task, self.shards[0].part_names)
         self._device = torch.device(config.device)
-        self._history = config.tactile_history
         inputs = config.input_features
         self._cameras = [IMAGE_KEYS[name] for name in CAMERAS if IMAGE_KEYS[name] in inputs]
-        self.needs_images = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
+        self.needs_images = needs_images(config)
         self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK}
         self._kept |= {HAND_POSES} if config.knows_hands else set()
         self._kept |= {PART_POSES} if config.part_poses else set()
-        self._root = 0
-        self._episode_N = np.zeros(envs.num_envs, dtype=np.int64)
-        self._observation: Observation = {}
-        self._window_NLK = np.zeros((0,))
+        firsts = np.cumsum([0, *(shard.num_envs for shard in self.shards)])
+        self._bounds = list(zip(firsts[:-1].tolist(), firsts[1:].tolist(), strict=True))
+        self._threads = [ThreadPoolExecutor(1) for _ in self.shards] if len(self.shards) > 1 else []
         self.watch = EpisodeWatch()
 
     @property
+    def limit_steps(self) -> int:
+        """Control steps until an episode is cut off."""
+        return self.shards[0].limit_steps
+
+    @property
     def num_envs(self) -> int:
-        return self.envs.num_envs
+        return self._bounds[-1][1]
+
+    def _each(self, work: Callable[[Shard, int, int], Any]) -> list[Any]:
+        """``work(shard, first, end)`` of all shards, side by side."""
+        if not self._threads:
+            return [work(self.shards[0], *self._bounds[0])]
+        calls = zip(self._threads, self.shards, self._bounds, strict=True)
+        waiting = [thread.submit(work, shard, *bounds) for thread, shard, bounds in calls]
+        return [each.result() for each in waiting]
 
     def restart(self, seed: int) -> None:
         """Begin the stream of scenes ``seed``."""
-        self._root, self._episode_N[:] = seed, 0
-        self._observation, _ = self.envs.reset(seed=self._seeds())
-        self._window_NLK = self._repeated(self._observation[TACTILE_KEY])
+        self._each(lambda shard, *_: shard.restart(seed))
         self.watch.reset()
 
     def observe(self) -> Seen:
         with self._clock.part("pictures"):
-            observation = self.envs.observe(images=self.needs_images)
-        return self._seen(observation, self._window_NLK, np.arange(self.num_envs))
+            seen = self._each(lambda shard, *_: shard.observe())
+        return self._seen(seen)
 
     def act(self, actions_NHA: Tensor) -> Acted:
         with self._clock.part("policy"):
             actions = self._postprocessor(actions_NHA).to("cpu").numpy().astype(np.float32)
         with self._clock.part("physics"):
-            chunk = self.envs.step_chunk(actions)
-            facts = self.envs.facts()
-        truncated, terminated = chunk.truncated, chunk.terminated
-        outcome = np.where(facts["is_success"], SUCCESS, facts["failure"])
-        outcomes = [str(o) or None for o in outcome]
-        windows = np.concatenate([self._window_NLK, chunk.tactile], axis=1)
-        ends = self._history + chunk.num_steps  # readings after the end of an episode do not count
-        self._window_NLK = np.stack([w[end - self._history : end] for w, end in zip(windows, ends, strict=True)])
-        self._observation = chunk.observation
-        self.watch.stepped(actions[0, : chunk.num_steps[0]])
-        if outcomes[0]:
-            self.watch.end(self._seeds()[0], outcomes[0], int(facts["partial"][0]))
-        last = self._before_reset(truncated) if truncated.any() else None
-        if (over := truncated | terminated).any():
-            with self._clock.part("physics"):
-                self.reset(torch.from_numpy(over))
+            acted = self._each(lambda shard, first, end: shard.act(actions[first:end]))
+        last = [each.last for each in acted if each.last is not None]
+        self._watch(actions, acted[0])
+
+        def joined(name: str) -> Tensor:
+            return torch.from_numpy(np.concatenate([getattr(each, name) for each in acted]))
+
         return Acted(
-            reward_N=torch.from_numpy(chunk.reward).float(),
-            terminated_N=torch.from_numpy(terminated),
-            truncated_N=torch.from_numpy(truncated),
-            last=last,
-            outcomes=outcomes,
+            reward_N=joined("reward_N").float(),
+            terminated_N=joined("terminated_N"),
+            truncated_N=joined("truncated_N"),
+            last=self._seen(last) if last else None,
+            outcomes=[o for each in acted for o in each.outcomes],
+            later_outcomes=[o for each in acted for o in each.later_outcomes],
         )
 
-    def _before_reset(self, rows: np.ndarray) -> Seen:
-        with self._clock.part("pictures"):
-            observation = self.envs.observe(images=self.needs_images)
-        ids = np.flatnonzero(rows)
-        return self._seen({key: x[ids] for key, x in observation.items()}, self._window_NLK[ids], ids)
-
-    def reset(self, rows_N: Tensor) -> None:
-        over = rows_N.numpy()
-        self._episode_N[over] += 1
-        self._observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": over})
-        self._window_NLK[over] = self._repeated(self._observation[TACTILE_KEY][over])
-        if over[0]:
+    def _watch(self, actions_NHA: np.ndarray, acted: ShardActed) -> None:
+        """Environment 0. Episodes that began in a state of an earlier one cannot be executed again from their seed."""
+        self.watch.stepped(actions_NHA[0, : acted.num_steps_N[0]])
+        if outcome := acted.outcomes[0]:
+            self.watch.end(int(acted.seed_N[0]), outcome, int(acted.partial_N[0]))
+        if outcome or acted.later_outcomes[0]:
             self.watch.reset()
 
-    def _seeds(self) -> list[int]:
-        return [episode_seed(self._root, i, int(k)) for i, k in enumerate(self._episode_N)]
+    def reset(self, rows_N: Tensor) -> None:
+        rows = rows_N.numpy()
+        if rows[0]:
+            self.watch.reset()
+        self._each(lambda shard, first, end: shard.reset(rows[first:end]) if rows[first:end].any() else None)
 
-    def _repeated(self, reading_NK: np.ndarray) -> np.ndarray:
-        """(N, L, K): before an episode's first reading there were none; it is repeated, as in datasets."""
-        return np.repeat(reading_NK[:, None], self._history, axis=1)
-
-    def _seen(self, observation: Observation, window_NLK: np.ndarray, ids: np.ndarray) -> Seen:
+    def _seen(self, parts: Sequence[ShardSeen]) -> Seen:
+        observation = {key: np.concatenate([p.observation[key] for p in parts]) for key in parts[0].observation}
+        window_NLK = np.concatenate([p.window_NLK for p in parts])
         with self._clock.part("policy"):
             numbers = {STATE_KEY: observation[STATE_KEY], TACTILE_KEY: window_NLK}
             if PARTS_KEY in observation:
                 numbers[PARTS_KEY] = observation[PARTS_KEY]
-            instructions = [self.envs.task_description] * len(ids)
+            instructions = [self.shards[0].instruction] * len(window_NLK)
             found = policy_batch(self._preprocessor, numbers, instructions)
             batch: Batch = {k: x.to(self._device) for k, x in found.items() if k in self._kept}
             for key in self._cameras:  # (N, 3, rows, columns) uint8, a quarter of float32
                 batch[key] = torch.from_numpy(observation[key]).to(self._device).permute(0, 3, 1, 2).contiguous()
-        return Seen(batch, torch.from_numpy(self._privileged_numbers(ids)).float().to(self._device))
-
-    def _privileged_numbers(self, ids: np.ndarray) -> np.ndarray:
-        """(n, P) positions and velocities of all joints, subtasks, goals, elapsed share of the time, the task's measures."""
-        if not self._privileged:
-            return np.zeros((len(ids), 0))
-        sim, facts = self.envs.sim, self.envs.facts()
-        elapsed = facts["steps"] / sim.judge.limit_steps
-        columns = [sim.arrays["qpos"], sim.arrays["qvel"], facts["subtask"], facts["partial"], elapsed]
-        columns += list(facts["measures"].values())
-        numbers = np.concatenate([np.asarray(x, dtype=np.float64).reshape(self.num_envs, -1) for x in columns], axis=1)
-        return np.nan_to_num(numbers[ids], nan=0.0, posinf=0.0, neginf=0.0)  # of a diverged simulation
+        privileged_NP = np.concatenate([p.privileged_NP for p in parts])
+        return Seen(batch, torch.from_numpy(privileged_NP).float().to(self._device))
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on bit for bit; no episode is over between two calls of ``act``."""
-        snapshot = self.envs.sim.snapshot()
-        fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
-        state = {"root": self._root, "episode": self._episode_N.copy(), "window": self._window_NLK, "snapshot": fields}
-        return state | {"watch": copy.deepcopy(vars(self.watch))}
+        return {"shards": self._each(lambda shard, *_: shard.state_dict()), "watch": copy.deepcopy(vars(self.watch))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """What ``state_dict`` gave.
 
         Raises:
-            TaccorlError: of another number of environments, task, difficulty, twin or randomisation.
+            TaccorlError: of another number of environments or shards, task, difficulty, twin or randomisation.
         """
-        if len(state["episode"]) != self.num_envs:
+        states = state["shards"]
+        if len(states) != len(self.shards):
             raise TaccorlError(
-                f"--env.num_envs={self.num_envs}: the run was stopped with {len(state['episode'])}; resume with the same"
+                f"--env.shards={len(self.shards)}: the run was stopped with {len(states)}; resume with the same"
             )
-        self._root, self._episode_N = state["root"], state["episode"].copy()
-        self._window_NLK = state["window"].copy()
+        own = dict(zip((first for first, _ in self._bounds), states, strict=True))
+        self._each(lambda shard, first, _: shard.load_state_dict(own[first]))
         self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
-        options = {"state": Snapshot(**state["snapshot"])}
-        self._observation, _ = self.envs.reset(seed=self._seeds(), options=options)
+
+    def close(self) -> None:
+        """Of all environments, each in its thread."""
+        self._each(lambda shard, *_: shard.close())
+        for thread in self._threads:
+            thread.shutdown()

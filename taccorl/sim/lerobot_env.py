@@ -10,7 +10,8 @@ import gymnasium
 import numpy as np
 
 from taccorl.sim.env import TaccorlEnv
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, PARTS_KEY, STATE_KEY, TACTILE_KEY, Observation
+from taccorl.sim.part_poses import PARTS_KEY
+from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 

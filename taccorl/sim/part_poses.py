@@ -5,12 +5,14 @@
 Bodies are the task's movable parts in their order, then those that are clamped where the reset draws them.
 """
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from taccorl.sim.tasks.task import Task
+if TYPE_CHECKING:  # it would load MuJoCo wherever LeRobot loads its plug-ins
+    from taccorl.sim.tasks.task import Task
 
+PARTS_KEY = "observation.environment_state"  # LeRobot's name
 POSE_NAMES = ("x", "y", "z", "r00", "r10", "r20", "r01", "r11", "r21")
 POSE_UNITS = ("m",) * 3 + ("1",) * 6
 
@@ -18,7 +20,7 @@ POSE_UNITS = ("m",) * 3 + ("1",) * 6
 class _Posed(Protocol):
     """A simulation, as far as its bodies' poses go."""
 
-    task: Task
+    task: "Task"
     num_sims: int
 
     def poses(self, body: str) -> np.ndarray:
@@ -26,12 +28,12 @@ class _Posed(Protocol):
         ...
 
 
-def posed_bodies(task: Task | type[Task]) -> tuple[str, ...]:
+def posed_bodies(task: "Task | type[Task]") -> tuple[str, ...]:
     """Bodies whose poses are given, in order."""
     return (*task.parts, *task.clamped)
 
 
-def part_pose_names(task: Task | type[Task]) -> tuple[str, ...]:
+def part_pose_names(task: "Task | type[Task]") -> tuple[str, ...]:
     """(9 · bodies) names such as ``plug.x``."""
     return tuple(f"{body}.{name}" for body in posed_bodies(task) for name in POSE_NAMES)
 

@@ -6,13 +6,13 @@ import numpy as np
 from gymnasium.spaces import Box, Dict
 
 from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.robot import PAD_TAXELS, PADS
 
 CAMERAS = ("front", "left_wrist", "right_wrist")
 IMAGE_SHAPE = (224, 224, 3)  # rows, columns, rgb: what π0.5 looks at
 NUM_TAXELS = len(PADS) * math.prod(PAD_TAXELS)  # K = 1536
 STATE_KEY, TACTILE_KEY = "observation.state", "observation.tactile"
-PARTS_KEY = "observation.environment_state"  # LeRobot's name; see ``part_poses``
 IMAGE_KEYS = {name: f"observation.images.{name}" for name in CAMERAS}
 
 Observation = dict[str, np.ndarray]

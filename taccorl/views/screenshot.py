@@ -33,6 +33,8 @@ SETTLE_S = 8.0
 """A web viewer that loads slowly looks finished, and the same twice, before its first picture is decoded."""
 CALM_LEVELS = 0.2
 """Mean difference of two shots (of 255) below which the page has come to rest."""
+CALM_SHOTS = 3
+"""So many shots in a row must be like the one before: on a busy machine a view's text comes seconds after its pictures."""
 BLANK_LEVELS = 15.0
 """Standard deviation (of 255) below which a page shows nothing yet; measured: 8 while loading, 51 with all views."""
 
@@ -95,8 +97,8 @@ class _NoPicture(Exception):
 
 
 def _settled_shot(page: "Page") -> bytes:
-    """The first shot that shows something and is like the one before."""
-    begin_s, before = time.monotonic(), None
+    """The first shot that shows something and is like those before it."""
+    begin_s, before, calm = time.monotonic(), None, 0
     while time.monotonic() - begin_s < PICTURE_TIMEOUT_S:
         page.wait_for_timeout(1000)
         text = page.inner_text("body")  # the viewer draws on a canvas: text is a note about loading, or about failure
@@ -104,8 +106,8 @@ def _settled_shot(page: "Page") -> bytes:
             raise _NoPicture(text)
         shot = page.screenshot(timeout=1e3 * PICTURE_TIMEOUT_S)
         now = np.asarray(Image.open(io.BytesIO(shot)).convert("L"), dtype=float)
-        calm = before is not None and np.abs(now - before).mean() < CALM_LEVELS
-        if calm and now.std() > BLANK_LEVELS and time.monotonic() - begin_s > SETTLE_S:
+        calm = calm + 1 if before is not None and np.abs(now - before).mean() < CALM_LEVELS else 0
+        if calm >= CALM_SHOTS and now.std() > BLANK_LEVELS and time.monotonic() - begin_s > SETTLE_S:
             return shot
         before = now
     raise _NoPicture(f"its page did not come to rest within {PICTURE_TIMEOUT_S:.0f} s")

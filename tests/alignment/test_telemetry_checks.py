@@ -52,7 +52,8 @@ def floors(m: Measurement) -> dict[str, float]:
 # clean data ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(12))
+# The first six have every choice of joints with every resolution.
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=[pytest.mark.slow] * (k >= 6)) for k in range(12)])
 def test_clean_sweeps_stay_clean(seed):
     rng = np.random.default_rng(seed)
     joints = [[4], ARMS_JOINTS[:6], ARMS_JOINTS][seed % 3]

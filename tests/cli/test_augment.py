@@ -29,20 +29,6 @@ def place(collected: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def said(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs a verb there; (exit code, all that was said)."""
-    monkeypatch.chdir(place)
-
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(list(map(str, words)))
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
-
-
 def report(folder: Path, name: str = "new") -> dict[str, Any]:
     return json.loads((folder / f"{name}.augment_report.json").read_text())
 
@@ -80,8 +66,9 @@ def test_the_same_command_again_makes_nothing_anew_and_says_so_of_its_cost(
 
 @pytest.mark.slow
 def test_an_attempt_is_executed_again_bit_for_bit_from_what_the_store_holds(place: Path) -> None:
-    folders = [path for path in (place / "store" / "mimicgen").iterdir() if (path / "dataset").is_dir()]
-    again, same = attempt_episode(folders[0]), Dataset(place / "new").episode(0)
+    entries = {path: json.loads((path / "entry.json").read_text()) for path in (place / "store/mimicgen").iterdir()}
+    [folder] = [path for path, entry in entries.items() if entry["outcome"] == "success"]
+    again, same = attempt_episode(folder), Dataset(place / "new").episode(0)
     assert again.arrays["sim.seed"][0] == same.arrays["sim.seed"][0]
     for key in ("action", "sim.state", "observation.tactile"):
         np.testing.assert_array_equal(again.arrays[key], same.arrays[key])

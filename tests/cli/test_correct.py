@@ -7,24 +7,9 @@ from typing import Any
 
 import pytest
 
-from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "evaluation"))
-
-
-@pytest.fixture
-def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs the verb in an empty folder; (exit code, all that was printed)."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(list(map(str, words)))
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
 
 
 @pytest.mark.parametrize(

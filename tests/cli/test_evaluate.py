@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from taccorl.cli.main import main
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import read_rows
 
@@ -22,20 +21,6 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_checkpoint import write_checkpoint
 
     return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
-
-
-@pytest.fixture
-def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs the verb in an empty folder; (exit code, all that was printed)."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(list(map(str, words)))
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
 
 
 def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: Path) -> None:

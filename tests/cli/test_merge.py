@@ -54,20 +54,6 @@ def test_who_stands_for_the_robot_is_not_the_twin_and_the_reverse(place: Path, s
     assert not (place / "nothing").exists()
 
 
-@pytest.fixture
-def said(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs a verb there; (exit code, all that was said)."""
-    monkeypatch.chdir(place)
-
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(list(map(str, words)))
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
-
-
 def test_every_episode_keeps_its_origin_and_every_row_its_domain(place: Path) -> None:
     both = Dataset(place / "both")
     episodes = [both.episode(k) for k in range(both.num_episodes)]

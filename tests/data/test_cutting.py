@@ -256,7 +256,7 @@ def test_a_silent_camera_splits_exactly_there_and_losses_add_up(tmp_path: Path, 
     assert [e.name.split()[-1] for e in found.episodes] == ["0", "1"]
 
 
-@pytest.mark.parametrize("outcome", [True, False])
+@pytest.mark.parametrize("outcome", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_only_the_part_with_the_episodes_end_carries_its_outcome(tmp_path: Path, outcome: bool) -> None:
     word = "success" if outcome else "failure"
     made = Made(
@@ -265,7 +265,7 @@ def test_only_the_part_with_the_episodes_end_carries_its_outcome(tmp_path: Path,
     assert [e.success for e in cut(made.path).episodes] == [None, outcome]
 
 
-@pytest.mark.parametrize(("silent_from_s", "success"), [(3.2, None), (3.75, True)])
+@pytest.mark.parametrize(("silent_from_s", "success"), [pytest.param(3.2, None, marks=pytest.mark.slow), (3.75, True)])
 def test_an_episode_whose_end_is_missing_has_no_outcome(
     tmp_path: Path, silent_from_s: float, success: bool | None
 ) -> None:
@@ -277,7 +277,8 @@ def test_an_episode_whose_end_is_missing_has_no_outcome(
 
 @pytest.mark.parametrize(
     ("gap_s", "success"),
-    [((1.6, 2.1), [None, True]), ((3.0, 3.5), [None])],  # what follows the second gap is shorter than a second
+    # what follows the second gap is shorter than a second
+    [pytest.param((1.6, 2.1), [None, True], marks=pytest.mark.slow), ((3.0, 3.5), [None])],
 )
 def test_a_part_that_is_too_short_takes_the_outcome_with_it(
     tmp_path: Path, gap_s: tuple[float, float], success: list[bool | None]

@@ -14,6 +14,7 @@ from taccorl.data.episode import Episode
 FPS = SPEC.fps
 NUM_SEEDS = 30
 FEW_SEEDS = 6
+SEEDS = [pytest.param(k, marks=[pytest.mark.slow] * (k >= 2)) for k in range(5)]
 LEFT_A, LEFT_B, RIGHT_A, RIGHT_B = range(4)
 
 
@@ -80,7 +81,7 @@ def test_contact_coverage_is_told(good: Episode) -> None:
         assert f"{name} in {share:.0%} of the rows" in text
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_one_armed_task_gives_nothing(seed: int) -> None:
     episode = make(seed=seed, duration_s=10.0)
     state, action, touch = copies(episode)
@@ -89,12 +90,12 @@ def test_one_armed_task_gives_nothing(seed: int) -> None:
     assert serious(with_arrays(episode, state=state, action=action, touch=flat(touch))) == []
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_grippers_that_close_on_nothing_give_nothing(seed: int) -> None:
     assert serious(make(seed=seed, duration_s=10.0, part_m={"left": 0.0, "right": 0.0})) == []
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_twin_without_noise_gives_nothing(seed: int) -> None:
     assert serious(make(seed=seed, duration_s=10.0, noise_count=0.0)) == []
 

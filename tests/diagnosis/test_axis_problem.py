@@ -171,6 +171,7 @@ def emps(name: str) -> Measurement:
     ).resampled(1000.0)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not EMPS.is_dir(), reason=f"the EMPS benchmark is not at {EMPS}; see nonlinearbenchmark.org")
 def test_a_real_drive_s_dry_friction_is_found_and_that_something_remains():
     """Janot, Gautier and Brunot 2019 identify 95.1 kg, 20.4 N of dry friction, 203.5 N·s/m, offset −3.16 N."""

@@ -138,6 +138,21 @@ def test_gate_is_the_papers_equation():
     assert contact(felt, 0.4, 2).tolist() == [False, False, True, False]
 
 
+def test_readings_up_to_the_noise_are_nothing():
+    """λ_noise = 0.1: a row whose other readings are at most that acts as if they were 0; those above stay."""
+    deaf, hears = tiny_policy(noise_threshold=0.1), tiny_policy()
+    deaf.load_state_dict(hears.state_dict())
+    batch = batch_of(True, True)
+    quiet, loud = (batch["observation.tactile"].clone() for _ in range(2))
+    quiet[quiet.abs() <= 0.4] = 0.0
+    loud[loud.abs() <= 0.4] = 0.1
+    noisy, silent = {**batch, "observation.tactile": loud}, {**batch, "observation.tactile": quiet}
+    assert torch.equal(chunk(deaf, noisy), chunk(hears, silent)) and torch.equal(
+        chunk(deaf, silent), chunk(hears, silent)
+    )
+    assert not torch.equal(chunk(hears, noisy), chunk(hears, silent))
+
+
 def test_kept_constants_change_nothing_and_are_made_once(policy):
     """What a CUDA graph needs of LeRobot's code; the graph itself needs a GPU (make bench ONLY=full_size)."""
     batch, constants = batch_of(True, False), KeptConstants()

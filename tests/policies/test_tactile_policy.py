@@ -429,6 +429,7 @@ def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
         ({"base_checkpoint": "lerobot/pi05_base"}, "fit --policy.backbone=full only, not tiny"),
         ({"tactile_history": 0}, "--policy.tactile_history=0: at least 1"),
         ({"contact_threshold": float("nan")}, "--policy.contact_threshold=nan"),
+        ({"noise_threshold": 0.5}, "--policy.noise_threshold=0.5: 0 to --policy.contact_threshold=0.4"),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, said):

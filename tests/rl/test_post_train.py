@@ -134,7 +134,7 @@ def test_rerun_files_of_rollouts_change_nothing(start: Path, tmp_path: Path) -> 
         made.run()
         rows = [{k: v for k, v in row.items() if k != "seconds"} for row in progress(tmp_path / name)]
         found.append((rows, made._actor.policy.state_dict(), made._generator.get_state()))
-        made.world.envs.close()
+        made.world.close()
     (rows, policy, state), (other_rows, other_policy, other_state) = found
     assert rows == other_rows and torch.equal(state, other_state)
     assert all(torch.equal(value, other_policy[name]) for name, value in policy.items())
@@ -180,7 +180,7 @@ def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path
     made._guard_collapse()
     assert bias.unique().tolist() == [20] and "000020" in lines[-1]
     assert made._ppo.actor_optimizer.param_groups[0]["lr"] == pytest.approx(2.5e-6)
-    made.world.envs.close()
+    made.world.close()
 
 
 def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(start: Path, tmp_path: Path) -> None:
@@ -199,7 +199,7 @@ def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(star
         assert row["undone_steps"] == 1 and row["actor_lr"] == 1e-2 and row["last_kl"] < 1e-6
         assert made._ppo.actor_lr == (5e-3 if adapt_lr else 1e-2)
         assert ("--ppo.adapt_lr=true" in lines[-1]) is not adapt_lr and "1 step undone" in "".join(lines)
-        made.world.envs.close()
+        made.world.close()
 
 
 def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, monkeypatch: Any) -> None:
@@ -214,7 +214,7 @@ def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, mo
         made._check_noise()
         assert any("--noise.level" in line for line in lines) is warned
         assert "100.0% without" in "".join(lines)
-    made.world.envs.close()
+    made.world.close()
 
 
 def test_noise_at_the_hand_is_that_of_the_kinematics() -> None:

@@ -16,9 +16,9 @@ from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.rollout import Clock
 from taccorl.rl.settings import PolicySettings
+from taccorl.rl.twin_shard import TwinShard
 from taccorl.rl.twin_world import TwinWorld
-from taccorl.sim.part_poses import part_pose_names
-from taccorl.sim.spaces import PARTS_KEY
+from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
 from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
@@ -37,7 +37,8 @@ def world_of(opened: Any, task: str = "assembly_2") -> TwinWorld:
     envs = TaccorlVectorEnv(
         task, 2, autoreset=AutoresetMode.DISABLED, max_episode_steps=7, num_threads=1, part_poses=True
     )
-    return TwinWorld(envs, opened.config, opened.preprocessor, opened.postprocessor, privileged=False, clock=Clock())
+    shard = TwinShard(envs, history=opened.config.tactile_history, images=False, privileged=False)
+    return TwinWorld([shard], opened.config, opened.preprocessor, opened.postprocessor, clock=Clock())
 
 
 def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -> None:
@@ -46,9 +47,11 @@ def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -
     world.restart(5)
     seen = world.observe().batch
     assert {PART_POSES, PARTS_KEY, "observation.state", TOUCH} <= set(seen) and not any("images" in key for key in seen)
-    observation = world.envs.observe()
+    (shard,) = world.shards
+    assert isinstance(shard, TwinShard)
+    observation = shard.envs.observe()
     observation[TOUCH] = np.repeat(observation[TOUCH][:, None], 10, axis=1)
-    expected = policy_batch(opened.preprocessor, observation, [world.envs.task_description] * 2)
+    expected = policy_batch(opened.preprocessor, observation, [shard.instruction] * 2)
     assert torch.equal(seen[PART_POSES], expected[PART_POSES])  # pyright: ignore
     for _ in range(2):
         acted = world.act(seen["observation.state"][:, None].expand(-1, 5, -1))
@@ -57,7 +60,7 @@ def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -
     features = actor.features(world.observe().batch)
     width = 96 + 14 + 69  # mean token of the prefix, state, poses of the parts
     assert features.shape == (2, width) and actor.num_features == width
-    world.envs.close()
+    world.close()
 
 
 def test_evaluation_switches_the_poses_on(opened: Any) -> None:

@@ -10,12 +10,16 @@ import torch
 from gymnasium.vector import AutoresetMode
 from tiny_checkpoint import write_checkpoint
 
+from taccorl.errors import TaccorlError
 from taccorl.evaluation.policy_actor import open_checkpoint, policy_batch
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
+from taccorl.rl import start_states
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.rollout import Clock
-from taccorl.rl.settings import FlowSDESettings, PolicySettings
+from taccorl.rl.settings import EnvSettings, FlowSDESettings, PolicySettings
+from taccorl.rl.start_states import StartStates
+from taccorl.rl.twin_shard import TwinShard
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.episode_seeds import episode_seed
 from taccorl.sim.vector_env import TaccorlVectorEnv
@@ -39,9 +43,24 @@ def envs() -> Iterator[TaccorlVectorEnv]:
 
 
 def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True) -> TwinWorld:
-    made = TwinWorld(
-        envs, opened.config, opened.preprocessor, opened.postprocessor, privileged=privileged, clock=Clock()
-    )
+    return world_of([envs], opened, seed, privileged=privileged)
+
+
+def world_of(
+    all_envs: list[TaccorlVectorEnv],
+    opened: Any,
+    seed: int = 5,
+    *,
+    privileged: bool = True,
+    share: float = 0.0,
+    size: int = 1,
+) -> TwinWorld:
+    history, first, shards = opened.config.tactile_history, 0, []
+    for envs in all_envs:
+        starts = StartStates(share, size)
+        shards.append(TwinShard(envs, history=history, images=True, privileged=privileged, starts=starts, first=first))
+        first += envs.num_envs
+    made = TwinWorld(shards, opened.config, opened.preprocessor, opened.postprocessor, clock=Clock())
     made.restart(seed)
     return made
 
@@ -172,3 +191,114 @@ def test_a_stopped_world_goes_on_bit_for_bit(envs: TaccorlVectorEnv, opened: Any
     again = make_world(envs, opened, seed=77)
     again.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=False))
     assert all(torch.equal(a, b) for a, b in zip(go_on(again), expected, strict=True))
+
+
+# states of earlier episodes -------------------------------------------------------------------------------------------
+
+
+def later_world(envs: TaccorlVectorEnv, opened: Any, share: float = 1.0, size: int = 3) -> TwinWorld:
+    return world_of([envs], opened, share=share, size=size)
+
+
+def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_counted_apart(
+    envs: TaccorlVectorEnv, opened: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """12 control steps, 5 a chunk. One third of the time must be left: states after 5 steps are kept, those after 10 are not."""
+    monkeypatch.setattr(start_states, "_KEPT", 1.0)
+    world = later_world(envs, opened)
+    envs.sim.judge.subtask[1] = 1  # environment 1 holds its parts, says the judge; environment 0 does not
+    world.act(home(world) + 0.1)
+    assert len(world.shards[0].starts) == 1
+    kept = envs.sim.snapshot(np.array([1]))
+    felt = world.observe().batch[TOUCH][1]
+    world.act(home(world))
+    assert len(world.shards[0].starts) == 1, "too late"
+    acted = world.act(home(world))
+    assert acted.outcomes == ["timeout", "timeout"] and acted.later_outcomes == [None, None]
+    for i in range(N):
+        now = envs.sim.snapshot(np.array([i]))
+        np.testing.assert_array_equal(now.physics, kept.physics)
+        assert now.judge["steps"] == kept.judge["steps"] == 5 and now.seeds == kept.seeds
+        assert torch.equal(world.observe().batch[TOUCH][i], felt)
+    world.act(home(world))
+    acted = world.act(home(world))  # 5 + 5 + 2 of 12 steps
+    assert acted.outcomes == [None, None] and acted.later_outcomes == ["timeout", "timeout"]
+
+
+def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(
+    envs: TaccorlVectorEnv, opened: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start_states, "_KEPT", 0.7)
+    world = later_world(envs, opened, share=0.5, size=2)
+
+    def steps(num: int) -> list[torch.Tensor]:
+        found = []
+        for _ in range(num):
+            envs.sim.judge.subtask[:] = 1
+            world.act(home(world) + 0.05)
+            found.append(world.observe().batch["observation.state"].clone())
+        return found
+
+    steps(8)
+    assert len(world.shards[0].starts) == 2, "the ring is full"
+    state = world.state_dict()
+    expected = steps(9)
+    world = later_world(envs, opened, share=0.5, size=2)
+    world.load_state_dict(state)
+    assert all(torch.equal(one, other) for one, other in zip(steps(9), expected, strict=True))
+
+
+def test_a_share_beyond_one_is_refused() -> None:
+    with pytest.raises(TaccorlError, match=r"start_share=1\.5"):
+        EnvSettings(start_share=1.5)
+
+
+# shards ---------------------------------------------------------------------------------------------------------------
+
+
+def test_shards_give_what_one_gives(opened: Any) -> None:
+    """Three environments at once, and as two and one in threads of their own: scenes, touch, outcomes, last observations."""
+
+    def made(*sizes: int) -> TwinWorld:
+        envs = [
+            TaccorlVectorEnv(
+                "assembly_2",
+                size,
+                images="on_request",
+                autoreset=AutoresetMode.DISABLED,
+                max_episode_steps=8,
+                num_threads=1,
+            )
+            for size in sizes
+        ]
+        return world_of(envs, opened, 7)
+
+    one, two = made(3), made(2, 1)
+    assert one.num_envs == two.num_envs == 3
+    one.reset(torch.tensor([False, True, False]))
+    two.reset(torch.tensor([False, True, False]))
+    shift = 0.05 * torch.arange(3)[:, None, None]
+    resumed = None
+    for step in range(4):
+        seen, other = one.observe(), two.observe()
+        assert torch.equal(seen.privileged_NP, other.privileged_NP)
+        for key, value in seen.batch.items():
+            assert torch.equal(value, other.batch[key]), key
+        chunk = home(one) + shift
+        found = [world.act(chunk) for world in (one, two)]
+        assert found[0].outcomes == found[1].outcomes and torch.equal(found[0].truncated_N, found[1].truncated_N)
+        assert (found[0].last is None) == (found[1].last is None) == (step in (0, 2))
+        if found[0].last is not None and found[1].last is not None:
+            assert torch.equal(found[0].last.batch[TOUCH], found[1].last.batch[TOUCH])
+            assert torch.equal(found[0].last.privileged_NP, found[1].last.privileged_NP)
+        if step == 2:
+            resumed = two.state_dict()
+    now = two.observe()
+    assert resumed is not None
+    with pytest.raises(TaccorlError, match=r"shards=1"):
+        one.load_state_dict(resumed)
+    two.load_state_dict(resumed)
+    two.act(chunk)
+    assert torch.equal(two.observe().privileged_NP, now.privileged_NP)
+    one.close()
+    two.close()

@@ -8,9 +8,8 @@ from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.recorder import EpisodeRecorder, with_simulator
 from taccorl.sim.env import TaccorlEnv
 from taccorl.sim.lerobot_env import raw_names
-from taccorl.sim.part_poses import part_pose_names, part_poses, posed_bodies
+from taccorl.sim.part_poses import PARTS_KEY, part_pose_names, part_poses, posed_bodies
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.spaces import PARTS_KEY
 from taccorl.sim.tasks import tasks
 from taccorl.sim.vector_env import TaccorlVectorEnv
 

@@ -264,15 +264,23 @@ def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> li
     """The plan's first ``num`` attempts, out of the store; nothing is made.
 
     Raises:
-        TaccorlError: one of them is not there.
+        TaccorlError: one of them is not there, or the plan has all its successes after fewer attempts.
     """
     sources, found, entries = store.source(source), [], []
     while len(found) < num:
-        for k in _next_numbers(plan, entries)[: num - len(found)]:
+        numbers = _next_numbers(plan, entries)[: num - len(found)]
+        if not numbers:
+            raise TaccorlError(
+                f"{num} attempts are asked for, but {plan.episodes} successes were reached after {len(found)}; "
+                f"more attempts come with more --episodes"
+            )
+        for k in numbers:
             attempt = store.find(_ATTEMPT, plan.config(k), [sources])
             if attempt is None:
                 raise TaccorlError(f"{store.root}: attempt {k} is not there any more; augment again makes it again")
-            rows = store.find(_ROWS, plan.config(k), [sources]) if plan.rows == "dataset" else None
+            # As in run_attempt: rows count only where the attempt is a success, whatever rows an attempt before it left.
+            wanted = plan.rows == "dataset" and _entry(attempt.path)["outcome"] == "success"
+            rows = store.find(_ROWS, plan.config(k), [sources]) if wanted else None
             parts = [attempt.path, *([rows.path] if rows else [])]
             entry = _entry(parts[-1])
             found.append(Made(attempt.path, entry, sum(read_manifest(part)["seconds"] for part in parts)))

@@ -18,7 +18,7 @@ from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
 from taccorl.policies.tactile_pi05.hand_poses import NUM_HAND_POSES, arm_names
 from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
 from taccorl.policies.tactile_pi05.part_poses import bodies_of, num_part_numbers
-from taccorl.sim.spaces import PARTS_KEY
+from taccorl.sim.part_poses import PARTS_KEY
 
 TACTILE = "observation.tactile"
 RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
@@ -139,6 +139,10 @@ class TactilePI05Config(PI05Config):
     """M_suf: touch tokens beside the actions, in the action expert."""
     contact_threshold: float = CONTACT_THRESHOLD
     """λ_f: a reading above this is contact."""
+    noise_threshold: float = 0.0
+    """λ_noise: readings up to this count as nothing, in training and in use (paper, App. B.2: background noise of both domains is
+    suppressed by one threshold). In normalised readings: what taccorl.alignment.touch measures in counts, times the gain.
+    0: readings as they are; of the twin alone there is one kind of noise."""
     contact_min_active: int = MIN_ACTIVE
     """m: taxels of one reading that have to be above it."""
     tactile_format: TactileFormat | None = None
@@ -229,6 +233,11 @@ class TactilePI05Config(PI05Config):
         if not 0 <= self.contact_threshold < math.inf:
             raise TaccorlError(
                 f"--policy.contact_threshold={self.contact_threshold}: 0 or more, in normalised readings"
+            )
+        if not 0 <= self.noise_threshold <= self.contact_threshold:
+            raise TaccorlError(
+                f"--policy.noise_threshold={self.noise_threshold}: 0 to --policy.contact_threshold={self.contact_threshold}, in "
+                "normalised readings: what is below is nothing, what is above that is contact"
             )
 
         self.image_changes()

@@ -10,9 +10,8 @@ The six numbers of a rotation are those of Zhou et al. 2019, On the Continuity o
 
 import functools
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
@@ -22,7 +21,9 @@ from torch import Tensor
 
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import ARMS, JOINTS, RobotConfig, add_arm
+
+if TYPE_CHECKING:
+    from taccorl.sim.robot import RobotConfig
 
 HAND_POSES = "observation.hand_poses"
 """(B, 27) [in units of ``WORLD_M`` and ``HAND_TO_HAND_M``; rotations without unit]."""
@@ -31,7 +32,8 @@ WORLD_M = 0.25
 """Unit of positions in the world."""
 HAND_TO_HAND_M = 0.1
 """Unit of the position of one hand in the other's frame."""
-_PER_ARM = len(JOINTS) + 1  # and a gripper
+_NUM_JOINTS = 6  # of an arm; sim.robot, which names them, would load MuJoCo wherever LeRobot loads its plug-ins
+_PER_ARM = _NUM_JOINTS + 1  # and a gripper
 
 # B batch, J joints
 
@@ -44,13 +46,17 @@ def arm_names() -> tuple[str, ...]:
     return tuple(names)
 
 
-def arm_chains(robot: RobotConfig | None = None) -> list[list[list[list[float]]]]:
+def arm_chains(robot: "RobotConfig | None" = None) -> list[list[list[list[float]]]]:
     """Of each arm, (7, 4, 4): every link's frame in its parent's where the joint is at 0 (the first in the world), then the TCP
     in link 6. A joint turns about its own z axis.
 
     Args:
         robot: None: the nominal one.
     """
+    import mujoco
+
+    from taccorl.sim.robot import ARMS, JOINTS, RobotConfig, add_arm
+
     chains = []
     for arm in ARMS:
         spec = mujoco.MjSpec()
@@ -87,14 +93,14 @@ def tcp_poses(state_BS: Tensor, chains: Tensor) -> list[Tensor]:
     """
     poses = []
     for arm, chain in enumerate(chains):
-        joints_BJ = state_BS[:, _PER_ARM * arm : _PER_ARM * arm + len(JOINTS)]
+        joints_BJ = state_BS[:, _PER_ARM * arm : _PER_ARM * arm + _NUM_JOINTS]
         cos_BJ, sin_BJ = joints_BJ.cos(), joints_BJ.sin()
         turns_BJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(*joints_BJ.shape, 1, 1)
         turns_BJ44[..., 0, 0], turns_BJ44[..., 0, 1] = cos_BJ, -sin_BJ
         turns_BJ44[..., 1, 0], turns_BJ44[..., 1, 1] = sin_BJ, cos_BJ
         steps_BJ44 = _product(chain[:-1], turns_BJ44)
         pose_B44 = steps_BJ44[:, 0]
-        for j in range(1, len(JOINTS)):
+        for j in range(1, _NUM_JOINTS):
             pose_B44 = _product(pose_B44, steps_BJ44[:, j])
         poses.append(_product(pose_B44, chain[-1]))
     return poses

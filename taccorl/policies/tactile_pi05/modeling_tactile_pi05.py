@@ -403,6 +403,8 @@ class TactilePI05Policy(PI05Policy):
                 "observation; select_action remembers it by itself"
             )
         readings = readings.to(torch.float32)
+        if self.config.noise_threshold:
+            readings = readings * (readings.abs() > self.config.noise_threshold)
         gate = contact(readings, self.config.contact_threshold, self.config.contact_min_active)
         return readings.unflatten(-1, told.layout), gate
 

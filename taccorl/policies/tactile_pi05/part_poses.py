@@ -22,8 +22,7 @@ from torch.nn import functional as F
 
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.hand_poses import HAND_TO_HAND_M, WORLD_M, arm_chains, arm_names, tcp_poses
-from taccorl.sim.part_poses import POSE_NAMES
-from taccorl.sim.spaces import PARTS_KEY
+from taccorl.sim.part_poses import PARTS_KEY, POSE_NAMES
 
 PART_POSES = "observation.part_poses"
 """(B, ``num_part_numbers``), see above."""

@@ -1,5 +1,6 @@
 """Speed delay: the controller damps the speed of a moment ago, because its loop is sampled and filtered."""
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -14,7 +15,8 @@ if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 MOST_LOST = 0.5
-"""Share of the inertia that may be lost in MuJoCo, where all joints move in every pose. A choice: stable with all six."""
+"""Share of the inertia that may be lost in MuJoCo, where all joints move in every pose. A choice: stable with all six. A delay
+that would take more is applied in part, with a warning."""
 POSES = 64
 
 
@@ -60,8 +62,16 @@ class SpeedDelay(JointEffect):
         for joint, inertia in zip(joints, least, strict=True):
             arm, name = joint.name.split("_", 1)
             control = config.controller_of("left" if arm == "left" else "right")
-            lost = control.kd_nms_per_rad[JOINTS.index(name)] * self.delay_s
-            joint.armature -= min(lost, MOST_LOST * inertia)
+            kd, most = control.kd_nms_per_rad[JOINTS.index(name)], MOST_LOST * inertia
+            lost = kd * self.delay_s
+            joint.armature -= min(lost, most)
+            if lost > most:
+                warnings.warn(
+                    f"effect speed_delay: {joint.name}: {1e3 * self.delay_s:.3g} ms would take {lost:.3g} kg·m², more than "
+                    f"{MOST_LOST:.0%} of the least inertia that the joint has in any pose, {inertia:.3g} kg·m²; MuJoCo applies "
+                    f"{1e3 * most / kd:.3g} ms",
+                    stacklevel=2,
+                )
 
 
 def _least_inertia(spec: mujoco.MjSpec, names: list[str]) -> np.ndarray:

@@ -154,6 +154,8 @@ def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again
     told = numbers(some, read_attempts(some, collected, store, 2), None)
     assert told["failures"] == {"crashed": 1}
     assert told["failed"][0]["command"] is None
+    with pytest.raises(TaccorlError, match="3 attempts are asked for, but 1 successes were reached after 2"):
+        made_attempts(some, collected, store, 3)
 
 
 @pytest.mark.slow
@@ -210,7 +212,7 @@ def test_a_run_that_is_killed_goes_on_and_gives_the_same_bytes(augmented, collec
         f"Path({str(collected)!r}), Path({str(tmp_path / 'new')!r}), Store(Path({str(tmp_path / 'store')!r})))\n"
     )
     rng = np.random.default_rng(0)
-    for _ in range(10):
+    for _ in range(4):
         with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.DEVNULL) as process:
             time.sleep(float(rng.uniform(4, 12)))
             os.kill(process.pid, signal.SIGKILL)

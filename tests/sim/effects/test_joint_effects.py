@@ -242,14 +242,22 @@ def test_only_the_chosen_joints_change(name: str, values: dict[str, float], fiel
     np.testing.assert_allclose(difference, expected, atol=1e-15)
 
 
-def test_a_delay_never_makes_an_inertia_of_the_twin_negative():
-    late = start(
-        *(
-            make_effect("speed_delay", arm=a, joints=[f"joint{k}" for k in range(1, 7)], delay_s=3e-3)
-            for a in ("left", "right")
+def test_a_delay_never_makes_an_inertia_of_the_twin_negative_and_says_where_less_is_applied():
+    with pytest.warns(UserWarning, match="effect speed_delay") as said:
+        late = start(
+            *(
+                make_effect("speed_delay", arm=a, joints=[f"joint{k}" for k in range(1, 7)], delay_s=3e-3)
+                for a in ("left", "right")
+            )
         )
-    )
     lost = start().model.dof_armature - late.model.dof_armature
+    texts = {str(w.message) for w in said}
+    for joint in (f"{a}_joint{k}" for a in ("left", "right") for k in range(1, 7)):
+        kd = late.config.controller.kd_nms_per_rad[int(joint[-1]) - 1]
+        applied_s = lost[late.model.joint(joint).dofadr[0]] / kd
+        mine = [text for text in texts if f": {joint}: " in text]
+        assert len(mine) == (applied_s < 3e-3 * (1 - 1e-9)), (joint, applied_s)
+        assert all("3 ms would take" in t and f"MuJoCo applies {1e3 * applied_s:.3g} ms" in t for t in mine)
     assert (lost[[late.model.joint(f"left_joint{k}").dofadr[0] for k in range(1, 7)]] > 0).all()
     for _ in range(50):
         late.advance(late.targets[None] + 0.02, 6)

@@ -1,0 +1,87 @@
+"""States of the policy's own episodes, in which later episodes begin: with the parts in the hands and not joined yet.
+
+Most decisions of an episode are transport, which a policy that was trained on demonstrations knows. Episodes that begin where the
+parts are about to meet have several times as many decisions where it fails. The states are the policy's own, so that they are
+those that it gets into. The newest ones are kept, in a ring.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from taccorl.sim.simulation import Simulation, Snapshot
+
+_KEPT = 0.1
+"""Share of the decisions with the parts in both hands, of which the state is kept."""
+_TIME_LEFT = 1 / 3
+"""Share of the time limit that has to be left."""
+
+
+class StartStates:
+    """A ring of states of single environments, each with its window of touch; and who begins in one."""
+
+    def __init__(self, share: float, size: int) -> None:
+        """
+        Args:
+            share: of episodes that begin in such a state, once there are some.
+            size: states that are kept.
+        """
+        self._share, self._size = share, size
+        self.restart(0)
+
+    def restart(self, seed: int | tuple[int, ...]) -> None:
+        """Forget all states."""
+        self._rng = np.random.default_rng(seed)
+        self._kept: list[tuple[Snapshot, np.ndarray]] = []
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def see(self, sim: Simulation, window_NLK: np.ndarray, over_N: np.ndarray) -> None:
+        """Keep states of some environments whose episodes go on and that hold a part in each hand."""
+        if not self._share:
+            return
+        in_time_N = sim.judge.steps <= (1 - _TIME_LEFT) * sim.judge.limit_steps
+        held_N = (sim.judge.subtask >= 1).all(axis=1) & in_time_N & ~over_N
+        for i in np.flatnonzero(held_N & (self._rng.random(len(held_N)) < _KEPT)):
+            state = sim.snapshot(np.array([i])), window_NLK[i].copy()
+            if len(self._kept) < self._size:
+                self._kept.append(state)
+            else:
+                self._kept[self._next] = state
+            self._next = (self._next + 1) % self._size
+
+    def draw(self, over_N: np.ndarray) -> tuple[np.ndarray, list[int]]:
+        """(N,) which of the environments ``over_N`` begin in a kept state, and the numbers of these states."""
+        if not self._share:
+            return np.zeros_like(over_N), []
+        chosen_N = over_N & (self._rng.random(len(over_N)) < self._share) & bool(self._kept)
+        return chosen_N, self._rng.integers(len(self._kept), size=chosen_N.sum()).tolist() if chosen_N.any() else []
+
+    def states(self, numbers: list[int]) -> tuple[Snapshot, np.ndarray]:
+        """Their snapshot, and windows (n, L, K)."""
+        chosen = [self._kept[k] for k in numbers]
+        return _joined([snapshot for snapshot, _ in chosen]), np.stack([window for _, window in chosen])
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on bit for bit."""
+        kept = [(dataclasses.asdict(snapshot), window) for snapshot, window in self._kept]
+        return {"kept": kept, "next": self._next, "generator": self._rng.bit_generator.state}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """What ``state_dict`` gave."""
+        self._kept = [(Snapshot(**fields), window) for fields, window in state["kept"]]
+        self._next = state["next"]
+        self._rng.bit_generator.state = state["generator"]
+
+
+def _joined(snapshots: list[Snapshot]) -> Snapshot:
+    def join(name: str) -> Any:
+        values = [getattr(snapshot, name) for snapshot in snapshots]
+        if isinstance(values[0], dict):
+            return {key: np.concatenate([value[key] for value in values]) for key in values[0]}
+        return np.concatenate(values)
+
+    return Snapshot(**{f.name: join(f.name) for f in dataclasses.fields(Snapshot)})
