@@ -123,8 +123,8 @@ def test_lerobots_algorithm_is_ppos_own_update(tmp_path: Path) -> None:
     from lerobot.rl.algorithms.configs import RLAlgorithmConfig
     from lerobot.rl.algorithms.factory import make_algorithm_config
 
-    import taccorl.lerobot_plugin  # noqa: F401
-    from taccorl.rl.lerobot_algorithm import FlowPPO, FlowPPOConfig
+    from taccorl.rl.flow_ppo import FlowPPO
+    from taccorl.rl.flow_ppo_config import FlowPPOConfig
 
     settings: dict[str, Any] = {"actor_lr": 1e-5, "critic_lr": 1e-3, "batch_size": 2}
     config: Any = make_algorithm_config("flow_ppo", seed=3, **settings)

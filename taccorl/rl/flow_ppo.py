@@ -1,45 +1,25 @@
 """PPO as LeRobot's ``RLAlgorithm`` with the name ``flow_ppo``: its configuration, its update and its checkpoints.
 
-Importing this registers it; LeRobot then makes the configuration by name (``make_algorithm_config("flow_ppo")``, 0.6.1). The
-plug-in does not, as every command of LeRobot would load the simulator. Its ``make_algorithm`` knows only ``sac``,
+``flow_ppo_config`` registers the configuration when it is imported, which LeRobot then makes by name
+(``make_algorithm_config("flow_ppo")``, 0.6.1). Its ``make_algorithm`` knows only ``sac``,
 its learner only replay buffers: build the algorithm by ``FlowPPO(policy, config)``. ``taccorl post-train`` uses ``PPO`` itself.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.rl.algorithms.base import RLAlgorithm
-from lerobot.rl.algorithms.configs import RLAlgorithmConfig, TrainingStats
+from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor
 
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.rl.anchor import Anchor
 from taccorl.rl.critic import Critic
 from taccorl.rl.flow_policy import TactileFlowPolicy
+from taccorl.rl.flow_ppo_config import FlowPPOConfig
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, Decisions
-from taccorl.rl.settings import FlowSDESettings, PolicySettings, PPOSettings
-
-
-@RLAlgorithmConfig.register_subclass("flow_ppo")
-@dataclass(kw_only=True)
-class FlowPPOConfig(PPOSettings, RLAlgorithmConfig):
-    """Settings of ``--ppo``, ``--policy`` and ``--noise`` of ``taccorl post-train``."""
-
-    policy: PolicySettings = field(default_factory=PolicySettings)
-    noise: FlowSDESettings = field(default_factory=FlowSDESettings)
-    num_privileged: int = 0
-    """Numbers of the simulator's state that the critic sees."""
-    seed: int = 0
-    """Of the order of decisions, and of the anchor's rows."""
-    policy_config: PreTrainedConfig | None = None
-
-    @classmethod
-    def from_policy_config(cls, policy_cfg: Any) -> "FlowPPOConfig":
-        return cls(policy_config=policy_cfg)
 
 
 class FlowPPO(RLAlgorithm):
