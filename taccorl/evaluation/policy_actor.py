@@ -43,7 +43,7 @@ def require_same_parts(config: Any, task: str, there: tuple[str, ...]) -> None:
     own = tuple(config.part_names or ())
     if own != there:
         raise TaccorlError(
-            f"--task={task}: its part poses are {', '.join(there[::9])} …, the policy was trained with "
+            f"task {task}: its part poses are {', '.join(there[::9])} …, the policy was trained with "
             f"{', '.join(own[::9])} …: another task"
         )
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.policy_actor import Checkpoint
@@ -27,17 +28,31 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
     Args:
         opened: the checkpoint that post-training began or resumed from, for its processors.
         policy: with the weights of now.
+
+    Raises:
+        TaccorlError: it cannot be written, as on a full disk.
     """
     folder = out / "checkpoints" / f"{iteration:06d}"
     unfinished = folder.with_name(f".{folder.name}.unfinished")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    (unfinished / _STATE).parent.mkdir(parents=True)
-    policy.save_pretrained(unfinished / _POLICY)
-    for processor in (opened.preprocessor, opened.postprocessor):
-        processor.save_pretrained(unfinished / _POLICY)
-    if (opened.path / _TRAIN_CONFIG).is_file():
-        shutil.copy(opened.path / _TRAIN_CONFIG, unfinished / _POLICY)
-    torch.save(state, unfinished / _STATE)
+    try:
+        shutil.rmtree(unfinished, ignore_errors=True)
+        (unfinished / _STATE).parent.mkdir(parents=True)
+        policy.save_pretrained(unfinished / _POLICY)
+        for processor in (opened.preprocessor, opened.postprocessor):
+            processor.save_pretrained(unfinished / _POLICY)
+        if (opened.path / _TRAIN_CONFIG).is_file():
+            shutil.copy(opened.path / _TRAIN_CONFIG, unfinished / _POLICY)
+        torch.save(state, unfinished / _STATE)
+    except (
+        OSError,
+        RuntimeError,
+        SafetensorError,
+    ) as error:  # torch and safetensors have errors of their own for a full disk
+        shutil.rmtree(unfinished, ignore_errors=True)
+        raise TaccorlError(
+            f"{folder}: cannot be written ({str(error).splitlines()[0]}): is the disk full? The last checkpoint is whole; make "
+            "room and go on: taccorl post-train --out=… --resume=true"
+        ) from error
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
     link(folder, LAST)

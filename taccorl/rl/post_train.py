@@ -182,8 +182,12 @@ class PostTraining:
         self.world.load_state_dict(state["world"])
         self._generator.set_state(state["generator"])
         self._iteration, self._best, self._recent = state["iteration"], state["best"], list(state["recent"])
+        if self._iteration > self.settings.iterations:
+            raise TaccorlError(
+                f"--iterations={self.settings.iterations}: the run in {self.settings.out} has done {self._iteration} already"
+            )
         progress = self.settings.out / PROGRESS
-        lines = progress.read_text(encoding="utf-8").splitlines()
+        lines = progress.read_text(encoding="utf-8").splitlines() if progress.is_file() else []
         progress.write_text("".join(f"{line}\n" for line in lines[: self._iteration]), encoding="utf-8")
         run_settings.write(self.settings)  # with other iterations, perhaps
         self._report(f"resumed at iteration {self._iteration} of {self.settings.iterations}")
@@ -261,7 +265,7 @@ class PostTraining:
             "iteration": self._iteration,
             "decisions": self._iteration * len(rollout.decisions),
             "episodes": episodes,
-            "success": rollout.outcomes[SUCCESS] / episodes if episodes else 0.0,
+            "success": rollout.outcomes[SUCCESS] / episodes if episodes else None,
             "outcomes": dict(rollout.outcomes),
             **rollout.facts,
             **facts,
@@ -386,7 +390,12 @@ def _line(row: dict[str, Any]) -> str:
     actor += (
         f", {row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}" if row["undone_steps"] else ""
     )
+    success = "no episode from a reset ended" if row["success"] is None else f"success {row['success']:.1%}"
+    if row["episodes"]:
+        success += f" of {row['episodes']} episodes"
+    if "later_episodes" in row:
+        success += f" ({row['later_success']:.1%} of {row['later_episodes']:.0f} begun in earlier states)"
     return (
-        f"iteration {row['iteration']}: success {row['success']:.1%} of {row['episodes']} episodes, explained variance "
+        f"iteration {row['iteration']}: {success}, explained variance "
         f"{row['explained_variance']:.2f}{actor}{anchor}; seconds: {seconds}"
     )

@@ -143,7 +143,7 @@ class PPO:
         for epoch in range(settings.epochs):
             for k, rows in enumerate(self._minibatches(len(decisions), generator)):
                 is_first = epoch == k == 0
-                probe = rows[: settings.micro_batch] if k == 0 else probe
+                probe = rows if k == 0 else probe
                 found = self._actor_gradient(decisions.rows(rows), advantage_M[rows], generator, is_first)
                 _append(facts, found)
                 if self._goes_too_far(found["kl"], counts, is_measured):
@@ -172,7 +172,8 @@ class PPO:
 
     @torch.no_grad()
     def _measure_kl(self, rows: Decisions) -> float:
-        return kl_divergence(self._log_ratios(rows))
+        parts = torch.arange(len(rows), device=rows.log_prob_M.device).split(self.settings.micro_batch)
+        return kl_divergence(torch.cat([self._log_ratios(rows.rows(part)) for part in parts]))
 
     def _adapt_lr(self, last_kl: float, counts: dict[str, int]) -> None:
         """Smaller after a step that was undone, larger after an iteration of small ones."""

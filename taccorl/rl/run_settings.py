@@ -31,7 +31,10 @@ def complete[SettingsT: PostTrainSettings](settings: SettingsT, given: Collectio
         TaccorlError: there is no run.
     """
     stored = {name: value for name, value in _read(settings.out).items() if name not in given}
-    return _replaced(settings, stored)
+    try:
+        return _replaced(settings, stored)
+    except TypeError as error:
+        raise TaccorlError(f"--resume=true: {settings.out / SETTINGS}: a value is of another type: {error}") from error
 
 
 def _replaced[T](target: T, stored: dict[str, Any], prefix: str = "") -> T:
@@ -66,13 +69,18 @@ def _read(out: Path) -> dict[str, Any]:
         TaccorlError: there is no such file, or it is not JSON.
     """
     try:
-        return json.loads((out / SETTINGS).read_text(encoding="utf-8"))
+        found = json.loads((out / SETTINGS).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise TaccorlError(
             f"--resume=true: {out} holds no post-training ({SETTINGS}); leave --resume away to begin"
         ) from None
     except ValueError as error:
         raise TaccorlError(f"--resume=true: {out / SETTINGS}: is not JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise TaccorlError(
+            f"--resume=true: {out / SETTINGS}: holds a {type(found).__name__}, not the settings of a run"
+        )
+    return found
 
 
 def _to_json(settings: PostTrainSettings) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class EnvSettings:
     """N_env: environments at once."""
     shards: int = 1
     """Groups of environments, each in a thread of its own: while one computes in Python, physics of the others runs. Scenes do
-    not depend on it."""
+    not depend on it, but for those of start_share: each shard has its own states."""
     threads: int | None = None
     """Of each shard; as many as there are CPUs if not given."""
     ray: bool = False
@@ -57,10 +57,10 @@ class EnvSettings:
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
     start_share: float = 0.0
-    """Share of episodes that begin in a state of the policy's own earlier episodes, with a part in each hand, instead of a
-    reset. They do not count as successes or failures in progress.jsonl."""
+    """Share of episodes, below 1, that begin in a state of the policy's own earlier ones, after each arm's first grasp, instead
+    of a reset. progress.jsonl counts them apart (later_success)."""
     start_states: int = 256
-    """States that are kept for that, the newest."""
+    """States that are kept for that, the newest; at least one for each shard."""
     stagger: bool = True
     """Before the first iteration, act for an episode's length and begin episodes at random times in it, so that environments are
     in different phases of the task."""
@@ -75,8 +75,11 @@ class EnvSettings:
             _at_least("env", 1, threads=self.threads)
         if not 1 <= self.shards <= self.num_envs:
             raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
-        if not 0 <= self.start_share <= 1:
-            raise TaccorlError(f"--env.start_share={self.start_share:g}: a share of the episodes, 0 … 1")
+        if not 0 <= self.start_share < 1:
+            raise TaccorlError(
+                f"--env.start_share={self.start_share:g}: a share of the episodes, 0 or more and below 1: success is counted "
+                "over the others"
+            )
 
 
 @dataclass(kw_only=True)
@@ -170,6 +173,7 @@ class PPOSettings:
             TaccorlError: a number below its range.
         """
         _at_least("ppo", 1, epochs=self.epochs, batch_size=self.batch_size, micro_batch=self.micro_batch)
+        _at_least("ppo", 0, actor_lr=self.actor_lr, critic_lr=self.critic_lr)
         _at_least("ppo", 1, critic_epochs=self.critic_epochs)
         _at_least("ppo", 0, critic_warmup=self.critic_warmup, kl_stop=self.kl_stop, clip=self.clip)
 

@@ -1,4 +1,4 @@
-"""States of the policy's own episodes, in which later episodes begin: with the parts in the hands and not joined yet.
+"""States of the policy's own episodes, in which later episodes begin: after each arm's first grasp, before an arm is done.
 
 Most decisions of an episode are transport, which a policy that was trained on demonstrations knows. Episodes that begin where the
 parts are about to meet have several times as many decisions where it fails. The states are the policy's own, so that they are
@@ -13,7 +13,7 @@ import numpy as np
 from taccorl.sim.simulation import Simulation, Snapshot
 
 _KEPT = 0.1
-"""Share of the decisions with the parts in both hands, of which the state is kept."""
+"""Share of such states that is kept, one a decision."""
 _TIME_LEFT = 1 / 3
 """Share of the time limit that has to be left."""
 
@@ -40,11 +40,12 @@ class StartStates:
         return len(self._kept)
 
     def see(self, sim: Simulation, window_NLK: np.ndarray, over_N: np.ndarray) -> None:
-        """Keep states of some environments whose episodes go on and that hold a part in each hand."""
+        """Keep states of some environments whose episodes go on. None in which the goal holds: they would be won by waiting."""
         if not self._share:
             return
+        subtask, counts = sim.judge.subtask, [len(subtasks) for subtasks in sim.task.subtasks().values()]
         in_time_N = sim.judge.steps <= (1 - _TIME_LEFT) * sim.judge.limit_steps
-        held_N = (sim.judge.subtask >= 1).all(axis=1) & in_time_N & ~over_N
+        held_N = ((subtask >= 1) & (subtask < counts)).all(axis=1) & (sim.judge.held == 0) & in_time_N & ~over_N
         for i in np.flatnonzero(held_N & (self._rng.random(len(held_N)) < _KEPT)):
             state = sim.snapshot(np.array([i])), window_NLK[i].copy()
             if len(self._kept) < self._size:

@@ -161,6 +161,11 @@ class TwinWorld:
         Raises:
             TaccorlError: of another number of environments or shards, task, difficulty, twin or randomisation.
         """
+        if "shards" not in state:
+            raise TaccorlError(
+                "--resume=true: the checkpoint was written by a taccorl of before 22 November 2026, which kept environments in "
+                "another form: begin anew from its policy, --policy.path=…/checkpoints/last/pretrained_model"
+            )
         states = state["shards"]
         if len(states) != len(self.shards):
             raise TaccorlError(

@@ -168,6 +168,19 @@ def test_a_step_that_goes_too_far_is_undone(batch_size: int) -> None:
     assert facts["actor_lr"] == 0.05 and learner.actor_lr == 0.025 and facts["last_kl"] < 1e-9
 
 
+def test_what_is_undone_does_not_depend_on_micro_batches() -> None:
+    """A step near the limit: measured on all of the first minibatch, however few decisions are in memory at once."""
+    found = rollout(ppo(LinePolicy()))
+    kept: dict[int, tuple[float, float]] = {}
+    for micro_batch in (192, 64, 4):
+        settings = PPOSettings(actor_lr=8e-3, batch_size=192, micro_batch=micro_batch, kl_stop=0.05)
+        learner = ppo(LinePolicy(), settings)
+        facts = learner.update(found, torch.Generator().manual_seed(2))
+        kept[micro_batch] = facts["undone_steps"], facts["last_kl"]
+    assert len({undone for undone, _ in kept.values()}) == 1
+    assert [kl for _, kl in kept.values()] == pytest.approx([kept[192][1]] * 3, rel=1e-4)
+
+
 def test_only_the_last_step_is_undone() -> None:
     """The same order and one step less, with a limit that is never reached, gives the same policy."""
     found = rollout(ppo(LinePolicy()))

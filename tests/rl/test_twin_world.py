@@ -206,7 +206,8 @@ def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_count
     """12 control steps, 5 a chunk. One third of the time must be left: states after 5 steps are kept, those after 10 are not."""
     monkeypatch.setattr(start_states, "_KEPT", 1.0)
     world = later_world(envs, opened)
-    envs.sim.judge.subtask[1] = 1  # environment 1 holds its parts, says the judge; environment 0 does not
+    envs.sim.judge.subtask[0] = 2  # environment 0 is done, says the judge, environment 1 holds its parts
+    envs.sim.judge.subtask[1] = 1
     world.act(home(world) + 0.1)
     assert len(world.shards[0].starts) == 1
     kept = envs.sim.snapshot(np.array([1]))

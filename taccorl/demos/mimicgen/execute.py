@@ -7,6 +7,7 @@ cache of training frames (``taccorl.training.rendered_frames``), or left out.
 
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import time
@@ -119,6 +120,8 @@ def execute_stored(
     )
     entries = [json.loads((each.artefact.path / "entry.json").read_text(encoding="utf-8")) for each in made]
     kept = [each.artefact for each, entry in zip(made, entries, strict=True) if entry["outcome"] == "success"]
+    for item, entry in zip(items, entries, strict=True):
+        entry["source"] = str(item.source.path)
     report = _report(found[0], entries)
     if not kept:
         names, meta = ", ".join(map(str, plan.sources)), found[0].meta
@@ -169,7 +172,7 @@ def _check_alike(found: Sequence[StoredActions]) -> None:
     for other in found[1:]:
         for key in _SAME:
             if other.meta[key] != first.meta[key]:
-                there, here = (str(one.meta[key]).splitlines()[0][:80] for one in (other, first))
+                there, here = _first_difference(str(other.meta[key]), str(first.meta[key]))
                 raise DatasetError(
                     f"--source={other.root}: its {key} is another one than that of {first.root} ({there}; {here}): execute them "
                     "into datasets of their own, taccorl merge joins those"
@@ -177,6 +180,12 @@ def _check_alike(found: Sequence[StoredActions]) -> None:
     roots = [one.root.resolve() for one in found]
     if twice := [one.root for one in found if roots.count(one.root.resolve()) > 1]:
         raise DatasetError(f"--source={twice[0]} is given twice: each once")
+
+
+def _first_difference(one: str, other: str) -> tuple[str, str]:
+    """The first lines that differ."""
+    lines = itertools.zip_longest(one.splitlines(), other.splitlines(), fillvalue="nothing")
+    return next(((a.strip()[:80], b.strip()[:80]) for a, b in lines if a != b), (one, other))
 
 
 def _may_be_of(plan: ExecutePlan, items: Sequence["_Item"], out: Path, store: Store) -> bool:
@@ -215,7 +224,7 @@ class _Item:
         return plan.config | executed | {"demonstration": self.index}
 
     def __str__(self) -> str:
-        return f"{self.source.path.name}, demonstration {self.index}"
+        return f"{self.source.path}, demonstration {self.index}"
 
 
 def _run(plan: ExecutePlan, store: Store, item: _Item) -> Executed:

@@ -105,11 +105,19 @@ def read_stored(root: Path) -> StoredActions:
         raise DatasetError(
             f"{path}: format {found!r}, this taccorl reads {FORMAT}; make it again: taccorl augment --rows=actions"
         )
+    missing = [key for key in (*SIMULATION, "spec", "disturbed", "action_time", "episodes") if key not in meta]
+    if missing:
+        raise DatasetError(f"{path}: has no {', '.join(missing)}: damaged, copy the folder again")
     if meta["action_time"] != action_time():
         raise DatasetError(
             f"{path}: action_time is {meta['action_time']}, this taccorl executes {action_time()}; make it again: "
             "taccorl augment --rows=actions"
         )
+    for i, episode in enumerate(meta["episodes"]):
+        lost = [key for key in ("attempt", "scene_seed", "rows", "last_state", "provenance") if key not in episode]
+        if lost or not 0 <= episode.get("first_row", 0) < episode["rows"]:
+            said = f"no {', '.join(lost)}" if lost else f"first_row {episode['first_row']} of {episode['rows']} rows"
+            raise DatasetError(f"{path}: episode {i} has {said}: damaged, copy the folder again")
     rows = [episode["rows"] for episode in meta["episodes"]]
     actions = _read_actions(root / ACTIONS, sum(rows))
     intended = _read_actions(root / INTENDED, sum(rows)) if meta["disturbed"] else None

@@ -248,6 +248,10 @@ class TactilePI05Config(PI05Config):
         Raises:
             TaccorlError: noise or rotation is out of its range.
         """
+        if self.image_rotation_deg not in (0.0, ImageRandomizationConfig.rotation_deg) and not self.image_randomization:
+            raise TaccorlError(
+                f"--policy.image_rotation_deg={self.image_rotation_deg:g} has no effect with --policy.image_randomization=false"
+            )
         if not self.image_randomization and not self.image_noise_std:
             return None
         if self.image_randomization:
