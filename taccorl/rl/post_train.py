@@ -11,7 +11,6 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -115,7 +114,8 @@ class PostTraining:
             ratio_guard=math.inf if settings.policy.tf32 else RATIO_GUARD,
         )
         self._iteration, self._best = 0, 0.0
-        self._recent: list[float] = []
+        self._recent: list[tuple[float, int]] = []
+        """Success and number of episodes of the last iterations in which some ended."""
         self._wants_rerun = True
         if settings.resume:
             self._resume(checkpoint.load_state(self._opened.path))
@@ -226,7 +226,7 @@ class PostTraining:
                 )
             if row["episodes"]:
                 longest = max(settings.save_freq, settings.collapse_iterations)
-                self._recent = [*self._recent, row["success"]][-longest:]
+                self._recent = [*self._recent, (row["success"], row["episodes"])][-longest:]
             self._guard_collapse()
             self._write_rerun()
             if is_due:
@@ -274,7 +274,8 @@ class PostTraining:
 
     def _save(self) -> None:
         self._wants_rerun = True
-        score = fmean(self._recent[-self.settings.save_freq :] or [0.0])
+        recent = self._recent[-self.settings.save_freq :]
+        score = sum(success * num for success, num in recent) / max(1, sum(num for _, num in recent))
         is_best = score > self._best
         self._best = max(score, self._best)
         state = {
@@ -296,7 +297,7 @@ class PostTraining:
         """Go back to the best checkpoint, with half of the learning rate, if success has fallen by half for long."""
         count = self.settings.collapse_iterations
         last = self._recent[-count:]
-        if not count or len(last) < count or self._best == 0 or max(last) >= 0.5 * self._best:
+        if not count or len(last) < count or self._best == 0 or max(success for success, _ in last) >= 0.5 * self._best:
             return
         folder = checkpoint.policy_folder(self.settings.out, checkpoint.BEST)
         if not folder.is_dir():  # killed after the checkpoint was written and before it was linked

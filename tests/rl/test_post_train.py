@@ -168,15 +168,15 @@ def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path
     for iteration, success in ((10, 0.6), (20, 0.8), (30, 0.5)):
         with torch.no_grad():
             bias.fill_(iteration)
-        made._iteration, made._recent = iteration, [success] * 5
+        made._iteration, made._recent = iteration, [(success, 8)] * 5
         made._guard_collapse()
         made._save()
     assert sorted(p.name for p in (tmp_path / "out" / "checkpoints").iterdir()) == ["000020", "000030", "best", "last"]
     assert bias.unique().tolist() == [30]  # 0.5 is no collapse
-    made._recent = [0.39, 0.0, 0.1, 0.2, 0.41]
+    made._recent = [(x, 8) for x in (0.39, 0.0, 0.1, 0.2, 0.41)]
     made._guard_collapse()
     assert bias.unique().tolist() == [30] and not any("warning" in line for line in lines)
-    made._recent = [0.39, 0.0, 0.1, 0.2, 0.3]
+    made._recent = [(x, 8) for x in (0.39, 0.0, 0.1, 0.2, 0.3)]
     made._guard_collapse()
     assert bias.unique().tolist() == [20] and "000020" in lines[-1]
     assert made._ppo.actor_optimizer.param_groups[0]["lr"] == pytest.approx(2.5e-6)
