@@ -110,7 +110,7 @@ class _Files:
         self._number, self._size = 0, 0
 
     def place_of(self, size: int) -> _Place:
-        """Chunk and file of the next table, of ``size`` bytes."""
+        """Which chunk and file the next table, of ``size`` bytes, is to be written into."""
         if self._size > 0 and self._size + size > self._limit:
             self._number, self._size = self._number + 1, 0
         self._size += size

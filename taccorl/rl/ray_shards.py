@@ -31,7 +31,7 @@ def start_ray() -> Any:
 
 
 class _Actor:
-    """In its own process."""
+    """A ``TwinShard`` in a process of its own, which Ray starts."""
 
     def __init__(self, envs: dict[str, Any], shard: dict[str, Any], starts: tuple[float, int]) -> None:
         self._shard = TwinShard(TaccorlVectorEnv(**envs), **shard, starts=StartStates(*starts))

@@ -78,7 +78,7 @@ class Acted:
 
 
 class World(Protocol):
-    """N environments."""
+    """Interface of the N environments in which a rollout acts."""
 
     @property
     def num_envs(self) -> int:

@@ -47,11 +47,11 @@ class ShardActed:
     seed_N: np.ndarray
     """Of the scenes of these episodes."""
     partial_N: np.ndarray
-    """Goals in place after the chunk."""
+    """How many of the task's goals are reached after the chunk, of each environment."""
 
 
 class Shard(Protocol):
-    """N environments, here or elsewhere; see ``TwinShard``."""
+    """Interface of a group of N environments, in this process (``TwinShard``) or in a Ray actor (``RayShard``)."""
 
     @property
     def num_envs(self) -> int: ...
@@ -73,7 +73,7 @@ class Shard(Protocol):
 
 
 class TwinShard:
-    """N environments."""
+    """A group of N environments that are simulated together in this process."""
 
     def __init__(
         self,

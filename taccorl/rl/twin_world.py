@@ -30,7 +30,7 @@ from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY
 
 
 def needs_images(config: Any) -> bool:
-    """Whether the policy has cameras."""
+    """Whether the policy has camera inputs, so that environments must render them."""
     return any(feature.type is FeatureType.VISUAL for feature in config.input_features.values())
 
 
@@ -176,7 +176,7 @@ class TwinWorld:
         self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
 
     def close(self) -> None:
-        """Of all environments, each in its thread."""
+        """Close all environments, each in the thread that made its OpenGL context."""
         self._each(lambda shard, *_: shard.close())
         for thread in self._threads:
             thread.shutdown()

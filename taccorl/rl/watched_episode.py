@@ -26,7 +26,7 @@ VALUE = "rl.value"
 
 @dataclass(frozen=True)
 class WatchedEpisode:
-    """One episode from its reset to its end."""
+    """Seed, actions and critic values of one finished episode of environment 0."""
 
     seed: int
     """Of the scene."""

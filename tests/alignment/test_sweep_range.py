@@ -17,7 +17,8 @@ def cycles_at_rising_zeros(wave: np.ndarray, time_s: np.ndarray) -> np.ndarray:
 
 
 def assert_is_the_sweep(wave: np.ndarray, time_s: np.ndarray) -> None:
-    """It rises through 0 at every whole cycle. (0.1 + 2.5) / 2 Hz · 10 s are 13; whether it passes the last one, rest decides."""
+    """A sweep crosses 0 upwards once a cycle: mean frequency (0.1 + 2.5) / 2 Hz times 10 s gives 13 crossings; rounding decides
+    whether the last one is inside."""
     cycles = cycles_at_rising_zeros(wave, time_s)[:12]
     np.testing.assert_allclose(cycles, np.arange(1, 13), atol=0.01)
 

@@ -73,7 +73,7 @@ def test_it_is_what_lerobot_makes_of_them(parts: list[Path], tmp_path: Path) -> 
         found, wanted = (json.loads((tmp_path / of / f"meta/{name}.json").read_text()) for of in ("ours", "theirs"))
         wanted.pop("video_path", None)  # LeRobot forgets where videos would be
         assert found.items() >= wanted.items()
-    # LeRobot's own goes through pandas, which forgets how many numbers a cell has.
+    # LeRobot's writer converts through pandas, which drops the fixed length of list columns.
     schemas = [pq.read_schema(root / "data/chunk-000/file-000.parquet") for root in (tmp_path / "ours", parts[0])]
     assert schemas[0].equals(schemas[1])
 

@@ -1,4 +1,4 @@
-"""What a resumed run takes from its folder, and what it refuses."""
+"""``--resume=true``: which settings are read from the run's settings.json, and which changed ones are refused."""
 
 import dataclasses
 from pathlib import Path

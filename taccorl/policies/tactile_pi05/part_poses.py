@@ -46,7 +46,7 @@ def num_pairs(num_bodies: int) -> int:
 
 
 def num_part_numbers(num_bodies: int) -> int:
-    """Numbers of ``PART_POSES``."""
+    """How many numbers ``PART_POSES`` has for a task with ``num_bodies`` parts."""
     return (1 + _ARMS) * _POSE * num_bodies + _PAIR * num_pairs(num_bodies)
 
 
