@@ -28,6 +28,8 @@ class Noise:
     joints_rad: float
     hand_mm: float
     """Displacement of the tool centre point, by the arm's Jacobian at the targets."""
+    offset_mm: float
+    """The same of the mean displacement over a chunk."""
     gripper_mm: float
 
 
@@ -47,16 +49,19 @@ def measure_noise(
     plain = _targets(actor, sde, batch, never, postprocess)
     arms = [ArmKinematics(arm, robot) for arm in ARMS]
     found = []
-    for k in range(sde.num_steps) if sde.num_stochastic == 1 else [-1]:
+    for k in sde.choices if sde.num_stochastic == 1 else [-1]:
         chosen = draws if k < 0 else draws._replace(step_BS=torch.full_like(draws.step_BS, k))
         noise = _targets(actor, sde, batch, chosen, postprocess) - plain
         joints = noise.reshape(*noise.shape[:2], len(ARMS), 7)
         hand_m = np.stack([hand_shift_m(arm, plain, noise, a) for a, arm in enumerate(arms)])
+        mean = noise.mean(axis=1, keepdims=True)
+        offset_m = np.stack([hand_shift_m(arm, plain, mean, a) for a, arm in enumerate(arms)])
         found.append(
             Noise(
                 step=k,
                 joints_rad=float(np.sqrt((joints[..., :6] ** 2).mean())),
                 hand_mm=1e3 * float(np.sqrt((hand_m**2).mean())),
+                offset_mm=1e3 * float(np.sqrt((offset_m**2).mean())),
                 gripper_mm=1e3 * float(np.sqrt((joints[..., 6] ** 2).mean())),
             )
         )

@@ -155,7 +155,8 @@ class PostTraining:
         for one in found:
             self._report(
                 f"noise of level {self._sde.level:g} in {'all steps' if one.step < 0 else f'step {one.step}'}: "
-                f"joints {1e3 * one.joints_rad:.2f} mrad, hand {one.hand_mm:.2f} mm, gripper {one.gripper_mm:.2f} mm (rms)"
+                f"joints {1e3 * one.joints_rad:.2f} mrad, hand {one.hand_mm:.2f} mm and {one.offset_mm:.2f} mm in the mean of a "
+                f"chunk, gripper {one.gripper_mm:.2f} mm (rms)"
             )
 
     def _check_noise(self) -> None:
