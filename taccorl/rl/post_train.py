@@ -10,6 +10,7 @@ import logging
 import math
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from taccorl.rl.exploration import measure_noise
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, RATIO_GUARD
-from taccorl.rl.ray_shards import RayShard, start_ray
+from taccorl.rl.remote_shards import ProcessShard, RayShard, start_ray
 from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
 from taccorl.rl.settings import PostTrainSettings
 from taccorl.rl.start_states import StartStates
@@ -339,8 +340,9 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
         raise TaccorlError("missing --env.task=…, such as assembly_2")
     ray = start_ray() if env.ray else None
     starts = env.start_share, max(1, env.start_states // env.shards)
-    made: list[Shard] = []
-    for numbers in np.array_split(np.arange(env.num_envs), env.shards):
+    num_threads = env.threads or max(1, len(os.sched_getaffinity(0)) // env.shards)
+
+    def make(numbers: np.ndarray) -> Shard:
         arguments: dict[str, Any] = {
             "task": env.task,
             "num_envs": len(numbers),
@@ -348,7 +350,7 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
             "twin": twin,
             "images": "on_request" if images else "never",
             "randomization": env.randomization,
-            "num_threads": min(len(numbers), env.threads or len(os.sched_getaffinity(0))),
+            "num_threads": min(len(numbers), num_threads),
             "autoreset": AutoresetMode.DISABLED,
             "max_episode_steps": env.episode_length,
             "part_poses": config.part_poses,
@@ -360,10 +362,16 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
             "first": int(numbers[0]),
         }
         if ray is not None:
-            made.append(RayShard(ray, arguments, shard, starts))
-        else:
-            made.append(TwinShard(TaccorlVectorEnv(**arguments), **shard, starts=StartStates(*starts)))
-    return made
+            return RayShard(ray, arguments, shard, starts)
+        if env.shards > 1:
+            return ProcessShard(arguments, shard, starts)
+        return TwinShard(TaccorlVectorEnv(**arguments), **shard, starts=StartStates(*starts))
+
+    parts = np.array_split(np.arange(env.num_envs), env.shards)
+    if ray is None and env.shards == 1:
+        return [make(parts[0])]
+    with ThreadPoolExecutor(env.shards) as pool:  # each compiles the twin for itself
+        return list(pool.map(make, parts))
 
 
 def _check_folder(settings: PostTrainSettings) -> None:

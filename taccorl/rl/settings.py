@@ -42,10 +42,10 @@ class EnvSettings:
     num_envs: int = 128
     """N_env: environments at once."""
     shards: int = 1
-    """Groups of environments, each in a thread of its own: while one computes in Python, physics of the others runs. Scenes do
-    not depend on it, but for those of start_share: each shard has its own states."""
+    """Groups of environments; with more than one, each is in a process of its own, since Python keeps one process from using more
+    than about ten cores. Scenes do not depend on it, but for those of start_share: each shard has its own states."""
     threads: int | None = None
-    """Of each shard; as many as there are CPUs if not given."""
+    """Of each shard; CPUs / shards if not given."""
     ray: bool = False
     """Shards are Ray actors: on this machine, or on those of the cluster that RAY_ADDRESS names. Needs the extra ray."""
     decisions: int = 36

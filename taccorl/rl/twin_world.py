@@ -1,7 +1,6 @@
 """The twin's environments for rollouts: a policy's own processors, its history of touch, pictures only where it looks.
 
-Several shards of environments compute side by side, each in a thread of its own: while one is in Python, physics of the others
-runs. What is rendered in a thread stays in it, as OpenGL wants.
+Several shards of environments compute side by side; a thread waits for each.
 
 Letters in shapes: N environments, n executed actions of a chunk, A action, L history, K taxels, P privileged numbers.
 """
@@ -176,7 +175,7 @@ class TwinWorld:
         self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
 
     def close(self) -> None:
-        """Close all environments, each in the thread that made its OpenGL context."""
+        """Close all environments, each in the thread that called it before: its OpenGL context may belong to that."""
         self._each(lambda shard, *_: shard.close())
         for thread in self._threads:
             thread.shutdown()

@@ -1,7 +1,10 @@
-"""Shards in Ray actors: what they give is what shards in this process give."""
+"""Shards in other processes: what they give is what a shard in this process gives."""
 
 import importlib.util
+import subprocess
 import sys
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +12,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from taccorl.errors import TaccorlError
-from taccorl.rl.ray_shards import RayShard, start_ray
+from taccorl.rl.remote_shards import ProcessShard, RayShard, RemoteShard, start_ray
 from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_shard import ShardSeen, TwinShard
 from taccorl.sim.twin import TwinConfig
@@ -34,12 +37,9 @@ def test_without_ray_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> N
         start_ray()
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="extra ray is not installed")
-def test_an_actor_gives_the_numbers_of_this_process() -> None:
-    ray = start_ray()
+def agree(there: RemoteShard) -> None:
+    """Three chunks over a time limit, and a state that goes from there to here."""
     here = TwinShard(TaccorlVectorEnv(**ENVS), **SHARD, starts=StartStates(0.5, 4))
-    there = RayShard(ray, ENVS, SHARD, (0.5, 4))
     names = ("num_envs", "task", "instruction", "part_names", "limit_steps")
     assert [getattr(there, name) for name in names] == [getattr(here, name) for name in names]
 
@@ -68,4 +68,55 @@ def test_an_actor_gives_the_numbers_of_this_process() -> None:
     check(here.observe(), there.observe())
     there.close()
     here.close()
+
+
+def test_a_process_gives_the_numbers_of_this_one() -> None:
+    agree(ProcessShard(ENVS, SHARD, (0.5, 4)))
+
+
+def test_what_environments_refuse_in_a_process_is_said_here() -> None:
+    with pytest.raises(TaccorlError, match="assembly_22"):
+        ProcessShard(ENVS | {"task": "assembly_22"}, SHARD, (0.0, 1))
+
+
+def test_a_process_that_was_killed_is_named() -> None:
+    shard = ProcessShard(ENVS, SHARD, (0.0, 1))
+    shard.restart(0)
+    shard._process.kill()
+    with pytest.raises(TaccorlError, match=r"--env\.shards.*--resume=true"):
+        shard.observe()
+    shard.close()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="extra ray is not installed")
+def test_an_actor_gives_the_numbers_of_this_process() -> None:
+    ray = start_ray()
+    agree(RayShard(ray, ENVS, SHARD, (0.5, 4)))
     ray.shutdown()
+
+
+@pytest.mark.slow
+def test_environments_end_with_the_process_that_was_killed(tmp_path: Path) -> None:
+    script = tmp_path / "make.py"
+    script.write_text(
+        "import time\n"
+        "from gymnasium.vector import AutoresetMode\n"
+        "from taccorl.rl.remote_shards import ProcessShard\n"
+        "if __name__ == '__main__':\n"
+        "    envs = {'task': 'assembly_2', 'autoreset': AutoresetMode.DISABLED}\n"
+        "    shard = ProcessShard(envs, {'history': 3, 'images': False, 'privileged': False}, (0.0, 1))\n"
+        "    print(shard._process.pid, flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    status = Path(f"/proc/{child}/status")
+    for _ in range(100):
+        if not status.exists() or "State:\tZ" in status.read_text():
+            return
+        time.sleep(0.1)
+    pytest.fail(f"process {child} goes on without its parent")
