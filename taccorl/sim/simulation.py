@@ -235,22 +235,41 @@ class Simulation(SeenScene):
         arrive = self._send(commands, num_steps, ids)
         done = 0
         step_by_step = 1 if self.effects.rewrites else num_steps
-        for end in sorted({*range(step_by_step, total + 1, step_by_step), *watched}):
+        scans = self._scan_steps(stepped, total) if self.effects.remember_touch else {}
+        for end in sorted({*range(step_by_step, total + 1, step_by_step), *watched, *scans}):
             self.arrays["ctrl"][stepped[:, None], self.action_actuators] = arrive[done // num_steps][stepped]
             stages = mujoco.mjtStage
             all_of_it = end == total or self.effects.rewrites
-            stage = stages.mjSTAGE_ACC if all_of_it else stages.mjSTAGE_VEL if end in watched else stages.mjSTAGE_NONE
+            is_seen = end in watched or end in scans
+            stage = stages.mjSTAGE_ACC if all_of_it else stages.mjSTAGE_VEL if is_seen else stages.mjSTAGE_NONE
             self.batch.step(ids, nstep=end - done, stage=stage)
             done = end
             ids = self._sound(ids, at_end=all_of_it)
             if self.effects.rewrites:
                 self.effects.feel(stepped if ids is None else ids, self.config.physics.timestep_s)
+            if end in scans:
+                self._scan(scans[end] if ids is None else np.intersect1d(scans[end], ids))
             if watch and end in watched:
                 watch.see(end)
-        if self.effects.remember_touch:
-            self.effects.scan(self.sensor.reading(*self.pads.touch(self.batch), None))
         if self.effects.past:
             self.effects.past.keep()
+
+    def _scan_steps(self, ids: np.ndarray, num_steps: int) -> dict[int, np.ndarray]:
+        """Physics step of the next ``num_steps`` → simulations of ``ids`` whose boards scan the pads after it.
+
+        Effects with a memory advance at the boards' own rate, counted from an episode's begin, as they are fitted.
+        """
+        step_s = self.config.physics.timestep_s
+        done = np.rint(self.arrays["time"][ids] / step_s)
+        per_step = self.sensor.spec.rate_hz * step_s
+        scans = [np.floor((done + step) * per_step + 1e-6) for step in range(num_steps + 1)]
+        due = {step: ids[scans[step] > scans[step - 1]] for step in range(1, num_steps + 1)}
+        return {step: chosen for step, chosen in due.items() if chosen.size}
+
+    def _scan(self, ids: np.ndarray) -> None:
+        """The pads of ``ids`` are scanned, whether somebody looks or not."""
+        if ids.size:
+            self.effects.scan(self.sensor.reading(*self.pads.touch(self.batch), None), ids)
 
     def _sound(self, ids: np.ndarray | None, *, at_end: bool) -> np.ndarray | None:
         """Those of ``ids`` that have not diverged. A simulation of NaNs would cost twenty times a sound one's time.

@@ -161,7 +161,7 @@ def test_effects_act_as_in_the_simulation_scan_by_scan(motion: TouchMotion, effe
         ideal = np.zeros((1, len(PADS), *PAD_TAXELS), np.float32)
         ideal[0, :2] = plain[k]
         np.testing.assert_allclose(added(ideal)[0, :2], seen[k], atol=2e-6, err_msg=f"frame {k}")
-        added.scan(ideal)
+        added.scan(ideal, np.arange(1))
     assert np.abs(seen[:330] - plain[:330]).max() > 1e-3
 
 

@@ -24,7 +24,7 @@ class AddedEffects:
     """Effects of N simulations. Absent ones are left out; what is left acts in the order of ``LAYERS``, then by name.
 
     A sensor takes it as one of its transforms. Looking at the pads is one thing, their passing time another: only ``scan``,
-    which ``Simulation.advance`` calls at its end, moves their memory on.
+    which ``Simulation.advance`` calls at the boards' rate, moves their memory on.
 
     Args:
         time_s: (N,) the simulations' clocks, live.
@@ -81,17 +81,28 @@ class AddedEffects:
 
     def __call__(self, reading: np.ndarray) -> np.ndarray:
         """What the pads read now where ideal ones would read ``reading`` (N, 4, 32, 12). Looking changes nothing."""
-        return self._read(reading, [{k: v.copy() for k, v in rows.items()} for rows in self._memory])
+        return self._read(reading, self._copied(np.arange(len(reading))), np.arange(len(reading)))
 
-    def scan(self, reading: np.ndarray) -> None:
-        """Remember ``reading`` (N, 4, 32, 12), what ideal pads would read now, as what there has been since the last scan."""
-        self._read(reading, self._memory)
-        self._scanned_s[:] = self._time_s
+    def scan(self, reading: np.ndarray, ids: np.ndarray) -> None:
+        """Remember ``reading`` (N, 4, 32, 12), what ideal pads would read now, as what there has been since the last scan.
 
-    def _read(self, reading: np.ndarray, memories: list[Memory]) -> np.ndarray:
-        now = np.array(self._time_s)
+        Args:
+            ids: (n,) simulations whose pads are scanned now; other rows are not used.
+        """
+        memories = self._copied(ids)
+        self._read(reading[ids], memories, ids)
+        for memory, rows in zip(self._memory, memories, strict=True):
+            for name, values in rows.items():
+                memory[name][ids] = values
+        self._scanned_s[ids] = self._time_s[ids]
+
+    def _copied(self, ids: np.ndarray) -> list[Memory]:
+        return [{name: values[ids] for name, values in rows.items()} for rows in self._memory]
+
+    def _read(self, reading: np.ndarray, memories: list[Memory], ids: np.ndarray) -> np.ndarray:
+        now = self._time_s[ids]
         for effect, memory in zip(self.present, memories, strict=True):
-            reading = effect.reading(reading, memory, now, now - self._scanned_s)
+            reading = effect.reading(reading, memory, now, now - self._scanned_s[ids])
         return reading
 
     def picture_age_s(self, camera: str) -> float:

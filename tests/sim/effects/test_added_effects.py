@@ -10,7 +10,8 @@ from press_bench import BLOCK_M, PressBench, perform, start
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, parameter
-from taccorl.sim.simulation import Simulation
+from taccorl.sim.effects.touch_lag import TouchLag
+from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.twin import TwinConfig
 
 
@@ -138,3 +139,36 @@ class Shapeless(JointEffect):
 def test_a_class_that_could_never_take_part_says_so(cls: type[Effect], said: str) -> None:
     with pytest.raises(TaccorlError, match=said):
         cls()
+
+
+def test_a_memory_advances_at_the_boards_rate_whatever_the_phase_of_its_neighbours() -> None:
+    """100 Hz are 12 of the 40 physics steps of a control step, so scans of step 36, 48, … fall within control steps.
+
+    Against the effect's own law over ideal readings that a watch takes at these instants. Simulation 1 begins a step later.
+    """
+    lag = make_effect("touch_lag", time_constant_s=0.02)
+    assert isinstance(lag, TouchLag)
+    sim, ideal = start(lag, num_sims=2), start()
+    press = sim.targets.copy()
+    press[:, 6] = BLOCK_M - 0.006
+    sim.step(press, np.array([0]))
+
+    memory, at_scan, count = lag.memory(1), [], 0
+    expected = []
+    for control_step in range(6):
+        due = [s for s in range(1, 41) if (40 * control_step + s) % 12 == 0]
+        ideal.step(press[:1], watch=Watch(due, lambda _: at_scan.append(ideal.reading())))
+        for reading in at_scan[count:]:
+            lag.scans(reading[None], memory, np.full((1, 1), 0.01))
+        count = len(at_scan)
+        since_s = (40 * (control_step + 1) % 12) * ideal.config.physics.timestep_s
+        looked = {name: values.copy() for name, values in memory.items()}
+        expected.append(lag.scans(ideal.reading()[None], looked, np.full((1, 1), since_s))[0, 0])
+    assert count == 20 and expected[-1].max() > 0.3
+
+    np.testing.assert_allclose(sim.reading()[0], expected[0], atol=1e-5)
+    for control_step in range(5):
+        sim.step(press)
+        found = sim.reading()
+        np.testing.assert_allclose(found[0], expected[control_step + 1], atol=1e-5, err_msg=f"0, {control_step}")
+        np.testing.assert_allclose(found[1], expected[control_step], atol=1e-5, err_msg=f"1, {control_step}")
