@@ -25,6 +25,8 @@ class CheckConfig:
     """Recording spec; needed for recordings."""
     pictures: bool = True
     """Look at every picture, too: finds frozen ones, takes a few seconds an episode."""
+    quick: bool = False
+    """Do not read all files of a dataset to compare them with the digests in its manifest."""
 
 
 def main(argv: list[str]) -> int:
@@ -52,13 +54,18 @@ def _check_dataset(config: CheckConfig) -> int:
     from taccorl.data.dataset import Dataset
 
     av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
+    stored = [] if config.quick else _stored_findings(config.path)
+    worst = _worst(stored)
+    if worst:  # said before a changed file may prevent the rest
+        findings_table(f"{config.path}: files", stored)
     dataset = Dataset(config.path)
-    findings = [Finding("video_count", "error", "video", text) for text in dataset.video_problems()]
+    findings = [] if worst else stored
+    findings += [Finding("video_count", "error", "video", text) for text in dataset.video_problems()]
     findings += [Finding("skipped_feature", "note", key, f"{key}: {why}") for key, why in dataset.skipped.items()]
     episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
     findings += check_recording_episodes(episodes) if len(episodes) > 1 else []
     findings_table(str(config.path), findings)
-    worst = _worst(findings)
+    worst = max(worst, _worst(findings))
     for number, episode in enumerate(episodes):
         try:
             found = check_episode(episode, pictures=config.pictures)
@@ -67,6 +74,31 @@ def _check_dataset(config: CheckConfig) -> int:
         findings_table(f"  episode {number}: {episode.num_rows} rows", found)
         worst = max(worst, _worst(found))
     return worst
+
+
+def _stored_findings(folder: Path) -> list["Finding"]:
+    """On files that are not what was stored."""
+    from taccorl.data.finding import Finding, listed, not_judged
+    from taccorl.lineage.errors import LineageError
+    from taccorl.lineage.manifest import verify
+
+    try:
+        found = verify(folder)
+    except LineageError as error:
+        return [Finding("changed_file", "error", "files", str(error))]
+    if found is None:
+        return [
+            not_judged("files", "whether files are as they were written", "no manifest of taccorl lies in meta/taccorl")
+        ]
+    advice = "copy the dataset again, or make it again from its sources"
+    findings = []
+    if found.changed:
+        text = f"{len(found.changed)} of {found.num_files} files are not what was written (SHA-256): {listed([*found.changed])}"
+        findings.append(Finding("changed_file", "error", "files", f"{text}; {advice}"))
+    if found.missing:
+        text = f"{len(found.missing)} of {found.num_files} files are missing: {listed([*found.missing])}"
+        findings.append(Finding("missing_file", "error", "files", f"{text}; {advice}"))
+    return findings
 
 
 def _check_recordings(config: CheckConfig) -> int:

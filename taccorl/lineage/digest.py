@@ -72,22 +72,22 @@ def digest_file(path: Path, cache: DigestCache | None = None) -> str:
         LineageError: ``path`` is no regular file, or changes while it is read.
     """
     path = Path(path).absolute()
-    stamp = _stamp(path)
-    if cache is not None and (known := cache.get(path, stamp)) is not None:
+    before = stamp(path)
+    if cache is not None and (known := cache.get(path, before)) is not None:
         return known
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if _stamp(path) != stamp:
+    if stamp(path) != before:
         raise LineageError(
             f"{path} changed while it was read. Is it still being recorded? Run again when it is complete."
         )
-    ctime_s = stamp[2] / 1e9
+    ctime_s = before[2] / 1e9
     if cache is not None and abs(time.time() - ctime_s) > FRESH_S:
-        cache.put(path, stamp, digest)
+        cache.put(path, before, digest)
     return digest
 
 
-def _stamp(path: Path) -> list[int]:
+def stamp(path: Path) -> list[int]:
     """Size, modification time, change time (which ``touch -d`` cannot set back) and inode."""
     try:
         info = path.stat()

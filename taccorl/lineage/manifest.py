@@ -1,21 +1,25 @@
 """The record that lies in every artefact: which stage made it, with what config, from which inputs, and its files."""
 
+import contextlib
 import functools
 import importlib.metadata
 import json
 import os
 import platform
 from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import taccorl
-from taccorl.lineage.digest import DigestCache, digest_each
+from taccorl.lineage.digest import DigestCache, digest_each, digest_file, digest_files, stamp
 from taccorl.lineage.errors import LineageError
 
 MANIFEST_PLACES = ("manifest.json", "meta/taccorl/manifest.json")  # an artefact; a LeRobot dataset
 FORMAT = 1  # under the key "taccorl_manifest": tells our manifest.json from anybody else's
 
+_VERIFIED = ".verified.json"  # beside the manifest
 RECORDED_PACKAGES = ("numpy", "scipy", "av", "h5py", "mcap", "rosbags", "pyarrow", "lerobot", "torch", "mujoco")
 
 
@@ -71,6 +75,64 @@ def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str
     listed: Collection[str] = read_manifest(folder).get("files", {})
     digests = digest_each(folder, cache, also=listed)
     return {name: digest for name, digest in digests.items() if name != place}
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What became of the files that a manifest lists."""
+
+    num_files: int
+    changed: tuple[str, ...]
+    """Relative paths of files whose content is not what was written."""
+    missing: tuple[str, ...]
+
+
+def verify(folder: Path) -> Verified | None:
+    """Read every file that the manifest in ``folder`` lists, and compare its SHA-256; None: there is no manifest of ours.
+
+    Nothing is taken from a cache. Files that were added do not count. Where nothing is wrong, a hidden file keeps that for
+    ``is_verified``, if the folder can be written.
+
+    Raises:
+        LineageError: the manifest is damaged, or a file cannot be read.
+    """
+    place = manifest_place(folder)
+    if place is None:
+        ours = folder / MANIFEST_PLACES[1]
+        if ours.is_file():
+            raise LineageError(f"{ours}: is damaged or was written by something else: it does not say what was stored")
+        return None
+    manifest = _load(folder, place)
+    files = manifest.get("files")
+    if not isinstance(files, dict) or manifest.get("digest") != digest_files(files):
+        raise LineageError(f"{folder / place}: is damaged: its list of files does not have the digest that it states")
+    missing = tuple(name for name in files if not (folder / name).is_file())
+    present = [name for name in files if name not in missing]
+    with ThreadPoolExecutor(4) as pool:
+        now = list(pool.map(lambda name: digest_file(folder / name), present))
+    changed = tuple(name for name, digest in zip(present, now, strict=True) if digest != files[name])
+    if not changed and not missing:
+        with contextlib.suppress(OSError):
+            marker = {"digest": manifest["digest"], "stamps": _stamps(folder, files)}
+            (folder / place).with_name(_VERIFIED).write_text(json.dumps(marker), encoding="ascii")
+    return Verified(len(files), changed, missing)
+
+
+def is_verified(folder: Path) -> bool:
+    """Whether ``verify`` found nothing wrong in ``folder``, and size, times and inode of its files stand as they did then."""
+    place = manifest_place(folder)
+    if place is None:
+        return False
+    try:
+        marker = json.loads((folder / place).with_name(_VERIFIED).read_bytes())
+        manifest = _load(folder, place)
+        return marker == {"digest": manifest["digest"], "stamps": _stamps(folder, manifest["files"])}
+    except (OSError, ValueError, KeyError, LineageError):
+        return False
+
+
+def _stamps(folder: Path, files: Collection[str]) -> dict[str, list[int]]:
+    return {name: stamp(folder / name) for name in files}
 
 
 @functools.cache

@@ -103,8 +103,8 @@ class ProcessShard(RemoteShard):
             result, error = self._pipe.recv()
         except (EOFError, ConnectionResetError) as end:
             raise TaccorlError(
-                "--env.shards: a process of environments ended by itself; the machine may be out of memory: lower --env.shards "
-                "or --env.num_envs, and go on from the last checkpoint with --resume=true"
+                "--env.shards: a process of environments ended by itself. If it said nothing above, the machine may be out of "
+                "memory: lower --env.shards or --env.num_envs, and go on from the last checkpoint with --resume=true"
             ) from end
         if error is not None:
             raise error

@@ -34,6 +34,7 @@ from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from taccorl.errors import DatasetError, TaccorlError
+from taccorl.lineage.manifest import is_verified, read_manifest
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.training.frame_cache import CacheRequest, Frames, open_frames
@@ -241,6 +242,17 @@ class Column:
         return torch.from_numpy(np.stack(found).astype(self._dtype)).reshape(len(rows), *self.shape)
 
 
+_warned: set[Path] = set()
+
+
+def _warn_unverified(root: Path) -> None:
+    """Say once that nobody has compared a dataset of taccorl with its manifest."""
+    if root in _warned or not read_manifest(root) or is_verified(root):
+        return
+    _warned.add(root)
+    _log.warning("%s: its files have not been compared with its manifest here: taccorl check %s", root, root)
+
+
 class FastReader(DatasetReader):
     """LeRobot's reader, where a dataset is numbers and colour videos; anything else goes LeRobot's own way."""
 
@@ -249,6 +261,7 @@ class FastReader(DatasetReader):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        _warn_unverified(Path(self.root))
         self._cache = _requested
         self.cameras: list[str] = self._meta.video_keys if _reads_pictures else []
         """Whose pictures are read."""

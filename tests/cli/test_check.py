@@ -1,5 +1,6 @@
 """``taccorl check`` on recordings and datasets: its words and its exit codes."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -139,6 +140,71 @@ def test_an_incomplete_dataset_is_one_clear_line(dataset: Path, tmp_path: Path, 
     code, text = said(copy)
     assert code == 2
     assert "data files are missing" in text
+
+
+def flip_bit(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "data/**/*.parquet",
+        "meta/episodes/**/*.parquet",
+        "meta/tasks.parquet",
+        "videos/**/*.mp4",
+        "meta/info.json",
+        "meta/taccorl/episodes.json",
+    ],
+)
+def test_one_bit_that_flipped_is_an_error_that_names_the_file(
+    pattern: str, dataset: Path, tmp_path: Path, said: Any
+) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    path = next(copy.glob(pattern))
+    flip_bit(path)
+    code, text = said(copy, "--pictures=false")
+    assert code >= 1
+    assert "changed_file" in text and path.relative_to(copy).as_posix() in " ".join(text.split())
+
+
+def test_quick_reads_no_digest(dataset: Path, tmp_path: Path, said: Any) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    with next(copy.glob("videos/**/*.mp4")).open("ab") as file:
+        file.write(b"0")
+    assert "changed_file" in said(copy, "--pictures=false")[1]
+    assert "changed_file" not in said(copy, "--pictures=false", "--quick=true")[1]
+
+
+def test_a_file_that_is_gone_is_an_error(dataset: Path, tmp_path: Path, said: Any) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    (copy / "meta" / "stats.json").unlink()
+    code, text = said(copy, "--pictures=false")
+    assert code == 1 and "missing_file" in text and "meta/stats.json" in text
+
+
+@pytest.mark.parametrize("how", ["digest of a file", "not JSON"])
+def test_a_damaged_manifest_is_an_error(how: str, dataset: Path, tmp_path: Path, said: Any) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    path = copy / "meta" / "taccorl" / "manifest.json"
+    if how == "not JSON":
+        path.write_bytes(path.read_bytes()[:-40])
+    else:
+        manifest = json.loads(path.read_text())
+        name = next(iter(manifest["files"]))
+        manifest["files"][name] = manifest["files"][name][::-1]
+        path.write_text(json.dumps(manifest))
+    code, text = said(copy, "--pictures=false")
+    assert code >= 1 and "changed_file" in text and "manifest.json" in " ".join(text.split())
+
+
+def test_a_dataset_without_a_manifest_says_that_nothing_was_compared(dataset: Path, tmp_path: Path, said: Any) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    (copy / "meta" / "taccorl" / "manifest.json").unlink()
+    text = " ".join(said(copy, "--pictures=false")[1].split())
+    assert "not_judged" in text and "no manifest of taccorl" in text and "changed_file" not in text
 
 
 # ---- what is no recording ----

@@ -1,0 +1,82 @@
+"""Whether an artefact's files are what its manifest says."""
+
+import json
+import logging
+import os
+from pathlib import Path
+
+import pytest
+
+from taccorl.lineage.digest import digest_each, digest_files
+from taccorl.lineage.errors import LineageError
+from taccorl.lineage.manifest import is_verified, verify, write_manifest
+
+PLACE = "meta/taccorl/manifest.json"
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Path:
+    (tmp_path / "data").mkdir()
+    for name in ("a", "b", "c"):
+        (tmp_path / "data" / name).write_bytes(name.encode() * 1000)
+    files = digest_each(tmp_path)
+    write_manifest(tmp_path, PLACE, {"files": files, "digest": digest_files(files)})
+    return tmp_path
+
+
+def test_untouched_files_are_what_was_stored(stored: Path) -> None:
+    assert not is_verified(stored)
+    found = verify(stored)
+    assert found is not None and (found.num_files, found.changed, found.missing) == (3, (), ())
+    assert is_verified(stored)
+    assert digest_each(stored).keys() == {"data/a", "data/b", "data/c", PLACE}, "the mark is no part of the content"
+
+
+def test_changed_and_missing_files_are_named_also_with_their_old_times(stored: Path) -> None:
+    verify(stored)
+    path = stored / "data" / "b"
+    times = path.stat()
+    path.write_bytes(b"b" * 999 + b"B")
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    (stored / "data" / "c").unlink()
+    assert not is_verified(stored)
+    found = verify(stored)
+    assert found is not None and (found.changed, found.missing) == (("data/b",), ("data/c",))
+    assert not is_verified(stored)
+
+
+def test_another_manifest_is_not_verified(stored: Path) -> None:
+    verify(stored)
+    (stored / "data" / "d").write_bytes(b"d")
+    files = digest_each(stored / "data")
+    (stored / PLACE).unlink()
+    write_manifest(stored, PLACE, {"files": {f"data/{k}": v for k, v in files.items()}, "digest": "other"})
+    assert not is_verified(stored)
+
+
+def test_a_list_of_files_that_was_changed_is_a_damaged_manifest(stored: Path) -> None:
+    manifest = json.loads((stored / PLACE).read_text())
+    del manifest["files"]["data/a"]
+    (stored / PLACE).write_text(json.dumps(manifest))
+    with pytest.raises(LineageError, match=r"manifest\.json: is damaged"):
+        verify(stored)
+
+
+def test_a_folder_of_somebody_else_has_nothing_to_compare_with(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text("{}")
+    assert verify(tmp_path) is None and not is_verified(tmp_path)
+
+
+def test_training_says_once_that_a_dataset_was_never_compared(stored: Path, caplog: pytest.LogCaptureFixture) -> None:
+    from taccorl.training.reading import _warn_unverified
+
+    with caplog.at_level(logging.WARNING, "taccorl.training.reading"):
+        for _ in range(2):
+            _warn_unverified(stored)
+        assert len(caplog.records) == 1 and f"taccorl check {stored}" in caplog.text
+        caplog.clear()
+        other = stored.with_name("other")
+        stored.rename(other)
+        verify(other)
+        _warn_unverified(other)
+        assert not caplog.records
