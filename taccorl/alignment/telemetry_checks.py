@@ -22,6 +22,7 @@ from taccorl.alignment.clock_checks import check_clock
 from taccorl.alignment.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.noise_floor import noise_floor
+from taccorl.alignment.range_end import stood_at_stop
 from taccorl.alignment.repeats import Overlay, overlay
 from taccorl.alignment.time_checks import check_time
 from taccorl.alignment.unrepeated import check_repeatability
@@ -269,6 +270,8 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
         held_s = m.time_s[end - 1] - m.time_s[first - 1]
         if held_s < FROZEN_S or np.ptp(target[rows[0] : rows[1]]) < FROZEN_MOVE:
             continue
+        if (sign := _stop_side(m, j, rows)) is not None:
+            return [_blocked(m, j, sign, rows)]
         if (jump := _moves_on(m, j, rows)) is not None:
             text = (
                 f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command goes "
@@ -296,15 +299,34 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
         at_stop = (sign * measured > furthest - 0.1 * BLOCKED_RAD) & (sign * target > furthest + BLOCKED_RAD)
         for first, end in runs(at_stop):
             if m.time_s[end - 1] - m.time_s[first] >= BLOCKED_S:
-                text = (
-                    f"{name} stands at {sign * furthest:.3f} {m.units[j]} for "
-                    f"{m.time_s[end - 1] - m.time_s[first]:.2f} s although it is commanded "
-                    f"{np.max(sign * target[first:end]) - furthest:.3f} further, {_place(m, first, end)}: a stop, "
-                    "something in its way, or the motor's limit; sweep within its range if that is not what you "
-                    "measure"
-                )
-                return [Finding("blocked", "warning", name, text, (first, end))]
+                return [_blocked(m, j, sign, (first, end))]
     return []
+
+
+def _blocked(m: Measurement, j: int, sign: float, rows: tuple[int, int]) -> Finding:
+    """A joint that stands at its furthest reading on one side (``sign``) while its command lies beyond."""
+    first, end = rows
+    furthest = float(np.nanmax(sign * m.measured[:, j]))
+    text = (
+        f"{m.signals[j]} stands at {sign * furthest:.3f} {m.units[j]} for {m.time_s[end - 1] - m.time_s[first]:.2f} s although "
+        f"it is commanded {np.max(sign * m.target[first:end, j]) - furthest:.3f} further, {_place(m, first, end)}: a stop or "
+        "something in its way (effect end_stop), or the motor's limit (effect torque_saturation); sweep within its range if "
+        "that is not what you measure"
+    )
+    return Finding("blocked", "warning", m.signals[j], text, rows)
+
+
+def _stop_side(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
+    """+1 or −1 if the joint stood at a stop at that end of its range; None if it did not, or that is not known."""
+    first, end = rows
+    measured, target = m.measured[:, j], m.target[:, j]
+    near = 0.1 * BLOCKED_RAD
+    for sign in (1.0, -1.0):
+        at_end = sign * measured[first] > np.nanmax(sign * measured) - near
+        beyond = np.max(sign * (target[first:end] - measured[first])) > BLOCKED_RAD
+        if at_end and beyond and stood_at_stop(target, measured, m.period_s, rows, sign, near):
+            return sign
+    return None
 
 
 def _moves_on(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:

@@ -10,6 +10,7 @@ from typing import Any
 from mcap.records import Channel, Schema
 
 from taccorl.data import decode
+from taccorl.data.joint_state_cdr import joint_state_decoder
 from taccorl.errors import RecordingError
 
 Decoder = Callable[[bytes], Any]
@@ -39,6 +40,8 @@ def message_decoder(channel: Channel, schema: Schema | None) -> Decoder:
 
             with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):  # it prints what it raises
                 found = Ros2().decoder_for(encoding, schema)
+            if found is not None and schema is not None and decode.type_key(schema.name) == "sensor_msgs/JointState":
+                found = joint_state_decoder(found)
         elif encoding == "protobuf":
             from mcap_protobuf.decoder import DecoderFactory as Protobuf
 

@@ -212,7 +212,10 @@ class PadArray:
         return touch
 
     def _fields(self, state: Kinematics, start: int = 0, end: int | None = None) -> Fields:
-        fields = Fields(*(getattr(state, name)[start:end] for name in KINEMATIC_FIELDS))
+        views = [getattr(state, name)[start:end] for name in KINEMATIC_FIELDS]
+        for view in views:
+            view.flags.writeable = False  # of all states alike, or Numba compiles the kernel once more (12 s)
+        fields = Fields(*views)
         if not fields.site_xmat[:, self._site[0], 2::3].any(axis=1).all():
             raise TaccorlError(
                 f"site {self.pads[0]!r} has no orientation: bind {', '.join(KINEMATIC_FIELDS)} before the batch's last step, "

@@ -34,8 +34,17 @@ def rested(motion: np.ndarray, before_s: float = 1.0, after_s: float = 1.0) -> n
     return HOME + np.concatenate([still[0], motion, still[1]])
 
 
-def answer(target: np.ndarray, friction_nm: float = 0.0, delay_s: float = 0.0, damping: float = 1.0) -> np.ndarray:
-    """(T, 14) true positions at the time of each row, before its target acts; at rest at the first. ``damping`` times K_d."""
+def answer(
+    target: np.ndarray,
+    friction_nm: float = 0.0,
+    delay_s: float = 0.0,
+    damping: float = 1.0,
+    highest_rad: np.ndarray | float = np.inf,
+) -> np.ndarray:
+    """(T, 14) true positions at the time of each row, before its target acts; at rest at the first. ``damping`` times K_d.
+
+    At ``highest_rad`` a joint hits a rigid stop and loses its speed.
+    """
     kp = np.array([*KP_NM_PER_RAD, 1500.0] * 2)
     kd = damping * np.array([*KD_NMS_PER_RAD, 40.0] * 2)
     torque = np.array([*TORQUE_FF_NM, 0.0] * 2)
@@ -49,6 +58,7 @@ def answer(target: np.ndarray, friction_nm: float = 0.0, delay_s: float = 0.0, d
             rows[k // PARTS] = q
         free = (v + step / INERTIA * (kp * (held[k] - q) + torque)) / weight
         v = np.sign(free) * np.maximum(np.abs(free) - step / INERTIA * friction_nm / weight, 0.0)
+        v = np.where((q + step * v > highest_rad) & (v > 0), 0.0, v)
         q = q + step * v
     return rows
 

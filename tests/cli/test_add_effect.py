@@ -10,14 +10,13 @@ import yaml
 
 from taccorl.alignment.measurements import Measurements
 from taccorl.cli.main import main
-from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.sim.actions import ACTION_NAMES
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin
 
 sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
-from imagined_motions import recorded
+from imagined_motions import QUICK_AGAIN, QUICK_CHIRP, QUICK_VALIDATION, recorded
 from simulated_sweeps import write_folder
 
 SIGNAL = "left_joint4"  # the paper's J3
@@ -32,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     truth = TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=TRUTH_NM, arm="left", joints=["joint4"])])
     made = [
         recorded(truth, m, k, signal=SIGNAL, stated=False, effort=True)
-        for k, m in enumerate((CHIRP, AGAIN, VALIDATION[0]))
+        for k, m in enumerate((QUICK_CHIRP, QUICK_AGAIN, QUICK_VALIDATION))
     ]
     write_folder(path / "sweeps", Measurements(tuple(made[:2]), (made[2],)), ACTION_NAMES[:7])
     save_twin(TwinConfig(), path / "twin.yaml")

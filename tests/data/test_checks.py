@@ -27,7 +27,7 @@ from taccorl.data.episode import Episode
 
 FPS = SPEC.fps
 NUM_SEEDS = 30
-FEW_SEEDS = 6
+FEW_SEEDS = 4
 
 
 def serious(findings: list[Finding]) -> list[Finding]:

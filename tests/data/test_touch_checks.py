@@ -13,7 +13,7 @@ from taccorl.data.episode import Episode
 
 FPS = SPEC.fps
 NUM_SEEDS = 30
-FEW_SEEDS = 6
+FEW_SEEDS = 4
 SEEDS = [pytest.param(k, marks=[pytest.mark.slow] * (k >= 2)) for k in range(5)]
 LEFT_A, LEFT_B, RIGHT_A, RIGHT_B = range(4)
 

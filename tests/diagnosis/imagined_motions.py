@@ -7,12 +7,32 @@ import numpy as np
 from taccorl.alignment.joint_model import JointModel, joint_motion
 from taccorl.alignment.measurement import Measurement
 from taccorl.diagnosis.excitation import imagined, rest_pose, room_of
-from taccorl.diagnosis.motions import Motion
+from taccorl.diagnosis.motions import RATE_HZ, Motion, Room, chirp
 from taccorl.sim.twin import TwinConfig
 
 SIGNAL = "left_joint5"
 NOISE_RAD = 2e-4
 NOISE_NM = 0.05
+
+
+def quick(name: str, hz: tuple[float, float], off: float = 0.0, repeat_of: str | None = None) -> Motion:
+    """A chirp of 4 s between two halves of a second of rest: half as many rows as a motion of the library has, or fewer.
+
+    Args:
+        off: how far from the middle of the range (amplitudes).
+    """
+
+    def target(room: Room) -> np.ndarray:
+        still = np.zeros(RATE_HZ // 2)
+        motion = np.concatenate([still, chirp(4.0, *hz, room.sweep_rad), still])
+        return room.middle_rad + off * room.sweep_rad + motion
+
+    return Motion(name=name, target=target, repeat_of=repeat_of)
+
+
+QUICK_CHIRP = quick("chirp", (0.2, 2.0))
+QUICK_AGAIN = quick("chirp_again", (0.2, 2.0), repeat_of="chirp")
+QUICK_VALIDATION = quick("held_chirp", (0.3, 1.7), off=-0.3)
 
 
 def recorded(

@@ -15,7 +15,7 @@ from simulated_sweeps import SIGNAL, friction, sweeps
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.compare import compare
 from taccorl.diagnosis.joints import JointFinding, diagnose_joint, mended, refitted
-from taccorl.diagnosis.report import NUMBERS, PAGE, Report, check_folder, write_report
+from taccorl.diagnosis.report import NUMBERS, PAGE, Report, Written, check_folder, write_report
 from taccorl.diagnosis.search import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
@@ -51,8 +51,13 @@ class Tags(HTMLParser):
         self.text += data
 
 
-def test_page_needs_no_other_file_and_says_where_its_data_is_from(tmp_path: Path):
-    written = write_report(small(provenance={"command": "taccorl compare sweeps"}), tmp_path / "report")
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
+    """A report without a diagnosis; tests change copies only."""
+    return write_report(small(provenance={"command": "taccorl compare sweeps"}), tmp_path_factory.mktemp("report"))
+
+
+def test_page_needs_no_other_file_and_says_where_its_data_is_from(written: Written):
     page = written.page.read_text()
     tags = Tags(page)
     assert tags.open == [], "every element is closed"
@@ -76,8 +81,8 @@ def test_numbers_are_those_of_the_comparison(tmp_path: Path):
     assert "5 mrad" in text and "-96%" in text and "mended twin" in text
 
 
-def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(tmp_path: Path):
-    write_report(small(), tmp_path)
+def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(written: Written, tmp_path: Path):
+    shutil.copytree(written.page.parent, tmp_path, dirs_exist_ok=True)
     again = write_report(small(title="the second"), tmp_path)
     assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d", again.replaced)
     assert "the second" in again.page.read_text()

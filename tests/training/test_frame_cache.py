@@ -51,9 +51,14 @@ def assert_same(ours: dict, theirs: dict, but: tuple[str, ...] = ()) -> None:
             assert ours[key] == value
 
 
-@pytest.mark.parametrize("place", ["host", "disk"])
-@pytest.mark.parametrize("windows", [WINDOWS, None])
-@pytest.mark.parametrize("episodes", [None, [0, 2]])
+# Of the eight cases those that have every pair of choices; the others are slow.
+PAIRS = [("host", WINDOWS, None), ("disk", None, None), ("host", None, [0, 2]), ("disk", WINDOWS, [0, 2])]
+OTHERS = [("disk", WINDOWS, None), ("host", None, None), ("disk", None, [0, 2]), ("host", WINDOWS, [0, 2])]
+
+
+@pytest.mark.parametrize(
+    ("place", "windows", "episodes"), [*PAIRS, *(pytest.param(*case, marks=pytest.mark.slow) for case in OTHERS)]
+)
 def test_a_batch_is_the_plain_reader_s_to_the_bit_and_the_type(root, tmp_path, monkeypatch, place, windows, episodes):
     plain = load(root, monkeypatch, None, delta_timestamps=windows, episodes=episodes)
     cached = load(root, monkeypatch, request(tmp_path, place), delta_timestamps=windows, episodes=episodes)

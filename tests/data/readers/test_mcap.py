@@ -494,7 +494,9 @@ def mutated(rng: np.random.Generator, data: bytes) -> tuple[bytes, int, int, boo
     return data[:at] + rng.integers(0, 256, length, dtype=np.uint8).tobytes() + data[at:], at, at + 1, True
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    "layout", [pytest.param(k, marks=[pytest.mark.slow] * (k in ("none", "lz4"))) for k in LAYOUTS]
+)
 def test_random_damage_costs_only_what_it_touched(tmp_path, layout):
     """150 seeded mutations a layout: flipped bytes, zeroed and scrambled stretches, bytes lost, bytes added."""
     rng = np.random.default_rng(LAYOUTS.index(layout))
