@@ -9,7 +9,7 @@ import platform
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import taccorl
@@ -106,6 +106,9 @@ def verify(folder: Path) -> Verified | None:
     files = manifest.get("files")
     if not isinstance(files, dict) or manifest.get("digest") != digest_files(files):
         raise LineageError(f"{folder / place}: is damaged: its list of files does not have the digest that it states")
+    for name in files:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise LineageError(f"{folder / place}: is damaged: lists {name!r}, which lies outside of {folder}")
     missing = tuple(name for name in files if not (folder / name).is_file())
     present = [name for name in files if name not in missing]
     with ThreadPoolExecutor(4) as pool:

@@ -62,6 +62,17 @@ def test_a_list_of_files_that_was_changed_is_a_damaged_manifest(stored: Path) ->
         verify(stored)
 
 
+@pytest.mark.parametrize("name", ["../other", "/etc/hostname", "data/../../other"])
+def test_a_file_outside_of_the_folder_is_not_read(name: str, tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (tmp_path / "other").write_bytes(b"other")
+    files = {name: "0" * 64}
+    write_manifest(folder, PLACE, {"files": files, "digest": digest_files(files)})
+    with pytest.raises(LineageError, match="outside"):
+        verify(folder)
+
+
 def test_a_folder_of_somebody_else_has_nothing_to_compare_with(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text("{}")
     assert verify(tmp_path) is None and not is_verified(tmp_path)
