@@ -85,20 +85,27 @@ def _stored_findings(folder: Path) -> list["Finding"]:
     try:
         found = verify(folder)
     except LineageError as error:
-        return [Finding("changed_file", "error", "files", str(error))]
+        return [Finding("damaged_manifest", "error", "files", str(error))]
     if found is None:
-        return [
-            not_judged("files", "whether files are as they were written", "no manifest of taccorl lies in meta/taccorl")
-        ]
+        text = "no manifest of taccorl lies in meta/taccorl"
+        if (folder / "meta" / "taccorl" / "dataset_spec.json").is_file():
+            return [
+                Finding(
+                    "no_manifest", "warning", "files", f"{text}, although taccorl wrote this dataset: copy it again"
+                )
+            ]
+        return [not_judged("files", "whether files are as they were written", text)]
     advice = "copy the dataset again, or make it again from its sources"
     findings = []
-    if found.changed:
-        text = f"{len(found.changed)} of {found.num_files} files are not what was written (SHA-256): {listed([*found.changed])}"
-        findings.append(Finding("changed_file", "error", "files", f"{text}; {advice}"))
-    if found.missing:
-        text = f"{len(found.missing)} of {found.num_files} files are missing: {listed([*found.missing])}"
-        findings.append(Finding("missing_file", "error", "files", f"{text}; {advice}"))
-    return findings
+    for check, names, what in (
+        ("changed_file", found.changed, "are not what was written (SHA-256)"),
+        ("missing_file", found.missing, "are missing"),
+        ("unreadable_file", found.unreadable, "cannot be read"),
+    ):
+        if names:
+            text = f"{len(names)} of {found.num_files} files {what}: {listed([*names])}; {advice}"
+            findings.append(Finding(check, "error", "files", text))
+    return findings or [Finding("verified", "note", "files", f"all {found.num_files} files are as they were written")]
 
 
 def _check_recordings(config: CheckConfig) -> int:

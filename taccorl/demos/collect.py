@@ -36,7 +36,7 @@ from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
-ATTEMPT_VERSION = 2
+ATTEMPT_VERSION = 3
 COLLECTION_VERSION = 2
 _MANY = 20  # attempts after which a success rate means something
 AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long

@@ -44,7 +44,7 @@ from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
-VERSION = 1  # of an episode's correction
+VERSION = 2  # of an episode's correction
 CORRECTIONS_VERSION = 1  # of the dataset
 TAKEOVERS = ("failures", "all")
 ROWS = ("dataset", "actions")

@@ -11,7 +11,7 @@ from taccorl.evaluation.rollouts import Actor, Progress, roll_out
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 
-VERSION = 1
+VERSION = 2
 
 
 def policy_episodes(

@@ -20,6 +20,7 @@ MANIFEST_PLACES = ("manifest.json", "meta/taccorl/manifest.json")  # an artefact
 FORMAT = 1  # under the key "taccorl_manifest": tells our manifest.json from anybody else's
 
 _VERIFIED = ".verified.json"  # beside the manifest
+_MISSING = "missing"
 RECORDED_PACKAGES = ("numpy", "scipy", "av", "h5py", "mcap", "rosbags", "pyarrow", "lerobot", "torch", "mujoco")
 
 
@@ -85,6 +86,8 @@ class Verified:
     changed: tuple[str, ...]
     """Relative paths of files whose content is not what was written."""
     missing: tuple[str, ...]
+    unreadable: tuple[str, ...]
+    """Relative path and reason of files that could not be read."""
 
 
 def verify(folder: Path) -> Verified | None:
@@ -94,48 +97,63 @@ def verify(folder: Path) -> Verified | None:
     ``is_verified``, if the folder can be written.
 
     Raises:
-        LineageError: the manifest is damaged, or a file cannot be read.
+        LineageError: the manifest is damaged, or cannot be read.
     """
-    place = manifest_place(folder)
+    try:
+        place = manifest_place(folder)
+    except (OSError, RecursionError) as error:
+        raise LineageError(f"{folder}: its manifest cannot be read: {error}") from error
     if place is None:
         ours = folder / MANIFEST_PLACES[1]
-        if ours.is_file():
+        if ours.exists():
             raise LineageError(f"{ours}: is damaged or was written by something else: it does not say what was stored")
         return None
     manifest = _load(folder, place)
     files = manifest.get("files")
-    if not isinstance(files, dict) or manifest.get("digest") != digest_files(files):
+    if not isinstance(files, dict) or not files or manifest.get("digest") != digest_files(files):
         raise LineageError(f"{folder / place}: is damaged: its list of files does not have the digest that it states")
     for name in files:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
             raise LineageError(f"{folder / place}: is damaged: lists {name!r}, which lies outside of {folder}")
-    missing = tuple(name for name in files if not (folder / name).is_file())
-    present = [name for name in files if name not in missing]
     with ThreadPoolExecutor(4) as pool:
-        now = list(pool.map(lambda name: digest_file(folder / name), present))
-    changed = tuple(name for name, digest in zip(present, now, strict=True) if digest != files[name])
-    if not changed and not missing:
+        found = dict(zip(files, pool.map(lambda name: _read_again(folder / name), files), strict=True))
+    seen = {name: digest for name, (digest, _, _) in found.items()}
+    result = Verified(
+        len(files),
+        changed=tuple(name for name, digest in seen.items() if digest and digest != files[name]),
+        missing=tuple(name for name, (_, _, why) in found.items() if why == _MISSING),
+        unreadable=tuple(f"{name} ({why})" for name, (_, _, why) in found.items() if why and why != _MISSING),
+    )
+    if seen == files:
         with contextlib.suppress(OSError):
-            marker = {"digest": manifest["digest"], "stamps": _stamps(folder, files)}
+            marker = {"digest": manifest["digest"], "stamps": {name: mark for name, (_, mark, _) in found.items()}}
             (folder / place).with_name(_VERIFIED).write_text(json.dumps(marker), encoding="ascii")
-    return Verified(len(files), changed, missing)
+    return result
+
+
+def _read_again(path: Path) -> tuple[str, list[int], str]:
+    """Digest of a file, its stamp of before it was read, and why there is neither."""
+    try:
+        if not path.is_file():
+            return "", [], _MISSING
+        before = stamp(path)  # a change while it is read leaves it unverified
+        return digest_file(path), before, ""
+    except (OSError, LineageError) as error:
+        return "", [], getattr(error, "strerror", None) or str(error)
 
 
 def is_verified(folder: Path) -> bool:
     """Whether ``verify`` found nothing wrong in ``folder``, and size, times and inode of its files stand as they did then."""
-    place = manifest_place(folder)
-    if place is None:
-        return False
     try:
+        place = manifest_place(folder)
+        if place is None:
+            return False
         marker = json.loads((folder / place).with_name(_VERIFIED).read_bytes())
         manifest = _load(folder, place)
-        return marker == {"digest": manifest["digest"], "stamps": _stamps(folder, manifest["files"])}
-    except (OSError, ValueError, KeyError, LineageError):
+        stamps = {name: stamp(folder / name) for name in manifest["files"]}
+        return marker == {"digest": manifest["digest"], "stamps": stamps}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, LineageError):
         return False
-
-
-def _stamps(folder: Path, files: Collection[str]) -> dict[str, list[int]]:
-    return {name: stamp(folder / name) for name in files}
 
 
 @functools.cache

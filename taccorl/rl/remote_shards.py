@@ -8,6 +8,8 @@ import contextlib
 import importlib
 import logging
 import multiprocessing
+import pickle
+import traceback
 from abc import ABC, abstractmethod
 from multiprocessing.connection import Connection
 from typing import Any
@@ -18,6 +20,9 @@ from taccorl.errors import TaccorlError
 from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_shard import ShardActed, ShardSeen, TwinShard
 from taccorl.sim.vector_env import TaccorlVectorEnv
+
+_PATIENCE_S = 5.0
+"""For a process to end when it is told to."""
 
 
 class _Worker:
@@ -101,18 +106,23 @@ class ProcessShard(RemoteShard):
     def _received(self) -> Any:
         try:
             result, error = self._pipe.recv()
-        except (EOFError, ConnectionResetError) as end:
+        except (EOFError, OSError) as end:
             raise TaccorlError(
                 "--env.shards: a process of environments ended by itself. If it said nothing above, the machine may be out of "
-                "memory: lower --env.shards or --env.num_envs, and go on from the last checkpoint with --resume=true"
+                "memory: --resume=true goes on from the last checkpoint with the same numbers; with lower --env.num_envs or "
+                "--env.shards begin in another --out from --policy.path=…/checkpoints/last/pretrained_model. (In a script of "
+                'your own, environments are made below if __name__ == "__main__":)'
             ) from end
         if error is not None:
             raise error
         return result
 
     def close(self) -> None:
-        self._pipe.close()
+        self._process.terminate()  # it holds nothing that must be saved
+        self._process.join(_PATIENCE_S)
+        self._process.kill()
         self._process.join()
+        self._pipe.close()
 
 
 def _serve(pipe: Connection, envs: dict[str, Any], shard: dict[str, Any], starts: tuple[float, int]) -> None:
@@ -126,6 +136,11 @@ def _serve(pipe: Connection, envs: dict[str, Any], shard: dict[str, Any], starts
     except (EOFError, BrokenPipeError, KeyboardInterrupt):
         return
     except Exception as error:
+        error.add_note(f"In a process of environments:\n{traceback.format_exc()}")
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # it cannot travel
+            error = RuntimeError(traceback.format_exc())
         pipe.send((None, error))
 
 

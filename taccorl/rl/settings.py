@@ -1,5 +1,6 @@
 """Settings of post-training; the defaults are the paper's table of post-training parameters. Free of torch."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -7,6 +8,7 @@ from taccorl.errors import TaccorlError, nearest
 
 _STOCHASTIC_STEPS = ("one", "last", "all")
 _TRAINED = ("expert", "all")
+_MOST_CORRELATION = 0.99
 
 
 @dataclass(kw_only=True)
@@ -104,8 +106,10 @@ class FlowSDESettings:
         """
         _at_least("noise", 1, num_steps=self.num_steps)
         _at_least("noise", 0, level=self.level, correlation=self.correlation)
-        if not self.correlation < 1:
-            raise TaccorlError(f"--noise.correlation={self.correlation:g}: 0 or more and below 1")
+        if not self.correlation <= _MOST_CORRELATION:  # beyond it float32 densities round coarsely
+            raise TaccorlError(f"--noise.correlation={self.correlation:g}: 0 to {_MOST_CORRELATION:g}")
+        if not math.isfinite(self.level):
+            raise TaccorlError(f"--noise.level={self.level:g}: is not finite")
         if self.stochastic_steps not in _STOCHASTIC_STEPS:
             known = nearest(self.stochastic_steps, _STOCHASTIC_STEPS)
             raise TaccorlError(f"--noise.stochastic_steps={self.stochastic_steps}: {known}")

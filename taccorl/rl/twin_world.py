@@ -21,6 +21,7 @@ from taccorl.evaluation.policy_actor import Processor, policy_batch, require_sam
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
+from taccorl.rl.remote_shards import RemoteShard
 from taccorl.rl.rollout import Acted, Clock, Seen
 from taccorl.rl.twin_shard import Shard, ShardActed, ShardSeen
 from taccorl.rl.watched_episode import EpisodeWatch
@@ -175,7 +176,11 @@ class TwinWorld:
         self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
 
     def close(self) -> None:
-        """Close all environments, each in the thread that called it before: its OpenGL context may belong to that."""
-        self._each(lambda shard, *_: shard.close())
+        """Close all environments; those of this process in the thread that called them before: OpenGL contexts belong to it."""
+        if all(isinstance(shard, RemoteShard) for shard in self.shards):  # also while a thread waits for one of them
+            for shard in self.shards:
+                shard.close()
+        else:
+            self._each(lambda shard, *_: shard.close())
         for thread in self._threads:
             thread.shutdown()

@@ -34,7 +34,7 @@ from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from taccorl.errors import DatasetError, TaccorlError
-from taccorl.lineage.manifest import is_verified, read_manifest
+from taccorl.lineage.manifest import MANIFEST_PLACES, is_verified
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.training.frame_cache import CacheRequest, Frames, open_frames
@@ -247,7 +247,7 @@ _warned: set[Path] = set()
 
 def _warn_unverified(root: Path) -> None:
     """Say once that nobody has compared a dataset of taccorl with its manifest."""
-    if root in _warned or not read_manifest(root) or is_verified(root):
+    if root in _warned or not any((root / place).is_file() for place in MANIFEST_PLACES[1:]) or is_verified(root):
         return
     _warned.add(root)
     _log.warning("%s: its files have not been compared with its manifest here: taccorl check %s", root, root)

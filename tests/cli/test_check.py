@@ -118,6 +118,7 @@ def test_a_bad_file_in_a_folder_does_not_hide_the_others(good: Path, tmp_path: P
 def test_a_sound_dataset_is_checked_by_the_spec_it_carries(dataset: Path, said: Any) -> None:
     code, text = said(dataset)
     assert "episode 0: " in text and "episode 1: " in text
+    assert "verified" in text and "files are as they were written" in " ".join(text.split())
     assert code == int("warning" in text)
     assert "error" not in text
 
@@ -197,14 +198,17 @@ def test_a_damaged_manifest_is_an_error(how: str, dataset: Path, tmp_path: Path,
         manifest["files"][name] = manifest["files"][name][::-1]
         path.write_text(json.dumps(manifest))
     code, text = said(copy, "--pictures=false")
-    assert code >= 1 and "changed_file" in text and "manifest.json" in " ".join(text.split())
+    assert code >= 1 and "damaged_manifest" in text and "manifest.json" in " ".join(text.split())
 
 
 def test_a_dataset_without_a_manifest_says_that_nothing_was_compared(dataset: Path, tmp_path: Path, said: Any) -> None:
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     (copy / "meta" / "taccorl" / "manifest.json").unlink()
-    text = " ".join(said(copy, "--pictures=false")[1].split())
-    assert "not_judged" in text and "no manifest of taccorl" in text and "changed_file" not in text
+    code, text = said(copy, "--pictures=false")
+    assert code == 1 and "no_manifest" in text and "changed_file" not in text
+    shutil.rmtree(copy / "meta" / "taccorl")  # now it could be anybody's
+    text = said(copy, "--pictures=false")[1]
+    assert "no manifest of taccorl" in " ".join(text.split()) and "no_manifest" not in text
 
 
 # ---- what is no recording ----

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.lineage.digest import digest_each, digest_files
+from taccorl.lineage import manifest
+from taccorl.lineage.digest import digest_each, digest_file, digest_files
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import is_verified, verify, write_manifest
 
@@ -54,10 +55,60 @@ def test_another_manifest_is_not_verified(stored: Path) -> None:
     assert not is_verified(stored)
 
 
+def test_a_file_that_changes_while_others_are_read_is_not_taken_as_verified(
+    stored: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(path: Path) -> str:
+        digest = digest_file(path)
+        if path.name == "b":
+            path.write_bytes(b"changed after it was read")
+        return digest
+
+    monkeypatch.setattr(manifest, "digest_file", read)
+    found = verify(stored)
+    assert found is not None and not found.changed
+    assert not is_verified(stored)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_a_file_that_cannot_be_read_does_not_hide_the_others(stored: Path) -> None:
+    (stored / "data" / "a").chmod(0)
+    (stored / "data" / "b").write_bytes(b"x")
+    found = verify(stored)
+    assert found is not None and found.changed == ("data/b",)
+    assert found.unreadable == ("data/a (Permission denied)",)
+
+
+def test_a_name_that_no_file_can_have_is_missing_or_unreadable(stored: Path) -> None:
+    files = {"x" * 5000: "0" * 64}
+    (stored / PLACE).unlink()
+    write_manifest(stored, PLACE, {"files": files, "digest": digest_files(files)})
+    found = verify(stored)
+    assert found is not None and len(found.missing) + len(found.unreadable) == 1
+
+
+@pytest.mark.parametrize(
+    "content",
+    ['{"files": 3}', '{"files": [1, 2]}', '{"files": {}}', "[" * 200_000, '{"files": null}'],
+)
+def test_a_manifest_of_nonsense_is_damaged_and_does_not_stop_training(
+    content: str, stored: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    from taccorl.training.reading import _warn_unverified
+
+    if content.startswith("{"):
+        content = json.dumps(json.loads((stored / PLACE).read_text()) | json.loads(content))
+    (stored / PLACE).write_text(content)
+    with pytest.raises(LineageError):
+        verify(stored)
+    _warn_unverified(stored)
+    assert "have not been compared" in caplog.text
+
+
 def test_a_list_of_files_that_was_changed_is_a_damaged_manifest(stored: Path) -> None:
-    manifest = json.loads((stored / PLACE).read_text())
-    del manifest["files"]["data/a"]
-    (stored / PLACE).write_text(json.dumps(manifest))
+    content = json.loads((stored / PLACE).read_text())
+    del content["files"]["data/a"]
+    (stored / PLACE).write_text(json.dumps(content))
     with pytest.raises(LineageError, match=r"manifest\.json: is damaged"):
         verify(stored)
 

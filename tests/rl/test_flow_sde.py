@@ -257,6 +257,7 @@ def test_last_step_alone_is_stochastic() -> None:
     assert given.step_BS.tolist() == [[3]] * 50
 
 
-def test_correlation_of_one_is_refused() -> None:
-    with pytest.raises(TaccorlError, match=r"--noise\.correlation=1"):
-        FlowSDESettings(correlation=1.0)
+@pytest.mark.parametrize("settings", [{"correlation": 1.0}, {"correlation": 0.999999}, {"level": math.inf}])
+def test_noise_without_a_density_is_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(TaccorlError, match=f"--noise.{next(iter(settings))}="):
+        FlowSDESettings(**settings)  # pyright: ignore[reportArgumentType]

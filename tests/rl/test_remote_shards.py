@@ -1,6 +1,8 @@
 """Shards in other processes: what they give is what a shard in this process gives."""
 
 import importlib.util
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -12,6 +14,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from taccorl.errors import TaccorlError
+from taccorl.rl import remote_shards
 from taccorl.rl.remote_shards import ProcessShard, RayShard, RemoteShard, start_ray
 from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_shard import ShardSeen, TwinShard
@@ -72,6 +75,21 @@ def agree(there: RemoteShard) -> None:
 
 def test_a_process_gives_the_numbers_of_this_one() -> None:
     agree(ProcessShard(ENVS, SHARD, (0.5, 4)))
+
+
+def test_an_error_in_a_process_says_where_it_arose() -> None:
+    with pytest.raises(TypeError, match="foo") as caught:
+        ProcessShard(ENVS | {"foo": 1}, SHARD, (0.0, 1))
+    assert any("_Worker" in note or "__init__" in note for note in caught.value.__notes__)
+
+
+def test_a_process_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote_shards, "_PATIENCE_S", 0.5)
+    shard = ProcessShard(ENVS, SHARD, (0.0, 1))
+    assert shard._process.pid is not None
+    os.kill(shard._process.pid, signal.SIGSTOP)
+    shard.close()
+    assert not shard._process.is_alive()
 
 
 def test_what_environments_refuse_in_a_process_is_said_here() -> None:

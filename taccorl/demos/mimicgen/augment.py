@@ -47,8 +47,8 @@ from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
-VERSION = 3  # of an attempt
-ROWS_VERSION = 1  # of a success's rows
+VERSION = 4  # of an attempt
+ROWS_VERSION = 2  # of a success's rows
 AUGMENTED_VERSION = 3  # of the dataset
 ACTIONS_VERSION = 1  # of stored actions
 _ROUND = (

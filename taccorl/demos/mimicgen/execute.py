@@ -205,7 +205,7 @@ def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
     raise NotImplementedError("the function comes with the demonstrations")
 
 
-_EXECUTION = Stage("execution", _not_yet, 1)
+_EXECUTION = Stage("execution", _not_yet, 2)
 _DATASET = Stage("executed", _not_yet, 1, manifest=f"{PROVENANCE}/manifest.json")
 
 
