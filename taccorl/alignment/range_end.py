@@ -1,4 +1,4 @@
-"""Did a joint stand still at a mechanical stop, or did its reading end there? Told apart by the time at which it moves again.
+"""Was a joint held by a mechanical stop, or did its encoder's range end there? When the reading changes again decides.
 
 Both leave a reading without change while the command lies beyond it. A joint whose *reading* ended moved on unseen: the reading
 changes when the joint's free answer to the command comes back, about a lag τ (0.1 s on a PiPER) after the command did. A joint
@@ -21,7 +21,7 @@ from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
 SETTLED_S = 0.3
-"""So long after a hold (3 τ) a joint that stood at a stop moves as if there were none."""
+"""Time after a hold in which a stop still influences the motion (three time constants τ of 0.1 s): rows in it are not fitted."""
 
 
 def stood_at_stop(
@@ -67,6 +67,6 @@ def stood_at_stop(
 
 
 def _first(reached: np.ndarray, after: int) -> int:
-    """The first row from ``after`` on; the number of rows if there is none."""
+    """The first row from ``after`` on where ``reached`` is true; the number of rows if there is none."""
     found = np.flatnonzero(reached[after:])
     return after + int(found[0]) if len(found) else len(reached)

@@ -304,7 +304,12 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
 
 
 def _blocked(m: Measurement, j: int, sign: float, rows: tuple[int, int]) -> Finding:
-    """A joint that stands at its furthest reading on one side (``sign``) while its command lies beyond."""
+    """Warning that a joint stays at the end of its measured range although its command lies beyond that end.
+
+    Args:
+        sign: +1 for the upper end, −1 for the lower end.
+        rows: first row, and last row + 1, in which it does.
+    """
     first, end = rows
     furthest = float(np.nanmax(sign * m.measured[:, j]))
     text = (

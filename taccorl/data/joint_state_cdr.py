@@ -38,7 +38,7 @@ class _Places:
 
 
 def joint_state_decoder(general: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
-    """``general`` with the short way for messages like the last one that it read."""
+    """A decoder that reads messages with the layout of the last one directly, and all others with ``general``."""
     places: _Places | None = None
 
     def decode(data: bytes) -> Any:
@@ -67,7 +67,7 @@ def _read(data: bytes, places: _Places) -> Any:
 
 
 def _places(data: bytes, message: Any) -> _Places | None:
-    """Of a message that the general decoder read; None if it does not lie as a little-endian JointState does."""
+    """Places of the values in a message that the general decoder has read; None if it has not the layout of a JointState."""
     if data[:4] != LITTLE_ENDIAN or _fields(message) != ["header", "name", *KEYS]:
         return None
     at = 12  # frame_id, a text, begins here; offsets count from behind the encapsulation, and 4 does not matter below 8

@@ -80,7 +80,7 @@ def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str
 
 @dataclass(frozen=True)
 class Verified:
-    """What became of the files that a manifest lists."""
+    """Comparison of the files that a manifest lists with the files in the folder."""
 
     num_files: int
     changed: tuple[str, ...]
@@ -132,7 +132,7 @@ def verify(folder: Path) -> Verified | None:
 
 
 def _read_again(path: Path) -> tuple[str, list[int], str]:
-    """Digest of a file, its stamp of before it was read, and why there is neither."""
+    """SHA-256 of a file, size, times and inode from before it was read, and the reason if it could not be read."""
     try:
         if not path.is_file():
             return "", [], _MISSING
@@ -143,7 +143,7 @@ def _read_again(path: Path) -> tuple[str, list[int], str]:
 
 
 def is_verified(folder: Path) -> bool:
-    """Whether ``verify`` found nothing wrong in ``folder``, and size, times and inode of its files stand as they did then."""
+    """Whether ``verify`` has found all files of ``folder`` unchanged, and their sizes, times and inodes are still the same."""
     try:
         place = manifest_place(folder)
         if place is None:

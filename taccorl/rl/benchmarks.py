@@ -1,4 +1,4 @@
-"""Figures of rollouts for post-training. ``make bench ONLY=rollout_shards``."""
+"""Benchmark of the environments that collect rollouts for post-training. ``make bench ONLY=rollout_shards``."""
 
 import dataclasses
 import os

@@ -43,11 +43,8 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
         if (opened.path / _TRAIN_CONFIG).is_file():
             shutil.copy(opened.path / _TRAIN_CONFIG, unfinished / _POLICY)
         torch.save(state, unfinished / _STATE)
-    except (
-        OSError,
-        RuntimeError,
-        SafetensorError,
-    ) as error:  # torch and safetensors have errors of their own for a full disk
+    # torch and safetensors have errors of their own for a full disk
+    except (OSError, RuntimeError, SafetensorError) as error:
         shutil.rmtree(unfinished, ignore_errors=True)
         raise TaccorlError(
             f"{folder}: cannot be written ({str(error).splitlines()[0]}): is the disk full? The last checkpoint is whole; make "

@@ -87,10 +87,8 @@ class TactileFlowPolicy(FlowPolicy):
         """
         policy.eval()
         policy.averaged, policy.config.average_decay = None, 0.0
-        policy.pose_head, policy.config.pose_loss = (
-            None,
-            0.0,
-        )  # it trained the cameras; the anchor is the flow's loss alone
+        # The pose head trained the cameras. The anchor is the loss of the flow alone.
+        policy.pose_head, policy.config.pose_loss = None, 0.0
         policy.config.num_inference_steps = num_steps
         self.policy, self.model = policy.float(), policy.model
         if settings.trained == "expert":

@@ -21,7 +21,7 @@ class FlowPPOConfig(PPOSettings, RLAlgorithmConfig):
     num_privileged: int = 0
     """Numbers of the simulator's state that the critic sees."""
     seed: int = 0
-    """Of the order of decisions, and of the anchor's rows."""
+    """Seed of the random order in which decisions are used, and of the choice of real rows for the anchor."""
     policy_config: PreTrainedConfig | None = None
 
     @classmethod

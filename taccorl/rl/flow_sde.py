@@ -93,7 +93,10 @@ class FlowSDE:
         return Draws(initial.to(device), noise.to(device), step.to(device))
 
     def mean(self, x_BHD: Tensor, v_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean (B, H, D) of x after step k, and the standard deviation (B, 1, 1) of each number where ``noisy``."""
+        """Mean (B, H, D) and standard deviation (B, 1, 1) of x after denoising step ``k_B``, in normalised actions.
+
+        Where ``noisy_BHD`` is False, the mean is that of Euler's step and the deviation does not apply.
+        """
         t = torch.tensor(self.times, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
         std = torch.tensor(self.stds, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
         euler_BHD = x_BHD + self.dt * v_BHD
@@ -105,7 +108,7 @@ class FlowSDE:
         return torch.where(noisy_BHD, euler_BHD - std**2 / (2 * t) * noise_hat_BHD, euler_BHD), std
 
     def coloured(self, z_BHD: Tensor) -> Tensor:
-        """L z: independent numbers made into noise of deviation 1 that is correlated along the chunk."""
+        """Noise L z of standard deviation 1, correlated along the chunk, from independent normal numbers z."""
         if not self.correlation:
             return z_BHD
         rho, rows = self.correlation, [z_BHD[:, 0]]

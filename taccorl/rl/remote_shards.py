@@ -22,11 +22,11 @@ from taccorl.rl.twin_shard import ShardActed, ShardSeen, TwinShard
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 _PATIENCE_S = 5.0
-"""For a process to end when it is told to."""
+"""How long ``close`` waits after SIGTERM before it sends SIGKILL [s]."""
 
 
 class _Worker:
-    """A ``TwinShard`` over there."""
+    """Holds a ``TwinShard`` in the other process and calls its methods."""
 
     def __init__(self, envs: dict[str, Any], shard: dict[str, Any], starts: tuple[float, int]) -> None:
         self._shard = TwinShard(TaccorlVectorEnv(**envs), **shard, starts=StartStates(*starts))
@@ -78,7 +78,10 @@ class RemoteShard(ABC):
 
 
 class ProcessShard(RemoteShard):
-    """In a process of this machine. A script that makes one needs ``if __name__ == "__main__":``, as multiprocessing wants."""
+    """A ``TwinShard`` in another process of this machine.
+
+    A script that makes one must do so below ``if __name__ == "__main__":``, because multiprocessing imports the script again.
+    """
 
     def __init__(self, envs: dict[str, Any], shard: dict[str, Any], starts: tuple[float, int]) -> None:
         """
@@ -126,7 +129,7 @@ class ProcessShard(RemoteShard):
 
 
 def _serve(pipe: Connection, envs: dict[str, Any], shard: dict[str, Any], starts: tuple[float, int]) -> None:
-    """In the process: make a ``_Worker``, and do what comes through the pipe until its other end is gone."""
+    """Body of the other process: make a ``_Worker`` and answer calls from the pipe until the pipe's other end is closed."""
     try:
         worker = _Worker(envs, shard, starts)
         pipe.send((worker.facts(), None))
@@ -160,7 +163,7 @@ def start_ray() -> Any:
 
 
 class RayShard(RemoteShard):
-    """In a Ray actor."""
+    """A ``TwinShard`` in a Ray actor."""
 
     def __init__(self, ray: Any, envs: dict[str, Any], shard: dict[str, Any], starts: tuple[float, int]) -> None:
         """

@@ -44,8 +44,8 @@ class EnvSettings:
     num_envs: int = 128
     """N_env: environments at once."""
     shards: int = 1
-    """Groups of environments; with more than one, each is in a process of its own, since Python keeps one process from using more
-    than about ten cores. Scenes do not depend on it, but for those of start_share: each shard has its own states."""
+    """Groups of environments. With more than one, each runs in a process of its own: in one process about 10 of 32 CPUs were busy
+    (docs/learning.md). Scenes do not depend on it, except with start_share: each group stores states of its own."""
     threads: int | None = None
     """Of each shard; CPUs / shards if not given."""
     ray: bool = False
@@ -59,10 +59,10 @@ class EnvSettings:
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
     start_share: float = 0.0
-    """Share of episodes, below 1, that begin in a state of the policy's own earlier ones, after each arm's first grasp, instead
-    of a reset. progress.jsonl counts them apart (later_success)."""
+    """Share of episodes, 0 or more and below 1, that begin in a stored state of one of the policy's earlier episodes instead of a
+    reset. States are stored after each arm has grasped its part. progress.jsonl counts these episodes apart (later_success)."""
     start_states: int = 256
-    """States that are kept for that, the newest; at least one for each shard."""
+    """Number of states that are stored for start_share. New states replace the oldest. Each shard stores at least one."""
     stagger: bool = True
     """Before the first iteration, act for an episode's length and begin episodes at random times in it, so that environments are
     in different phases of the task."""

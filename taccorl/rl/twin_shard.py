@@ -51,7 +51,7 @@ class ShardActed:
 
 
 class Shard(Protocol):
-    """Interface of a group of N environments, in this process (``TwinShard``) or another one (``RemoteShard``)."""
+    """Interface of a group of N environments that run in this process (``TwinShard``) or in another one (``RemoteShard``)."""
 
     @property
     def num_envs(self) -> int: ...

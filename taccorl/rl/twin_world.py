@@ -1,6 +1,6 @@
 """The twin's environments for rollouts: a policy's own processors, its history of touch, pictures only where it looks.
 
-Several shards of environments compute side by side; a thread waits for each.
+Several groups of environments (shards) compute at the same time. One thread for each of them waits for its results.
 
 Letters in shapes: N environments, n executed actions of a chunk, A action, L history, K taxels, P privileged numbers.
 """
@@ -176,7 +176,10 @@ class TwinWorld:
         self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
 
     def close(self) -> None:
-        """Close all environments; those of this process in the thread that called them before: OpenGL contexts belong to it."""
+        """Close all environments.
+
+        Those of this process are closed in the thread that rendered their pictures: an OpenGL context works in one thread only.
+        """
         if all(isinstance(shard, RemoteShard) for shard in self.shards):  # also while a thread waits for one of them
             for shard in self.shards:
                 shard.close()

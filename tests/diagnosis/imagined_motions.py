@@ -16,10 +16,11 @@ NOISE_NM = 0.05
 
 
 def quick(name: str, hz: tuple[float, float], off: float = 0.0, repeat_of: str | None = None) -> Motion:
-    """A chirp of 4 s between two halves of a second of rest: half as many rows as a motion of the library has, or fewer.
+    """A chirp that lasts 4 s, with 0.5 s of rest before and after it. It has at most half as many rows as the library's motions.
 
     Args:
-        off: how far from the middle of the range (amplitudes).
+        hz: lowest and highest frequency [Hz].
+        off: distance of the chirp from the middle of the joint's range, in amplitudes of the chirp.
     """
 
     def target(room: Room) -> np.ndarray:

@@ -84,9 +84,10 @@ class AddedEffects:
         return self._read(reading, self._copied(np.arange(len(reading))), np.arange(len(reading)))
 
     def scan(self, reading: np.ndarray, ids: np.ndarray) -> None:
-        """Remember ``reading`` (N, 4, 32, 12), what ideal pads would read now, as what there has been since the last scan.
+        """Advance the memory of touch effects. The reading is taken as constant since the last scan.
 
         Args:
+            reading: (N, 4, 32, 12) what pads without effects would read now, in units of the policy's normalised reading.
             ids: (n,) simulations whose pads are scanned now; other rows are not used.
         """
         memories = self._copied(ids)
