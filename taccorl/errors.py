@@ -32,10 +32,14 @@ class LostError(TaccorlError):
     """A state from which an expert cannot complete its task. Messages have no numbers: they are counted."""
 
 
+_MOST_NAMES = 60  # all effects fit, the files of a large folder do not
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
-    """`` did you mean 'x'? `` for the closest known name, else the list of all; ends without a full stop."""
+    """`` did you mean 'x'? `` for the closest known name, else the known names, at most 60; ends without a full stop."""
     names = sorted(str(k) for k in known)
     close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
     if close:
         return f"did you mean {close[0]!r}?"
-    return f"known: {', '.join(names) if names else 'none'}"
+    rest = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return f"known: {', '.join(names[:_MOST_NAMES]) if names else 'none'}{rest}"

@@ -107,7 +107,7 @@ class FlowSDESettings:
         _at_least("noise", 1, num_steps=self.num_steps)
         _at_least("noise", 0, level=self.level, correlation=self.correlation)
         if not self.correlation <= _MOST_CORRELATION:  # beyond it float32 densities round coarsely
-            raise TaccorlError(f"--noise.correlation={self.correlation:g}: 0 to {_MOST_CORRELATION:g}")
+            raise TaccorlError(f"--noise.correlation={self.correlation:g}: must be 0 to {_MOST_CORRELATION:g}")
         if not math.isfinite(self.level):
             raise TaccorlError(f"--noise.level={self.level:g}: is not finite")
         if self.stochastic_steps not in _STOCHASTIC_STEPS:
