@@ -20,9 +20,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 _MB = 1024 * 1024
+_FORMAT: dict[str, Any] = {"compression": "snappy", "use_dictionary": True}
 _DATA, _EPISODES = "data", "meta/episodes"
 _Place = tuple[int, int]  # chunk and file
-_Source = tuple[_Place, Path, Callable[[Path, Any], pa.Table]]  # where to, from where, and how it is read
+_Source = tuple[_Place, Path, "_Part"]  # where to, from where
 
 
 def has_videos(root: Path) -> bool:
@@ -54,9 +55,8 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
         part.data = {path: data.place_of(path.stat().st_size) for path in _files(part.root, _DATA)}
         part.episodes = {path: meta.place_of(path.stat().st_size) for path in _files(part.root, _EPISODES)}
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # pyarrow works outside of Python's lock
-        data.write(pool, [(place, path, part.rows_table) for part in parts for path, place in part.data.items()], tasks)
-        sources = [(place, path, part.episodes_table) for part in parts for path, place in part.episodes.items()]
-        meta.write(pool, sources, tasks, at_once=True)
+        data.write(pool, [(place, path, part) for part in parts for path, place in part.data.items()], tasks)
+        _write_episodes(destination, parts, infos[0]["features"], tasks, pool)
     tasks.write(destination)
     totals = {"total_episodes": int(episodes[-1]), "total_frames": int(rows[-1]), "total_tasks": len(tasks.names)}
     splits = {"train": f"0:{episodes[-1]}"}
@@ -85,20 +85,9 @@ class _Part:
     episodes: dict[Path, _Place] = field(default_factory=dict)
 
     def rows_table(self, path: Path, tasks: "_Tasks") -> pa.Table:
-        table = _plus(pq.read_table(path), "index", self.first_row)
+        table = _plus(_read(path), "index", self.first_row)
         table = _plus(table, "episode_index", self.first_episode)
         return _set(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
-
-    def episodes_table(self, path: Path, tasks: "_Tasks") -> pa.Table:
-        table = _without_lost_features(pq.read_table(path), _info(self.root)["features"])
-        table = _plus(table, "episode_index", self.first_episode)
-        for key in ("dataset_from_index", "dataset_to_index"):
-            table = _plus(table, key, self.first_row)
-        table = _with_own_statistics(table, self.first_row, self.first_episode, tasks)
-        was = zip(*(table[f"data/{kind}_index"].to_pylist() for kind in ("chunk", "file")), strict=True)
-        into = {_numbers(own): place for own, place in self.data.items()}
-        table = _placed(table, "data", [into[numbers] for numbers in was])
-        return _placed(table, "meta/episodes", [self.episodes[path]] * len(table))
 
 
 class _Files:
@@ -116,34 +105,65 @@ class _Files:
         self._size += size
         return divmod(self._number, self._per_chunk)
 
-    def write(
-        self, pool: ThreadPoolExecutor, sources: Sequence[_Source], tasks: "_Tasks", *, at_once: bool = False
-    ) -> None:
+    def write(self, pool: ThreadPoolExecutor, sources: Sequence[_Source], tasks: "_Tasks") -> None:
         """Each file by a thread of its own.
 
         Args:
             sources: in the order of their rows.
-            at_once: a file's tables as one, for small ones.
         """
         by_file: dict[_Place, list[_Source]] = {}
         for source in sources:
             by_file.setdefault(source[0], []).append(source)
 
-        def tables(own: list[_Source]) -> Iterator[pa.Table]:
-            made = (table(path, tasks) for _, path, table in own)
-            yield from [pa.concat_tables(made)] if at_once else made
-
         def one(place: _Place) -> None:
-            path = self._root / self._kind / f"chunk-{place[0]:03d}" / f"file-{place[1]:03d}.parquet"
-            path.parent.mkdir(parents=True, exist_ok=True)
+            path = _path(self._root, self._kind, place)
             writer: pq.ParquetWriter | None = None
-            for table in tables(by_file[place]):
-                writer = writer or pq.ParquetWriter(path, table.schema, compression="snappy", use_dictionary=True)
+            for _, source, part in by_file[place]:
+                table = part.rows_table(source, tasks)
+                writer = writer or pq.ParquetWriter(path, table.schema, **_FORMAT)
                 writer.write_table(table)
             if writer is not None:
                 writer.close()
 
         list(pool.map(one, by_file))
+
+
+def _write_episodes(
+    destination: Path, parts: Sequence[_Part], features: dict[str, Any], tasks: "_Tasks", pool: ThreadPoolExecutor
+) -> None:
+    """The tables of episodes, changed all together: one by one they took most of the time of a merge."""
+    sources = [(place, path, part) for part in parts for path, place in part.episodes.items()]
+    read = list(pool.map(lambda source: _without_lost_features(_read(source[1]), features), sources))
+    for place in dict.fromkeys(source[0] for source in sources):
+        own = [(table, part) for table, (to, _, part) in zip(read, sources, strict=True) if to == place]
+        table = pa.concat_tables(table for table, _ in own)
+        part_of = [part for table, part in own for _ in range(len(table))]
+        first_rows, first_episodes = (
+            np.array([getattr(p, key) for p in part_of]) for key in ("first_row", "first_episode")
+        )
+        table = _plus(table, "episode_index", first_episodes)
+        for key in ("dataset_from_index", "dataset_to_index"):
+            table = _plus(table, key, first_rows)
+        table = _with_own_statistics(table, first_rows, first_episodes, tasks)
+        was = zip(*(table[f"data/{kind}_index"].to_pylist() for kind in ("chunk", "file")), strict=True)
+        into = {part: {_numbers(path): to for path, to in part.data.items()} for part in dict.fromkeys(part_of)}
+        table = _placed(table, "data", [into[part][numbers] for part, numbers in zip(part_of, was, strict=True)])
+        table = _placed(table, "meta/episodes", [place] * len(table))
+        with pq.ParquetWriter(_path(destination, _EPISODES, place), table.schema, **_FORMAT) as writer:
+            writer.write_table(table)
+
+
+def _read(path: Path) -> pa.Table:
+    """``pq.read_table`` takes twice as long for a small file of many columns."""
+    with pq.ParquetFile(path) as file:
+        return file.read()
+
+
+def _path(root: Path, kind: str, place: _Place) -> Path:
+    """Of a Parquet file; its folder is made."""
+    path = root / kind / f"chunk-{place[0]:03d}" / f"file-{place[1]:03d}.parquet"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 class _Tasks:
@@ -168,13 +188,16 @@ class _Tasks:
         frame.to_parquet(root / "meta/tasks.parquet")
 
 
-def _with_own_statistics(table: pa.Table, first_row: int, first_episode: int, tasks: _Tasks) -> pa.Table:
+def _with_own_statistics(
+    table: pa.Table, first_rows: np.ndarray, first_episodes: np.ndarray, tasks: _Tasks
+) -> pa.Table:
     """Of rows' and episodes' numbers, which are others here, and of tasks, as LeRobot tells them of an episode's instructions."""
-    for key, more in (("index", first_row), ("episode_index", first_episode)):
+    for key, more in (("index", first_rows), ("episode_index", first_episodes)):
         for name in set(_STATISTICS) - {"std"}:
             column = f"stats/{key}/{name}"
             if column in table.column_names:
-                moved = [[x + more for x in cell] for cell in table[column].to_pylist()]
+                cells = zip(table[column].to_pylist(), more.tolist(), strict=True)
+                moved = [[x + plus for x in cell] for cell, plus in cells]
                 table = _set(table, column, _like(moved, table, column))
     number = {name: k for k, name in enumerate(tasks.names)}
     ids = [np.array([number[name] for name in names], dtype=float) for names in table["tasks"].to_pylist()]
@@ -218,8 +241,10 @@ def _numbers(path: Path) -> tuple[int, int]:
     return int(path.parent.name.removeprefix("chunk-")), int(path.stem.removeprefix("file-"))
 
 
-def _plus(table: pa.Table, key: str, more: int) -> pa.Table:
-    return _set(table, key, pc.add(table[key], more))  # pyright: ignore[reportAttributeAccessIssue]
+def _plus(table: pa.Table, key: str, more: int | np.ndarray) -> pa.Table:
+    """Args: more: one number, or one for each row."""
+    plus = pa.array(more) if isinstance(more, np.ndarray) else more
+    return _set(table, key, pc.add(table[key], plus))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _placed(table: pa.Table, prefix: str, places: Sequence[tuple[int, int]]) -> pa.Table:
