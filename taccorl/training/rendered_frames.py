@@ -2,7 +2,8 @@
 
 The artefact is that of ``frame_cache``: the same stage, key and files, so that ``lerobot-train --dataset.cache=…`` finds it. Each
 worker renders the cameras of whole episodes at the size of the dataset's pictures, resizes them as the policy does, and writes
-the rows of these episodes into the memory-mapped arrays.
+the rows of these episodes into the memory-mapped arrays. An episode whose frames are in the store already, as one of another
+dataset, is copied: demonstrations are rendered once, however often corrections join them.
 """
 
 import dataclasses
@@ -10,6 +11,7 @@ import functools
 import multiprocessing
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +19,13 @@ import numpy as np
 import torch
 
 from taccorl.data.dataset import Dataset
-from taccorl.demos.mimicgen.execute import mean_seconds
+from taccorl.demos.mimicgen.execute import DATASET_STAGE, mean_seconds
 from taccorl.demos.mimicgen.from_dataset import simulation_told
 from taccorl.demos.recorder import PICTURE
 from taccorl.errors import DatasetError
+from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine
+from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
@@ -52,11 +56,16 @@ def render_frames(
         for key in cameras:
             shape = tuple(dataset.info["features"][key]["shape"][:2])
             empty_frames(out_dir, key, num_rows, config.resolution or shape).flush()
+        rendered = _rendered_before(store, config)
+        executions = _executions(inputs[0]) or [""] * dataset.num_episodes
         found = engine.map(
-            functools.partial(_render_episode, inputs[0], out_dir, config.resolution),
-            range(dataset.num_episodes),
-            on_done=lambda i, _: progress(f"episode {i} of {dataset.num_episodes}: rendered"),
-            name=lambda i: f"episode {i}",
+            functools.partial(_fill_episode, inputs[0], out_dir, config.resolution),
+            [
+                _Item(i, dataset.first_row(i), dataset.num_rows(i), rendered.get(key))
+                for i, key in enumerate(executions)
+            ],
+            on_done=lambda item, _: progress(f"{item} of {dataset.num_episodes}: {item.done}"),
+            name=str,
         )
         seconds.extend(found)
 
@@ -64,8 +73,67 @@ def render_frames(
     return artefact, mean_seconds(seconds)
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Of an episode's frames in the store."""
+
+    folder: Path
+    """Artefact of frames."""
+    first_row: int
+
+
+@dataclass(frozen=True)
+class _Item:
+    """An episode whose frames are wanted."""
+
+    index: int
+    first_row: int
+    num_rows: int
+    known: _Place | None
+    """Where its frames are; None: nowhere yet."""
+
+    def __str__(self) -> str:
+        return f"episode {self.index}"
+
+    @property
+    def done(self) -> str:
+        return "rendered" if self.known is None else "copied"
+
+
+def _executions(root: Path) -> list[str]:
+    """Digest of the execution that each episode of the dataset was made of; empty if the dataset does not say so."""
+    manifest = read_manifest(root)
+    inputs = manifest["inputs"] if manifest and manifest["stage"] == DATASET_STAGE else []
+    return [entry["digest"] for entry in inputs]
+
+
+def _rendered_before(store: Store, config: FramesConfig) -> dict[str, _Place]:
+    """Digest of an execution → its frames at this resolution. Only of datasets that are still there, as they were."""
+    found: dict[str, _Place] = {}
+    for folder in store.artefacts():
+        manifest = read_manifest(folder) if folder.parent.name == FRAMES.name else {}
+        if not manifest or (manifest["config"], manifest["stage_version"]) != (canonical(config), FRAMES.version):
+            continue
+        root = Path(manifest["inputs"][0]["path"])
+        executions = _executions(root) if root.is_dir() else []
+        if executions and store.source(root).digest == manifest["inputs"][0]["digest"]:
+            dataset = Dataset(root)
+            found |= {key: _Place(folder, dataset.first_row(i)) for i, key in enumerate(executions)}
+    return found
+
+
+def _fill_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | None, item: _Item) -> dict[str, float]:
+    """Every frame of an episode into its rows; returns the seconds of rendering and of resizing and writing, none if copied."""
+    if item.known is None:
+        return _render_episode(root, out_dir, resolution, item.index)
+    for path in out_dir.glob("*.npy"):
+        there = np.load(item.known.folder / path.name, mmap_mode="r")
+        here = np.load(path, mmap_mode="r+")
+        here[item.first_row :][: item.num_rows] = there[item.known.first_row :][: item.num_rows]
+    return {}
+
+
 def _render_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | None, i: int) -> dict[str, float]:
-    """Every frame of an episode into its rows; returns the seconds of rendering and of resizing and writing."""
     if multiprocessing.parent_process() is not None:
         torch.set_num_threads(1)  # as many workers as cores
     dataset, sim = _opened(root)

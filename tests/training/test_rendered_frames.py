@@ -1,6 +1,7 @@
 """Datasets whose pictures are frames in the cache alone: the numbers of the video form, frames as rendered, refused elsewhere."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import av
@@ -117,3 +118,35 @@ def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected
     request = CacheRequest(place="host", resolution=(28, 28), store=tmp_path / "store", device="cpu")
     (batch,) = load(tmp_path / "cache", monkeypatch, request).__getitems__([100])
     np.testing.assert_array_equal(batch[FRONT][0].numpy(), np.load(artefact.path / f"{FRONT}.npy")[100])
+
+
+@pytest.mark.slow
+def test_frames_of_an_episode_are_rendered_once_and_copied_into_the_next_dataset(collected, tmp_path, monkeypatch):
+    store, said = Store(tmp_path / "store"), []
+    for seed in (0, 1):
+        plan = AugmentPlan(spec=load_mimic_spec("assembly_2"), episodes=1, rows="actions", seed=seed)
+        augment(plan, collected, tmp_path / f"actions_{seed}", store, progress=lambda _: None)
+    sources = (tmp_path / "actions_1", tmp_path / "actions_0")
+
+    def made(name: str, sources: tuple[Path, ...], size: tuple[int, int] = (28, 28)) -> tuple[Dataset, np.ndarray]:
+        execute_stored(ExecutePlan(sources=sources, pictures="cache"), tmp_path / name, store, progress=lambda _: None)
+        said.clear()
+        artefact, _ = render_frames(tmp_path / name, size, store, LocalEngine(), said.append)
+        return Dataset(tmp_path / name), np.load(artefact.path / f"{FRONT}.npy")
+
+    _, frames_of_one = made("one", sources[1:])
+    assert said == ["episode 0 of 1: rendered"]
+    both, frames_of_both = made("both", sources)
+    assert said == ["episode 0 of 2: rendered", "episode 1 of 2: copied"]
+    first = both.first_row(1)
+    assert first == both.num_rows(0) > 0
+    np.testing.assert_array_equal(frames_of_both[first:], frames_of_one)
+    assert frames_of_both[:first].std() > 10  # the other was rendered, too
+
+    made("one again", sources[1:], (14, 14))
+    assert said == ["episode 0 of 1: rendered"], "another resolution"
+    with (tmp_path / "both" / "meta" / "info.json").open("a") as file:  # no longer what its frames were made of
+        file.write(" ")
+    shutil.rmtree(tmp_path / "one")
+    made("twice", sources[::-1])
+    assert said == ["episode 0 of 2: rendered", "episode 1 of 2: rendered"]

@@ -37,6 +37,8 @@ from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 
 PicturesAs = Literal["video", "cache", "none"]
+DATASET_STAGE = "executed"
+"""Stage of the dataset; its inputs are the executions, one an episode."""
 _SECONDS = ("physics", "touch", "writing")
 _SAME = ("task", "difficulty", "twin", "randomization")  # of all sources
 
@@ -206,7 +208,7 @@ def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
 
 
 _EXECUTION = Stage("execution", _not_yet, 2)
-_DATASET = Stage("executed", _not_yet, 1, manifest=f"{PROVENANCE}/manifest.json")
+_DATASET = Stage(DATASET_STAGE, _not_yet, 1, manifest=f"{PROVENANCE}/manifest.json")
 
 
 @dataclass(frozen=True)
