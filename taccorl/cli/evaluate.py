@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
+from taccorl.lineage.destinations import is_free
 
 if TYPE_CHECKING:
     from taccorl.evaluation.evaluate import Scenes
@@ -182,7 +183,7 @@ def _check_places(config: EvaluateConfig) -> None:
     Raises:
         TaccorlError: something lies at ``out``.
     """
-    if config.out.exists() and not (config.out.is_dir() and not any(config.out.iterdir())):
+    if not is_free(config.out):
         raise TaccorlError(
             f"--out={config.out}: holds files already; nothing was touched: give another folder, or move it away"
         )

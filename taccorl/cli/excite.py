@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
+from taccorl.lineage.destinations import is_free
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,7 +60,7 @@ def main(argv: list[str]) -> int:
     """0: something tells them apart; 1: nothing does."""
     config = parse(ExciteConfig, argv, positional="joint")
     part = _part(config)
-    if config.out.exists():
+    if not is_free(config.out):
         raise TaccorlError(f"{config.out}: is there already; give another --out, or remove it")
     from taccorl.alignment.measurements import read_measurements
     from taccorl.cli.measured import twin_of
@@ -262,7 +263,7 @@ def _one_way(found: "Plan", pair: str, rows: Sequence[Sequence[str]]) -> str:
 def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
     from taccorl.diagnosis.motions import RATE_HZ
 
-    config.out.mkdir(parents=True)
+    config.out.mkdir(parents=True, exist_ok=True)
     entries = []
     for number, p in enumerate(found.planned[: config.num], 1):
         name = f"{number}_{p.motion.name}.csv"
@@ -294,7 +295,7 @@ def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
 def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
     from taccorl.diagnosis.motions import RATE_HZ
 
-    config.out.mkdir(parents=True)
+    config.out.mkdir(parents=True, exist_ok=True)
     gripper = f"{config.pads}_gripper"
     entries = []
     for number, p in enumerate(found.planned[: config.num], 1):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError
+from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
             raise DatasetError(f"{place}: {folder} is no folder")
         if not os.access(folder, os.W_OK | os.X_OK):
             raise DatasetError(f"{place}: nothing may be written in {folder}")
-    if out.exists() and not config.replace:
+    if not is_free(out) and not config.replace:
         _check_same(out, jobs)
 
 

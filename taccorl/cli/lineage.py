@@ -6,7 +6,6 @@ prune    what no dataset was made from; deletes it only with --yes=true. Dataset
          count by themselves; name moved or copied ones with --keep
 """
 
-import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,7 +68,7 @@ def _prune(argv: list[str]) -> int:
     from taccorl.cli.parse import parse
     from taccorl.lineage.prune import delete, open_store, unneeded
 
-    config = parse(PruneConfig, join_repeated(argv, "keep"), prog="taccorl lineage prune")
+    config = parse(PruneConfig, argv, prog="taccorl lineage prune")
     store = open_store(config.store)
     folders = unneeded(store, config.keep)
     for folder in folders:
@@ -94,15 +93,6 @@ def _prune(argv: list[str]) -> int:
     for folder in busy:
         print(f"Left alone, as a run is using it now: {folder.path}", file=sys.stderr)
     return 0
-
-
-def join_repeated(argv: list[str], name: str) -> list[str]:
-    """``--keep=a --keep=b`` as the one list that draccus reads, ``--keep=["a", "b"]``."""
-    prefix = f"--{name}="
-    values = [word.removeprefix(prefix) for word in argv if word.startswith(prefix)]
-    if not values or values[0].startswith("["):
-        return argv
-    return [word for word in argv if not word.startswith(prefix)] + [prefix + json.dumps(values)]
 
 
 def _count(number: int, noun: str) -> str:

@@ -28,6 +28,9 @@ VERBS = {
         "view": "an episode in Rerun: pictures, touch, joints, arms",
     },
     "store": {"lineage": "what was made from what: `lineage explain PATH`, `lineage prune`"},
+    "shell": {
+        "completion": "`completion bash`, `zsh` or `fish`: a script that completes verbs, options and files there"
+    },
 }
 
 

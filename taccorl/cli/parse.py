@@ -1,4 +1,5 @@
-"""Config dataclass from a command line, in the syntax of lerobot-train (draccus): ``--a.b=c``, ``--config_path=file.yaml``.
+"""Config dataclass from a command line, in the syntax of lerobot-train (draccus): ``--a.b=c`` or ``--a.b c``,
+``--config_path=file.yaml``.
 
 Bare words fill one named field: ``taccorl view episode.mcap`` is ``taccorl view --path=episode.mcap``.
 """
@@ -6,6 +7,7 @@ Bare words fill one named field: ``taccorl view episode.mcap`` is ``taccorl view
 import argparse
 import dataclasses
 import json
+import re
 import sys
 import types
 import typing
@@ -16,6 +18,8 @@ from typing import Any
 from taccorl.errors import TaccorlError, nearest
 
 HELP = ("-h", "--help")
+_BOOLEANS = ("true", "false", "yes", "no", "on", "off", "y", "n", "1", "0")  # what YAML or Python may take for one
+_NEGATIVE = re.compile(r"-\.?\d.*")
 
 
 def parse[ConfigT](
@@ -30,6 +34,7 @@ def parse[ConfigT](
     Raises:
         TaccorlError: unknown option, value of the wrong type, missing or surplus word.
     """
+    argv = joined(argv)
     words = [a for a in argv if not a.startswith("-")]
     options = [a for a in argv if a.startswith("-")]
     hints = typing.get_type_hints(config_class)
@@ -62,12 +67,25 @@ def parse[ConfigT](
     return dataclasses.replace(_draccus(config_class, rest), **texts)  # pyright: ignore[reportArgumentType]
 
 
+def joined(argv: Sequence[str]) -> list[str]:
+    """``--a b`` as ``--a=b``. Every option takes a value; one that begins with a minus is a number."""
+    found: list[str] = []
+    for word in argv:
+        before = found[-1] if found else ""
+        takes_value = before.startswith("--") and "=" not in before and before not in HELP
+        if takes_value and (not word.startswith("-") or _NEGATIVE.fullmatch(word)):
+            found[-1] = f"{before}={word}"
+        else:
+            found.append(word)
+    return found
+
+
 def given_names(argv: Sequence[str]) -> set[str]:
     """Names of the options in ``argv`` and in its --config_path, after ``parse`` has accepted them: ``out``, ``ppo.clip``."""
     import yaml
 
     names: set[str] = set()
-    for option in argv:
+    for option in joined(argv):
         name, _, value = option.removeprefix("--").partition("=")
         if name == "config_path":
             names |= set(_flat(yaml.safe_load(_path(value).read_text(encoding="utf-8"))))
@@ -125,6 +143,8 @@ def _check_option(option: str, hints: dict[str, Any]) -> None:
         raise TaccorlError(f"unknown option {option!r}; {nearest(name, known)}")
     if not equals or not value:
         raise TaccorlError(f"option {option!r} needs a value: --{name}=…")
+    if hints.get(name) is bool and value.lower() not in _BOOLEANS:
+        raise TaccorlError(f"option --{name} takes a bool, found {value!r}: --{name}=true")
     if value in getattr(hints.get(name), "get_known_choices", dict)():
         raise TaccorlError(f"{option}: one of several kinds, say --{name}.type={value}")
 

@@ -13,6 +13,7 @@ from typing import Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
+from taccorl.lineage.destinations import is_free
 
 
 @dataclass(kw_only=True)
@@ -50,7 +51,7 @@ def main(argv: list[str]) -> int:
     if config.secret is None or config.secret < 0:
         raise TaccorlError("missing --secret=, a whole number of at least 0; --help says more")
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
-    if out.exists():
+    if not is_free(out):
         raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
     made = _sweeps(config, config.secret, out) if config.pads == "no" else _presses(config, config.secret, out)
     print(f"{made} in {out / SWEEPS}: a simulated robot, not a real one")

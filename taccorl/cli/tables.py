@@ -1,9 +1,11 @@
 """What the verbs print: tables and progress bars, readable in a narrow terminal and in a log file."""
 
+import sys
+import time
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -11,6 +13,8 @@ from taccorl.data.inspection import Inventory
 
 WIDE = 150
 """Columns of a log file or pipe, which has no width of its own."""
+LINE_EVERY_S = 5.0
+"""Seconds between two lines of progress where there is no terminal for a bar."""
 LONG_TEXT = 400
 """Characters of a metadata record to show: rosbag2 writes pages of settings into one."""
 COLORS = {"written": "green", "split": "yellow", "quarantined": "red", "refused": "red"}
@@ -30,7 +34,10 @@ def console() -> Console:
 
 
 class Bars:
-    """Progress over recordings: rows of the one at work, or recordings done when several are at work."""
+    """Progress over recordings on stderr: rows of the one at work, or recordings done when several are at work.
+
+    A bar in a terminal; elsewhere a line every ``LINE_EVERY_S`` with rate and time left.
+    """
 
     def __init__(self, num_recordings: int) -> None:
         columns = (
@@ -38,23 +45,39 @@ class Bars:
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
+            TimeRemainingColumn(),
         )
         self._progress = Progress(*columns, transient=True, console=Console(stderr=True))
         self._num = num_recordings
         self._task: Any = None
-        self._name = ""
+        self._line_s = time.monotonic()
+        self._begin = (0, 0, self._line_s)
+        """Total, number done and time [s] where the rate is measured from."""
 
     def __enter__(self) -> "Bars":
-        self._progress.start()
+        if self._progress.console.is_terminal:
+            self._progress.start()
         self._task = self._progress.add_task(f"reading ({self._num} recordings)", total=None)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._progress.stop()
+        if self._progress.console.is_terminal:
+            self._progress.stop()
 
     def update(self, name: str, done: int, total: int) -> None:
         """``done`` of ``total`` of the recording ``name``."""
         self._progress.update(self._task, description=_shorten(name), completed=done, total=total)
+        if self._progress.console.is_terminal:
+            return
+        now_s = time.monotonic()
+        if self._begin[0] != total or done < self._begin[1]:
+            self._begin = (total, done, now_s)
+        if now_s - self._line_s >= LINE_EVERY_S:
+            self._line_s = now_s
+            _, first, first_s = self._begin
+            rate_hz = (done - first) / (now_s - first_s) if now_s > first_s else 0.0
+            left = f", {rate_hz:.3g}/s, {(total - done) / rate_hz:.0f} s left" if rate_hz else ""
+            print(f"{name}: {done} of {total}{left}", file=sys.stderr, flush=True)
 
 
 def ingest_table(report: dict[str, Any]) -> None:

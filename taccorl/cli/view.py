@@ -140,7 +140,7 @@ def _write(config: ViewConfig, episode: "Episode") -> bool:
     if config.screenshot is not None:  # last: it alone needs what a machine may lack
         from taccorl.views.screenshot import screenshot
 
-        who = screenshot(episode, config.screenshot)
+        who = screenshot(episode, config.screenshot, progress=lambda text: print(text, file=sys.stderr, flush=True))
         print(f"wrote {config.screenshot}, drawn by {who}")
     return any(path is not None for path in (config.save, config.screenshot, config.sheet))
 

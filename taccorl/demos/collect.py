@@ -8,7 +8,6 @@ import abc
 import dataclasses
 import functools
 import json
-import os
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -28,6 +27,7 @@ from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.demos.twin_recording import write_twin_mcap
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
 from taccorl.lineage.canonical import canonical
+from taccorl.lineage.destinations import is_free
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
@@ -217,7 +217,7 @@ REPORT = "collect_report.json"
 
 def _check_out(plan: Plan, out: Path, store: Store) -> None:
     """Refuses what cannot be the dataset of this plan: hours of attempts would end at the store's refusal."""
-    if os.path.lexists(out) and not _may_be_of(plan, out, store):
+    if not is_free(out) and not _may_be_of(plan, out, store):
         raise in_the_way(out, _COLLECTION, plan.task)
 
 
@@ -325,7 +325,7 @@ def collect_recordings(plan: Plan, out: Path, progress: Progress = print) -> lis
     Raises:
         TaccorlError: ``out`` holds something already.
     """
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+    if not is_free(out):
         raise TaccorlError(f"{out} holds files already; nothing was touched: give another folder")
     sim = plan.make()
     spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)

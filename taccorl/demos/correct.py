@@ -11,7 +11,6 @@ Letters in shapes: T control steps of the policy's episode.
 import dataclasses
 import functools
 import json
-import os
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -34,6 +33,7 @@ from taccorl.demos.mimicgen.stored_actions import CORRECTION, write_stored
 from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.errors import LostError, TaccorlError, UnreachableError, nearest
 from taccorl.lineage.canonical import canonical
+from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.processes import Care, Failed
@@ -368,7 +368,7 @@ def check_out(plan: CorrectionPlan, out: Path) -> None:
     """
     manifest = read_manifest(out) if out.is_dir() else None
     is_ours = manifest and manifest["stage"] == _stage(plan).name and manifest["config"] == _dataset_config(plan)
-    if os.path.lexists(out) and not is_ours:
+    if not is_free(out) and not is_ours:
         raise in_the_way(out, _stage(plan), plan.task)
 
 

@@ -8,6 +8,11 @@ from taccorl.lineage.digest import digest_bytes
 from taccorl.lineage.manifest import read_manifest
 
 
+def is_free(path: Path) -> bool:
+    """True if nothing is at ``path``, or an empty folder."""
+    return not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
+
+
 class Destinations:
     """The paths outside a store that it published to, each with the key of what it put there last."""
 

@@ -6,6 +6,7 @@ there (``.DS_Store``, ``.cache``), and they are no data. What a stage wrote is d
 A link to a file counts as the file; a link to a folder is refused.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -38,27 +39,38 @@ def digest_files(files: Mapping[str, str]) -> str:
 class DigestCache:
     """Digests of files by path, valid while size, times and inode stand still.
 
-    One small file per entry, renamed into place: processes need no lock and lose no entry of one another.
+    One small file per entry, renamed into place: processes need no lock and lose no entry of one another. As long as the
+    parent of ``folder`` is not there, entries are kept in memory: a command that is refused makes no store.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._kept: dict[Path, str] = {}
 
     def get(self, path: Path, stamp: list[int]) -> str | None:
         """The digest of ``path`` if it was recorded under the same ``stamp``."""
+        file = self._entry(path)
         try:
-            entry = json.loads(self._entry(path).read_text())
+            entry = json.loads(self._kept[file] if file in self._kept else file.read_text())
             return entry["digest"] if entry["stamp"] == stamp else None
         except (OSError, ValueError, KeyError, TypeError):  # absent, or torn by a power cut: read the file again
             return None
 
     def put(self, path: Path, stamp: list[int], digest: str) -> None:
         """Remember ``digest``."""
-        entry = self._entry(path)
-        entry.parent.mkdir(parents=True, exist_ok=True)
-        temp = entry.with_name(f"{entry.name}.{os.getpid()}-{os.urandom(4).hex()}")
-        temp.write_text(json.dumps({"path": os.fsdecode(path), "stamp": stamp, "digest": digest}))
-        temp.replace(entry)
+        self._kept[self._entry(path)] = json.dumps({"path": os.fsdecode(path), "stamp": stamp, "digest": digest})
+        if self.folder.parent.is_dir():
+            self.write_kept()
+
+    def write_kept(self) -> None:
+        """Write the entries that are in memory alone."""
+        while self._kept:
+            with contextlib.suppress(KeyError):  # another thread writes them, too
+                entry, text = self._kept.popitem()
+                entry.parent.mkdir(parents=True, exist_ok=True)
+                temp = entry.with_name(f"{entry.name}.{os.getpid()}-{os.urandom(4).hex()}")
+                temp.write_text(text)
+                temp.replace(entry)
 
     def _entry(self, path: Path) -> Path:
         name = digest_bytes(os.fsencode(path))[:32]

@@ -16,7 +16,10 @@ import contextlib
 import logging
 import os
 import re
+import shlex
 import shutil
+import socket
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -29,7 +32,7 @@ from filelock import FileLock, Timeout
 from taccorl.errors import DatasetError, InTheWayError
 from taccorl.lineage.ancestors import ancestors
 from taccorl.lineage.canonical import canonical, canonical_text, differences, not_default
-from taccorl.lineage.destinations import Destinations
+from taccorl.lineage.destinations import Destinations, is_free
 from taccorl.lineage.digest import (
     DigestCache,
     digest_bytes,
@@ -46,6 +49,7 @@ from taccorl.lineage.stage import Artefact, Stage
 MARKER = "taccorl-store.txt"
 MARKER_TEXT = "A taccorl store: every folder here can be made again. `taccorl lineage prune` frees space.\n"
 KEY_DIGITS = 16
+_COMMAND_LENGTH = 200  # characters of the command of a lock's holder
 KEY = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}")
 
 logger = logging.getLogger(__name__)
@@ -55,9 +59,13 @@ class Store:
     """A folder of artefacts. It can be sent to other processes; all of them may use it at once."""
 
     def __init__(self, root: Path) -> None:
-        """Open the store in folder ``root``; a folder that is absent or empty becomes one."""
+        """Open the store in folder ``root``; a folder that is absent or empty becomes one when the first stage runs.
+
+        Raises:
+            LineageError: ``root`` is a file, or a folder that holds something else.
+        """
         self.root = Path(root).resolve()
-        _mark(self.root)
+        _check(self.root)
         self.digests = DigestCache(self.root / ".digests")
         self.destinations = Destinations(self.root / ".destinations")
 
@@ -115,6 +123,8 @@ class Store:
 
     def folders(self) -> list[Path]:
         """Every folder below a stage's folder: artefacts, and what runs are building or left."""
+        if not self.root.is_dir():
+            return []
         stages = [path for path in sorted(self.root.iterdir()) if _is_own(path) and not path.name.startswith(".")]
         return [path for stage in stages for path in sorted(stage.iterdir()) if _is_own(path)]
 
@@ -160,7 +170,7 @@ class Store:
                 raise LineageError(f"stage {stage.name}: sources are for a destination's manifest, and it has none.")
             return _Job(stage, config, inputs, key, self._place(stage, key), lock_name=key, temp_prefix=f".{key}.")
         final = Path(destination).absolute()
-        final = final.parent.resolve() / final.name
+        final = final.resolve() if is_free(final) else final.parent.resolve() / final.name
         if final.is_relative_to(self.root) or self.root.is_relative_to(final):
             raise DatasetError(f"destination {final} and the store {self.root} lie in one another; choose another.")
         lock_name = f"destination-{digest_bytes(str(final).encode())[:KEY_DIGITS]}"
@@ -206,7 +216,7 @@ class Store:
 
     def _existing(self, job: "_Job") -> Artefact | None:
         found = _with_key(job.final, job.key)
-        if found is None and os.path.lexists(job.final):
+        if found is None and (not is_free(job.final) or job.final.is_mount()):  # a mount point cannot be renamed to
             raise InTheWayError(_in_the_way(job))
         return found
 
@@ -220,18 +230,22 @@ class Store:
         Raises:
             filelock.Timeout: somebody else holds it and ``wait`` is False.
         """
+        _mark(self.root)
+        self.digests.write_kept()
         folder = self.root / ".locks"
         folder.mkdir(exist_ok=True)
         # The lock file stays: removing it would let a waiter and a newcomer hold "the same" lock on two files.
-        lock = FileLock(folder / f"{name}.lock")
+        lock, holder = FileLock(folder / f"{name}.lock"), folder / f"{name}.holder"
         try:
             lock.acquire(timeout=0)
         except Timeout:
             if not wait:
                 raise
-            logger.info("waiting: another run is making %s", name)
+            by = holder.read_text(encoding="utf-8") if holder.is_file() else "another process"
+            logger.warning("waiting for %s in the store %s, held by %s; Ctrl-C ends this run", name, self.root, by)
             lock.acquire()
         try:
+            holder.write_text(_this_process(), encoding="utf-8")
             yield
         finally:
             lock.release()
@@ -264,15 +278,24 @@ def is_store(root: Path) -> bool:
     return (Path(root) / MARKER).is_file()
 
 
-def _mark(root: Path) -> None:
-    if is_store(root):
-        return
+def _check(root: Path) -> None:
     if root.exists() and not root.is_dir():
         raise LineageError(f"store {root} is a file; give a folder.")
     if root.is_dir() and any(root.iterdir()) and not is_store(root):
         raise LineageError(f"{root} is not a taccorl store (it has no {MARKER}) and not empty. Give a new folder.")
-    root.mkdir(parents=True, exist_ok=True)
-    (root / MARKER).write_text(MARKER_TEXT)  # its existence is the mark, so a second writer does no harm
+
+
+def _mark(root: Path) -> None:
+    if not is_store(root):
+        _check(root)
+        root.mkdir(parents=True, exist_ok=True)
+        (root / MARKER).write_text(MARKER_TEXT)  # its existence is the mark, so a second writer does no harm
+
+
+def _this_process() -> str:
+    """Who holds a lock, for those who wait for it."""
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    return f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%H:%M:%S')} ({command[:_COMMAND_LENGTH]})"
 
 
 def _is_own(path: Path) -> bool:

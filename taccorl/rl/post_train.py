@@ -25,6 +25,7 @@ from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
+from taccorl.lineage.destinations import is_free
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.rl import checkpoint, run_settings
 from taccorl.rl.anchor import RealAnchor
@@ -385,7 +386,7 @@ def _check_folder(settings: PostTrainSettings) -> None:
             raise TaccorlError(
                 "missing --anchor.dataset=…, a dataset of real demonstrations; without one: --anchor.weight=0"
             )
-        if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        if not is_free(out):
             raise TaccorlError(
                 f"--out={out}: holds files already; nothing was touched: give another folder, or --resume=true to go on there"
             )

@@ -19,6 +19,7 @@ from taccorl.data.lerobot_format import merge, quiet_lerobot, require_videos, wr
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.demos.recorder import ORIGIN
 from taccorl.errors import DatasetError, InTheWayError
+from taccorl.lineage.destinations import is_free
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
@@ -110,7 +111,7 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
             twin are given as real.
         InTheWayError: something is at ``out``.
     """
-    if out.exists():
+    if not is_free(out):
         raise InTheWayError(f"{out} exists already; nothing was touched: give another folder")
     shared = check_domains(real, sim)
     datasets = [Dataset(root) for root in (*real, *sim)]

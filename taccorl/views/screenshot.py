@@ -5,6 +5,7 @@ import io
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,8 +40,13 @@ BLANK_LEVELS = 15.0
 """Standard deviation (of 255) below which a page shows nothing yet; measured: 8 while loading, 51 with all views."""
 
 
-def screenshot(episode: Episode, png: Path, *, at_s: float | None = None) -> str:
+def screenshot(
+    episode: Episode, png: Path, *, at_s: float | None = None, progress: Callable[[str], None] = lambda text: None
+) -> str:
     """The episode's Rerun view as a PNG, at ``at_s`` or where touch is strongest. Returns who drew it.
+
+    Args:
+        progress: called with what is done next and how long it may take.
 
     Raises:
         ViewerError: neither the Rerun program nor a browser can draw here.
@@ -49,9 +55,12 @@ def screenshot(episode: Episode, png: Path, *, at_s: float | None = None) -> str
     at_s = best_time_s(episode) if at_s is None else at_s
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd, drawn = Path(folder) / "episode.rrd", Path(folder) / "drawn.png"
+        progress(f"writing {episode.num_rows} rows for the viewer")
         save_episode(episode, rrd, at_s=at_s, native=True)
+        progress(f"drawing with the Rerun program, at most {PICTURE_TIMEOUT_S:.0f} s")
         who, why_not = "the Rerun program", picture_without_window(rrd, drawn, WIDTH_PX, HEIGHT_PX)
         if why_not is not None:
+            progress(f"{why_not}; drawing in a browser, at most {PICTURE_TIMEOUT_S:.0f} s")
             who, why_not_either = "a browser", picture_by_browser(rrd, drawn)
             if why_not_either is not None:
                 raise ViewerError(

@@ -62,6 +62,12 @@ def test_the_command_of_the_readme_says_where_everything_is(good: Path, said: An
     assert said(good, SPEC, "--out=./outputs/../outputs/my dataset")[0] == 0
 
 
+def test_an_empty_folder_is_a_free_place_and_options_may_be_followed_by_a_space(good: Path, said: Any) -> None:
+    Path("out").mkdir()
+    code, text = said(good, "--spec", "piper_flexitac_mcap", "--out", "out")
+    assert (code, Path("out/meta/info.json").is_file()) == (0, True), text
+
+
 def test_a_dry_run_in_an_empty_folder_leaves_it_empty(good: Path, said: Any) -> None:
     code, text = said(good, SPEC, "--dry_run=true")
     assert code == 0

@@ -111,6 +111,33 @@ def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
     assert len(shown.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("collect", "--task=nope"), "nope"),
+        (("collect", "--task=assembly_1", "--episodes=0"), "--episodes=0"),
+        (("collect", "--task=assembly_1", "--out=full"), "full"),
+        (("augment", "--task=assembly_2", "--source=nope"), "nope"),
+        (("execute", "--source=full", "--out=new"), "full"),
+        (("merge", "--real=full", "--out=new"), "full"),
+        (("ingest", "full", "--spec=piper_flexitac_mcap", "--out=new"), "full"),
+    ],
+)
+def test_a_refused_command_makes_no_store(
+    words: tuple[str, ...],
+    named: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    assert main(list(words)) == 2
+    assert named in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["full", "notes.txt"]
+
+
 @pytest.mark.parametrize("words", [(), ("lineage", "--help"), ("ingest", "inspect", "{recording}")])
 def test_a_reader_that_goes_away_is_no_error_message(words: tuple[str, ...], tmp_path: Path) -> None:
     from taccorl.demos.stand_in import StandInConfig, write_mcap

@@ -7,7 +7,7 @@ from typing import Any
 import draccus
 import pytest
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import given_names, parse
 from taccorl.errors import TaccorlError
 
 
@@ -89,6 +89,13 @@ def test_paths_and_texts_are_taken_as_typed(odd: str) -> None:
         assert robot("x", "--name=x", f"--home={odd}").home == Path(odd)
 
 
+def test_a_value_may_follow_its_option_as_a_word() -> None:
+    found = robot("a.mcap", "--name", "arm", "--joints", "7", "b.mcap", "--reach_m", "-0.8", "--motor.coil.turns", "7")
+    motor = SmallMotor(coil=Coil(turns=7))
+    assert found == Robot(paths=[Path("a.mcap"), Path("b.mcap")], name="arm", joints=7, reach_m=-0.8, motor=motor)
+    assert given_names(["--out", "a", "--ppo.clip", "0.2"]) == {"out", "ppo.clip"}
+
+
 def test_a_list_may_be_given_by_repeating_or_as_yaml() -> None:
     assert robot("--paths=a", "--paths=b", "--name=x").paths == [Path("a"), Path("b")]
     assert robot("--paths=[a, b]", "--name=x").paths == [Path("a"), Path("b")]
@@ -135,7 +142,9 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("x", "--name=a", "--motor.type=bigg"), ("'bigg'", "small", "big")),
         (("x", "--name=a", "--motor.type=big"), ("voltage_v",)),
         (("x", "--name=a", "--motor.type=big", "--motor.poles=3"), ("poles",)),
-        (("x", "--name", "a"), ("option '--name' needs a value: --name=…",)),
+        (("x", "--name"), ("option '--name' needs a value: --name=…",)),
+        (("x", "--name", "--joints=3"), ("option '--name' needs a value: --name=…",)),
+        (("--quick", "x", "--name=a"), ("--quick", "'x'", "--quick=true")),
         (("x", "--name="), ("option '--name=' needs a value",)),
         (("x", "--name=a", "--quick"), ("option '--quick' needs a value",)),
         (("--name=a",), ("missing --paths= (give a file or folder); --help says more",)),

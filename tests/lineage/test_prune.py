@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.cli.lineage import join_repeated, main
+from taccorl.cli.lineage import PruneConfig, main
+from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.explain import explain, trace
 from taccorl.lineage.prune import delete, open_store, unneeded
@@ -215,7 +216,8 @@ def test_unknown_verb_names_the_nearest(capsys):
     assert capsys.readouterr().out.startswith("taccorl lineage explain PATH")
 
 
-def test_repeated_keep_becomes_one_list():
-    assert join_repeated(["--keep=a", "--yes=true", "--keep=b c"], "keep") == ["--yes=true", '--keep=["a", "b c"]']
-    assert join_repeated(["--keep=[a, b]"], "keep") == ["--keep=[a, b]"]
-    assert join_repeated(["--yes=true"], "keep") == ["--yes=true"]
+def test_keep_may_be_repeated_and_is_one_list():
+    both = [Path("a"), Path("b c")]
+    assert parse(PruneConfig, ["--keep=a", "--yes=true", "--keep", "b c"]) == PruneConfig(keep=both, yes=True)
+    assert parse(PruneConfig, ["--keep=[a, b c]"]) == PruneConfig(keep=both)
+    assert parse(PruneConfig, ["--yes=true"]) == PruneConfig(yes=True)

@@ -2,8 +2,13 @@
 
 import hashlib
 import json
+import os
 import pickle
 import shutil
+import socket
+import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +16,7 @@ import pytest
 
 from taccorl.errors import DatasetError
 from taccorl.lineage.canonical import canonical_text
+from taccorl.lineage.digest import stamp
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store, is_store
@@ -259,7 +265,7 @@ def test_destination_with_another_config_is_refused_with_both_named(store, raw, 
     assert store.source(tmp_path / "d").digest == made.digest
 
 
-@pytest.mark.parametrize("what", ["folder", "empty folder", "file", "broken link", "foreign manifest"])
+@pytest.mark.parametrize("what", ["folder", "file", "broken link", "foreign manifest"])
 def test_destination_that_is_the_users_is_never_touched(store, tmp_path, what):
     destination = tmp_path / "d"
     if what == "file":
@@ -280,6 +286,18 @@ def test_destination_that_is_the_users_is_never_touched(store, tmp_path, what):
     assert set(before) <= set(tmp_path.rglob("*"))
 
 
+@pytest.mark.parametrize("linked", [False, True])
+def test_empty_folder_is_a_free_destination(store, tmp_path, linked):
+    (tmp_path / "d").mkdir()
+    if linked:
+        (tmp_path / "link").symlink_to("d")
+    destination = tmp_path / ("link" if linked else "d")
+    for _ in range(2):  # and found there by a second run
+        store.run(ONE, "x", [], destination=destination)
+        assert (tmp_path / "d" / "one").read_text() == "x"
+        assert temporary(tmp_path) == []
+
+
 def test_destination_in_the_store_is_refused(store):
     with pytest.raises(DatasetError, match="in one another"):
         store.run(ONE, "x", [], destination=store.root / "mine")
@@ -297,12 +315,53 @@ def test_leftovers_beside_a_destination_go_only_if_they_are_this_stores(store, t
 
 
 def test_store_marks_its_folder_and_refuses_a_folder_that_holds_other_things(tmp_path):
-    assert is_store(Store(tmp_path / "new").root)
+    Store(tmp_path / "new").run(ONE, "x", [])
+    assert is_store(tmp_path / "new")
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.txt").write_text("mine")
     with pytest.raises(LineageError, match="not a taccorl store"):
         Store(tmp_path / "home")
     assert [path.name for path in (tmp_path / "home").iterdir()] == ["thesis.txt"]
+
+
+def test_store_is_made_by_the_first_stage_and_knows_digests_from_before(tmp_path, raw):
+    old_s = time.time() - 60  # a file that was just written is not remembered
+    os.utime(raw / "demo_0.raw", (old_s, old_s))
+    store = Store(tmp_path / "store")
+    store.digests.put(raw / "demo_0.raw", stamp(raw / "demo_0.raw"), "known")
+    assert store.source(raw / "demo_0.raw").digest == "known"
+    assert store.artefacts() == [] and store.find_key("0" * 16) is None
+    assert not store.root.exists()
+    store.run(ONE, "x", [])
+    assert Store(store.root).source(raw / "demo_0.raw").digest == "known"
+
+
+def test_who_waits_for_a_lock_says_for_what_and_who_holds_it(store, caplog):
+    held, done = threading.Event(), threading.Event()
+
+    def hold():
+        with store.lock("abc"):
+            held.set()
+            done.wait(30)
+
+    def wait():
+        with store.lock("abc"):
+            pass
+
+    threads = [threading.Thread(target=hold), threading.Thread(target=wait)]
+    threads[0].start()
+    assert held.wait(30)
+    threads[1].start()
+    begin_s = time.monotonic()
+    while not caplog.records and time.monotonic() - begin_s < 30:
+        time.sleep(0.01)
+    done.set()
+    for thread in threads:
+        thread.join(30)
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"  # is shown without any setting
+    for part in ("abc", str(store.root), f"process {os.getpid()} on {socket.gethostname()}", Path(sys.argv[0]).name):
+        assert part in record.getMessage()
 
 
 def test_store_can_be_sent_to_another_process(store):

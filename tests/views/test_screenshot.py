@@ -105,9 +105,13 @@ def test_a_machine_without_either_is_told_what_to_install(
 ):
     monkeypatch.setenv("WGPU_BACKEND", "metal")  # what the Rerun program finds on Linux without Vulkan: nothing
     monkeypatch.setenv("PATH", str(tmp_path))  # and no browser
+    told: list[str] = []
     with pytest.raises(ViewerError, match=r"apt-get install mesa-vulkan-drivers libvulkan1.*apt-get install chromium"):
-        screenshot(episode, tmp_path / "view.png")
+        screenshot(episode, tmp_path / "view.png", progress=told.append)
     assert not list(tmp_path.iterdir())
+    assert ["90 rows" in told[0], "Rerun program, at most 180 s" in told[1], "browser, at most 180 s" in told[2]] == [
+        True
+    ] * 3
 
 
 def test_picture_is_taken_where_touch_is_strongest(episode: Episode):

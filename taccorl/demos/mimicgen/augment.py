@@ -9,7 +9,6 @@ Attempts are physics; rows of a success, with touch and pictures, are another ar
 import dataclasses
 import functools
 import json
-import os
 import shlex
 import traceback
 from collections import Counter
@@ -36,6 +35,7 @@ from taccorl.demos.mimicgen.stratify import ResetSpace, first_attempts, next_rou
 from taccorl.demos.recorder import ORIGIN, with_simulator
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.canonical import canonical
+from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.processes import Care, Failed
@@ -239,7 +239,7 @@ def check_out(plan: AugmentPlan, source: Path, out: Path, store: Store) -> None:
     Raises:
         InTheWayError: says what is at ``out``.
     """
-    if os.path.lexists(out) and not _may_be_of(plan, store.source(source), out, store):
+    if not is_free(out) and not _may_be_of(plan, store.source(source), out, store):
         raise in_the_way(out, plan.stage, plan.spec.task)
 
 

@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import itertools
 import json
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -30,6 +29,7 @@ from taccorl.demos.mimicgen.from_dataset import simulation_told
 from taccorl.demos.mimicgen.stored_actions import StoredActions, read_stored
 from taccorl.demos.recorder import EpisodeRecorder, with_simulator
 from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Artefact, Stage
@@ -107,7 +107,7 @@ def execute_stored(
         for source, stored in zip(sources, found, strict=True)
         for i in range(len(stored.demonstrations))
     ]
-    if os.path.lexists(out) and not _may_be_of(plan, items, out, store):
+    if not is_free(out) and not _may_be_of(plan, items, out, store):
         raise in_the_way(out, _DATASET, found[0].meta["task"])
     sim = _simulation(found[0])
     spec = plan.contract(sim, pictures=plan.pictures != "none", executed=executed)
