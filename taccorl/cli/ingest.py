@@ -1,6 +1,6 @@
 """``taccorl ingest recordings/ --spec=piper_flexitac_mcap --out=outputs/my_dataset``
 
-Recordings (MCAP, ROS 2 bags, HDF5, LeRobot datasets) into one LeRobot v3 dataset with touch.
+Recordings (MCAP, ROS 2 and ROS 1 bags, HDF5, LeRobot datasets) into one LeRobot v3 dataset with touch.
 ``taccorl ingest inspect FILE`` prints what a recording holds and a draft spec.
 """
 
@@ -50,7 +50,7 @@ class InspectConfig:
     paths: list[Path]
     """Files, bag folders, datasets, or folders of those."""
     reader: str | None = None
-    """mcap, db3, hdf5, lerobot or a plug-in's; by the file's kind if not given."""
+    """mcap, db3, rosbag1, hdf5, lerobot or a plug-in's; by the file's kind if not given."""
     split_bag: bool = False
     """Files x_0, x_1, … of a folder are one recording."""
     draft: Path | None = None

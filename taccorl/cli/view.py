@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import parse
+from taccorl.data.file_kinds import no_recording
 from taccorl.errors import TaccorlError
 
 if TYPE_CHECKING:
@@ -102,9 +103,13 @@ def _opened(config: ViewConfig) -> Iterator["Episode"]:
             yield attempt_episode(config.path)
             return
     if config.spec is None:
-        raise TaccorlError(
-            f"{config.path} is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"
+        what = no_recording(config.path)
+        known = (
+            f": {what}"
+            if what
+            else " is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"
         )
+        raise TaccorlError(f"{config.path}{known}")
     from taccorl.data.cutting import open_episodes
 
     with open_episodes(config.path, config.spec) as episodes:

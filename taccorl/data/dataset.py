@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
+from taccorl.data.file_kinds import no_recording
 from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, nearest
@@ -529,4 +530,5 @@ def _plainly(path: Path, what: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise DatasetError(f"{path}: is missing: copy the whole dataset") from error
     except (pa.ArrowException, av.error.FFmpegError, OSError, ValueError, IndexError) as error:
-        raise DatasetError(f"{path}: is not {what} ({type(error).__name__}: {' '.join(str(error).split())})") from error
+        known = no_recording(path) or f"is not {what} ({type(error).__name__}: {' '.join(str(error).split())})"
+        raise DatasetError(f"{path}: {known}") from error

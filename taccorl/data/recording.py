@@ -18,6 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from taccorl.data import decode
+from taccorl.data.file_kinds import no_recording, sniff
 from taccorl.data.spec import ChannelSpec, RecordingSpec, shipped_recording_specs
 from taccorl.errors import RecordingError, nearest
 from taccorl.plugins import Registry
@@ -86,6 +87,13 @@ class Reader(ABC):
     """File endings that this reader opens, for finding recordings in a folder."""
 
     def __init__(self, source: Source, spec: RecordingSpec | None = None) -> None:
+        """
+        Raises:
+            RecordingError: one of the files is an archive, a Git LFS pointer or a picture.
+        """
+        for path in source.files:
+            if (what := no_recording(path)) is not None:
+                raise RecordingError(f"{path}: {what}")
         self.source = source
         self.spec = spec
         """None while somebody only looks into a file."""
@@ -126,14 +134,6 @@ class Reader(ABC):
 readers: Registry[type[Reader]] = Registry("reader", "taccorl.data.readers")
 
 
-MAGICS = (
-    (b"\x89HDF\r\n\x1a\n", "an HDF5 file", "hdf5"),
-    (b"SQLite format 3\0", "an SQLite bag", "db3"),
-    (b"\x89MCAP0\r\n", "an MCAP file", "mcap"),
-    (b"\xff\xd8\xff", "a JPEG picture", None),
-    (b"\x89PNG\r\n", "a PNG picture", None),
-)
-"""How files begin, what they are, and the reader that opens them."""
 MOST_NAMED = 5
 """Entries of a folder to name in an error."""
 DEEPEST = 4
@@ -169,7 +169,8 @@ def find_sources(
         if skipped is not None:
             skipped += left
         return found
-    _, opens = sniff(path)
+    kind = sniff(path)
+    opens = kind.reader if kind else None
     if opens in names or (reader is not None and _other_kind(path, names, split_bag) is None):
         # an odd ending: the reader will say what is wrong with it
         return [(opens if opens in names else names[0], Source(path, (path,)))]
@@ -218,16 +219,20 @@ def _why_not(path: Path, names: list[str], split_bag: bool) -> str:
         return (
             "a folder without recordings" if deeper is None else f"there are recordings in {deeper}: give that folder"
         )
-    kind, _ = sniff(path)
-    return "no recording" if kind is None else f"{kind} with another ending: give the file itself"
+    kind = sniff(path)
+    return "no recording" if kind is None else f"{kind.name} with another ending: give the file itself"
 
 
 def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
     """What ``path`` is, where that is known and none of the readers ``names`` opens it."""
     others = [name for name in readers if name not in names]
     reads = f"; this spec reads {', '.join(names)}" if others else ""
-    kind, opens = sniff(path)
-    if kind is None:
+    if (what := no_recording(path)) is not None:
+        return what
+    found_kind = sniff(path)
+    if found_kind is not None:
+        kind, opens = found_kind.name, found_kind.reader
+    else:
         try:
             found = _sources_at(path, others, split_bag)
         except RecordingError as error:
@@ -236,21 +241,7 @@ def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
             return None
         opens = found[0][0]
         kind = "a LeRobot dataset" if opens == "lerobot" else opens
-    if opens is None:
-        return f"{kind}, no recording"
     return None if opens in names else kind + reads
-
-
-def sniff(path: Path) -> tuple[str, str | None] | tuple[None, None]:
-    """What a file is by its first bytes, and the reader that opens it; None where nobody knows."""
-    if not path.is_file():  # a pipe would wait for ever
-        return None, None
-    try:
-        with path.open("rb") as file:
-            head = file.read(max(len(magic) for magic, _, _ in MAGICS))
-    except OSError:
-        return None, None
-    return next(((kind, opens) for magic, kind, opens in MAGICS if head.startswith(magic)), (None, None))
 
 
 def without_place(text: str, path: Path | str) -> str:
@@ -262,7 +253,7 @@ def _why_nothing(path: Path, names: list[str], split_bag: bool, left: list[str])
     """Why no recording was found at ``path``, and the way to one."""
     other = _other_kind(path, names, split_bag)
     if other is not None:
-        _, opens = sniff(path)
+        opens = kind.reader if (kind := sniff(path)) else None
         fitting = [name for name, spec in shipped_recording_specs().items() if spec.reader == opens]
         return other + (f" ({', '.join(fitting)} reads {opens})" if fitting and len(names) == 1 else "")
     deeper = _nearest_folder(path, names, split_bag) if path.is_dir() else None

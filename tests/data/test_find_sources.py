@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.data.recording import find_sources, sniff
+from taccorl.cli.main import main
+from taccorl.data.file_kinds import sniff
+from taccorl.data.recording import find_sources
 from taccorl.demos.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 from taccorl.errors import RecordingError
 
@@ -60,7 +62,7 @@ def test_a_bad_entry_keeps_the_others_only_from_those_who_do_not_ask(mixed: Path
         ("good.mcap", "hdf5", "an MCAP file; this spec reads hdf5 (piper_flexitac_mcap reads mcap)"),
         ("cover.jpg", "mcap", "a JPEG picture, no recording"),
         ("cover.jpg", None, "a JPEG picture, no recording"),
-        ("notes.txt", None, "no recording here; readers db3, hdf5, lerobot, mcap open .db3, .h5, .hdf5, .mcap and LeRobot"),
+        ("notes.txt", None, "no recording here; readers db3, hdf5, lerobot, mcap, rosbag1 open .bag, .db3, .h5, .hdf5, .mcap"),
         ("days", "mcap", "no recording here, but there are some in {mixed}/days/one: give that folder"),
         ("v21", "mcap", V21),
         ("v21", None, V21),
@@ -81,8 +83,55 @@ def test_a_known_file_with_an_odd_ending_is_opened_by_what_it_is(mixed: Path) ->
 
 
 def test_files_are_known_by_their_first_bytes(mixed: Path, tmp_path: Path) -> None:
-    assert sniff(mixed / "aloha1.hdf5") == ("an HDF5 file", "hdf5")
+    kind = sniff(mixed / "aloha1.hdf5")
+    assert kind is not None and (kind.name, kind.reader) == ("an HDF5 file", "hdf5")
     (tmp_path / "a").write_bytes(b"SQLite format 3\0" + bytes(100))
-    assert sniff(tmp_path / "a") == ("an SQLite bag", "db3")
+    kind = sniff(tmp_path / "a")
+    assert kind is not None and (kind.name, kind.reader) == ("an SQLite bag", "db3")
     (tmp_path / "a").write_bytes(b"")
-    assert sniff(tmp_path / "a") == sniff(tmp_path) == sniff(tmp_path / "gone") == (None, None)
+    assert sniff(tmp_path / "a") is sniff(tmp_path) is sniff(tmp_path / "gone") is None
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+TAR = bytes(257) + b"ustar\x0000" + bytes(248)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "what", "command"),
+    [
+        ("p.mcap", POINTER, "a Git LFS pointer", "git -C {folder} lfs pull"),
+        ("p.hdf5", POINTER, "a Git LFS pointer", "git -C {folder} lfs pull"),
+        ("p.db3", POINTER, "a Git LFS pointer", "git -C {folder} lfs pull"),
+        ("p.bag", POINTER, "a Git LFS pointer", "git -C {folder} lfs pull"),
+        ("day 1.zip", b"PK\x03\x04" + bytes(30), "a ZIP archive", "unzip '{folder}/day 1.zip' -d {folder}"),
+        ("really_zipped.mcap", b"PK\x03\x04" + bytes(30), "a ZIP archive", "unzip {folder}/really_zipped.mcap"),
+        ("a.bag.gz", b"\x1f\x8b\x08" + bytes(30), "a gzip archive", "gunzip --keep {folder}/a.bag.gz"),
+        ("a.mcap.zst", b"\x28\xb5\x2f\xfd" + bytes(30), "a zstd archive", "unzstd {folder}/a.mcap.zst"),
+        ("days.tar", TAR, "a tar archive", "tar -xf {folder}/days.tar -C {folder}"),
+    ],
+)
+def test_what_only_stands_for_a_recording_is_named_with_the_command_that_gives_it(
+    name: str, content: bytes, what: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    for words in (["ingest", "inspect", path], ["ingest", tmp_path, "--spec=piper_flexitac_mcap", "--dry_run=true"]):
+        assert main([str(word) for word in words]) != 0
+        shown = "".join("".join(capsys.readouterr()).split())  # a table folds long lines
+        assert name.replace(" ", "") in shown
+        if "inspect" in words or path.suffix in (".zip", ".gz", ".zst", ".tar"):
+            for part in (what, command.format(folder=tmp_path)):
+                assert part.replace(" ", "") in shown
+
+
+@pytest.mark.parametrize("file", ["meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"])
+def test_a_dataset_of_git_lfs_pointers_is_named(file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    info = {"codebase_version": "v3.0", "fps": 30, "features": {}, "total_episodes": 0, "data_path": "data/x"}
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_bytes(POINTER)
+    (tmp_path / "meta/info.json").write_text(json.dumps(info))
+    for words in (["check"], ["view"], ["ingest", "inspect"]):
+        assert main([*words, str(tmp_path)]) == 2
+        shown = capsys.readouterr().err
+        assert f"{tmp_path / file}: a Git LFS pointer" in shown
+        assert f"git -C {(tmp_path / file).parent} lfs pull" in shown
