@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from taccorl.data.inspection import Inventory
+from taccorl.data.recording import without_place
 
 WIDE = 150
 """Columns of a log file or pipe, which has no width of its own."""
@@ -81,16 +82,20 @@ class Bars:
 
 
 def ingest_table(report: dict[str, Any]) -> None:
-    """One line a recording, what was wrong below it."""
-    table = Table("recording", "outcome", "episodes", "rows", "why", box=None, pad_edge=False)
+    """One line a recording, what was wrong below the table, in lines that are never cut or folded: they are copied."""
+    table = Table(box=None, pad_edge=False)
+    for column in ("recording", "outcome", "episodes", "rows"):
+        table.add_column(column, overflow="fold", no_wrap=column != "recording")
     for r in report["recordings"]:
         written = [e for e in r["episodes"] if e["outcome"] == "written"]
         rows = str(sum(e["rows"] for e in written))
-        cells = (Text(_name(r)), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows)
-        table.add_row(*cells, Text(r["reason"]))
+        table.add_row(Text(_name(r)), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows)
     out = console()
     out.print(table)
     for r in report["recordings"]:
+        if r["reason"]:
+            reason = without_place(r["reason"], r["recording"])
+            out.print(Text(r["outcome"], COLORS[r["outcome"]]) + Text(f" {_name(r)}: {reason}"), soft_wrap=True)
         if r["outcome"] != "written":
             out.print(Text("  look: ") + Text(r["command"], "bold"), soft_wrap=True)
         for e in r["episodes"]:
@@ -104,7 +109,7 @@ def ingest_table(report: dict[str, Any]) -> None:
 
 
 def _name(r: dict[str, Any]) -> str:
-    return _shorten(r["recording"] + (f"#{r['part']}" if r["part"] else ""))
+    return r["recording"] + (f"#{r['part']}" if r["part"] else "")
 
 
 def findings_table(name: str, findings: list[Any]) -> None:

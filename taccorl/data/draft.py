@@ -78,7 +78,7 @@ def _roles(inventory: Inventory) -> _Roles:
     commands = [t for t in numbers if _says(t, COMMAND_WORDS)]
     commands = [t for t in commands if t.names] or commands
     measured = [t for t in numbers if not _says(t, COMMAND_WORDS)]
-    states = [t for t in measured if t.names] or [t for t in measured if _says(t, STATE_WORDS)]
+    states = [t for t in measured if t.holds(JOINTS) and t.names] or [t for t in measured if _says(t, STATE_WORDS)]
     states = _one_of_each(states) or (measured if len(measured) == 1 else [])
     # a mobile base has commands of its own: one topic that alone commands all of the state is enough
     commands = next(([t] for t in commands if t.num_values == sum(s.num_values or 0 for s in states)), commands)
@@ -252,7 +252,7 @@ def _elements(topics: list[TopicSummary], roles: _Roles) -> list[str]:
         for name in t.names:
             plain = re.sub(r"[^A-Za-z0-9_.]+", "_", name).strip("_") or "joint"
             full = plain if plain.startswith(prefix) else f"{prefix}{plain}"
-            full = full if full.endswith(".pos") else f"{full}.pos"
+            full = full if full.endswith(".pos") or not t.holds(JOINTS) else f"{full}.pos"
             found.append(full if full not in found else f"{len(found)}_{full}")
     return found
 

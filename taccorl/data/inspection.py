@@ -42,7 +42,7 @@ class TopicSummary:
     zero_stamps: int
     """Messages stamped 0, where others have a time."""
     names: tuple[str, ...] = ()
-    """Of its values, from the ``name`` list of its first message."""
+    """Of its values, from the ``name`` list of its first message, or as its type says."""
     num_values: int | None = None
     """Numbers in a message of joints or of an array; None where it holds no list of numbers."""
     sensor: str | None = None
@@ -160,7 +160,8 @@ def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpe
         return {}
     if shape is not None:
         sizes = [name for name, s in sensors.items() if t.type.name == s.wire.dtype and shape in _frames(s)]
-        return {"num_values": math.prod(shape) if len(shape) <= 1 else None, "sensor": next(iter(sizes), None)}
+        size = math.prod(shape) if len(shape) <= 1 else None
+        return {"names": t.type.names, "num_values": size, "sensor": next(iter(sizes), None)}
     if not t.holds((*JOINTS, *ARRAYS, *PICTURES)):
         return {}
     try:

@@ -48,6 +48,8 @@ class TopicType:
     """Why its values cannot be decoded; None where they can."""
     shape: tuple[int, ...] | None = None
     """Shape of one value, where the format says so (HDF5, LeRobot)."""
+    names: tuple[str, ...] = ()
+    """Of the elements of one value, where the format says so (LeRobot)."""
 
 
 @dataclass(frozen=True)

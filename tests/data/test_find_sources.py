@@ -117,11 +117,11 @@ def test_what_only_stands_for_a_recording_is_named_with_the_command_that_gives_i
     path.write_bytes(content)
     for words in (["ingest", "inspect", path], ["ingest", tmp_path, "--spec=piper_flexitac_mcap", "--dry_run=true"]):
         assert main([str(word) for word in words]) != 0
-        shown = "".join("".join(capsys.readouterr()).split())  # a table folds long lines
-        assert name.replace(" ", "") in shown
-        if "inspect" in words or path.suffix in (".zip", ".gz", ".zst", ".tar"):
+        shown = "".join(capsys.readouterr())
+        assert name in shown
+        if "inspect" in words or path.suffix not in (".hdf5", ".db3", ".bag"):  # another reader's: not looked into
             for part in (what, command.format(folder=tmp_path)):
-                assert part.replace(" ", "") in shown
+                assert part in shown
 
 
 @pytest.mark.parametrize("file", ["meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"])

@@ -39,15 +39,15 @@ class LerobotReader(Reader):
             return None
         with _as_recording_errors():
             dataset = Dataset(path)
-            cameras = [k for k, f in dataset.info["features"].items() if f["dtype"] == "video"]
-            return [
-                Source(
-                    path,
-                    (dataset.data_file(i), *(dataset.video(i, camera).path for camera in cameras)),
-                    f"episode_{i:06d}",
-                )
-                for i in range(dataset.num_episodes)
-            ]
+            videos = [k for k, f in dataset.info["features"].items() if f["dtype"] == "video"]
+            cameras = [k for k in videos if k not in dataset.unstored]
+            found = []
+            for i in range(dataset.num_episodes):
+                files = [dataset.video(i, camera).path for camera in cameras]
+                # a video that was not copied is missed by those who read it
+                files = [dataset.data_file(i), *(file for file in files if file.is_file())]
+                found.append(Source(path, tuple(files), f"episode_{i:06d}"))
+            return found
 
     @functools.cached_property
     def dataset(self) -> Dataset:
@@ -71,10 +71,10 @@ class LerobotReader(Reader):
             if f["dtype"] == "string":
                 found[key] = TopicType("String", "lerobot")
             elif f["dtype"] in ("video", "image"):
-                colour = f["dtype"] == "video" and 3 in shape and not (f.get("info") or {}).get("is_depth_map")
-                found[key] = TopicType(f["dtype"], "lerobot", None if colour else self.dataset.skipped[key], shape)
+                found[key] = TopicType(f["dtype"], "lerobot", self.dataset.skipped.get(key), shape)
             else:
-                found[key] = TopicType(f["dtype"], "lerobot", None, shape)
+                feature = self.dataset.spec.features.get(key)
+                found[key] = TopicType(f["dtype"], "lerobot", None, shape, feature.names if feature else ())
         for key, pad in self._pads():
             sensor = self.dataset.spec.sensors[key]
             found[f"{key}/{pad}"] = TopicType(sensor.wire.dtype, "lerobot", None, (sensor.rows * sensor.columns,))

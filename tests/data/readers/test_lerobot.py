@@ -10,10 +10,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import yaml
 
 from taccorl.data.cutting import Cutter
 from taccorl.data.dataset import dataset_spec_to_json, episode_record
+from taccorl.data.draft import draft_specs
 from taccorl.data.episode import Episode
+from taccorl.data.inspection import inspect_source
 from taccorl.data.recording import find_sources, opened, readers
 from taccorl.data.spec import RecordingSpec, data_specs_folder, load_dataset_spec, load_recording_spec
 from taccorl.errors import RecordingError
@@ -276,3 +279,45 @@ def test_a_dataset_without_baselines_gives_the_counts_it_has(ours: Path, tmp_pat
     (tmp_path / "copy/meta/taccorl/episodes.json").unlink()
     (first, *_) = reader_of(tmp_path / "copy").messages({"observation.tactile/left_a"})
     assert not first.value.any()
+
+
+@pytest.mark.parametrize("how", ["no file", "not in the table"])
+def test_a_camera_without_videos_is_missed_only_by_specs_that_read_it(ours: Path, tmp_path: Path, how: str) -> None:
+    root, key = shutil.copytree(ours, tmp_path / "d"), "observation.images.front"
+    shutil.rmtree(root / "videos" / key)
+    if how == "not in the table":  # as taccorl execute --pictures=cache leaves it
+        (path,) = (root / "meta/episodes").glob("*/*.parquet")
+        table = pq.read_table(path)
+        pq.write_table(table.drop_columns([n for n in table.column_names if n.startswith(f"videos/{key}/")]), path)
+    feature = "{dtype: video, shape: [224, 224, 3], unit: rgb8, frame: f, rate_hz: 30, range: [0, 255]}"
+    for camera in ("left_wrist", "front"):
+        (tmp_path / f"{camera}_data.yaml").write_text(
+            f"spec_version: 1\nname: d\nrobot_type: r\nfps: 30\nfeatures:\n  observation.images.{camera}: {feature}\n"
+        )
+        (tmp_path / f"{camera}.yaml").write_text(
+            f"spec_version: 1\ndataset: {camera}_data.yaml\nreader: lerobot\nclock: log\nepisodes: {{by: whole_file}}\n"
+            "instruction: {from: topic, topic: task}\n"
+            f"channels:\n  c: {{topic: observation.images.{camera}, rate_hz: 30, max_age_s: 0.08}}\n"
+            f"features:\n  observation.images.{camera}: {{channels: [c], align: asof}}\n"
+        )
+
+    def pictures(camera: str) -> list[Any]:
+        (_, source), _ = find_sources(root)
+        assert all(file.is_file() for file in source.files)
+        reader = readers.get("lerobot")(source, load_recording_spec(tmp_path / f"{camera}.yaml"))
+        return list(reader.messages({f"observation.images.{camera}"}))
+
+    assert len(pictures("left_wrist")) == ROWS[0]
+    with pytest.raises(RecordingError, match=r"observation\.images\.front"):
+        pictures("front")
+
+
+def test_drafts_keep_the_names_that_a_dataset_gives_its_joints(theirs: Path, ours: Path) -> None:
+    expected = {theirs: ["a", "b"], ours: ["left_joint_1.pos", "left_joint_2.pos"]}
+    for root, names in expected.items():
+        ((reader, source), *_) = find_sources(root)
+        draft = yaml.safe_load(draft_specs(inspect_source(reader, source)).dataset)
+        assert draft["features"]["observation.state"]["names"][:2] == names
+        assert (
+            len(draft["features"]["observation.state"]["names"]) == draft["features"]["observation.state"]["shape"][0]
+        )
