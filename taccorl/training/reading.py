@@ -38,6 +38,7 @@ from taccorl.lineage.manifest import MANIFEST_PLACES, is_verified
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.training.frame_cache import CacheRequest, Frames, open_frames
+from taccorl.training.video_backend import default_video_backend
 
 COMPARED_VERSION = "0.6.1"
 OPEN_VIDEOS = 16
@@ -47,7 +48,7 @@ _log = logging.getLogger(__name__)
 
 def install() -> bool:
     """Let LeRobot make its datasets with ``FastReader``; once, however often it is called. False: left as it is."""
-    from lerobot.datasets import factory, lerobot_dataset
+    from lerobot.datasets import factory, lerobot_dataset, video_utils
 
     if os.environ.get("TACCORL_NO_PATCH") == "1":
         _log.warning(
@@ -67,6 +68,8 @@ def install() -> bool:
             COMPARED_VERSION,
         )
         return False
+    for module in (lerobot_dataset, video_utils):
+        module.get_safe_default_video_backend = default_video_backend  # pyright: ignore[reportAttributeAccessIssue]
     if lerobot_dataset.DatasetReader is not FastReader:
         lerobot_dataset.DatasetReader = FastReader
         factory.resolve_delta_timestamps = with_windows(factory.resolve_delta_timestamps)
@@ -79,13 +82,15 @@ def install() -> bool:
 
 
 def add_cache_options() -> None:
-    """``--dataset.cache`` and ``--dataset.cache_store`` among LeRobot's options of a dataset."""
+    """``--dataset.cache`` and ``--dataset.cache_store`` among LeRobot's options of a dataset; the default of
+    ``--dataset.video_backend`` is ``default_video_backend``."""
     if "cache" in {f.name for f in dataclasses.fields(DatasetConfig)}:
         return
     # none, disk, host or gpu: decode every frame once, at the policy's resolution, and gather whole batches.
     for f in dataclasses.fields(DatasetConfig):  # once made, a dataclass has lost its default factories
         if f.default_factory is not dataclasses.MISSING:
-            setattr(DatasetConfig, f.name, dataclasses.field(default_factory=f.default_factory))
+            default = default_video_backend if f.name == "video_backend" else f.default_factory
+            setattr(DatasetConfig, f.name, dataclasses.field(default_factory=default))
     for name in ("__init__", "__repr__", "__eq__", "__match_args__"):  # nor does it make again what it has made
         delattr(DatasetConfig, name)
     DatasetConfig.__annotations__ |= {"cache": str, "cache_store": str}

@@ -17,8 +17,8 @@ ALL = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.*
 TRAINING = [name for name in ALL if name.startswith(("cotrain/", "learn/"))]
 
 
-def lerobot_train(path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:
-    """The configuration that ``lerobot-train --config_path=PATH`` would run."""
+def lerobot_train(path: Path | None, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:
+    """The configuration that ``lerobot-train --config_path=PATH`` would run; without a path, ``words`` alone."""
     from lerobot.configs import parser
     from lerobot.configs.train import TrainPipelineConfig
 
@@ -29,9 +29,20 @@ def lerobot_train(path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> A
         cfg.validate()
         return cfg
 
-    given = ("--dataset.repo_id=local/both", "--dataset.root=both", "--output_dir=outputs/not_there")
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", f"--config_path={path}", *given, *words])
+    given = (f"--config_path={path}", "--dataset.repo_id=local/both", "--dataset.root=both") if path else ()
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *given, "--output_dir=outputs/not_there", *words])
     return main()  # pyright: ignore[reportCallIssue]
+
+
+def test_the_lines_of_the_readme_download_no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    readme = (CONFIGS.parent / "README.md").read_text(encoding="utf-8")
+    lines = [line for line in readme.splitlines() if line.startswith("lerobot-train --policy.type=")]
+    kinds = {}
+    for line in lines:
+        config = lerobot_train(None, monkeypatch, *line.split()[1:])
+        kinds[config.policy.type] = config.policy
+    assert kinds["act"].pretrained_backbone_weights is None
+    assert kinds["tactile_pi05"].base_checkpoint is None
 
 
 @pytest.mark.parametrize("name", ALL)
