@@ -25,7 +25,7 @@ Kind = Literal["position", "effort"]
 Way = Literal["joint", "twin"]
 USES: tuple[Use, ...] = ("fit", "validation", "test")
 BLOCK_S = 0.5
-"""Residuals of neighbouring rows are alike: intervals come from whole blocks, as in research/discrepancy.md §4.1."""
+"""Residuals of neighbouring rows are alike: intervals come from whole blocks (block bootstrap, Carlstein 1986)."""
 FELT_FLOORS = 4.0
 """A taxel feels something beyond so many of its noise floors."""
 NOT_STATED = "origin not stated by the recordings"

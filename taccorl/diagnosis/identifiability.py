@@ -16,7 +16,7 @@ from taccorl.diagnosis.screen import alike, probe
 VISIBLE = 0.75
 """RMS of a signature in floors: √(1 + 0.75²) = 1.25, the error above which the search looks for an effect."""
 ALIKE = 0.95
-"""|cos| of two signatures above which recordings do not tell two effects apart (research/discrepancy.md §4.5)."""
+"""|cos| of two signatures above which recordings do not tell two effects apart; a choice."""
 RIDGE = 0.999
 """|correlation| of two fitted numbers above which only a combination of them is known."""
 

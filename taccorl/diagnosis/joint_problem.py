@@ -1,7 +1,8 @@
 """One joint as a problem for the search: its controller's numbers, the effects it may have, its recordings.
 
 Channels are the angle, and the motor's effort where every recording has it. Commanded gains that the recordings state stay fixed:
-free ones hide missing physics (on a real leg they gave K_p 116 for a commanded 20; research/discrepancy.md §0).
+free ones hide missing physics (on the knee of a Unitree Go2 they gave K_p 116 for a commanded 20; recordings of
+iit-DLSLab/sim2real-robot-identification).
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Where a twin is off: by regime, which is a stretch of the motion.
 
 This says WHERE, never WHY: a delay, a payload, a wrong gain scale and missing inertia all light up "high speed" and "high load"
-(measured, research/discrepancy.md §4.4). ``taccorl diagnose`` tells causes apart, by simulating each.
+(measured on surrogates). ``taccorl diagnose`` tells causes apart, by simulating each.
 
 Letters in shapes: T rows.
 """

@@ -47,7 +47,7 @@ WORDS: dict[Status, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig:
-    """When an effect is believed. The values of research/discrepancy.md §4.1, checked in docs/diagnosis.md."""
+    """When an effect is believed. The values are choices, checked in docs/diagnosis.md."""
 
     stop_at: float = 1.3
     """Validation error in noise floors at which nothing more is looked for,"""

@@ -56,7 +56,7 @@ def in_hand_m(data: mujoco.MjData) -> np.ndarray:
 def shake(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float = 3.0, swing_rad: float = 0.06) -> float:
     """Swing the right arm about its joints 1 and 2 (1.5 and 1.2 Hz) and turn joint 6; how far the part slips in the hand [m].
 
-    The shake of research/mujoco.md: 0.06 and 0.04 rad, joint 6 by 0.2 rad at 1 Hz.
+    Amplitudes, a choice: ``swing_rad`` (0.06) and two thirds of it (0.04), joint 6 by 0.2 rad at 1 Hz.
     """
     actuators = [model.actuator(f"right_{joint}").id for joint in JOINTS]
     before, now = in_hand_m(data), data.ctrl[actuators].copy()

@@ -6,7 +6,7 @@ of the pad towards the other finger, y from palm to tip, x across), and geom ``P
 box has a body of its own on joints with springs, undeformed at qpos0; which joints does not matter here.
 
 Contact in MuJoCo is softer under a light part than under a heavy one, so plain depth tells the part's mass: 2.4 mm at 10 g
-and 0.4 mm at 300 g under the same 10 N (research/mujoco.md §1). A sprung plate yields by x = N / K whatever the mass, but the
+and 0.4 mm at 300 g under the same 10 N (measured). A sprung plate yields by x = N / K whatever the mass, but the
 part still sinks by r into it. r is what the taxels have beyond the plate, so it is taken off all of them: the one that is
 furthest beyond reads the spring, the others how much less they are pressed. Rigid pads have nothing to go by and read plain
 depth.

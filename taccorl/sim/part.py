@@ -28,7 +28,7 @@ PART_CONTACT: Mapping[str, Any] = {
     "priority": 1,
 }
 """Contact of a part with anything: stiffness 8e5 /s² and damping 1790 /s, critical, a time constant of 1.1 ms, because
-MuJoCo's defaults let parts of 0.5 mm clearance overlap by 1–2 mm (research/mimicgen.md §4.2). Given as negative numbers, since
+MuJoCo's defaults let parts of 0.5 mm clearance overlap by 1–2 mm (measured). Given as negative numbers, since
 MuJoCo holds a positive time constant at two physics steps or more: at those 1.7 ms plugs sink 0.25 mm when they hit. An
 impedance of (0.99, 0.999) is too hard: a part that slides in the hand then pops out of contact and back (0.4 mm).
 Priority 1: the part's friction and stiffness count, not the table's or the pad's, because the paper randomises the part's

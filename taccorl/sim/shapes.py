@@ -3,7 +3,7 @@
 An outline is a simple polygon, (N, 2), counter-clockwise, m. A region with holes (a shapely polygon) is cut along its
 constrained Delaunay triangulation; triangles are merged while they stay convex. Pieces share vertices bit for bit, so they
 neither overlap nor leave gaps (MuJoCo then stores mesh vertices in single precision: 4 nm at 60 mm).
-An approximate decomposition (CoACD) closes the puzzle's holes by 0.8–4 mm (research/mimicgen.md §0).
+An approximate decomposition (CoACD) closes the puzzle's holes by 0.8–4 mm (measured).
 """
 
 import math

@@ -147,7 +147,7 @@ def test_compiled_mass_and_centre_are_as_stated(part, mass_kg, com_z_mm):
 
 
 def test_cradle_plug_centre_of_mass_is_where_the_task_needs_it():
-    """18–20 mm from the tip (research/mimicgen.md §3.6), with a core no denser than brass (8.5 g/cm³)."""
+    """18–20 mm from the tip, with a core no denser than brass (8.5 g/cm³)."""
     plug = cradle_plug()
     assert 0.018 <= plug.com_part_m[2] <= 0.020
     core = plug.solids[-1]
@@ -496,7 +496,7 @@ def test_a_tenon_goes_straight_in_and_wedges_where_geometry_says(friction):
 @pytest.mark.parametrize("clearance_m", [0.0003, 0.0005, 0.001])
 @pytest.mark.parametrize("friction", [0.3, 0.7])
 def test_a_plug_released_in_the_cradle_stays_exactly_if_its_centre_of_mass_is_inside(friction, clearance_m):
-    """Axis level, lying on the cradle's floor, released (research/mimicgen.md §3.6): 2 mm to either side decide."""
+    """Axis level, lying on the cradle's floor, released: 2 mm to either side decide."""
     plug, cradle = cradle_plug(), replace(open_cradle(clearance_m=clearance_m), clamped=True)
     bench = Bench(plug, cradle, friction=friction)
     held = pose_at(0, 0, 0.3) @ cradle.table_from_part

@@ -110,7 +110,7 @@ def test_rate_is_the_central_difference_of_the_depth(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["sphere", "capsule", "cylinder"])
 def test_depth_agrees_with_mujocos_own_distance(name: str) -> None:
-    """MuJoCo's ``mj_geomDistance`` from a tiny sphere; its boxes are not exact inside (research/mujoco.md §1)."""
+    """MuJoCo's ``mj_geomDistance`` from a tiny sphere; its boxes are not exact inside."""
     probe_m = 1e-5
     xml = f'<mujoco><worldbody>{SHAPES[name][0]}<body name="p" mocap="true"><geom size="{probe_m}"/></body></worldbody></mujoco>'
     model = mujoco.MjModel.from_xml_string(xml)

@@ -41,7 +41,7 @@ class Armature(JointEffect):
         high=1.0,
         typical=0.05,
         over="kp",
-        source="a choice; 0.007–0.020 on a Unitree Go2, research/discrepancy.md §4.6",
+        source="a choice; 0.007–0.020 fitted to a Unitree Go2 (iit-DLSLab/sim2real-robot-identification)",
     )
 
     def drive(self) -> dict[str, float]:

@@ -54,7 +54,7 @@ class CommandDelay(JointEffect):
         low=0.0,
         high=0.2,
         typical=0.02,
-        source="a choice; 0.8–4 ms on a Unitree Go2, research/discrepancy.md §4.6",
+        source="a choice; 0.8–4 ms fitted to a Unitree Go2 (iit-DLSLab/sim2real-robot-identification)",
     )
 
     def drive(self) -> dict[str, float]:

@@ -51,7 +51,7 @@ class CoulombFriction(JointEffect):
         high=20.0,
         typical=0.4,
         over="kp",
-        source="0.2–0.8 N·m on a Unitree Go2, research/discrepancy.md §4.6; 0.3 in Menagerie’s PiPER",
+        source="0.2–0.8 N·m fitted to a Unitree Go2 (iit-DLSLab/sim2real-robot-identification); 0.3 in Menagerie’s PiPER",
     )
 
     def drive(self) -> dict[str, float]:

@@ -50,7 +50,7 @@ class LoadFriction(JointEffect):
         low=0.0,
         high=0.5,
         typical=0.1,
-        source="a choice; hobby servos need such a term (research/discrepancy.md §0, Dynamixel XL330)",
+        source="a choice; hobby servos need such a term (Duclusaud et al., ICRA 2025; their Dynamixel XL330 logs, Rhoban/bam)",
     )
 
     def drive(self) -> dict[str, float]:

@@ -50,7 +50,7 @@ class TaxelCreep(RememberingEffect):
         low=-0.8,
         high=2.0,
         typical=0.2,
-        source="a Velostat taxel: 0.29 in 0.77 s, research/discrepancy.md §4.6",
+        source="fitted to a Velostat taxel: 0.29 in 0.77 s (Lupasic/tactile-sensor-velostat)",
     )
     time_constant_s: float = parameter(
         unit="s",

@@ -38,7 +38,7 @@ class TaxelSaturation(TouchEffect):
         low=0.05,
         high=200.0,
         typical=4.0,
-        source="a choice: 300 counts, above what the converter sends; the TAMS taxels' divider, research/discrepancy.md §4.6",
+        source="a choice: 300 counts, above what the converter sends; resistive taxels saturate by their voltage divider",
     )
 
     @classmethod

@@ -46,7 +46,7 @@ class TorqueSaturation(JointEffect):
         high=200.0,
         typical=8.0,
         over="kp",
-        source="torque range of the MIT mode, ±8 N·m by default (research/mujoco.md §2)",
+        source="torque range of the MIT mode, ±8 N·m by default (piper_sdk issues 73, 91 and 99)",
     )
 
     @classmethod

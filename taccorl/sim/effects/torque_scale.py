@@ -56,7 +56,7 @@ class TorqueScale(JointEffect):
         low=0.2,
         high=5.0,
         typical=0.8,
-        source="a choice; one firmware of this arm gives 4 times the torque (piper_sdk issue 73, research/discrepancy.md §1)",
+        source="a choice; one firmware of this arm gives 4 times the torque (piper_sdk issue 73)",
     )
 
     def drive(self) -> dict[str, float]:

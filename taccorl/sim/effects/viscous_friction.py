@@ -40,7 +40,7 @@ class ViscousFriction(JointEffect):
         high=50.0,
         typical=1.0,
         over="kp",
-        source="a choice; 0.15 on a Unitree Go2, research/discrepancy.md §4.6",
+        source="a choice; 0.15 fitted to a Unitree Go2 (iit-DLSLab/sim2real-robot-identification)",
     )
 
     def drive(self) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Assembly #2: a plug goes into an open cradle in the air, which carries it only if its centre of mass is inside.
 
 The left hand holds the cradle with its open side up, the right hand slides the plug in along the cradle's axis; both lie on
-the table at first, their axes along y. Let go too early, the plug tips over the cradle's lip (research/mimicgen.md §3.6).
+the table at first, their axes along y. Let go too early, the plug tips over the cradle's lip (the paper's failure analysis).
 """
 
 import mujoco

@@ -1,4 +1,4 @@
-"""The parts of the four tasks (research/mimicgen.md §3). Clearance is per side: a hole is its part's outline, moved out."""
+"""The parts of the four tasks; dimensions are choices. Clearance is per side: a hole is its part's outline, moved out."""
 
 import math
 from dataclasses import replace
@@ -23,7 +23,8 @@ from taccorl.sim.shapes import (
     with_mass,
 )
 
-CLEARANCE_M = 0.0005  # per side; 0.001 is easy, 0.0003 hard (research/mimicgen.md §3.1)
+# Per side; 0.001 is easy, 0.0003 hard. A choice between 0.06 mm (Isaac Lab's Factory) and 3 mm (ManiSkill's PegInsertionSide).
+CLEARANCE_M = 0.0005
 _FINGER_ROOM_M = 0.004  # between the fingers' tips and what lies below them
 _TCP_ABOVE_M = PAD_LENGTH_M / 2 + _FINGER_ROOM_M  # lowest TCP over a surface: the pads reach 32 mm beyond it
 
@@ -257,7 +258,7 @@ def open_cradle(name: str = "cradle", clearance_m: float = CLEARANCE_M) -> Part:
     """U-shaped cradle 36 mm wide and 34 mm deep, open at +y, then 30 mm of solid tail, 160 g. Origin in the mouth, z into it.
 
     A closed socket holds a plug by the couple between its floor and its roof from 8 mm on. Without the roof the plug stays
-    only if its centre of mass is inside (research/mimicgen.md §3.6).
+    only if its centre of mass is inside (tests/sim/test_parts.py).
     """
     _check_clearance(name, clearance_m)
     inner, outer, end = 0.010 + clearance_m, 0.018, 0.034

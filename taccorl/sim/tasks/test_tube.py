@@ -1,7 +1,7 @@
 """Test Tube Insertion: a lying tube is lifted, turned upright and let go in the middle hole of a rack that the other hand holds.
 
 The tube lies in a clamped stand, its bottom towards −y; stand and tube are drawn together. The rack stands free on the table,
-its handle towards the left arm. Geometry and failures: research/mimicgen.md §3.3.
+its handle towards the left arm. Failures: the paper's failure analysis.
 """
 
 import mujoco
