@@ -1,4 +1,4 @@
-"""Assembly #1: a tenon goes into a mortise in the air, the axes level; a direction that is off wedges.
+"""Assembly #1: a tenon goes into a mortise in the air, the axes level; a direction that is off wedges or slides off.
 
 The left hand holds the socket, the right hand the plug; both lie on the table at first, their axes along y.
 """
@@ -21,6 +21,7 @@ HOME_RAD = {
 LIFTED_M = 0.03
 _IN_DEPTH_M, _IN_TILT_RAD, _IN_LATERAL_M = 0.034, np.deg2rad(2.0), 0.003
 _WEDGED_M, _WEDGED_N = (0.004, 0.030), 15.0
+_AT_MOUTH_M = -0.002  # depth beyond which the plug's end is at the socket's face or has passed it
 
 
 @tasks.register("assembly_1")
@@ -31,7 +32,9 @@ class Assembly1(Task):
     instruction = "insert the orange plug into the grey socket in the air"
     parts = ("plug", "socket")
     mating = (("plug", "socket"),)
-    failures = {"dropped": 0.0, "wedged": 1.0}  # noqa: RUF012
+    # Paper, failure analysis: a wrong direction of insertion ends in wedging, or in sliding past the mortise.
+    # The expert touches the socket beside the mortise for 0.2 s at most (16 scenes, simulated).
+    failures = {"dropped": 0.0, "wedged": 1.0, "sliding": 1.0}  # noqa: RUF012
     home_rad = HOME_RAD
 
     def __init__(self, difficulty: str = "train") -> None:
@@ -50,12 +53,14 @@ class Assembly1(Task):
 
     def look(self, scene: Scene) -> Verdict:
         fit, contact = self._fit(scene), scene.contact("plug", "socket")
-        between = (fit.depth_m > _WEDGED_M[0]) & (fit.depth_m < _WEDGED_M[1]) & (fit.lateral_m < _IN_LATERAL_M)
+        beside = fit.lateral_m >= _IN_LATERAL_M
+        between = (fit.depth_m > _WEDGED_M[0]) & (fit.depth_m < _WEDGED_M[1]) & ~beside
         return Verdict(
             goal=self._inserted(scene),
             failures={
                 "dropped": fell(scene.poses("plug")) | fell(scene.poses("socket")),
                 "wedged": between & (contact.force_n > _WEDGED_N),
+                "sliding": beside & (fit.depth_m > _AT_MOUTH_M) & contact.touching,
             },
             partial=self._inside(fit).astype(int),
             measures={"depth_m": fit.depth_m, "tilt_rad": fit.tilt_rad, "lateral_m": fit.lateral_m},

@@ -131,10 +131,28 @@ def test_a_plug_that_is_pressed_half_way_in_for_a_second_is_wedged():
         {"depth_mm": 20.0, "force_n": 14.0},  # a push that people call gentle
         {"depth_mm": 3.0, "force_n": 20.0},  # on the rim
         {"depth_mm": 31.0, "force_n": 20.0},  # home
-        {"depth_mm": 20.0, "force_n": 20.0, "aside_mm": 5.0},  # beside the socket
     ],
 )
 def test_a_push_elsewhere_or_a_gentle_one_is_no_wedge(case):
+    assert after(2.0, placed(pads=(2, 3), **case)) == [""]
+
+
+@pytest.mark.parametrize("depth_mm", [-1.9, 0.0, 20.0])  # on the socket's face, and past it
+def test_a_plug_that_touches_the_socket_beside_the_mortise_for_a_second_is_sliding(depth_mm):
+    beside = placed(depth_mm, aside_mm=5.0, force_n=1.0, pads=(2, 3))
+    assert after(0.9, beside) == [""]
+    assert after(1.0, beside) == ["sliding"]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"depth_mm": -1.0, "aside_mm": 2.9, "force_n": 10.0},  # at the mortise's edge, where aiming again helps
+        {"depth_mm": -2.1, "aside_mm": 5.0, "force_n": 10.0},  # another place of the parts touches
+        {"depth_mm": 20.0, "aside_mm": 5.0, "force_n": 0.0},  # beside the socket, without contact
+    ],
+)
+def test_a_plug_at_the_edge_or_without_contact_is_not_sliding(case):
     assert after(2.0, placed(pads=(2, 3), **case)) == [""]
 
 

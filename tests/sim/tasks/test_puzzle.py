@@ -265,6 +265,53 @@ def test_a_piece_on_the_rim_is_not_lost_while_a_hand_is_near(sim):
     assert now(sim).failures["rim"][0]
 
 
+def hold_on_the_tray(sim: Simulation, height_m: float = ON_TRAY_M - 5e-5) -> np.ndarray:
+    """The right hand holds the triangle 3 mm beside its hole; its pose (4, 4)."""
+    held = over_hole(sim, "triangle", height_m, aside_m=0.003)
+    put(sim, {"triangle": held})
+    move_hand(sim, "right", hand_over(held, 0.060), opening_m=0.0178)  # the knob is 18 mm wide
+    assert sim.pads_touching("triangle")[0].tolist() == [False, False, True, True]
+    return held
+
+
+def test_a_piece_that_is_pressed_beside_its_hole_for_three_seconds_is_at_the_wrong_place(sim):
+    held = hold_on_the_tray(sim)
+    seen = now(sim)
+    assert seen.failures["wrong place"][0] and not seen.failures["rim"][0]
+    move_hand(sim, "right", hand_over(held, 0.060), opening_m=0.03)  # let go
+    assert not now(sim).failures["wrong place"][0]
+    hold_on_the_tray(sim)
+    targets = sim.targets.copy()
+    targets[0, 13] = 0.012  # grip; the arm presses down by 2 mm
+    below = hand_over(held, 0.058)
+    targets[0, 7:13] = ArmKinematics("right", RobotConfig()).search(below, np.random.default_rng(0))
+    for _ in range(round(2.9 / STEP_S)):
+        sim.step(targets)
+    assert sim.contact("triangle", "tray").force_n[0] > 1.0
+    assert sim.judge.outcome.failure[0] == ""
+    for _ in range(round(0.5 / STEP_S)):  # the first steps settle
+        sim.step(targets)
+    assert sim.judge.outcome.failure[0] == "wrong place"
+
+
+@pytest.mark.parametrize(("speed_mps", "counts"), [(0.004, True), (0.006, False)])
+def test_a_pressed_piece_that_moves_is_searching(sim, speed_mps, counts):
+    hold_on_the_tray(sim)
+    sim.arrays["qvel"][0, sim.model.joint("triangle").dofadr[0]] = speed_mps
+    sim.batch.forward(np.array([0]))
+    assert now(sim).failures["wrong place"][0] == counts
+
+
+def test_a_held_piece_over_the_tray_or_in_its_hole_is_at_no_wrong_place(sim):
+    hold_on_the_tray(sim, ON_TRAY_M + 1e-3)
+    assert not now(sim).failures["wrong place"][0]
+    held = over_hole(sim, "triangle", IN_HOLE_M - 5e-5)
+    put(sim, {"triangle": held})
+    move_hand(sim, "right", hand_over(held, 0.060), opening_m=0.0178)
+    assert sim.contact("triangle", "tray").touching[0]
+    assert not now(sim).failures["wrong place"][0]
+
+
 def test_a_piece_in_its_hole_or_beside_the_tray_is_not_on_the_rim(sim):
     assert not now(sim).failures["rim"][0]  # pieces on the table
     put_all_in(sim)
