@@ -92,6 +92,8 @@ def _ingest(config: IngestConfig) -> int:
         print(f"not read: {line}")
     _check_out(config, jobs)
     store = None if config.dry_run else Store(config.store)
+    if store is not None:
+        store.make()  # each recording's errors are its own: a store that cannot be written would be an error of all
     moved: list[Path] = []
     replace = moved.append if config.replace else None
     with Bars(len(jobs)) as bars:

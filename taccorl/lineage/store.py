@@ -69,6 +69,15 @@ class Store:
         self.digests = DigestCache(self.root / ".digests")
         self.destinations = Destinations(self.root / ".destinations")
 
+    def make(self) -> None:
+        """Make the store's folder if it is not there yet, as the first stage does: fails early where nothing may be written.
+
+        Raises:
+            OSError: the folder cannot be made.
+        """
+        _mark(self.root)
+        self.digests.write_kept()
+
     def source(self, path: Path) -> Artefact:
         """A raw file or folder (or an earlier artefact, wherever it lies), addressed by its content as it is now."""
         path = Path(path).absolute()
@@ -230,8 +239,7 @@ class Store:
         Raises:
             filelock.Timeout: somebody else holds it and ``wait`` is False.
         """
-        _mark(self.root)
-        self.digests.write_kept()
+        self.make()
         folder = self.root / ".locks"
         folder.mkdir(exist_ok=True)
         # The lock file stays: removing it would let a waiter and a newcomer hold "the same" lock on two files.
