@@ -164,7 +164,7 @@ class Store:
             if job.is_published:  # a store that was made anew knows it from now on
                 self.destinations.remember(job.final, job.key)
             return found
-        with self.lock(job.lock_name):
+        with self.lock(job.lock_name, what=f"{stage.name}, {job.final}"):
             for leftover in job.leftovers():
                 shutil.rmtree(leftover)
             found = self._existing(job)
@@ -233,8 +233,11 @@ class Store:
         return self.root / stage.name / key
 
     @contextlib.contextmanager
-    def lock(self, name: str, *, wait: bool = True) -> Iterator[None]:
+    def lock(self, name: str, *, wait: bool = True, what: str = "") -> Iterator[None]:
         """Hold the lock ``name`` of this store: the kernel frees it when its holder dies.
+
+        Args:
+            what: what is made under the lock, for the message of those who wait; ``name`` if not given.
 
         Raises:
             filelock.Timeout: somebody else holds it and ``wait`` is False.
@@ -250,7 +253,7 @@ class Store:
             if not wait:
                 raise
             by = holder.read_text(encoding="utf-8") if holder.is_file() else "another process"
-            logger.warning("waiting for %s in the store %s, held by %s; Ctrl-C ends this run", name, self.root, by)
+            logger.warning("waiting for %s (store %s), held by %s; Ctrl-C ends this run", what or name, self.root, by)
             lock.acquire()
         try:
             holder.write_text(_this_process(), encoding="utf-8")

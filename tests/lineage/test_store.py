@@ -345,7 +345,7 @@ def test_who_waits_for_a_lock_says_for_what_and_who_holds_it(store, caplog):
             done.wait(30)
 
     def wait():
-        with store.lock("abc"):
+        with store.lock("abc", what="recording, /data/out"):
             pass
 
     threads = [threading.Thread(target=hold), threading.Thread(target=wait)]
@@ -360,7 +360,12 @@ def test_who_waits_for_a_lock_says_for_what_and_who_holds_it(store, caplog):
         thread.join(30)
     (record,) = caplog.records
     assert record.levelname == "WARNING"  # is shown without any setting
-    for part in ("abc", str(store.root), f"process {os.getpid()} on {socket.gethostname()}", Path(sys.argv[0]).name):
+    for part in (
+        "recording, /data/out",
+        str(store.root),
+        f"process {os.getpid()} on {socket.gethostname()}",
+        Path(sys.argv[0]).name,
+    ):
         assert part in record.getMessage()
 
 
