@@ -15,15 +15,17 @@ import numpy as np
 from taccorl.alignment.touch_motion import TouchMotion
 from taccorl.data.spec import find_spec, load_sensor_spec
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects.added import present
 from taccorl.sim.effects.effect import Effect, Memory, TouchEffect
 from taccorl.sim.effects.pad_frame import PadFrameEffect
 from taccorl.sim.effects.touch_memory import RememberingEffect
-from taccorl.sim.robot import PAD_TAXELS, PADS
 from taccorl.sim.sensors.flexitac import FlexiTacConfig, normal_reading
 from taccorl.sim.twin import TwinConfig
 
-_TAXELS_AT_ONCE = 64 * len(PADS) * math.prod(PAD_TAXELS)  # 0.4 MB: a core's cache holds what is being worked on
+_TAXELS_AT_ONCE = (
+    64 * len(ROBOT.pads) * math.prod(ROBOT.pad.shape)
+)  # 0.4 MB: a core's cache holds what is being worked on
 
 
 class TouchModel:
@@ -63,22 +65,22 @@ class TouchModel:
         depth, rate = motion.depth(_offsets(acting, motion.pads))
         shape = depth.shape[2:]
         acting = [e for e in acting if _reads(e)]
-        if shape != PAD_TAXELS:
+        if shape != ROBOT.pad.shape:
             acting = [_within(e, motion.window) for e in acting]
-        slots = [PADS.index(pad) for pad in motion.pads]
+        slots = [ROBOT.pads.index(pad) for pad in motion.pads]
         time_s = motion.time_s.mean(axis=1)
         time_s = time_s - (time_s[0] if start_s is None else start_s)
         dt_s = np.diff(time_s, prepend=time_s[0])
         memories = [_memory(effect, motion.window) for effect in acting]
         seen = np.empty(depth.shape, np.float32)
-        at_once = _TAXELS_AT_ONCE // (len(PADS) * math.prod(shape))
+        at_once = _TAXELS_AT_ONCE // (len(ROBOT.pads) * math.prod(shape))
         for start in range(0, len(time_s), at_once):
             some = slice(start, start + at_once)
             law = normal_reading(depth[some], rate[some], float(stiffness_per_m), float(damping_s_per_m))
             if not acting:
                 seen[some] = law
                 continue
-            reading = np.zeros((len(law), len(PADS), *shape), np.float32)
+            reading = np.zeros((len(law), len(ROBOT.pads), *shape), np.float32)
             reading[:, slots] = law
             for effect, memory in zip(acting, memories, strict=True):
                 reading = _through(effect, reading, memory, time_s[some], dt_s[some])
@@ -93,7 +95,7 @@ class TouchModel:
 
     def remembers(self, effects: Sequence[Effect]) -> bool:
         """Whether a frame's readings hang on the frames before it."""
-        return any(bool(e.memory(1)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
+        return any(bool(e.memory(1, ROBOT.pad.shape)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
 
     def counts(self, motion: TouchMotion, reading: np.ndarray) -> np.ndarray:
         """(T, P, R, C) counts above baseline, without noise and rounding; the converter's ends are kept."""
@@ -117,8 +119,8 @@ def _within(effect: Effect, window: tuple[slice, slice]) -> Effect:
 def _memory(effect: Effect, window: tuple[slice, slice]) -> Memory:
     """As before the first scan, of the taxels in the window."""
     return {
-        name: np.ascontiguousarray(array[..., *window]) if array.shape[-2:] == PAD_TAXELS else array
-        for name, array in effect.memory(1).items()
+        name: np.ascontiguousarray(array[..., *window]) if array.shape[-2:] == ROBOT.pad.shape else array
+        for name, array in effect.memory(1, ROBOT.pad.shape).items()
     }
 
 

@@ -10,10 +10,11 @@ import numpy as np
 
 from taccorl.benchmark import Row, against_reference, benchmark, cpu_s, spread
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.grip_rig import gripped, in_hand_m, rest, shake
 from taccorl.sim.pad import OneSim, PadArray
 from taccorl.sim.rendering import Renderer
-from taccorl.sim.robot import PADS, RobotConfig
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
@@ -46,7 +47,6 @@ def holding(num_sims: int = NUM_SIMS) -> tuple[Simulation, np.ndarray]:
     qpos = sim.arrays["qpos"]
     goal = sim.targets.copy()
     for arm, part, width_m in (("left", "socket", 0.030), ("right", "plug", 0.020)):
-        a = 0 if arm == "left" else 7
         joint = sim.model.joint(part).qposadr[0]
         task_part = getattr(sim.task, part)
         grasp = next(iter(task_part.grasps.values())).part_from_tcp
@@ -54,9 +54,9 @@ def holding(num_sims: int = NUM_SIMS) -> tuple[Simulation, np.ndarray]:
         for i in range(num_sims):
             qpos[i, joint : joint + 3] = pose[i, :3, 3]
             mujoco.mju_mat2Quat(qpos[i, joint + 3 : joint + 7], np.ascontiguousarray(pose[i, :3, :3]).ravel())
-        for finger in "ab":
+        for finger in ROBOT.fingers:
             qpos[:, sim.model.joint(f"{arm}_finger_{finger}").qposadr[0]] = width_m / 2 + 0.0001
-        goal[:, a + 6] = width_m - 0.02
+        goal[:, ROBOT.gripper_index(arm)] = width_m - 0.02
     sim.batch.forward()
     for _ in range(15):
         sim.step(goal)
@@ -92,7 +92,9 @@ def twin_speed() -> Iterator[Row]:
     )
     touch = [t / NUM_SIMS for t in _cpu_s(lambda: sim.pads.touch(sim.batch))]
     # Its goal is the share of a control step, below: memory bounds both, and a step of the reference loop stays in the cache.
-    name = f"touch, depth and rate of 4 × 384 taxels, per env in a batch of {NUM_SIMS}"
+    name = (
+        f"touch, depth and rate of {len(ROBOT.pads)} × {ROBOT.pad.num_taxels} taxels, per env in a batch of {NUM_SIMS}"
+    )
     yield Row(name=name, value=1e6 * median(touch), unit="µs/env", n=len(touch), spread=1e6 * spread(touch))
     alone, goal_alone = holding(1)
     alone.step(goal_alone)
@@ -210,8 +212,8 @@ def grip() -> Iterator[Row]:
 def _peak_reading(mass_kg: float, pads: str) -> float:
     config = TwinConfig(robot=RobotConfig(pads=pads))  # pyright: ignore[reportArgumentType]
     model, data = gripped(mass_kg, 10.0, config)
-    array = PadArray(model, PADS)
-    sensor = config.sensor.build(PADS)
+    array = PadArray(model, ROBOT.pads)
+    sensor = config.sensor.build(ROBOT.pads)
     reading = sensor.reading(*array.touch(OneSim(data)), None)
     return float(reading[0, 2:].max())
 

@@ -4,6 +4,7 @@ Pixels: (0, 0) is the centre of the top left pixel, u to the right, v down, as O
 Camera frame: MuJoCo's, x right, y up, looking along −z. (The optical frame of ROS is the same one turned by 180° about x.)
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,21 +191,9 @@ class CameraConfig:
         return offset_pose(position, quat, self.offset)
 
 
-def bench_cameras() -> tuple[CameraConfig, CameraConfig, CameraConfig]:
-    """The paper's three (App. A): a fixed D415 in front, a D405 on each wrist. The mounts are ours, the paper gives none."""
-    front = CameraConfig(name="front", model="d415", position_m=(0.87, 0.0, 0.54), look_at_m=(0.27, 0.0, 0.09))
-    left, right = (
-        CameraConfig(
-            name=f"{arm}_wrist",
-            body=f"{arm}_link6",
-            model="d405",
-            position_m=(-0.09, 0.0, 0.06),  # both pads show over the hand
-            look_at_m=(0.0, 0.0, 0.2),
-            up=(-1.0, 0.0, 0.0),  # fingers enter the picture from below
-        )
-        for arm in ("left", "right")
-    )
-    return front, left, right
+def bench_cameras() -> tuple[CameraConfig, ...]:
+    """The robot's cameras at their nominal mounts."""
+    return tuple(CameraConfig(**dataclasses.asdict(mount)) for mount in ROBOT.camera_mounts)
 
 
 def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -10,29 +10,28 @@ from dataclasses import dataclass, field
 import mujoco
 
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import JOINTS, RobotConfig
+from taccorl.robots import ROBOT
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.settings import check_numbers
 
-# J0 … J5 of the paper are joint1 … joint6 here. Table in Fig. "Per-joint controller SysID", App. B.1.
-KP_NM_PER_RAD = (1813.0, 1392.4, 974.8, 587.1, 151.1, 151.8)
-KD_NMS_PER_RAD = (159.4, 123.7, 87.9, 69.8, 17.1, 16.5)
-TORQUE_FF_NM = (0.12, -0.44, 0.04, -0.12, 1.73, 0.07)
+# Other packages still take these from here.
+KP_NM_PER_RAD, KD_NMS_PER_RAD, TORQUE_FF_NM = ROBOT.kp_nm_per_rad, ROBOT.kd_nms_per_rad, ROBOT.torque_ff_nm
 
 
 @dataclass(kw_only=True)
 class ControllerConfig:
-    """Per joint, joint1 … joint6, the same for both arms."""
+    """Per joint, base to hand, the same for all arms."""
 
-    kp_nm_per_rad: list[float] = field(default_factory=lambda: list(KP_NM_PER_RAD))
-    kd_nms_per_rad: list[float] = field(default_factory=lambda: list(KD_NMS_PER_RAD))
-    torque_ff_nm: list[float] = field(default_factory=lambda: list(TORQUE_FF_NM))
+    kp_nm_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kp_nm_per_rad))
+    kd_nms_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kd_nms_per_rad))
+    torque_ff_nm: list[float] = field(default_factory=lambda: list(ROBOT.torque_ff_nm))
 
     def __post_init__(self) -> None:
         for name in ("kp_nm_per_rad", "kd_nms_per_rad", "torque_ff_nm"):
             values = getattr(self, name)
-            if len(values) != len(JOINTS):
+            if len(values) != ROBOT.num_joints:
                 raise TaccorlError(
-                    f"controller.{name}: {len(values)} values, the arm has {len(JOINTS)} joints: {values}"
+                    f"controller.{name}: {len(values)} values, the arm has {ROBOT.num_joints} joints: {values}"
                 )
         # Without stiffness no joint has a place where it rests.
         check_numbers(
@@ -41,8 +40,8 @@ class ControllerConfig:
 
 
 def add_actuators(spec: mujoco.MjSpec, arm: str, robot: RobotConfig, controller: ControllerConfig) -> None:
-    """Six joint actuators ``left_joint1`` … and ``left_gripper``, whose control is the opening between the pads [m]."""
-    gains = zip(JOINTS, controller.kp_nm_per_rad, controller.kd_nms_per_rad, controller.torque_ff_nm, strict=True)
+    """One actuator per joint, ``left_joint1`` …, and ``left_gripper``, whose control is the opening between the pads [m]."""
+    gains = zip(ROBOT.joints, controller.kp_nm_per_rad, controller.kd_nms_per_rad, controller.torque_ff_nm, strict=True)
     for joint, kp, kd, torque_ff in gains:
         _affine(spec, f"{arm}_{joint}", mujoco.mjtTrn.mjTRN_JOINT, f"{arm}_{joint}", kp, kd, torque_ff)
     opening = spec.add_tendon(name=f"{arm}_opening")

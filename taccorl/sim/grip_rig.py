@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from taccorl.robots import ROBOT
 from taccorl.sim.part import PART_CONTACT
-from taccorl.sim.robot import ARMS, JOINTS
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig, empty_bench
 
 HOME_RAD = np.array([0.0, 1.45, -1.35, 0.0, 0.9, 0.0])
@@ -27,10 +27,10 @@ def gripped(
     squeeze_m = force_n / config.robot.grip_stiffness_n_per_m
     if config.robot.pads == "sprung":
         squeeze_m += 2 * force_n / config.robot.pad_stiffness_n_per_m
-    for arm in ARMS:
-        data.qpos[[model.joint(f"{arm}_{j}").qposadr[0] for j in JOINTS]] = HOME_RAD
-        data.ctrl[[model.actuator(f"{arm}_{j}").id for j in JOINTS]] = HOME_RAD
-        for finger in "ab":
+    for arm in ROBOT.arms:
+        data.qpos[[model.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints]] = HOME_RAD
+        data.ctrl[[model.actuator(f"{arm}_{j}").id for j in ROBOT.joints]] = HOME_RAD
+        for finger in ROBOT.fingers:
             data.qpos[model.joint(f"{arm}_finger_{finger}").qposadr[0]] = _PART_HALF_M[1] + 0.0001
         data.ctrl[model.actuator(f"{arm}_gripper").id] = 2 * _PART_HALF_M[1] - squeeze_m
     mujoco.mj_kinematics(model, data)
@@ -58,7 +58,7 @@ def shake(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float = 3.0, s
 
     Amplitudes, a choice: ``swing_rad`` (0.06) and two thirds of it (0.04), joint 6 by 0.2 rad at 1 Hz.
     """
-    actuators = [model.actuator(f"right_{joint}").id for joint in JOINTS]
+    actuators = [model.actuator(f"right_{joint}").id for joint in ROBOT.joints]
     before, now = in_hand_m(data), data.ctrl[actuators].copy()
     start = now.copy()
     for k in range(1, round(duration_s * CONTROL_HZ) + 1):

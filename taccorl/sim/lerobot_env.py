@@ -9,16 +9,17 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from taccorl.robots import ROBOT
 from taccorl.sim.env import TaccorlEnv
 from taccorl.sim.part_poses import PARTS_KEY
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
+from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 
 def raw_names(observation: Observation) -> dict[str, Any]:
     """An observation, or a batch of them, renamed; ``pixels`` only if it has pictures. Counts become float32, as LeRobot's
     recorder wants them."""
-    pixels = {name: observation[IMAGE_KEYS[name]] for name in CAMERAS if IMAGE_KEYS[name] in observation}
+    pixels = {name: observation[IMAGE_KEYS[name]] for name in ROBOT.cameras if IMAGE_KEYS[name] in observation}
     return {
         **({"pixels": pixels} if pixels else {}),
         **({"environment_state": observation[PARTS_KEY]} if PARTS_KEY in observation else {}),
@@ -32,7 +33,7 @@ def _raw_space(space: gymnasium.Space) -> gymnasium.spaces.Dict:
     counts = space[TACTILE_KEY]
     assert isinstance(counts, gymnasium.spaces.Box)
     tactile = gymnasium.spaces.Box(counts.low.astype(np.float32), counts.high.astype(np.float32))
-    pixels = gymnasium.spaces.Dict({name: space[IMAGE_KEYS[name]] for name in CAMERAS})
+    pixels = gymnasium.spaces.Dict({name: space[IMAGE_KEYS[name]] for name in ROBOT.cameras})
     parts = {"environment_state": space[PARTS_KEY]} if PARTS_KEY in space.spaces else {}
     return gymnasium.spaces.Dict({"pixels": pixels, "agent_pos": space[STATE_KEY], "tactile": tactile, **parts})
 

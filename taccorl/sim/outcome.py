@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.tasks.task import HOLD_S, Task, Verdict
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Judge:
         self.lasted = np.zeros((num_sims, len(task.failures)), dtype=np.int64)
         """(N, categories) control steps for which each failure has been seen without a break."""
         self._limits = np.array([max(1, round(seconds * control_hz)) for seconds in task.failures.values()])
-        self.subtask = np.zeros((num_sims, len(ARMS)), dtype=np.int64)
+        self.subtask = np.zeros((num_sims, len(ROBOT.arms)), dtype=np.int64)
         """(N, 2) index of each arm's current subtask; one past the last when all are done."""
         self.verdict: Verdict | None = None
         self._subtasks = task.subtasks()
@@ -88,7 +88,7 @@ class Judge:
         self.failure[running] = failure[running]
         # Only the current subtask may end, and one a step at most: an edge before its turn does not count.
         before = self.subtask.copy()
-        for a, arm in enumerate(ARMS):
+        for a, arm in enumerate(ROBOT.arms):
             for k, subtask in enumerate(self._subtasks[arm]):
                 waiting = stepped & (before[:, a] == k)
                 if waiting.any():

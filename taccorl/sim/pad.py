@@ -21,8 +21,9 @@ import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+from taccorl.robots.robot_spec import PadLayout
 from taccorl.sim.felt_shapes import shapes_of
-from taccorl.sim.robot import PAD_TAXELS, TAXEL_PITCH_M
 from taccorl.sim.touch_kernel import (
     FeltGeoms,
     Fields,
@@ -109,16 +110,19 @@ class PadArray:
     its thickness: pressed in further, the taxel is nearer to the wall's back. And near an edge it is the distance to the
     edge's sides: a sharp one between two rows of taxels is felt little or not at all.
 
+    Args:
+        layout: of the taxels on every pad.
+
     Raises:
         TaccorlError: a pad without site or geom; a geom of a kind that pads cannot feel (``shapes_of``).
     """
 
-    def __init__(self, model: mujoco.MjModel, pads: Sequence[str]) -> None:
+    def __init__(self, model: mujoco.MjModel, pads: Sequence[str], layout: PadLayout = ROBOT.pad) -> None:
         self.pads = tuple(pads)
-        rows, columns = PAD_TAXELS
-        x = (np.arange(columns) - (columns - 1) / 2) * TAXEL_PITCH_M
-        y = (np.arange(rows) - (rows - 1) / 2) * TAXEL_PITCH_M
-        self.taxel_pos_pad = np.stack([np.tile(x, rows), np.repeat(y, columns), np.zeros(rows * columns)], axis=1)
+        x, y = layout.taxel_axes_m()
+        self.taxel_pos_pad = np.stack(
+            [np.tile(x, layout.rows), np.repeat(y, layout.columns), np.zeros(layout.num_taxels)], axis=1
+        )
         """(K, 3) m."""
         self._site = np.array([_id(model, "site", pad) for pad in pads])
         self._box = np.array([_id(model, "geom", pad) for pad in pads])
@@ -148,7 +152,7 @@ class PadArray:
             plate_normal=self._plate_normal,
             root=model.body_rootid.copy(),
             half_m=np.array([x.max(), y.max(), 0.0]),
-            grid=np.stack([*self.taxel_pos_pad[:, :2].T, np.ones(rows * columns)]).astype(np.float32),
+            grid=np.stack([*self.taxel_pos_pad[:, :2].T, np.ones(layout.num_taxels)]).astype(np.float32),
         )
 
     @property

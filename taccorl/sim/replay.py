@@ -12,7 +12,7 @@ import numpy as np
 
 from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 
 _COMMAND_HZ = 150.0  # as Simulation.step sends them
@@ -45,9 +45,9 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
         TaccorlError: a rate that is no whole number of physics steps, or a wrong shape.
     """
     targets = np.asarray(targets, dtype=float)
-    if targets.ndim != 2 or targets.shape[1] != len(ACTION_NAMES) or not np.isfinite(targets).all():
+    if targets.ndim != 2 or targets.shape[1] != ROBOT.num_actions or not np.isfinite(targets).all():
         raise TaccorlError(
-            f"replay: targets of shape {targets.shape} must be (T, {len(ACTION_NAMES)}) finite rad and m"
+            f"replay: targets of shape {targets.shape} must be (T, {ROBOT.num_actions}) finite rad and m"
         )
     steps = 1.0 / (rate_hz * sim.config.physics.timestep_s)
     if abs(steps - round(steps)) > 1e-6:

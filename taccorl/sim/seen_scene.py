@@ -7,12 +7,12 @@ import numpy as np
 from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.blocks import Blocks
 from taccorl.sim.effects.added import PAST_POSITIONS, PAST_TIME_S, AddedEffects
 from taccorl.sim.effects.camera_past import place_past
 from taccorl.sim.pad import PadArray
 from taccorl.sim.rendering import Renderer
-from taccorl.sim.robot import PADS
 from taccorl.sim.sensors import Noise, Sensor, TactileFrames
 from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.tasks.task import Contact, Task
@@ -62,7 +62,7 @@ class SeenScene:
         """(N, 4, 32, 12) float32 what the pads read before gain, noise and rounding: a pure function of the state, and of
         the past where effects remember it."""
         spec = self.sensor.spec
-        reading = np.empty((self.num_sims, len(PADS), spec.rows, spec.columns), np.float32)
+        reading = np.empty((self.num_sims, len(ROBOT.pads), spec.rows, spec.columns), np.float32)
 
         def read(start: int, end: int) -> None:
             reading[start:end] = self.sensor.reading(*self.pads.touch(self.batch, start, end), None)
@@ -86,7 +86,7 @@ class SeenScene:
         return above
 
     def _above_baseline(self, counts: np.ndarray) -> np.ndarray:
-        return TactileFrames(counts, self.sensor.baseline, PADS, self.sensor.spec).counts_above_baseline
+        return TactileFrames(counts, self.sensor.baseline, ROBOT.pads, self.sensor.spec).counts_above_baseline
 
     def render(
         self, cameras: Sequence[str] | None = None, ids: np.ndarray | None = None, size: tuple[int, int] = (224, 224)

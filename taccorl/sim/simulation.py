@@ -1,18 +1,19 @@
 """N simulations of one task in lock-step on ``mujoco.batch``: reset, control steps, touch, pictures, exact state.
 
 One simulation is the batch with N = 1, so a run is the same bit for bit alone, in a batch and with any number of threads.
-Letters in shapes: N simulations, S sub-commands of one control step.
+Letters in shapes: N simulations, S sub-commands of one control step, A numbers of an action.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, check_actions
+from taccorl.robots import ROBOT
+from taccorl.sim.actions import check_actions
 from taccorl.sim.blocks import Blocks
 from taccorl.sim.effects.added import AddedEffects
 from taccorl.sim.effects.history import fill_histories
@@ -20,7 +21,6 @@ from taccorl.sim.outcome import Judge
 from taccorl.sim.pad import PadArray
 from taccorl.sim.randomize import draw
 from taccorl.sim.rendering import Renderer
-from taccorl.sim.robot import ARMS, FINGER_STROKE_M, JOINTS, PADS
 from taccorl.sim.scene_digest import scene_digest
 from taccorl.sim.seen_scene import SeenScene
 from taccorl.sim.tasks.task import Reset, Task
@@ -99,27 +99,33 @@ class Simulation(SeenScene):
         self.blocks = Blocks(self.batch.nthread)
         self.arrays = {name: self.batch.bind(name) for name in _BOUND}
         self.judge = Judge(task, num_sims, CONTROL_HZ)
-        self.pads = PadArray(self.model, PADS)
-        self.effects = AddedEffects(self.config.effects, self.arrays["time"], self.batch)
-        self.sensor = self.config.sensor.build(PADS, [self.effects])
+        self.sensor = self.config.sensor.build(ROBOT.pads)
+        layout = replace(ROBOT.pad, rows=self.sensor.spec.rows, columns=self.sensor.spec.columns)
+        self.pads = PadArray(self.model, ROBOT.pads, layout)
+        self.effects = AddedEffects(self.config.effects, self.arrays["time"], self.batch, layout.shape)
+        self.sensor.transforms.append(self.effects)
         self.seeds = np.full(num_sims, -1, dtype=np.int64)
         self.draws: list[dict[str, np.ndarray]] = [{} for _ in range(num_sims)]
         self.diverged = np.zeros(num_sims, dtype=bool)
         self.clipped = np.zeros(num_sims, dtype=bool)
         """(N,) whether the newest action lay beyond the limits."""
-        self.executed = np.zeros((num_sims, len(ACTION_NAMES)))
-        """(N, 14) the newest action as it acted."""
-        self.targets = np.zeros((num_sims, len(ACTION_NAMES)))
-        """(N, 14) the newest targets asked for; effects may hold them up on their way to the controllers."""
+        self.executed = np.zeros((num_sims, ROBOT.num_actions))
+        """(N, A) the newest action as it acted."""
+        self.targets = np.zeros((num_sims, ROBOT.num_actions))
+        """(N, A) the newest targets asked for; effects may hold them up on their way to the controllers."""
         self._renderers: dict[tuple, Renderer] = {}
         self._index()
 
     def _index(self) -> None:
         m = self.model
-        self.action_actuators = np.array([m.actuator(name).id for name in ACTION_NAMES])
-        self._encoders = np.array([m.sensor(f"{name}_pos").adr[0] for name in ACTION_NAMES])
-        self._joint_qpos = {arm: np.array([m.joint(f"{arm}_{j}").qposadr[0] for j in JOINTS]) for arm in ARMS}
-        self._fingers = np.array([m.joint(f"{arm}_finger_{f}").qposadr[0] for arm in ARMS for f in "ab"])
+        self.action_actuators = np.array([m.actuator(name).id for name in ROBOT.action_names])
+        self._encoders = np.array([m.sensor(f"{name}_pos").adr[0] for name in ROBOT.action_names])
+        self._joint_qpos = {
+            arm: np.array([m.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints]) for arm in ROBOT.arms
+        }
+        self._fingers = {
+            arm: np.array([m.joint(f"{arm}_finger_{f}").qposadr[0] for f in ROBOT.fingers]) for arm in ROBOT.arms
+        }
         self._free = {part: m.joint(part) for part in self.task.parts}
         self._bodies = {name: m.body(name).id for name in (*self.task.parts, *self.task.clamped)}
         owner = m.geom_bodyid
@@ -127,7 +133,7 @@ class Simulation(SeenScene):
         self._friction = self.batch.expand("geom_friction")
         self._mass = {name: (m.body_mass[i], m.body_inertia[i].copy()) for name, i in self._bodies.items()}
         self._body_mass, self._body_inertia = self.batch.expand("body_mass"), self.batch.expand("body_inertia")
-        touching = [[m.sensor(f"{pad}_on_{part}").adr[0] for pad in PADS] for part in self.task.parts]
+        touching = [[m.sensor(f"{pad}_on_{part}").adr[0] for pad in ROBOT.pads] for part in self.task.parts]
         self._touching = {part: np.array(row) for part, row in zip(self.task.parts, touching, strict=True)}
         self._mating = {
             pair: (m.sensor("{}_on_{}".format(*pair)).adr[0], m.sensor("{}_on_{}_force".format(*pair)).adr[0])
@@ -174,29 +180,30 @@ class Simulation(SeenScene):
         for body in self.task.clamped:
             slot = self.model.body(body).mocapid[0]
             self.arrays["mocap_pos"][i, slot], self.arrays["mocap_quat"][i, slot] = np.split(scene.poses[body], [3])
-        for arm in ARMS:
+        for arm in ROBOT.arms:
             home = np.array(self.task.home_rad[arm])
             qpos[i, self._joint_qpos[arm]] = home
             # The arm rests T_ref / K_p away from its target, so that it stands still where it stands.
             controller = self.config.controller_of(arm)
             rest = np.array(controller.torque_ff_nm) / np.array(controller.kp_nm_per_rad)
-            self.arrays["ctrl"][i, [self.model.actuator(f"{arm}_{j}").id for j in JOINTS]] = home - rest
-            self.arrays["ctrl"][i, self.model.actuator(f"{arm}_gripper").id] = ACTION_HIGH[6]
-        qpos[i, self._fingers] = FINGER_STROKE_M
+            self.arrays["ctrl"][i, [self.model.actuator(f"{arm}_{j}").id for j in ROBOT.joints]] = home - rest
+            opening_m = ROBOT.action_high[ROBOT.gripper_index(arm)]
+            self.arrays["ctrl"][i, self.model.actuator(f"{arm}_gripper").id] = opening_m
+            qpos[i, self._fingers[arm]] = ROBOT.finger_stroke_m
 
     def place_arms(self, joints: np.ndarray, targets: np.ndarray) -> None:
-        """Put the arms of every simulation at rest at ``joints`` (14,) [rad, m] with ``targets`` (14,) in force."""
+        """Put the arms of every simulation at rest at ``joints`` (A,) [rad, m] with ``targets`` (A,) in force."""
         qpos, qvel = self.arrays["qpos"], self.arrays["qvel"]
         joints = self._true(joints)
-        for a, arm in enumerate(ARMS):
-            qpos[:, self._joint_qpos[arm]] = joints[7 * a : 7 * a + 6]
-            qpos[:, self._fingers[2 * a : 2 * a + 2]] = joints[7 * a + 6] / 2
+        for arm in ROBOT.arms:
+            qpos[:, self._joint_qpos[arm]] = joints[ROBOT.joint_slice(arm)]
+            qpos[:, self._fingers[arm]] = joints[ROBOT.gripper_index(arm)] / 2
         qvel[:] = 0.0
         self.arrays["ctrl"][:, self.action_actuators] = targets
         self._settle(np.arange(self.num_sims))
 
     def _true(self, reported: np.ndarray) -> np.ndarray:
-        """Where joints and grippers (14,) are when their encoders report ``reported``: fixed point, encoders are nearly right."""
+        """Where joints and grippers (A,) are when their encoders report ``reported``: fixed point, encoders are nearly right."""
         true = reported
         for _ in range(_ENCODER_ROUNDS):
             true = true + (reported - self.effects.encoder(true[None])[0])
@@ -212,7 +219,7 @@ class Simulation(SeenScene):
     # stepping --------------------------------------------------------------------------------------------------------
 
     def step(self, action: np.ndarray, ids: np.ndarray | None = None, watch: Watch | None = None) -> None:
-        """One control step (1/30 s) with targets ``action`` (N, 14) [rad, m], reached in a straight line over the step.
+        """One control step (1/30 s) with targets ``action`` (N, A) [rad, m], reached in a straight line over the step.
 
         Simulations that are not of ``ids`` (all by default) stand still, judge and targets included; their rows are not used.
         ``watch`` sees the state in between; it changes nothing.
@@ -228,7 +235,7 @@ class Simulation(SeenScene):
     def advance(
         self, commands: np.ndarray, num_steps: int, ids: np.ndarray | None = None, watch: Watch | None = None
     ) -> None:
-        """Physics only: S targets (S, N, 14), each held for ``num_steps`` physics steps. For replay and recording."""
+        """Physics only: S targets (S, N, A), each held for ``num_steps`` physics steps. For replay and recording."""
         stepped = np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
         watched = set(watch.at) if watch else set()
         total = len(commands) * num_steps
@@ -286,22 +293,22 @@ class Simulation(SeenScene):
         return ids[~bad[ids]]
 
     def _send(self, commands: np.ndarray, num_steps: int, ids: np.ndarray | None) -> list[np.ndarray]:
-        """What of S targets (S, N, 14), each held for ``num_steps`` physics steps, reaches the controllers."""
+        """What of S targets (S, N, A), each held for ``num_steps`` physics steps, reaches the controllers."""
         held_s, sent = np.zeros(self.num_sims), slice(None) if ids is None else ids
         held_s[sent] = num_steps * self.config.physics.timestep_s
         self.targets[sent] = commands[-1][sent]
         return [self.effects.command(command, held_s) for command in commands]
 
     def _checked(self, action: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
-        """``action`` (N, 14) within the limits; kept as what ``ids`` execute."""
+        """``action`` (N, A) within the limits; kept as what ``ids`` execute."""
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != (self.num_sims, len(ACTION_NAMES)):
+        if action.shape != (self.num_sims, ROBOT.num_actions):
             raise TaccorlError(
-                f"action: shape {action.shape}, the twin wants ({self.num_sims}, {len(ACTION_NAMES)}): "
-                f"{', '.join(ACTION_NAMES[:7])}, and the same of the right arm"
+                f"action: shape {action.shape}, the twin wants ({self.num_sims}, {ROBOT.num_actions}): "
+                f"{', '.join(ROBOT.action_names)}"
             )
         check_actions(action)
-        goal = np.clip(action, ACTION_LOW, ACTION_HIGH)
+        goal = np.clip(action, ROBOT.action_low, ROBOT.action_high)
         sent = slice(None) if ids is None else ids
         self.clipped[sent] = (goal != action).any(1)[sent]
         self.executed[sent] = goal[sent]

@@ -1,19 +1,15 @@
 """What an environment of the twin shows and takes, as gymnasium spaces, under the names of data_specs/taccorl_bimanual.yaml."""
 
-import math
-
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY
-from taccorl.sim.robot import PAD_TAXELS, PADS
 
-CAMERAS = ("front", "left_wrist", "right_wrist")
+CAMERAS, NUM_TAXELS = ROBOT.cameras, ROBOT.num_taxels  # other packages still take these from here
 IMAGE_SHAPE = (224, 224, 3)  # rows, columns, rgb: what π0.5 looks at
-NUM_TAXELS = len(PADS) * math.prod(PAD_TAXELS)  # K = 1536
 STATE_KEY, TACTILE_KEY = "observation.state", "observation.tactile"
-IMAGE_KEYS = {name: f"observation.images.{name}" for name in CAMERAS}
+IMAGE_KEYS = {name: f"observation.images.{name}" for name in ROBOT.cameras}
 
 Observation = dict[str, np.ndarray]
 
@@ -26,8 +22,8 @@ def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
     """
     counts = np.iinfo(np.int16)
     spaces = {
-        STATE_KEY: Box(-np.inf, np.inf, (len(ACTION_NAMES),), np.float32),
-        TACTILE_KEY: Box(counts.min, counts.max, (NUM_TAXELS,), np.int16),
+        STATE_KEY: Box(-np.inf, np.inf, (ROBOT.num_actions,), np.float32),
+        TACTILE_KEY: Box(counts.min, counts.max, (ROBOT.num_taxels,), np.int16),
     }
     if part_numbers is not None:
         spaces[PARTS_KEY] = Box(-np.inf, np.inf, (part_numbers,), np.float32)
@@ -37,5 +33,5 @@ def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
 
 
 def action_space() -> Box:
-    """Of one environment: 14 targets within the joint limits [rad] and the grippers' openings [m]."""
-    return Box(ACTION_LOW.astype(np.float32), ACTION_HIGH.astype(np.float32))
+    """Of one environment: targets within the joint limits [rad] and the grippers' openings [m]."""
+    return Box(ROBOT.action_low.astype(np.float32), ROBOT.action_high.astype(np.float32))

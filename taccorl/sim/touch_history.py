@@ -12,7 +12,8 @@ Letters in shapes: N environments, L readings, H control steps of a chunk, K tax
 import numpy as np
 
 from taccorl.errors import TaccorlError
-from taccorl.sim.spaces import NUM_TAXELS, TACTILE_KEY
+from taccorl.robots import ROBOT
+from taccorl.sim.spaces import TACTILE_KEY
 from taccorl.sim.vector_env import Chunk
 
 
@@ -26,7 +27,7 @@ class TouchHistory:
         """
         if length < 1:
             raise TaccorlError(f"touch history: length {length}; give at least 1")
-        self.window = np.zeros((num_envs, length, NUM_TAXELS), dtype=np.int16)
+        self.window = np.zeros((num_envs, length, ROBOT.num_taxels), dtype=np.int16)
         """(N, L, K) counts above baseline, oldest first."""
 
     def reset(self, first: np.ndarray, mask: np.ndarray | None = None) -> None:

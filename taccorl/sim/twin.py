@@ -5,12 +5,13 @@ from dataclasses import dataclass, field
 import mujoco
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
 from taccorl.sim.cameras import CameraConfig, add_cameras, bench_cameras
 from taccorl.sim.controller import ControllerConfig, add_actuators
 from taccorl.sim.effects.added import edit_model
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.rendering import style
-from taccorl.sim.robot import ARMS, JOINTS, PADS, RobotConfig, add_arm
+from taccorl.sim.robot import RobotConfig, add_arm
 from taccorl.sim.sensors import SensorConfig
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.settings import check_numbers
@@ -57,8 +58,8 @@ class TwinConfig:
 
     def __post_init__(self) -> None:
         for arm in self.arm_controllers:
-            if arm not in ARMS:
-                raise TaccorlError(f"arm_controllers: no arm {arm!r}; {nearest(arm, ARMS)}")
+            if arm not in ROBOT.arms:
+                raise TaccorlError(f"arm_controllers: no arm {arm!r}; {nearest(arm, ROBOT.arms)}")
 
     def controller_of(self, arm: str) -> ControllerConfig:
         """Gains of one arm."""
@@ -86,9 +87,9 @@ def empty_bench(config: TwinConfig) -> mujoco.MjSpec:
         friction=[0.6, 0.005, 0.0001],
         solref=[0.005, 1],
     )
-    for arm in ARMS:
+    for arm in ROBOT.arms:
         add_arm(spec, arm, config.robot)
-    for arm in ARMS:
+    for arm in ROBOT.arms:
         add_actuators(spec, arm, config.robot, config.controller_of(arm))
     return spec
 
@@ -107,8 +108,8 @@ def build_spec(config: TwinConfig, task: Task) -> mujoco.MjSpec:
 
 def _add_encoders(spec: mujoco.MjSpec) -> None:
     """``left_joint1_pos`` … ``right_gripper_pos``: read through MuJoCo's sensors, so that a delay is an attribute of theirs."""
-    for arm in ARMS:
-        for joint in JOINTS:
+    for arm in ROBOT.arms:
+        for joint in ROBOT.joints:
             spec.add_sensor(
                 name=f"{arm}_{joint}_pos",
                 type=mujoco.mjtSensor.mjSENS_JOINTPOS,
@@ -139,7 +140,7 @@ def _add_contact_sensors(spec: mujoco.MjSpec, task: Task) -> None:
     ``plug_on_socket_force`` for each mating pair."""
     body, geom = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM
     for part in task.parts:
-        for pad in PADS:
+        for pad in ROBOT.pads:
             _contact_sensor(spec, f"{pad}_on_{part}", (geom, pad), part, _FOUND, _MIN_DIST)
     for one, other in task.mating:
         _contact_sensor(spec, f"{one}_on_{other}", (body, one), other, _FOUND | _DIST, _MIN_DIST)

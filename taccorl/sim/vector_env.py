@@ -20,17 +20,16 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.actions import ACTION_NAMES, beyond_reason, why_bad
+from taccorl.robots import ROBOT
+from taccorl.sim.actions import beyond_reason, why_bad
 from taccorl.sim.episode_seeds import EpisodeSeeds
 from taccorl.sim.outcome import BAD_ACTION
 from taccorl.sim.part_poses import part_pose_names, part_poses
 from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.simulation import Simulation, Snapshot, checked_seeds
 from taccorl.sim.spaces import (
-    CAMERAS,
     IMAGE_KEYS,
     IMAGE_SHAPE,
-    NUM_TAXELS,
     PARTS_KEY,
     STATE_KEY,
     TACTILE_KEY,
@@ -53,14 +52,12 @@ def shaped(actions: np.ndarray, *leading: int | None) -> np.ndarray:
     Raises:
         TaccorlError: it has another shape.
     """
-    actions, wanted = np.asarray(actions), (*leading, len(ACTION_NAMES))
+    actions, wanted = np.asarray(actions), (*leading, ROBOT.num_actions)
     if actions.ndim != len(wanted) or not all(
         n == w or (w is None and n) for n, w in zip(actions.shape, wanted, strict=True)
     ):
         shape = ", ".join("H" if w is None else str(w) for w in wanted)
-        raise TaccorlError(
-            f"action: shape {actions.shape}, wanted is ({shape}): {', '.join(ACTION_NAMES[:7])}, and the same of the right arm"
-        )
+        raise TaccorlError(f"action: shape {actions.shape}, wanted is ({shape}): {', '.join(ROBOT.action_names)}")
     return actions
 
 
@@ -138,7 +135,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             num_threads=num_threads,
             scale=randomization,
         )
-        self.sim.require_cameras(CAMERAS if images != "never" else ["front"] if render_mode else [])
+        self.sim.require_cameras(ROBOT.cameras if images != "never" else ROBOT.cameras[:1] if render_mode else [])
         checked_seeds([] if seed is None else seed)
         if max_episode_steps is not None:
             if not isinstance(max_episode_steps, int | np.integer) or max_episode_steps < 1:
@@ -156,13 +153,13 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self._seeds = EpisodeSeeds(num_envs, seed)
         self._begun = False
         self._over, self._clipped = np.zeros(num_envs, dtype=bool), np.zeros(num_envs, dtype=bool)
-        self._state = np.zeros((num_envs, len(ACTION_NAMES)), dtype=np.float32)
-        self._tactile = np.zeros((num_envs, NUM_TAXELS), dtype=np.int16)
+        self._state = np.zeros((num_envs, ROBOT.num_actions), dtype=np.float32)
+        self._tactile = np.zeros((num_envs, ROBOT.num_taxels), dtype=np.int16)
         self._parts = (
             np.zeros((num_envs, len(part_pose_names(self.sim.task))), dtype=np.float32) if part_poses else None
         )
         self._pictures = {
-            name: np.zeros((num_envs, *IMAGE_SHAPE), dtype=np.uint8) for name in CAMERAS if images != "never"
+            name: np.zeros((num_envs, *IMAGE_SHAPE), dtype=np.uint8) for name in ROBOT.cameras if images != "never"
         }
         self._reason = np.full(num_envs, "", dtype=object)
         self._unseen = np.zeros(num_envs, dtype=bool)
@@ -235,7 +232,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         if not self._begun:
             raise TaccorlError("step: call reset() first")
         reward, num_steps = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.int64)
-        tactile = np.empty((*actions.shape[:2], NUM_TAXELS), dtype=np.int16)
+        tactile = np.empty((*actions.shape[:2], ROBOT.num_taxels), dtype=np.int16)
         self._clipped = np.zeros(self.num_envs, dtype=bool)
         for k in range(actions.shape[1]):
             advanced, earned = self._advance(actions[:, k])
@@ -256,14 +253,14 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The front camera's picture of every environment, (224, 224, 3) uint8 each."""
+        """The first camera's picture of every environment, (224, 224, 3) uint8 each."""
         self._check_open("render")
         if self.render_mode is None:
             return None
         if self.images == "never":
-            return tuple(self.sim.render(["front"])["front"])
+            return tuple(self.sim.render(ROBOT.cameras[:1])[ROBOT.cameras[0]])
         self._look()
-        return tuple(self._pictures["front"])
+        return tuple(self._pictures[ROBOT.cameras[0]])
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Attribute or method ``name`` for each environment, as gymnasium's own vector environments have it."""
@@ -305,7 +302,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         ids = np.flatnonzero(self._unseen & ~self.sim.diverged & (True if wanted is None else wanted))
         if not ids.size:
             return
-        for name, new in self.sim.render(CAMERAS, ids).items():
+        for name, new in self.sim.render(ROBOT.cameras, ids).items():
             if len(ids) < self.num_envs:
                 pictures = self._pictures[name].copy()
                 pictures[ids] = new

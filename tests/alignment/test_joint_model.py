@@ -144,7 +144,7 @@ class _Late(JointEffect):
         },
     )
 
-    def memory(self, num_sims: int) -> dict[str, np.ndarray]:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> dict[str, np.ndarray]:
         return {"last": np.full((num_sims, 14), np.nan)}
 
     def command(self, targets: np.ndarray, memory: dict[str, np.ndarray], dt_s: np.ndarray) -> np.ndarray:

@@ -129,8 +129,8 @@ class Fades(TouchEffect):
     layer: ClassVar = "material"
     rate: float = parameter(unit="1", symbol="a", absent=0.0, low=0.0, high=1.0, typical=0.2, source="planted")
 
-    def memory(self, num_sims: int) -> Memory:
-        return {"sum": np.zeros((num_sims, len(PADS), *PAD_TAXELS), np.float32)}
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
+        return {"sum": np.zeros((num_sims, len(PADS), *pad_shape), np.float32)}
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         memory["sum"] += reading * dt_s[:, None, None, None].astype(np.float32)

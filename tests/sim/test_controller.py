@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM, ControllerConfig
-from taccorl.sim.robot import ARMS, JOINTS
+from taccorl.robots import ROBOT
+from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig, empty_bench
@@ -14,8 +14,10 @@ from taccorl.sim.twin import TwinConfig, empty_bench
 
 def test_actuators_hold_the_paper_s_numbers():
     model = empty_bench(TwinConfig()).compile()
-    for arm in ARMS:
-        for joint, kp, kd, bias in zip(JOINTS, KP_NM_PER_RAD, KD_NMS_PER_RAD, TORQUE_FF_NM, strict=True):
+    for arm in ROBOT.arms:
+        for joint, kp, kd, bias in zip(
+            ROBOT.joints, ROBOT.kp_nm_per_rad, ROBOT.kd_nms_per_rad, ROBOT.torque_ff_nm, strict=True
+        ):
             actuator = model.actuator(f"{arm}_{joint}")
             assert actuator.gainprm[0] == kp
             np.testing.assert_array_equal(actuator.biasprm[:3], [bias, -kp, -kd])
@@ -29,7 +31,7 @@ def test_step_response_is_a_first_order_lag_with_kd_over_kp(joint):
     before = sim.proprioception()[0].copy()
     target = sim.targets[0].copy()
     target[7 + joint] += 0.05
-    tau_s = KD_NMS_PER_RAD[joint] / KP_NM_PER_RAD[joint]
+    tau_s = ROBOT.kd_nms_per_rad[joint] / ROBOT.kp_nm_per_rad[joint]
     steps = round(tau_s / sim.config.physics.timestep_s)
     sim.advance(target[None, None], steps)
     done = (sim.proprioception()[0, 7 + joint] - before[7 + joint]) / 0.05
@@ -41,7 +43,7 @@ def test_arm_rests_torque_over_stiffness_away_from_its_target():
     sim.reset([0])
     np.testing.assert_allclose(sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=1e-9)
     offset = sim.proprioception()[0, 7:13] - sim.targets[0, 7:13]
-    np.testing.assert_allclose(offset, np.array(TORQUE_FF_NM) / KP_NM_PER_RAD, atol=1e-9)
+    np.testing.assert_allclose(offset, np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-9)
     for _ in range(30):
         sim.step(sim.targets.copy())
     np.testing.assert_allclose(sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=2e-5)  # it stays there
@@ -53,7 +55,7 @@ def test_an_arm_may_have_gains_of_its_own():
     sim.reset([0])
     offset = sim.proprioception()[0] - sim.targets[0]
     np.testing.assert_allclose(offset[7:13], 0.5 / 100.0, atol=1e-9)
-    np.testing.assert_allclose(offset[:6], np.array(TORQUE_FF_NM) / KP_NM_PER_RAD, atol=1e-9)
+    np.testing.assert_allclose(offset[:6], np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-9)
     with pytest.raises(TaccorlError, match=r"arm_controllers: no arm 'rigth'; did you mean 'right'"):
         TwinConfig(arm_controllers={"rigth": own})
 
@@ -70,7 +72,7 @@ def test_without_gravity_compensation_joint_2_sags_by_its_load_over_stiffness():
     load_nm = data.qfrc_bias[sim.model.joint("left_joint2").dofadr[0]]
     offset = sim.proprioception()[0, 1] - sim.targets[0, 1]
     assert abs(load_nm) > 3.0
-    assert offset == pytest.approx((TORQUE_FF_NM[1] - load_nm) / KP_NM_PER_RAD[1], abs=1e-5)
+    assert offset == pytest.approx((ROBOT.torque_ff_nm[1] - load_nm) / ROBOT.kp_nm_per_rad[1], abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
+from taccorl.robots.robot_spec import PadLayout
 from taccorl.sim.pad import KINEMATIC_FIELDS, OneSim, PadArray, Touch, without_sinking
 from taccorl.sim.shapes import triangle_outline
 
@@ -114,6 +115,23 @@ def test_ball_is_felt_at_the_row_and_column_where_it_is() -> None:
     deep = pads.penetration(OneSim(data)).depth_m.reshape(2, 32, 12)
     assert np.argwhere(deep[1]).tolist() == [[row, 11 - column]]
     assert pads.taxel_pos_pad[row * 12 + column] == pytest.approx([y, z, 0])
+
+
+def test_taxels_lie_as_the_layout_says() -> None:
+    """3 rows × 2 columns, 4 mm apart: x = ∓2 mm, y = −4, 0, 4 mm. A ball over row 2, column 0 is felt there only."""
+    layout = PadLayout(rows=3, columns=2, pitch_m=0.004)
+    radius_m, depth_m = 0.004, 0.0005
+    ball = f'<body name="part" pos="{-0.02 - depth_m + radius_m} -0.002 0.004"><freejoint/><geom size="{radius_m}"/></body>'
+    model = model_of(finger_xml("a", -1) + finger_xml("b", 1) + ball)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    pads = PadArray(model, PADS, layout)
+    expected = [(-2, -4), (2, -4), (-2, 0), (2, 0), (-2, 4), (2, 4)]
+    np.testing.assert_allclose(pads.taxel_pos_pad[:, :2] * 1e3, expected, atol=1e-12)
+    deep = pads.penetration(OneSim(data)).depth_m
+    assert deep.shape == (1, 2, 6)
+    assert np.argwhere(deep[0]).tolist() == [[0, 4]]
+    assert deep[0, 0, 4] == pytest.approx(depth_m, abs=1e-9)
 
 
 def test_all_parts_on_one_pad_are_felt_and_of_those_at_one_taxel_the_deepest() -> None:

@@ -14,8 +14,8 @@ from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.part import COLORS, Part, add_part, measure_fit
-from taccorl.sim.robot import FINGER_STROKE_M, PAD_LENGTH_M, PAD_THICKNESS_M, PAD_WIDTH_M
 from taccorl.sim.shapes import Box, Cylinder, Prism, circle_outline, extrude, heart_outline
 from taccorl.sim.tasks.parts import (
     PIECES,
@@ -299,13 +299,13 @@ def test_the_circle_is_a_true_disc_that_looks_the_same_after_any_turn():
 
 
 def jaw(side: int) -> Part:
-    half = (PAD_WIDTH_M / 2, PAD_THICKNESS_M / 2, PAD_LENGTH_M / 2)
+    half = (ROBOT.pad.width_m / 2, ROBOT.pad_thickness_m / 2, ROBOT.pad.length_m / 2)
     return Part(name=f"jaw{side}", solids=[Box(half_m=half, color="orange")], clamped=True)
 
 
 def place_jaws(bench: Bench, world_from_tcp: np.ndarray, opening_m: float) -> None:
     for side in (-1, 1):
-        bench.put(f"jaw{side}", world_from_tcp @ pose_at(0, side * (opening_m + PAD_THICKNESS_M) / 2, 0))
+        bench.put(f"jaw{side}", world_from_tcp @ pose_at(0, side * (opening_m + ROBOT.pad_thickness_m) / 2, 0))
 
 
 def jaws_to_m(bench: Bench, *names: str) -> list[float]:
@@ -316,7 +316,7 @@ def jaws_to_m(bench: Bench, *names: str) -> list[float]:
 
 def jaws_above_table_m(bench: Bench) -> float:
     """Height of the pads' lowest corner."""
-    half = (PAD_WIDTH_M / 2, PAD_THICKNESS_M / 2, PAD_LENGTH_M / 2)
+    half = (ROBOT.pad.width_m / 2, ROBOT.pad_thickness_m / 2, ROBOT.pad.length_m / 2)
     poses = [bench.pose(f"jaw{side}") for side in (-1, 1)]
     return min(pose[2, 3] - np.abs(pose[2, :3]) @ half for pose in poses)
 
@@ -341,7 +341,7 @@ def test_the_closed_pads_lie_on_the_part_and_clear_of_the_rest_and_the_open_ones
     grip = part.grasps[grasp]
     assert grip.width_m <= 0.050
     bench, rest, others = at_rest(part, jaw(-1), jaw(1))
-    for opening_m in (grip.width_m, 2 * FINGER_STROKE_M):
+    for opening_m in (grip.width_m, 2 * ROBOT.finger_stroke_m):
         place_jaws(bench, rest @ grip.part_from_tcp, opening_m)
         to_part_m = jaws_to_m(bench, part.name)
         assert to_part_m == pytest.approx([0, 0], abs=2e-6) if opening_m == grip.width_m else min(to_part_m) >= 0.0035

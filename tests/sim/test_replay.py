@@ -6,7 +6,7 @@ import pytest
 from taccorl.data.episode import Episode
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.replay import replay, replay_episode
 from taccorl.sim.simulation import Simulation
@@ -29,7 +29,7 @@ def test_sample_k_is_the_twin_before_command_k_acts(bench):
     start = bench.proprioception()[0].copy()
     done = replay(bench, targets, 200.0, start)
     np.testing.assert_allclose(done.reported[:11, 3], start[3], atol=1e-7)
-    tau_s = KD_NMS_PER_RAD[3] / KP_NM_PER_RAD[3]
+    tau_s = ROBOT.kd_nms_per_rad[3] / ROBOT.kp_nm_per_rad[3]
     for row in (11, 15, 25):
         expected = 0.02 * (1 - np.exp(-(row - 10) / 200 / tau_s))
         assert done.reported[row, 3] - start[3] == pytest.approx(expected, abs=0.02 * 0.012)
@@ -108,6 +108,10 @@ def test_dense_record_of_effort_is_the_controllers_law(bench):
         bench.step(goal, watch=recorder.watch())
     record = recorder.trajectory()
     velocity = np.gradient(record.reported[:, 4], 1 / SAMPLE_HZ)
-    expected = KP_NM_PER_RAD[4] * (goal[0, 4] - record.reported[:, 4]) - KD_NMS_PER_RAD[4] * velocity + TORQUE_FF_NM[4]
+    expected = (
+        ROBOT.kp_nm_per_rad[4] * (goal[0, 4] - record.reported[:, 4])
+        - ROBOT.kd_nms_per_rad[4] * velocity
+        + ROBOT.torque_ff_nm[4]
+    )
     np.testing.assert_allclose(record.effort[10:-2, 4], expected[10:-2], atol=0.03)
     assert np.abs(velocity[10:20]).min() > 0.05

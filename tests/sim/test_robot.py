@@ -7,20 +7,10 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.robots.bimanual_piper import INERTIAS
 from taccorl.sim.grip_rig import gripped, in_hand_m, rest, shake
-from taccorl.sim.robot import (
-    ARMS,
-    FINGER_STROKE_M,
-    INERTIAS,
-    JOINTS,
-    LINKS,
-    PAD_LENGTH_M,
-    PAD_WIDTH_M,
-    PADS,
-    RobotConfig,
-    add_arm,
-    link_poses,
-)
+from taccorl.sim.robot import RobotConfig, add_arm, link_poses
 from taccorl.sim.twin import TwinConfig, empty_bench
 
 
@@ -31,14 +21,14 @@ def compiled(**robot) -> mujoco.MjModel:
 def test_forward_kinematics_agrees_with_the_published_joint_frames():
     model = compiled()
     data = mujoco.MjData(model)
-    limits = np.array([link.range_rad for link in LINKS])
+    limits = np.array([link.range_rad for link in ROBOT.links])
     for seed in range(20):
-        for arm in ARMS:
+        for arm in ROBOT.arms:
             joints = np.random.default_rng(seed).uniform(*limits.T)
-            data.qpos[[model.joint(f"{arm}_{j}").qposadr[0] for j in JOINTS]] = joints
+            data.qpos[[model.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints]] = joints
             mujoco.mj_kinematics(model, data)
             base = data.body(f"{arm}_base_link").xpos
-            for i, link in enumerate(LINKS):
+            for i, link in enumerate(ROBOT.links):
                 ours = link_poses(joints)[i]
                 body = data.body(f"{arm}_{link.name}")
                 np.testing.assert_allclose(body.xpos - base, ours[:3, 3], atol=1e-12)
@@ -83,8 +73,8 @@ def test_both_mass_sets_are_physical_and_differ_by_a_third():
 @pytest.mark.parametrize("inertias", ["manufacturer", "menagerie"])
 def test_compiled_model_has_the_table_s_masses_and_limits(inertias):
     model = compiled(inertias=inertias)
-    for arm in ARMS:
-        for link, inertia in zip(LINKS, INERTIAS[inertias], strict=True):
+    for arm in ROBOT.arms:
+        for link, inertia in zip(ROBOT.links, INERTIAS[inertias], strict=True):
             body = model.body(f"{arm}_{link.name}")
             assert body.mass[0] == pytest.approx(inertia.mass_kg)
             np.testing.assert_allclose(body.ipos, inertia.com_link_m, atol=1e-12)
@@ -103,7 +93,7 @@ def test_taxel_frames_look_at_each_other_and_run_from_palm_to_tip():
     model = compiled()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    for arm in ARMS:
+    for arm in ROBOT.arms:
         hand = data.body(f"{arm}_link6").xmat.reshape(3, 3)
         a, b = (data.site(f"{arm}_{f}").xmat.reshape(3, 3) for f in "ab")
         np.testing.assert_allclose(a[:, 2], -b[:, 2], atol=1e-12)
@@ -111,17 +101,18 @@ def test_taxel_frames_look_at_each_other_and_run_from_palm_to_tip():
             np.testing.assert_allclose(frame[:, 1], hand[:, 2], atol=1e-12)
         # closed fingers: both undeformed surfaces lie in the hand's middle plane
         np.testing.assert_allclose(data.site(f"{arm}_a").xpos, data.site(f"{arm}_tcp").xpos, atol=1e-12)
-    for pad in PADS:
+    for pad in ROBOT.pads:
         half = model.geom(pad).size
-        assert half[[0, 2]] * 2 == pytest.approx([PAD_WIDTH_M, PAD_LENGTH_M])
+        assert half[[0, 2]] * 2 == pytest.approx([ROBOT.pad.width_m, ROBOT.pad.length_m])
 
 
 def test_an_arm_touches_table_parts_and_the_other_arm_but_not_itself():
     model = compiled()
     bits = {
-        arm: {(int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in _geoms(model, arm)} for arm in ARMS
+        arm: {(int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in _geoms(model, arm)}
+        for arm in ROBOT.arms
     }
-    (left,), (right,) = (bits[arm] - {(1, 1)} for arm in ARMS)
+    (left,), (right,) = (bits[arm] - {(1, 1)} for arm in ROBOT.arms)
 
     def collide(one: tuple[int, int], other: tuple[int, int]) -> bool:
         return bool(one[0] & other[1] or other[0] & one[1])
@@ -172,7 +163,7 @@ def test_fingers_stay_mirror_images_under_a_one_sided_push():
     mujoco.mj_step(model, data, nstep=600)
     a, b = (data.joint(f"right_finger_{f}").qpos[0] for f in "ab")
     assert abs(a - b) < 1e-4
-    assert 0 <= a <= FINGER_STROKE_M
+    assert 0 <= a <= ROBOT.finger_stroke_m
 
 
 def test_an_arm_can_be_built_alone():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.simulation import SUB_COMMANDS, Simulation, Watch
 from taccorl.sim.tasks import tasks
@@ -264,14 +264,14 @@ def test_an_action_a_little_beyond_the_limits_is_clipped_and_said():
     action[1, 1] = -0.2  # joint 2 ends at 0
     sim.step(action)
     assert sim.clipped.tolist() == [False, True]
-    assert sim.executed[1, 1] == ACTION_LOW[1]
+    assert sim.executed[1, 1] == ROBOT.action_low[1]
 
 
 def test_limits_are_float32_that_lie_inside_the_published_ones():
-    for limits in (ACTION_LOW, ACTION_HIGH):
+    for limits in (ROBOT.action_low, ROBOT.action_high):
         np.testing.assert_array_equal(limits, limits.astype(np.float32).astype(float))
-    assert ACTION_LOW[0] >= -2.618
-    assert ACTION_HIGH[0] <= 2.618
+    assert ROBOT.action_low[0] >= -2.618
+    assert ROBOT.action_high[0] <= 2.618
 
 
 def test_a_simulation_that_diverges_fails_alone_and_keeps_its_seed():

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from taccorl.robots import ROBOT
 from taccorl.sim.felt_shapes import shapes_of
 from taccorl.sim.pad import KINEMATIC_FIELDS, OneSim, PadArray
-from taccorl.sim.robot import PADS
 from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import TwinConfig, build_spec
 
@@ -25,7 +25,7 @@ def scattered(task: str) -> tuple[mujoco.MjModel, SimpleNamespace]:
     rng = np.random.default_rng(5)
     on_parts = np.flatnonzero((model.body_dofnum[model.geom_bodyid] == 6) & (model.geom_contype > 0))
     for n in range(NUM_SIMS):
-        for pad in PADS:
+        for pad in ROBOT.pads:
             site, geom = model.site(pad).id, rng.choice(on_parts)
             state.site_xpos[n, site] = data.geom_xpos[geom] + rng.normal(0, 0.004, 3)
             state.site_xmat[n, site] = Rotation.random(rng=rng).as_matrix().ravel()
@@ -37,12 +37,12 @@ def scattered(task: str) -> tuple[mujoco.MjModel, SimpleNamespace]:
 
 def reference(model: mujoco.MjModel, state: SimpleNamespace) -> tuple[np.ndarray, np.ndarray]:
     """(N, P, K) depth and rate: the deepest of all shapes that are not of the pad's own arm."""
-    x, y, _ = PadArray(model, PADS).taxel_pos_pad.T
+    x, y, _ = PadArray(model, ROBOT.pads).taxel_pos_pad.T
     grid = np.stack([x, y, np.ones_like(x)]).astype(np.float32)
     colliding = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
-    depth, rate = np.zeros((2, NUM_SIMS, len(PADS), len(x)), np.float32)
-    own = {pad: model.body_treeid[model.site(pad).bodyid[0]] for pad in PADS}
-    mounts = {pad: {model.geom(p).id for p in PADS if p != pad} for pad in PADS}
+    depth, rate = np.zeros((2, NUM_SIMS, len(ROBOT.pads), len(x)), np.float32)
+    own = {pad: model.body_treeid[model.site(pad).bodyid[0]] for pad in ROBOT.pads}
+    mounts = {pad: {model.geom(p).id for p in ROBOT.pads if p != pad} for pad in ROBOT.pads}
 
     def velocity_at(body: int, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         turn, shift = state.cvel[:, body, :3], state.cvel[:, body, 3:]
@@ -51,7 +51,7 @@ def reference(model: mujoco.MjModel, state: SimpleNamespace) -> tuple[np.ndarray
     for shapes in shapes_of(model, colliding.tolist()):
         for number, geom in sorted(enumerate(shapes.geoms), key=lambda one: one[1]):
             mat = state.geom_xmat[:, geom].reshape(-1, 3, 3).swapaxes(1, 2)
-            for p, pad in enumerate(PADS):
+            for p, pad in enumerate(ROBOT.pads):
                 if model.body_treeid[model.geom_bodyid[geom]] == own[pad] and geom not in mounts[pad]:
                     continue
                 site = model.site(pad).id
@@ -73,7 +73,7 @@ def reference(model: mujoco.MjModel, state: SimpleNamespace) -> tuple[np.ndarray
 @pytest.mark.parametrize("task", ["assembly_1", "test_tube"])
 def test_compiled_touch_is_that_of_the_shapes(task: str) -> None:
     model, state = scattered(task)
-    pads = PadArray(model, PADS)
+    pads = PadArray(model, ROBOT.pads)
     found, expected = pads.penetration(state), reference(model, state)
     touched = expected[0] > 0
     assert touched.sum() > 1000 and np.abs(expected[1][touched]).max() > 0.02

@@ -8,6 +8,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.cameras import CameraConfig, letterbox_window
 from taccorl.sim.effects.camera_past import PastScene
 from taccorl.sim.effects.effect import LAYERS, Effect, Memory
@@ -29,9 +30,18 @@ class AddedEffects:
     Args:
         time_s: (N,) the simulations' clocks, live.
         batch: the simulations' physics; without it nothing is felt or rewritten.
+        pad_shape: rows and columns of the sensor's pads.
+
+    Letters in shapes: N simulations, A numbers of an action, P pads, R rows and C columns of a pad.
     """
 
-    def __init__(self, effects: Sequence[Effect], time_s: np.ndarray, batch: Batch | None = None) -> None:
+    def __init__(
+        self,
+        effects: Sequence[Effect],
+        time_s: np.ndarray,
+        batch: Batch | None = None,
+        pad_shape: tuple[int, int] = ROBOT.pad.shape,
+    ) -> None:
         self.present = present(effects)
         rewritten = sorted({name for effect in self.present for name in effect.rewrites})
         self.rewrites = bool(rewritten)
@@ -39,7 +49,7 @@ class AddedEffects:
         self._live = LiveModel(batch, rewritten) if batch and self.present else None
         self._time_s = time_s
         self._scanned_s = np.array(time_s)
-        self._start = [effect.memory(len(time_s)) for effect in self.present]
+        self._start = [effect.memory(len(time_s), pad_shape) for effect in self.present]
         self._memory: list[Memory] = [{k: v.copy() for k, v in rows.items()} for rows in self._start]
         touch = [k for k, effect in enumerate(self.present) if effect.layer not in ("robot", "camera")]
         self.remember_touch = any(self._start[k] for k in touch)
@@ -49,7 +59,7 @@ class AddedEffects:
         """Where everything was, if a camera shows it; ``Simulation.advance`` keeps it up."""
 
     def command(self, targets: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        """What reaches the controllers of targets (N, 14) that stand for ``dt_s`` (N,)."""
+        """What reaches the controllers of targets (N, A) that stand for ``dt_s`` (N,)."""
         for effect, memory in zip(self.present, self._memory, strict=True):
             targets = effect.command(targets, memory, dt_s)
         return targets
@@ -74,20 +84,20 @@ class AddedEffects:
         return friction
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
-        """What is reported of joints and grippers (N, 14)."""
+        """What is reported of joints and grippers (N, A)."""
         for effect in self.present:
             values = effect.encoder(values)
         return values
 
     def __call__(self, reading: np.ndarray) -> np.ndarray:
-        """What the pads read now where ideal ones would read ``reading`` (N, 4, 32, 12). Looking changes nothing."""
+        """What the pads read now where ideal ones would read ``reading`` (N, P, R, C). Looking changes nothing."""
         return self._read(reading, self._copied(np.arange(len(reading))), np.arange(len(reading)))
 
     def scan(self, reading: np.ndarray, ids: np.ndarray) -> None:
         """Advance the memory of touch effects. The reading is taken as constant since the last scan.
 
         Args:
-            reading: (N, 4, 32, 12) what pads without effects would read now, in units of the policy's normalised reading.
+            reading: (N, P, R, C) what pads without effects would read now, in units of the policy's normalised reading.
             ids: (n,) simulations whose pads are scanned now; other rows are not used.
         """
         memories = self._copied(ids)
@@ -130,7 +140,7 @@ class AddedEffects:
 
         Args:
             ids: (n,) simulations that start anew.
-            targets: (N, 14) targets, taken as constant before the episode; rows of ``ids`` are read.
+            targets: (N, A) targets, taken as constant before the episode; rows of ``ids`` are read.
             seeds: (n,) of the episodes, for effects that draw random numbers; 0 by default.
         """
         seeds = np.zeros(len(ids), dtype=np.int64) if seeds is None else seeds

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import Effect
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ class CameraEffect(Effect):
     """An effect of pictures: the same numbers for all cameras that are chosen. Cameras that differ get an entry each."""
 
     layer: ClassVar = "camera"
-    cameras: list[str] = field(default_factory=lambda: ["front", "left_wrist", "right_wrist"])
+    cameras: list[str] = field(default_factory=lambda: list(ROBOT.cameras))
     """Names as in the twin's ``cameras``."""
 
     def __post_init__(self) -> None:

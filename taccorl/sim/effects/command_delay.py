@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import JointEffect, parameter
 from taccorl.sim.effects.history import delay
-from taccorl.sim.robot import JOINTS
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
@@ -46,7 +46,7 @@ class CommandDelay(JointEffect):
         ),
         "joint_compliance": "A small phase in either; a delay leaves no resonance: small, fast chirp.",
     }
-    possible: ClassVar = (*JOINTS, "gripper")
+    possible: ClassVar = (*ROBOT.joints, "gripper")
     delay_s: float = parameter(
         unit="s",
         symbol="d",

@@ -5,9 +5,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import CHANNELS, JointEffect, Memory, parameter
-from taccorl.sim.robot import JOINTS
+from taccorl.sim.effects.effect import JointEffect, Memory, parameter
 
 
 @effects.register("command_lag")
@@ -35,7 +35,7 @@ class CommandLag(JointEffect):
         "joint_compliance": "A small phase in either; a small, fast chirp shows the resonance of a spring.",
         "kp": "Soft gains with much K_d lag like this in free motion; a held load tells stiffness from smoothing.",
     }
-    possible: ClassVar = (*JOINTS, "gripper")
+    possible: ClassVar = (*ROBOT.joints, "gripper")
     time_constant_s: float = parameter(
         unit="s",
         symbol="T",
@@ -49,8 +49,8 @@ class CommandLag(JointEffect):
     def drive(self) -> dict[str, float]:
         return {"command_lag": self.time_constant_s}
 
-    def memory(self, num_sims: int) -> Memory:
-        return {"target": np.full((num_sims, len(CHANNELS)), np.nan)}
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
+        return {"target": np.full((num_sims, ROBOT.num_actions), np.nan)}
 
     def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
         smooth = memory["target"]

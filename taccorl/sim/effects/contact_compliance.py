@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect, parameter
-from taccorl.sim.robot import ARMS
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
@@ -52,7 +52,7 @@ class ContactCompliance(Effect):
         return ["parts"]
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-        arms = [f"{arm}_base_link" for arm in ARMS]
+        arms = [f"{arm}_base_link" for arm in ROBOT.arms]
         for body in spec.worldbody.bodies:
             if body.name in arms:
                 continue

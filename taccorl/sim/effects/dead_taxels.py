@@ -8,7 +8,6 @@ import numpy as np
 
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import BoardEffect, Memory, parameter
-from taccorl.sim.robot import PAD_TAXELS, PADS
 
 
 @effects.register("dead_taxels")
@@ -35,13 +34,13 @@ class DeadTaxels(BoardEffect):
         source="a choice",
     )
 
-    def dead(self) -> np.ndarray:
-        """(4, 32, 12) bool; round(s · 384) on each pad, chosen or not."""
-        num_taxels = math.prod(PAD_TAXELS)
-        rank = np.random.default_rng(self.seed).permuted(np.tile(np.arange(num_taxels), (len(PADS), 1)), axis=1)
-        return (rank < round(self.share * num_taxels)).reshape(-1, *PAD_TAXELS)
+    def dead(self, shape: tuple[int, int, int]) -> np.ndarray:
+        """Bool of ``shape`` (pads, rows, columns): round(s · taxels) on each pad, chosen or not."""
+        num_pads, num_taxels = shape[0], math.prod(shape[1:])
+        rank = np.random.default_rng(self.seed).permuted(np.tile(np.arange(num_taxels), (num_pads, 1)), axis=1)
+        return (rank < round(self.share * num_taxels)).reshape(shape)
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         reading = reading.copy()
-        reading[:, self.slots] *= ~self.dead()[self.slots]
+        reading[:, self.slots] *= ~self.dead(reading.shape[1:])[self.slots]
         return reading

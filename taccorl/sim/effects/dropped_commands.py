@@ -6,9 +6,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import CHANNELS, JointEffect, Memory, parameter
-from taccorl.sim.robot import JOINTS
+from taccorl.sim.effects.effect import JointEffect, Memory, parameter
 
 STRIDE, _FIRST, _SECOND = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 """SplitMix64's constants: between two numbers of a stream, and of its finaliser."""
@@ -40,7 +40,7 @@ class DroppedCommands(JointEffect):
         "command_delay": "On average commands are older by p / (1 − p) periods; a delay repeats, drops do not: record twice.",
     }
     fitted: ClassVar = False
-    possible: ClassVar = (*JOINTS, "gripper")
+    possible: ClassVar = (*ROBOT.joints, "gripper")
     probability: float = parameter(
         unit="1",
         symbol="p",
@@ -61,9 +61,9 @@ class DroppedCommands(JointEffect):
     def drive(self) -> dict[str, float]:
         return {"drop_probability": self.probability, "drop_seed": float(self.seed)}
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         return {
-            "target": np.full((num_sims, len(CHANNELS)), np.nan),
+            "target": np.full((num_sims, ROBOT.num_actions), np.nan),
             "count": np.zeros(num_sims),
             "episode": np.zeros(num_sims),
         }

@@ -4,10 +4,10 @@ An effect acts through as few of eight hooks as it needs:
 
 ==========  ==================================================  =======================================================
 ``edit``    MuJoCo's model, before it is compiled               friction, armature, delays: MuJoCo does the work
-``command`` targets on their way to the controller (N, 14)      each time they are sent, 150 Hz in ``Simulation.step``
+``command`` targets on their way to the controller (N, A)       each time they are sent, 150 Hz in ``Simulation.step``
 ``rewrite`` numbers of the compiled model, each simulation's    before every physics step, from what ``feel`` saw of the last
-``encoder`` angles and openings as reported (N, 14)             whenever they are read
-``reading`` the pads' reading (N, 4, 32, 12)                    between the sensor's law and its gain
+``encoder`` angles and openings as reported (N, A)              whenever they are read
+``reading`` the pads' reading (N, P, R, C)                      between the sensor's law and its gain
 ``picture`` what a camera gives, values 0 … 255                 after a picture is drawn, before it is rounded
 ``picture_age_s``  how old what a camera shows is               whenever a picture is drawn
 ``memory``  arrays (N, …) that hooks keep between calls         part of ``Simulation.snapshot``, so runs go on bit-exactly
@@ -22,6 +22,8 @@ A twin with an effect that rewrites makes its physics steps one by one and looks
 
 Two entries of one effect may not act on the same joint or pad. Entries act in the order of ``LAYERS``, then by name: how the
 file lists them does not matter.
+
+Letters in shapes: N simulations, A numbers of an action, P pads, R rows and C columns of a pad.
 """
 
 import dataclasses
@@ -34,14 +36,13 @@ import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.robot import ARMS, JOINTS, PADS
+from taccorl.robots import ROBOT
 
 if TYPE_CHECKING:
     from taccorl.sim.effects.live_model import LiveModel
     from taccorl.sim.twin import TwinConfig
 
-CHANNELS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in (*JOINTS, "gripper"))
-"""What the 14 columns of targets and reported values belong to: the order of actions."""
+CHANNELS = ROBOT.action_names  # other packages still take these from here
 Memory = dict[str, np.ndarray]
 """Name → array (N, …), changed in place."""
 LAYERS = ("robot", "material", "spread", "taxel", "baseline", "camera")
@@ -205,8 +206,12 @@ class Effect:
         """Sliding friction of parts and fixtures where the scene's is ``friction``; asked at every reset."""
         return friction
 
-    def memory(self, num_sims: int) -> Memory:
-        """Arrays (N, …) as they are after a reset, before ``command`` is told the targets at rest."""
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
+        """Arrays (N, …) as they are after a reset, before ``command`` receives the targets at rest.
+
+        Args:
+            pad_shape: rows and columns of the sensor's pads, for effects of taxels.
+        """
         return {}
 
     def begin(self, memory: Memory, ids: np.ndarray, seeds: np.ndarray) -> None:
@@ -217,7 +222,7 @@ class Effect:
         """
 
     def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
-        """What arrives at the controllers of the targets (N, 14) that are now sent.
+        """What arrives at the controllers of the targets (N, A) that are now sent.
 
         Args:
             targets: joint angles [rad] and openings [m] in the order of actions.
@@ -239,11 +244,11 @@ class Effect:
         before this one made of them. Of the memory and the simulations' time only: a restored simulation must go on the same."""
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
-        """What is reported where the joints say ``values`` (N, 14) [rad, m]."""
+        """What is reported where the joints say ``values`` (N, A) [rad, m]."""
         return values
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        """What the pads read where ideal ones would read ``reading`` (N, 4, 32, 12): as the sensor's law gives it, 0 without
+        """What the pads read where ideal ones would read ``reading`` (N, P, R, C): as the sensor's law gives it, 0 without
         contact, before gain, noise and rounding. To be returned as a new array of the same float type.
 
         What is written into ``memory`` lasts from one scan to the next, and a scan is at the end of every
@@ -278,11 +283,11 @@ class ArmEffect(Effect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.arm not in (*ARMS, "both"):
-            raise TaccorlError(f"effect {self.name}: no arm {self.arm!r}; {nearest(self.arm, (*ARMS, 'both'))}")
+        if self.arm not in (*ROBOT.arms, "both"):
+            raise TaccorlError(f"effect {self.name}: no arm {self.arm!r}; {nearest(self.arm, (*ROBOT.arms, 'both'))}")
 
     def arms(self) -> list[str]:
-        return [arm for arm in ARMS if self.arm in (arm, "both")]
+        return [arm for arm in ROBOT.arms if self.arm in (arm, "both")]
 
     def acts_on(self) -> list[str]:
         return self.arms()
@@ -292,9 +297,9 @@ class ArmEffect(Effect):
 class JointEffect(ArmEffect):
     """An effect of single joints: the same numbers for all that are chosen. Joints that differ get an entry each."""
 
-    possible: ClassVar[tuple[str, ...]] = JOINTS
+    possible: ClassVar[tuple[str, ...]] = ROBOT.joints
     """What ``joints`` may name."""
-    joints: list[str] = field(default_factory=lambda: list(JOINTS))
+    joints: list[str] = field(default_factory=lambda: list(ROBOT.joints))
     """``joint1`` … ``joint6``, which the paper calls J0 … J5; for some effects ``gripper``, too."""
 
     def __post_init__(self) -> None:
@@ -307,7 +312,7 @@ class JointEffect(ArmEffect):
     @property
     def columns(self) -> list[int]:
         """Where the chosen joints stand in targets and reported values."""
-        return [CHANNELS.index(name) for name in self.acts_on()]
+        return [ROBOT.action_names.index(name) for name in self.acts_on()]
 
     def chosen(self, spec: mujoco.MjSpec) -> Iterator[mujoco.MjsJoint]:
         """The joints' own entries of the model."""
@@ -321,12 +326,12 @@ class TouchEffect(Effect):
 
     windows: ClassVar[bool] = False
     """Whether ``reading`` and ``memory`` also hold for a rectangle of each pad's taxels, where nothing touches beyond its rim."""
-    pads: list[str] = field(default_factory=lambda: list(PADS))
+    pads: list[str] = field(default_factory=lambda: list(ROBOT.pads))
     """``left_a`` … ``right_b``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_chosen(self.name, "pad", self.pads, PADS)
+        _check_chosen(self.name, "pad", self.pads, ROBOT.pads)
 
     def acts_on(self) -> list[str]:
         return list(self.pads)
@@ -334,7 +339,7 @@ class TouchEffect(Effect):
     @property
     def slots(self) -> list[int]:
         """Where the chosen pads stand in the reading."""
-        return [PADS.index(pad) for pad in self.pads]
+        return [ROBOT.pads.index(pad) for pad in self.pads]
 
     def within(self, window: tuple[slice, slice]) -> "TouchEffect | None":
         """The effect for readings of these rows and columns only; None if it must have whole pads (``windows``)."""

@@ -66,7 +66,7 @@ class EncoderEccentricity(JointEffect):
         values[:, self.columns] += self.amplitude_rad * np.sin(values[:, self.columns] + self.phase_rad)
         return values
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         return {"angle_rad": np.zeros((num_sims, len(self.acts_on())))}
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:

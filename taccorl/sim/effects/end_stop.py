@@ -84,7 +84,7 @@ class EndStop(JointEffect):
     def drive(self) -> dict[str, float]:
         return {"stop_stiffness": self.stiffness_nm_per_rad, "stop_angle": self.angle_rad}
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         shape = (num_sims, len(self.acts_on()))
         return {"side": np.ones(shape), "touches": np.zeros(shape)}
 

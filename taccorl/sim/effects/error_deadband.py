@@ -53,7 +53,7 @@ class ErrorDeadband(JointEffect):
     def drive(self) -> dict[str, float]:
         return {"deadband": self.width_rad}
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         return {"error_rad": np.zeros((num_sims, len(self.acts_on())))}
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import ArmEffect, parameter
 
@@ -79,7 +80,7 @@ class Payload(ArmEffect):
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         inertia = 0.4 * self.mass_kg * _RADIUS_M**2
         for arm in self.arms():
-            ball = spec.body(f"{arm}_link6").add_body(name=f"{arm}_payload")
+            ball = spec.body(f"{arm}_{ROBOT.hand}").add_body(name=f"{arm}_payload")
             ball.mass, ball.explicitinertial = self.mass_kg, True
             ball.ipos = [self.x_link6_m, self.y_link6_m, self.z_link6_m]
             ball.inertia = [inertia] * 3

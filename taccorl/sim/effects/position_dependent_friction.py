@@ -99,7 +99,7 @@ class PositionDependentFriction(JointEffect):
         for joint in self.chosen(spec):
             add_dry_friction(joint, 0.0)
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         return {"friction_nm": np.zeros((num_sims, len(self.acts_on())))}
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import JointEffect, parameter
 from taccorl.sim.effects.history import delay
-from taccorl.sim.robot import JOINTS
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
@@ -36,7 +36,7 @@ class SensorDelay(JointEffect):
             "same clock tell which it is."
         ),
     }
-    possible: ClassVar = (*JOINTS, "gripper")
+    possible: ClassVar = (*ROBOT.joints, "gripper")
     delay_s: float = parameter(
         unit="s",
         symbol="d",

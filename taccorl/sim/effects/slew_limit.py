@@ -7,8 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import CHANNELS, JointEffect, Memory, parameter
+from taccorl.sim.effects.effect import JointEffect, Memory, parameter
 
 
 @effects.register("slew_limit")
@@ -54,8 +55,8 @@ class SlewLimit(JointEffect):
     def drive(self) -> dict[str, float]:
         return {"slew_rate": self.speed_rad_per_s}
 
-    def memory(self, num_sims: int) -> Memory:
-        return {"target": np.full((num_sims, len(CHANNELS)), np.nan)}
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
+        return {"target": np.full((num_sims, ROBOT.num_actions), np.nan)}
 
     def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
         limited = memory["target"]

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 import numpy as np
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import JointEffect, parameter
-from taccorl.sim.robot import JOINTS
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
@@ -61,8 +61,8 @@ class SpeedDelay(JointEffect):
         least = _least_inertia(spec, [joint.name for joint in joints])
         for joint, inertia in zip(joints, least, strict=True):
             arm, name = joint.name.split("_", 1)
-            control = config.controller_of("left" if arm == "left" else "right")
-            kd, most = control.kd_nms_per_rad[JOINTS.index(name)], MOST_LOST * inertia
+            control = config.controller_of(arm)
+            kd, most = control.kd_nms_per_rad[ROBOT.joints.index(name)], MOST_LOST * inertia
             lost = kd * self.delay_s
             joint.armature -= min(lost, most)
             if lost > most:

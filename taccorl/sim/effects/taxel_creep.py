@@ -10,7 +10,6 @@ import numpy as np
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Memory, parameter
 from taccorl.sim.effects.touch_memory import RememberingEffect
-from taccorl.sim.robot import PAD_TAXELS
 
 
 @effects.register("taxel_creep")
@@ -62,8 +61,8 @@ class TaxelCreep(RememberingEffect):
         source="the same Velostat taxel",
     )
 
-    def memory(self, num_sims: int) -> Memory:
-        return {"crept": np.zeros((num_sims, len(self.pads), *PAD_TAXELS), np.float32)}
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
+        return {"crept": np.zeros((num_sims, len(self.pads), *pad_shape), np.float32)}
 
     def scans(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
         seen = np.empty(own.shape, own.dtype)  # in order, so that its flat form is a view

@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
-from taccorl.sim.robot import PAD_TAXELS
 
 
 @effects.register("taxel_gain_map")
@@ -47,12 +47,12 @@ class TaxelGainMap(TouchEffect):
         source="1 is the map as it was measured; less fades it out",
     )
     gains: list[float] = field(default_factory=lambda: [0.0])
-    """g_i: 384 for each pad, row after row from palm to tip, pad after pad; or one for all of them. 0, as it is by default, is a
+    """g_i: one per taxel, row after row from palm to tip, pad after pad; or one for all of them. 0, as it is by default, is a
     pad that is not connected."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expected = len(self.pads) * math.prod(PAD_TAXELS)
+        expected = len(self.pads) * ROBOT.pad.num_taxels
         if len(self.gains) not in (1, expected):
             raise TaccorlError(
                 f"effect {self.name}: gains are {len(self.gains)} numbers; pads {', '.join(self.pads)} have {expected} taxels: "
@@ -67,7 +67,7 @@ class TaxelGainMap(TouchEffect):
 
     @classmethod
     def of(cls, gains: np.ndarray, pads: Sequence[str]) -> "TaxelGainMap":
-        """The map of gains (P, 32, 12), rounded to six digits: fine enough to be fitted with, short enough to be read."""
+        """The map of gains (P, R, C), rounded to six digits: fine enough to be fitted with, short enough to be read."""
         return cls(share=1.0, pads=list(pads), gains=np.round(np.asarray(gains, float), 6).reshape(-1).tolist())
 
     def within(self, window: tuple[slice, slice]) -> "TaxelGainMap":
@@ -76,7 +76,7 @@ class TaxelGainMap(TouchEffect):
         return found
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        gains = np.broadcast_to(self.gains, len(self.pads) * math.prod(PAD_TAXELS)).reshape(-1, *PAD_TAXELS)
+        gains = np.broadcast_to(self.gains, len(self.pads) * ROBOT.pad.num_taxels).reshape(-1, *ROBOT.pad.shape)
         gains = gains[:, *self._window]
         reading = reading.copy()
         reading[:, self.slots] *= (1.0 + self.share * (gains - 1.0)).astype(reading.dtype)

@@ -7,7 +7,6 @@ import numpy as np
 
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import BoardEffect, Memory, parameter
-from taccorl.sim.robot import PAD_TAXELS, PADS
 
 
 @effects.register("taxel_gain_spread")
@@ -37,7 +36,7 @@ class TaxelGainSpread(BoardEffect):
     )
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        log_gain = np.random.default_rng(self.seed).standard_normal((len(PADS), *PAD_TAXELS))[self.slots]
+        log_gain = np.random.default_rng(self.seed).standard_normal(reading.shape[1:])[self.slots]
         reading = reading.copy()
         reading[:, self.slots] *= np.exp(self.log_std * log_gain).astype(reading.dtype)
         return reading

@@ -42,7 +42,7 @@ class TorqueFade(JointEffect):
     def drive(self) -> dict[str, float]:
         return {"fade_rate": self.rate_per_min / 60}
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         return {"carried_nm": np.zeros((num_sims, len(self.acts_on())))}
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:

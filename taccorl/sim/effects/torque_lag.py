@@ -49,7 +49,7 @@ class TorqueLag(JointEffect):
     def drive(self) -> dict[str, float]:
         return {"torque_lag": self.time_constant_s}
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         shape = (num_sims, len(self.acts_on()))
         return {
             "torque_nm": np.zeros(shape),

@@ -68,7 +68,7 @@ class TorqueScale(JointEffect):
             actuator.gainprm[0] *= self.factor
             actuator.biasprm[:3] *= self.factor
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         return {"carried_nm": np.zeros((num_sims, len(self.acts_on())))}
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:

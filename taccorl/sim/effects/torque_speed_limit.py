@@ -87,7 +87,7 @@ class TorqueSpeedLimit(JointEffect):
             joint.actgravcomp, joint.actfrclimited = True, True
             joint.actfrcrange = [-most_nm, most_nm]
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         return {"speed_rad_per_s": np.zeros((num_sims, len(self.acts_on())))}
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Memory, parameter
 from taccorl.sim.effects.touch_memory import RememberingEffect
-from taccorl.sim.robot import PAD_TAXELS
 
 _GAP_S = 0.008  # readings closer than this are not kept beside each other; pads are scanned 100 times a second
 
@@ -48,10 +47,10 @@ class TouchDelay(RememberingEffect):
         source="a choice: three scans",
     )
 
-    def memory(self, num_sims: int) -> Memory:
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         kept = math.ceil(self.delay_s / _GAP_S) + 2
         return {
-            "past": np.zeros((num_sims, kept, len(self.pads), *PAD_TAXELS), np.float32),
+            "past": np.zeros((num_sims, kept, len(self.pads), *pad_shape), np.float32),
             "age_s": np.zeros((num_sims, kept)),
         }
 

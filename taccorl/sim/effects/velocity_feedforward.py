@@ -5,8 +5,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import CHANNELS, JointEffect, Memory, parameter
+from taccorl.sim.effects.effect import JointEffect, Memory, parameter
 from taccorl.sim.effects.live_model import LiveModel
 
 
@@ -46,8 +47,8 @@ class VelocityFeedforward(JointEffect):
     def drive(self) -> dict[str, float]:
         return {"feedforward": self.share}
 
-    def memory(self, num_sims: int) -> Memory:
-        nan, none = np.full((num_sims, len(CHANNELS)), np.nan), np.zeros((num_sims, len(CHANNELS)))
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
+        nan, none = np.full((num_sims, ROBOT.num_actions), np.nan), np.zeros((num_sims, len(ROBOT.action_names)))
         return {"target": nan, "speed": none, "lead_s": none.copy()}
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 from shapely.geometry import Polygon, box
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
 from taccorl.sim.part import Grasp, Hole, Mate, Part
-from taccorl.sim.robot import PAD_LENGTH_M
 from taccorl.sim.shapes import (
     Capsule,
     Cylinder,
@@ -26,7 +26,7 @@ from taccorl.sim.shapes import (
 # Per side; 0.001 is easy, 0.0003 hard. A choice between 0.06 mm (Isaac Lab's Factory) and 3 mm (ManiSkill's PegInsertionSide).
 CLEARANCE_M = 0.0005
 _FINGER_ROOM_M = 0.004  # between the fingers' tips and what lies below them
-_TCP_ABOVE_M = PAD_LENGTH_M / 2 + _FINGER_ROOM_M  # lowest TCP over a surface: the pads reach 32 mm beyond it
+_TCP_ABOVE_M = ROBOT.pad.length_m / 2 + _FINGER_ROOM_M  # lowest TCP over a surface: the pads reach 32 mm beyond it
 
 
 def _pose(x_axis: tuple = (1, 0, 0), z_axis: tuple = (0, 0, 1), at: tuple = (0, 0, 0)) -> np.ndarray:

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from taccorl.robots import ROBOT
 from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
-from taccorl.sim.robot import ARMS, TCP_FROM_LINK6_M
 from taccorl.sim.tasks import tasks
 from taccorl.sim.tasks.parts import PIECES, puzzle_piece, puzzle_tray
 from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell
@@ -154,6 +154,6 @@ def _left_alone(scene: Scene, pieces: np.ndarray, asked: np.ndarray) -> np.ndarr
     if not asked.any():
         return asked
     knobs = pieces[..., :3, 3] + _KNOB_ABOVE_M * pieces[..., :3, 2]
-    hands = np.stack([scene.poses(f"{arm}_link6") for arm in ARMS], axis=1)
-    tcps = hands[..., :3, 3] + TCP_FROM_LINK6_M * hands[..., :3, 2]
+    hands = np.stack([scene.poses(f"{arm}_{ROBOT.hand}") for arm in ROBOT.arms], axis=1)
+    tcps = hands[..., :3, 3] + ROBOT.tcp_from_hand_m * hands[..., :3, 2]
     return np.linalg.norm(knobs[:, :, None] - tcps[:, None], axis=3).min(axis=2) > _LEFT_ALONE_M

@@ -7,14 +7,14 @@ import mujoco
 import numpy as np
 from press_bench import PressBench
 
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.effect import CHANNELS, Effect
+from taccorl.sim.effects.effect import Effect
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 
-COLUMN = CHANNELS.index("right_joint5")
-KP, KD, TORQUE_FF = KP_NM_PER_RAD[4], KD_NMS_PER_RAD[4], TORQUE_FF_NM[4]
+COLUMN = ROBOT.action_names.index("right_joint5")
+KP, KD, TORQUE_FF = ROBOT.kp_nm_per_rad[4], ROBOT.kd_nms_per_rad[4], ROBOT.torque_ff_nm[4]
 STEP_S = TwinConfig().physics.timestep_s
 GRAVITY = 9.81
 
@@ -30,7 +30,7 @@ def drive(sim: Simulation, seconds: float, offset=lambda t: 0.0, column: int = C
         ``t`` [s], ``u`` target, ``q`` angle of the motor, ``v`` its velocity, ``reported``; each (T,).
     """
     rest = sim.targets.copy()
-    joint = sim.model.joint(CHANNELS[column])
+    joint = sim.model.joint(ROBOT.action_names[column])
     rows = []
     for k in range(round(seconds / STEP_S)):
         targets = rest.copy()
@@ -46,7 +46,7 @@ def static_torque_nm(sim: Simulation, column: int = COLUMN) -> float:
     model, data = sim.batch.get_model(0), sim.batch.get_data(0)
     data.qvel[:] = 0.0
     mujoco.mj_forward(model, data)
-    return float(data.qfrc_bias[model.joint(CHANNELS[column]).dofadr[0]])
+    return float(data.qfrc_bias[model.joint(ROBOT.action_names[column]).dofadr[0]])
 
 
 def asked_nm(motion: dict[str, np.ndarray]) -> np.ndarray:

@@ -3,9 +3,9 @@
 import mujoco
 import numpy as np
 
+from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.randomize import Row
-from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict
 from taccorl.sim.twin import TwinConfig, empty_bench
@@ -53,7 +53,7 @@ class PressBench(Task):
         return Verdict(goal=no, failures={"dropped": no}, partial=no.astype(int))
 
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
-        return dict.fromkeys(ARMS, ())
+        return dict.fromkeys(ROBOT.arms, ())
 
 
 def start(*effects: Effect, num_sims: int = 1, num_threads: int = 1) -> Simulation:
@@ -84,7 +84,7 @@ def perform(sim: Simulation, first: int = 0, last: int = 10) -> dict[str, np.nda
         seen.append(
             {
                 "reported": sim.proprioception().copy(),
-                "hands": np.stack([sim.tcp(arm) for arm in ARMS], axis=1),
+                "hands": np.stack([sim.tcp(arm) for arm in ROBOT.arms], axis=1),
                 "reading": sim.reading(),
                 "touch": sim.touch(),
                 "sensors": sim.arrays["sensordata"].copy(),

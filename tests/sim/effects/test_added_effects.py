@@ -8,6 +8,7 @@ import pytest
 from press_bench import BLOCK_M, PressBench, perform, start
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, parameter
 from taccorl.sim.effects.touch_lag import TouchLag
@@ -153,7 +154,7 @@ def test_a_memory_advances_at_the_boards_rate_whatever_the_phase_of_its_neighbou
     press[:, 6] = BLOCK_M - 0.006
     sim.step(press, np.array([0]))
 
-    memory, at_scan, count = lag.memory(1), [], 0
+    memory, at_scan, count = lag.memory(1, ROBOT.pad.shape), [], 0
     expected = []
     for control_step in range(6):
         due = [s for s in range(1, 41) if (40 * control_step + s) % 12 == 0]

@@ -20,14 +20,14 @@ from joint_bench import (
 )
 from press_bench import RIGHT_HOME, perform, start
 
-from taccorl.sim.controller import KP_NM_PER_RAD
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import CHANNELS, Effect
+from taccorl.sim.effects.effect import Effect
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
-SHOULDER = CHANNELS.index("right_joint2")
+SHOULDER = ROBOT.action_names.index("right_joint2")
 HOME = RIGHT_HOME[4]
 
 
@@ -89,7 +89,7 @@ def test_load_friction_follows_the_weight_that_the_gear_carries(sign: int) -> No
 def test_load_friction_holds_a_joint_whose_error_is_below_it() -> None:
     sim = start(on_shoulder("load_friction", share=0.2))
     load = static_torque_nm(sim, SHOULDER)
-    motion = drive(sim, 0.5, lambda t: 0.8 * 2 * 0.2 * abs(load) / KP_NM_PER_RAD[1], SHOULDER)
+    motion = drive(sim, 0.5, lambda t: 0.8 * 2 * 0.2 * abs(load) / ROBOT.kp_nm_per_rad[1], SHOULDER)
     assert abs(motion["q"][-1] - RIGHT_HOME[1]) < 2e-5
 
 
@@ -186,7 +186,7 @@ def test_a_lagging_torque_lets_a_damped_joint_ring() -> None:
 def test_a_scaled_torque_carries_its_share_of_the_weight_and_keeps_the_time_constant() -> None:
     """g (K_p (u − q) + T_ref + w) = w at rest: it sags by (1 − g) w / (g K_p). K_d / K_p is as before."""
     sim = start(on_shoulder("torque_scale", factor=0.8))
-    kp = KP_NM_PER_RAD[1]
+    kp = ROBOT.kp_nm_per_rad[1]
     load = static_torque_nm(sim, SHOULDER)
     sag = drive(sim, 1.5, column=SHOULDER)["q"][-1] - RIGHT_HOME[1]
     assert sag == pytest.approx(-0.2 * load / (0.8 * kp), rel=0.01)
@@ -202,7 +202,7 @@ def test_a_scaled_torque_carries_its_share_of_the_weight_and_keeps_the_time_cons
 def test_a_fading_torque_lets_the_arm_sag_more_and_more() -> None:
     """After t the share is f = 1 − R t, and the arm sags by (1 − f) w / (f K_p), K_d / K_p later."""
     sim = start(on_shoulder("torque_fade", rate_per_min=3.0))
-    load, kp = static_torque_nm(sim, SHOULDER), KP_NM_PER_RAD[1]
+    load, kp = static_torque_nm(sim, SHOULDER), ROBOT.kp_nm_per_rad[1]
     motion = drive(sim, 3.0, column=SHOULDER)
     for seconds in (1.0, 2.0, 3.0):
         left = 1 - 3.0 / 60 * (seconds - 0.089)  # K_d / K_p of joint 2

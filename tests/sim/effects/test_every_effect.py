@@ -11,7 +11,7 @@ from press_bench import perform, start
 
 from taccorl.alignment.joint_kernel import Drive, simulate
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, Memory, TouchEffect, parameter
 
@@ -102,7 +102,7 @@ def test_at_its_bounds_the_twin_stays_sound(name: str) -> None:
             seen = perform(sim, last=6)
             assert not sim.diverged.any(), f"{p.name} = {bound}"
             assert np.isfinite(seen["reading"]).all()
-            beyond = np.maximum(seen["reported"] - ACTION_HIGH, ACTION_LOW - seen["reported"])
+            beyond = np.maximum(seen["reported"] - ROBOT.action_high, ROBOT.action_low - seen["reported"])
             assert beyond.max() < 0.25, f"{p.name} = {bound}"
 
 

@@ -10,16 +10,15 @@ import pytest
 from joint_bench import COLUMN, GRAVITY, KD, KP, STEP_S, TORQUE_FF, drive, on_joint5, static_torque_nm
 from press_bench import RIGHT_HOME, PressBench, start
 
-from taccorl.sim.actions import ACTION_NAMES
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, ControllerConfig
+from taccorl.robots import ROBOT
+from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.effect import CHANNELS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 
 
 def test_columns_are_in_the_order_of_actions() -> None:
-    assert CHANNELS == ACTION_NAMES
+    assert ROBOT.action_names == ROBOT.action_names
 
 
 @pytest.mark.parametrize("delay_s", [0.02, 0.0204])
@@ -103,7 +102,7 @@ def test_armature_lengthens_the_period_of_an_undamped_joint() -> None:
     inertia = []
     for added in (0.1, 0.3):
         config = TwinConfig(effects=[on_joint5("armature", added_kgm2=added)])
-        config.controller = ControllerConfig(kd_nms_per_rad=[*KD_NMS_PER_RAD[:4], 0.0, KD_NMS_PER_RAD[5]])
+        config.controller = ControllerConfig(kd_nms_per_rad=[*ROBOT.kd_nms_per_rad[:4], 0.0, ROBOT.kd_nms_per_rad[5]])
         sim = Simulation(PressBench(), config)
         sim.reset([0])
         motion = drive(sim, 2.0, lambda t: 0.02)
@@ -129,7 +128,7 @@ def test_a_saturated_drive_accelerates_in_proportion_to_its_torque() -> None:
 
 @pytest.mark.parametrize(("share", "falls"), [(0.95, True), (1.05, False)])
 def test_a_saturated_drive_that_cannot_carry_the_arm_lets_it_fall(share: float, falls: bool) -> None:
-    shoulder = CHANNELS.index("right_joint2")
+    shoulder = ROBOT.action_names.index("right_joint2")
     load = static_torque_nm(start(), shoulder)
     assert abs(load) > 1.0
     sim = start(make_effect("torque_saturation", torque_max_nm=share * abs(load), arm="right", joints=["joint2"]))
@@ -170,7 +169,7 @@ def test_a_payload_sags_every_joint_by_its_moment_over_the_stiffness(centre: tup
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, point, model.body("right_link6").id)
     dofs = [model.joint(f"right_joint{k}").dofadr[0] for k in range(1, 7)]
-    expected = -0.3 * GRAVITY * jacobian[2, dofs] / np.array(KP_NM_PER_RAD)
+    expected = -0.3 * GRAVITY * jacobian[2, dofs] / np.array(ROBOT.kp_nm_per_rad)
     keys = ("x_link6_m", "y_link6_m", "z_link6_m")
     loaded = start(make_effect("payload", mass_kg=0.3, arm="right", **dict(zip(keys, centre, strict=True))))
     drive(loaded, 1.5)

@@ -7,17 +7,18 @@ import pytest
 from press_bench import BLOCK_M, perform, start
 
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects import make_effect
+from taccorl.robots import ROBOT
+from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.added import AddedEffects
 from taccorl.sim.effects.dead_taxels import DeadTaxels
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
-from taccorl.sim.robot import PAD_TAXELS, PADS, RobotConfig
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Watch
 from taccorl.sim.twin import TwinConfig, empty_bench
 from taccorl.sim.twin_file import load_twin, save_twin
 
-SHAPE = (1, len(PADS), *PAD_TAXELS)
+SHAPE = (1, len(ROBOT.pads), *ROBOT.pad.shape)
 
 
 class Pads:
@@ -96,7 +97,7 @@ def test_ghosting_adds_its_share_of_each_taxel_to_the_others_of_its_row_and_colu
     field = np.zeros(SHAPE[1:], np.float32)
     field[2, 10, 5], field[2, 10, 7] = 2.0, 1.0
     seen = pads.read(field)[2]
-    expected = np.zeros(PAD_TAXELS)
+    expected = np.zeros(ROBOT.pad.shape)
     expected[10] = 0.05 * 3.0  # both are in this row
     expected[10, 5], expected[10, 7] = 2.0 + 0.05 * 1.0, 1.0 + 0.05 * 2.0
     expected[:, 5] += 0.1 * (np.arange(32) != 10)
@@ -122,7 +123,7 @@ def test_a_delay_reads_what_there_was(scan_s: float, delay_s: float) -> None:
 
 
 def test_a_gain_map_is_of_the_taxels_it_names_and_a_share_of_it_fades_out() -> None:
-    gains = np.random.default_rng(0).uniform(0.0, 2.0, (2, *PAD_TAXELS))
+    gains = np.random.default_rng(0).uniform(0.0, 2.0, (2, *ROBOT.pad.shape))
     gains[0, 3, 4] = 0.0
     chosen = ["right_a", "left_b"]
     effect = TaxelGainMap.of(gains, chosen)
@@ -144,7 +145,7 @@ def test_a_map_that_fits_no_pads_is_refused(values: dict, message: str) -> None:
 
 
 def test_a_map_is_kept_in_the_twin_file(tmp_path: Path) -> None:
-    gains = np.random.default_rng(1).uniform(0.5, 1.5, (1, *PAD_TAXELS))
+    gains = np.random.default_rng(1).uniform(0.5, 1.5, (1, *ROBOT.pad.shape))
     config = TwinConfig(effects=[TaxelGainMap.of(gains, ["left_a"])])
     save_twin(config, tmp_path / "twin.yaml")
     assert load_twin(tmp_path / "twin.yaml") == config
@@ -176,7 +177,7 @@ def test_a_shifted_pad_feels_with_each_taxel_what_the_next_one_would() -> None:
         joints = sim.proprioception()[0].copy()
         joints[6] = BLOCK_M - 8e-4
         sim.place_arms(joints, sim.targets[0])
-        return sim.pads.penetration(sim.batch).depth_m[0, :2].reshape(2, *PAD_TAXELS)
+        return sim.pads.penetration(sim.batch).depth_m[0, :2].reshape(2, *ROBOT.pad.shape)
 
     plain, shifted = reading(), reading(make_effect("pad_shift", across_m=2e-3, along_m=-4e-3))
     assert plain.max() > 3e-4
@@ -211,7 +212,7 @@ def test_crosstalk_gives_a_quarter_of_its_share_to_each_neighbour_and_keeps_the_
     alone = np.zeros(SHAPE[1:], np.float32)
     alone[1, 10, 5] = alone[1, 0, 0] = 1.0
     seen = pads.read(alone)
-    expected = np.zeros(PAD_TAXELS)
+    expected = np.zeros(ROBOT.pad.shape)
     expected[10, 5], expected[0, 0] = 0.8, 0.9  # the corner has two neighbours and keeps two quarters
     for row, column in ((9, 5), (11, 5), (10, 4), (10, 6), (1, 0), (0, 1)):
         expected[row, column] = 0.05
@@ -234,11 +235,12 @@ def test_gain_spread_is_of_the_stated_width_and_belongs_to_the_board() -> None:
 
 def test_dead_taxels_are_as_many_as_stated_and_a_greater_share_adds_to_them() -> None:
     few, more = DeadTaxels(share=0.05, seed=1), DeadTaxels(share=0.10, seed=1)
-    assert few.dead().sum(axis=(1, 2)).tolist() == [19] * 4  # round(0.05 · 384)
-    assert more.dead().sum(axis=(1, 2)).tolist() == [38] * 4
-    assert more.dead()[few.dead()].all()
-    assert (few.dead()[0] != few.dead()[1]).any()
-    np.testing.assert_array_equal(Pads(few).read(1.0) == 0.0, few.dead())
+    some, others = few.dead(SHAPE[1:]), more.dead(SHAPE[1:])
+    assert some.sum(axis=(1, 2)).tolist() == [19] * 4  # round(0.05 · 384)
+    assert others.sum(axis=(1, 2)).tolist() == [38] * 4
+    assert others[some].all()
+    assert (some[0] != some[1]).any()
+    np.testing.assert_array_equal(Pads(few).read(1.0) == 0.0, some)
     np.testing.assert_array_equal(Pads(DeadTaxels(share=1.0)).read(1.0), 0.0)
 
 
@@ -314,7 +316,7 @@ def test_touch_of_a_simulation_passes_through_the_effects() -> None:
     assert plain["reading"].max() > 0.5
     dead = DeadTaxels(share=0.3, seed=2)
     seen = perform(start(dead))
-    np.testing.assert_array_equal(seen["reading"], plain["reading"] * ~dead.dead())
+    np.testing.assert_array_equal(seen["reading"], plain["reading"] * ~dead.dead(SHAPE[1:]))
     assert (seen["touch"] != plain["touch"]).any()
 
 
@@ -333,3 +335,23 @@ def test_creep_goes_on_whether_somebody_looks_or_not() -> None:
         alone.step(targets)
     assert (alone.reading() > 0).any()
     np.testing.assert_array_equal(alone.reading(), watched.reading())
+
+
+@pytest.mark.parametrize("name", ["touch_lag", "touch_delay", "taxel_creep", "taxel_hysteresis"])
+def test_an_effect_with_memory_takes_pads_of_any_size(name: str) -> None:
+    """The taxels do not interact: a pad of 16 × 16 reads what the first 256 taxels of a pad of 32 × 12 read."""
+    cls = effects.get(name)
+    rng = np.random.default_rng(0)
+    scans = rng.uniform(0.0, 2.0, (5, 1, len(ROBOT.pads), ROBOT.pad.num_taxels)).astype(np.float32)
+    seen = {}
+    for shape in (ROBOT.pad.shape, (16, 16)):
+        time_s = np.zeros(1)
+        added = AddedEffects([cls(**{p.name: p.typical for p in cls.parameters()})], time_s, pad_shape=shape)
+        frames = []
+        for scan in scans[..., : shape[0] * shape[1]]:
+            reading = scan.reshape(1, -1, *shape)
+            frames.append(added(reading).reshape(1, len(ROBOT.pads), -1)[..., :256])
+            added.scan(reading, np.arange(1))
+            time_s += 0.01
+        seen[shape] = np.array(frames)
+    np.testing.assert_array_equal(seen[16, 16], seen[ROBOT.pad.shape])

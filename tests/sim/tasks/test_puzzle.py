@@ -11,9 +11,10 @@ from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
 from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.robots import ROBOT
 from taccorl.sim.part import Part
 from taccorl.sim.randomize import draw
-from taccorl.sim.robot import ARMS, RobotConfig
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.shapes import Box, Cylinder, Prism
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.parts import PIECES
@@ -61,7 +62,7 @@ def put_all_in(sim: Simulation, **instead: np.ndarray) -> None:
 def move_hand(sim: Simulation, arm: str, tcp: np.ndarray, opening_m: float) -> None:
     """Put an arm at rest with its TCP at a world pose (4, 4)."""
     joints = sim.proprioception()[0].copy()
-    a = 7 * ARMS.index(arm)
+    a = 7 * ROBOT.arms.index(arm)
     joints[a : a + 6] = ArmKinematics(arm, RobotConfig()).search(tcp, np.random.default_rng(0))
     joints[a + 6] = opening_m
     sim.place_arms(joints, joints)
