@@ -39,6 +39,7 @@ from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.processes import Care, Failed
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
@@ -53,9 +54,8 @@ _WORD = "correct"  # apart from the scenes of other commands with the same seed
 _DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of an episode: ``default_rng([scene seed, which])``
 _CARE = Care(limit_s=600.0, tries=2)
 _STALL_STEPS = CONTROL_HZ  # 1 s
-_STILL = np.tile(
-    [0.02] * 6 + [0.001], 2
-)  # (14,) [rad, m]: range of a hand's joints and opening that is hardly a motion
+_STILL = ROBOT.per_action(0.02, 0.001)
+"""(A,) [rad, m] range of a hand's joints and opening that is hardly a motion."""
 
 Progress = Callable[[str], None]
 
@@ -194,7 +194,7 @@ class Correction:
     """First action of the expert; None: it did nothing."""
     cause: str = ""
     """Of the takeover: ``drawn``, ``stall``, or ``drawn before the grasp``: the parts were never in the hands."""
-    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 14), np.float32))
+    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
     """(S, 14) float32 all that were executed since the reset: the policy's, then the expert's."""
     last_state: str = ""
     """``state_digest`` after the last of them."""
@@ -229,7 +229,7 @@ def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, ep
         done.outcome, done.reason = "not taken over", str(error)
     except UnreachableError as error:
         done.outcome, done.reason = "unreachable", str(error)
-    own = np.array([row["action"] for row in done.recorder.rows], np.float32).reshape(-1, 14)
+    own = np.array([row["action"] for row in done.recorder.rows], np.float32).reshape(-1, ROBOT.num_actions)
     done.actions, done.felt = np.concatenate([episode.actions[:step], own]), expert.events
     done.last_state = state_digest(sim)
     return done

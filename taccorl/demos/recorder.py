@@ -15,8 +15,8 @@ import numpy as np
 
 from taccorl.data.episode import EXECUTED, Episode, Pictures
 from taccorl.data.spec import DatasetSpec, FeatureSpec
+from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY, POSE_UNITS, part_pose_names, part_poses, posed_bodies
-from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
@@ -48,7 +48,7 @@ def with_simulator(
     features |= {
         "sim.state": FeatureSpec(dtype="float64", shape=(sim.row_size,), range=_ANY, **own),
         "sim.seed": FeatureSpec(dtype="int64", shape=(1,), range=(0, 2**62), **own),
-        "sim.subtask": FeatureSpec(dtype="int16", shape=(len(ARMS),), range=(0, 99), names=ARMS, **own),
+        "sim.subtask": FeatureSpec(dtype="int16", shape=(len(ROBOT.arms),), range=(0, 99), names=ROBOT.arms, **own),
         "sim.success": FeatureSpec(dtype="int16", shape=(1,), range=(0, 1), **own),
     }
     if parts:
@@ -154,6 +154,6 @@ class EpisodeRecorder:
         for row in np.flatnonzero(np.any(np.diff(subtask, axis=0, prepend=-1) != 0, axis=1)):
             now = [
                 f"{arm}: {subtasks[arm][k].name if k < len(subtasks[arm]) else 'done'}"
-                for arm, k in zip(ARMS, subtask[row], strict=True)
+                for arm, k in zip(ROBOT.arms, subtask[row], strict=True)
             ]
             yield int(row), ", ".join(now)

@@ -35,6 +35,7 @@ from taccorl.demos.stand_in_scene import CAMERAS, Scene
 from taccorl.demos.stand_in_story import PAD_WIRE_SHAPE, PADS, Story, plan_episodes
 from taccorl.demos.stand_in_streams import StandInTruth, Streams, as_piper_publishes, jpeg
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 
 __all__ = [
     "CAMERAS",
@@ -125,12 +126,12 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
         "observations/effort": story.effort(time_s),
         "action": as_piper_publishes(story.command(time_s + 1 / CAMERA_HZ), config.joints_in_degrees),
     }
-    arms["observations/qvel"][:, [6, 13]] = 0.0  # PiPER reports none for its grippers
+    arms["observations/qvel"][:, ROBOT.gripper_indices] = 0.0  # PiPER reports none for its grippers
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         file.attrs.update({"sim": False, "compress": config.hdf5_jpeg, "origin": SURROGATE})
         for name, rows in arms.items():
-            file[name] = np.roll(rows, 7 if config.swap_arms else 0, axis=1).astype(np.float32)
+            file[name] = np.roll(rows, ROBOT.num_per_arm if config.swap_arms else 0, axis=1).astype(np.float32)
         file["base_action"] = np.zeros((len(time_s), 2), np.float32)
         lengths = np.zeros((len(CAMERAS), len(time_s)), np.float32)
         for c, camera in enumerate(CAMERAS):

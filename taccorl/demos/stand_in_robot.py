@@ -5,13 +5,12 @@ World frame: x forward from the arms, y to the left, z up, origin on the table b
 
 import numpy as np
 
-ARMS = ("left", "right")
-JOINT_NAMES = ("joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "gripper")  # as piper_ros names them
-JOINT_LIMITS_RAD = np.array(  # lower, upper; PiPER's URDF and driver
-    [(-2.618, 2.618), (0.0, 3.14), (-2.967, 0.0), (-1.745, 1.745), (-1.22, 1.22), (-2.0944, 2.0944)]
-)
+from taccorl.robots import ROBOT
+
+ARMS = ROBOT.arms
+JOINT_NAMES = (*ROBOT.joints, "gripper")  # as piper_ros names them
+JOINT_LIMITS_RAD = np.array([link.range_rad for link in ROBOT.links])  # lower, upper
 MOUNT_POS_WORLD = {"left": (0.0, 0.30, 0.26), "right": (0.0, -0.30, 0.26)}
-TCP_FROM_LINK6_M = 0.168  # middle between the pads, on link 6's z axis; the fingers close along its y axis
 
 # Parent-to-link origins (xyz in m, fixed-axis rpy in rad), each joint turning about its own z: piper_description.urdf
 _LINK_ORIGINS = (
@@ -43,10 +42,10 @@ _PARENT_FROM_LINK = np.stack([_transform(xyz, rpy) for xyz, rpy in _LINK_ORIGINS
 def link_poses(arm: str, joints_rad: np.ndarray) -> np.ndarray:
     """World-from-link of link 1 to 6, (N, 6, 4, 4), for joints (N, 6)."""
     n = len(joints_rad)
-    world_from_link = np.empty((n, 6, 4, 4))
+    world_from_link = np.empty((n, ROBOT.num_joints, 4, 4))
     pose = np.tile(np.eye(4), (n, 1, 1))
     pose[:, :3, 3] = MOUNT_POS_WORLD[arm]
-    for i in range(6):
+    for i in range(ROBOT.num_joints):
         turn = np.zeros((n, 4, 4))
         c, s = np.cos(joints_rad[:, i]), np.sin(joints_rad[:, i])
         turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = c, -s, s, c
@@ -58,7 +57,7 @@ def link_poses(arm: str, joints_rad: np.ndarray) -> np.ndarray:
 
 def tcp_pos_world(world_from_link6: np.ndarray) -> np.ndarray:
     """Middle between the pads, (..., 3), from link-6 poses (..., 4, 4)."""
-    return world_from_link6[..., :3, 3] + TCP_FROM_LINK6_M * world_from_link6[..., :3, 2]
+    return world_from_link6[..., :3, 3] + ROBOT.tcp_from_hand_m * world_from_link6[..., :3, 2]
 
 
 def solve_joints(arm: str, tcp_world: np.ndarray) -> np.ndarray:
@@ -73,7 +72,7 @@ def solve_joints(arm: str, tcp_world: np.ndarray) -> np.ndarray:
     )
 
     def task(joints: np.ndarray) -> np.ndarray:
-        pose = link_poses(arm, joints)[:, 5]
+        pose = link_poses(arm, joints)[:, -1]
         return np.concatenate([place * tcp_pos_world(pose), tilt * pose[:, :3, 2], tilt * pose[:, :3, 1]], axis=1)
 
     low, high = JOINT_LIMITS_RAD[:, 0] + _LIMIT_MARGIN_RAD, JOINT_LIMITS_RAD[:, 1] - _LIMIT_MARGIN_RAD
@@ -81,8 +80,8 @@ def solve_joints(arm: str, tcp_world: np.ndarray) -> np.ndarray:
     joints = np.tile(np.array(start), (len(tcp_world), 1))
     for _ in range(50):
         value = task(joints)
-        jacobian = np.stack([(task(joints + 1e-6 * np.eye(6)[j]) - value) / 1e-6 for j in range(6)], axis=2)
+        jacobian = np.stack([(task(joints + step) - value) / 1e-6 for step in 1e-6 * np.eye(ROBOT.num_joints)], axis=2)
         gradient = np.einsum("kij,ki->kj", jacobian, wanted - value)
-        hessian = np.einsum("kij,kil->kjl", jacobian, jacobian) + 1e-4 * np.eye(6)
+        hessian = np.einsum("kij,kil->kjl", jacobian, jacobian) + 1e-4 * np.eye(ROBOT.num_joints)
         joints = np.clip(joints + np.linalg.solve(hessian, gradient[..., None])[..., 0], low, high)
     return joints

@@ -17,8 +17,9 @@ from taccorl.demos.stand_in_shapes import (
     shadow_outlines_px,
 )
 from taccorl.demos.stand_in_story import Story
+from taccorl.robots import ROBOT
 
-CAMERAS = ("front", "left_wrist", "right_wrist")
+CAMERAS = ROBOT.cameras
 
 # Camera and the point it looks at [m], vertical field of view [deg]
 _FRONT_SIGHT = ((1.12, 0.0, 0.66), (0.25, 0.0, 0.21), 49.0)  # world frame
@@ -65,15 +66,15 @@ class Scene:
         """World poses (N, 4, 4) of everything that boxes, capsules and cameras are fixed to."""
         frames: dict[str, np.ndarray] = {}
         state = self.story.state(time_s)
-        for a, arm in enumerate(ARMS):
-            links = link_poses(arm, state[:, 7 * a : 7 * a + 6])
-            for i in range(6):
-                frames[f"{arm} link{i + 1}"] = links[:, i]
+        for arm in ARMS:
+            links = link_poses(arm, state[:, ROBOT.joint_slice(arm)])
+            for i, link in enumerate(ROBOT.links):
+                frames[f"{arm} {link.name}"] = links[:, i]
             for side, finger in ((0.5, "finger+"), (-0.5, "finger-")):
-                pose = links[:, 5].copy()
-                pose[:, :3, 3] += side * state[:, 7 * a + 6, None] * pose[:, :3, 1]
+                pose = links[:, -1].copy()
+                pose[:, :3, 3] += side * state[:, ROBOT.gripper_index(arm), None] * pose[:, :3, 1]
                 frames[f"{arm} {finger}"] = pose
-        left, right = frames["left link6"], frames["right link6"]
+        left, right = (frames[f"{arm} {ROBOT.hand}"] for arm in ARMS)
         parts = [self.story.part_poses(float(t), left[n], right[n]) for n, t in enumerate(time_s)]
         return frames | {name: np.stack([poses[name] for poses in parts]) for name in parts[0]}
 
@@ -90,7 +91,7 @@ class Scene:
         if camera == "front":
             world_from_camera = np.tile(base_from_camera, (count, 1, 1))
         else:
-            world_from_camera = frames[f"{camera.split('_')[0]} link6"] @ base_from_camera
+            world_from_camera = frames[f"{camera.split('_')[0]} {ROBOT.hand}"] @ base_from_camera
         focal_px = 0.5 * self.rows / np.tan(np.radians(fovy_deg / 2))
         return View(np.linalg.inv(world_from_camera), focal_px, self.rows, self.columns)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.demos.stand_in_robot import ARMS, link_poses, solve_joints
+from taccorl.robots import ROBOT
 
 PADS = ("left_robot_left_finger", "left_robot_right_finger", "right_robot_left_finger", "right_robot_right_finger")
 PAD_WIRE_SHAPE = (12, 32)  # rows across the finger, columns from palm to finger tip, as FlexiTac's board sends them
@@ -105,18 +106,18 @@ class Story:
     ) -> None:
         self.plans, self.contact_delay_s = plans, contact_delay_s
         self.time_s = np.arange(-_GRID_HZ, math.ceil((duration_s + 1.0) * _GRID_HZ) + 1) / _GRID_HZ  # −1 s to end + 1 s
-        self._command = np.empty((len(self.time_s), 14))
+        self._command = np.empty((len(self.time_s), ROBOT.num_actions))
         for a, arm in enumerate(ARMS):
-            self._command[:, 7 * a : 7 * a + 6] = self._joint_commands(arm, np.random.default_rng([seed, 2, a]))
-            self._command[:, 7 * a + 6] = self._gripper_commands(arm)
+            self._command[:, ROBOT.joint_slice(arm)] = self._joint_commands(arm, np.random.default_rng([seed, 2, a]))
+            self._command[:, ROBOT.gripper_index(arm)] = self._gripper_commands(arm)
         self._state = _follow(self._command, command_lead_s)
         self._velocity = (self._command - self._state) / command_lead_s
-        self._squeeze_m = np.empty((len(self.time_s), 2))
+        self._squeeze_m = np.empty((len(self.time_s), len(ARMS)))
         for a, arm in enumerate(ARMS):
-            opening_m = self._state[:, 7 * a + 6]
+            opening_m = self._state[:, ROBOT.gripper_index(arm)]
             self._squeeze_m[:, a] = np.maximum(PART_WIDTH_M[arm] - opening_m, 0.0)
             np.maximum(opening_m, PART_WIDTH_M[arm], out=opening_m)  # the part is in the way
-            self._velocity[self._squeeze_m[:, a] > 0, 7 * a + 6] = 0.0
+            self._velocity[self._squeeze_m[:, a] > 0, ROBOT.gripper_index(arm)] = 0.0
         self._load = self._insertion_load()
         self._holds = {arm: self._hold_times(arm) for arm in ARMS}
         self._parts = [self._part_anchors(i) for i in range(len(plans))]
@@ -127,7 +128,7 @@ class Story:
         i = np.clip(np.searchsorted(times, self.time_s, side="right") - 1, 0, len(times) - 2)
         command = poses[i] + _ramp(self.time_s, times[i], times[i + 1])[:, None] * (poses[i + 1] - poses[i])
         for _ in range(3):  # a hand is never still
-            hz, phase = rng.uniform(0.3, 2.2, 6), rng.uniform(0, 2 * np.pi, 6)
+            hz, phase = rng.uniform(0.3, 2.2, ROBOT.num_joints), rng.uniform(0, 2 * np.pi, ROBOT.num_joints)
             command += _TREMOR_RAD * np.sin(2 * np.pi * hz * self.time_s[:, None] + phase)
         return command
 
@@ -174,11 +175,12 @@ class Story:
         """Efforts (N, 14) [N·m] that look right: gravity on the long links, tracking error, the grippers' squeeze."""
         joints = self.state(time_s)
         effort = 6.0 * (self.command(time_s) - joints)
-        for a, arm in enumerate(ARMS):
-            shoulder, elbow = joints[:, 7 * a + 1], joints[:, 7 * a + 2]
-            effort[:, 7 * a + 1] += 5.0 * np.cos(shoulder)
-            effort[:, 7 * a + 2] += 2.5 * np.cos(shoulder + elbow)
-            effort[:, 7 * a + 6] = 1.2 * self.grip(arm, time_s)
+        for arm in ARMS:
+            own, own_effort = (rows[:, ROBOT.joint_slice(arm)] for rows in (joints, effort))
+            shoulder, elbow = own[:, 1], own[:, 2]
+            own_effort[:, 1] += 5.0 * np.cos(shoulder)
+            own_effort[:, 2] += 2.5 * np.cos(shoulder + elbow)
+            effort[:, ROBOT.gripper_index(arm)] = 1.2 * self.grip(arm, time_s)
         return effort
 
     def grip(self, arm: str, time_s: np.ndarray) -> np.ndarray:
@@ -222,8 +224,7 @@ class Story:
         return np.where(grip > 0, counts, 0.0).astype(np.float32)
 
     def _world_from_gripper(self, arm: str, time_s: np.ndarray) -> np.ndarray:
-        first = 7 * ARMS.index(arm)
-        return link_poses(arm, self.state(time_s)[:, first : first + 6])[:, 5]
+        return link_poses(arm, self.state(time_s)[:, ROBOT.joint_slice(arm)])[:, -1]
 
     def _part_anchors(self, episode: int) -> dict[str, np.ndarray]:
         """Constant poses of one episode: where parts start, how they sit in the grippers, where they end."""

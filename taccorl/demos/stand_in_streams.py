@@ -30,9 +30,9 @@ from taccorl.demos.stand_in_config import (
 from taccorl.demos.stand_in_robot import ARMS, JOINT_NAMES
 from taccorl.demos.stand_in_scene import CAMERAS
 from taccorl.demos.stand_in_story import PAD_WIRE_SHAPE, PADS, EpisodePlan, Story
+from taccorl.robots import ROBOT
 
 _SLICE_S = 1  # streams work in slices of this length, so memory does not grow with pictures and readings
-_GRIPPERS, _JOINTS = [6, 13], [0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]  # columns of the 14
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,9 +116,9 @@ class Event(NamedTuple):
 def as_piper_publishes(joints: np.ndarray, in_degrees: bool) -> np.ndarray:
     """Joints (N, 14) in rad and m as piper_ros gives them: CAN counts of 0.001° and 0.001 mm, times its own factor."""
     published = np.empty_like(joints)
-    published[:, _GRIPPERS] = np.round(joints[:, _GRIPPERS] * 1e6) * 1e-6
-    degrees = np.round(np.degrees(joints[:, _JOINTS]) * 1e3) * 1e-3
-    published[:, _JOINTS] = degrees if in_degrees else degrees * PIPER_RAD_PER_DEG
+    published[:, ROBOT.gripper_indices] = np.round(joints[:, ROBOT.gripper_indices] * 1e6) * 1e-6
+    degrees = np.round(np.degrees(joints[:, ROBOT.joint_indices]) * 1e3) * 1e-3
+    published[:, ROBOT.joint_indices] = degrees if in_degrees else degrees * PIPER_RAD_PER_DEG
     return published
 
 
@@ -201,7 +201,7 @@ class Streams:
     def _joints(self, topic: str, arm: str, command: bool) -> Iterator[Event]:
         """Seven positions, six velocities, seven efforts; 200 Hz, now and then the last message once more."""
         config, rng, story = self.config, self._random(topic), self.story
-        columns = slice(7 * ARMS.index(arm), 7 * ARMS.index(arm) + 7)
+        columns, own_joints = ROBOT.arm_slice(arm), ROBOT.joint_slice(arm)
         last_stamp_s = log_s = 0.0
         for ticks in self._slices(JOINT_HZ):
             tick_s = ticks / JOINT_HZ
@@ -213,7 +213,7 @@ class Streams:
             )
             joints = story.command(stamp_s) if command else story.state(stamp_s)
             position = as_piper_publishes(joints, config.joints_in_degrees)[:, columns].tolist()
-            velocity = story.velocity(stamp_s)[:, columns][:, :6].tolist()
+            velocity = story.velocity(stamp_s)[:, own_joints].tolist()
             effort = story.effort(stamp_s)[:, columns].tolist()
             missing = self._in_gap(topic, stamp_s)
             for n, stamp in enumerate(stamp_s.tolist()):
@@ -222,10 +222,10 @@ class Streams:
                     continue
                 message = {"header": self._header(topic, stamp, ""), "name": list(JOINT_NAMES), "position": position[n]}
                 if command:
-                    message |= {"velocity": [0.0] * 6, "effort": [0.0] * 7}
+                    message |= {"velocity": [0.0] * ROBOT.num_joints, "effort": [0.0] * ROBOT.num_per_arm}
                     if tick_s[n] < config.command_silence_s:  # the driver has not seen a command yet
                         message["header"]["stamp"] = {"sec": 0, "nanosec": 0}
-                        message["position"] = [0.0] * 7
+                        message["position"] = [0.0] * ROBOT.num_per_arm
                 else:
                     message |= {"velocity": velocity[n], "effort": effort[n]}
                 yield Event(log_s, stamp, topic, messages.JOINT_STATE, message)

@@ -26,13 +26,12 @@ from taccorl.demos.collect import Actions, Source, outcome_of
 from taccorl.demos.teleop_actions import ActionLog, find_finished, give_time, replay, scene_of
 from taccorl.demos.teleop_jog import AXES, Command, GlfwGamepad, JogHands, Keyboard, gamepad_map, key_map, label
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
 _AFTER_S = 1.0  # what is called finished is watched for so long, as in the experts' episodes
-_CATCH_UP_STEP = np.array([*[0.6] * 6, 0.1] * len(ARMS)) / CONTROL_HZ  # rad/s and m/s until arms and leader first agree
+_CATCH_UP_STEP = ROBOT.per_action(0.6, 0.1) / CONTROL_HZ  # rad/s and m/s until arms and leader first agree
 _LATE_S = 0.2  # a machine that is later than this is too slow for real time: it does not try to catch up
 
 
@@ -411,8 +410,8 @@ class LeaderHands:
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
         read = self._device.read()
-        wanted = np.clip(read, ACTION_LOW, ACTION_HIGH)
-        beyond = [name for name, off in zip(ACTION_NAMES, read != wanted, strict=True) if off]
+        wanted = np.clip(read, ROBOT.action_low, ROBOT.action_high)
+        beyond = [name for name, off in zip(ROBOT.action_names, read != wanted, strict=True) if off]
         self._lines = [f"beyond the twin's range: {', '.join(beyond)}"] if beyond else []
         if not self._caught_up:
             away = wanted - self._now

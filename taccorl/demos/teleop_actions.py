@@ -24,7 +24,7 @@ import taccorl
 from taccorl.demos.collect import Actions, Plan, Source, outcome_of
 from taccorl.errors import TaccorlError
 from taccorl.lineage.digest import digest_bytes
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
@@ -68,7 +68,7 @@ class ActionLog:
                 **scene,
                 "time_limit_s": sim.judge.limit_steps / CONTROL_HZ,
                 "source": source,
-                "names": list(ACTION_NAMES),
+                "names": list(ROBOT.action_names),
                 "units": "rad, gripper openings in m",
                 "control_hz": CONTROL_HZ,
                 "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -169,9 +169,9 @@ class ActionFile:
         last = values[-1] if len(values) > 1 and isinstance(values[-1], dict) else {}
         rows = values[1:-1] if last else values[1:]
         for k, row in enumerate(rows, 2):
-            if not isinstance(row, list) or len(row) != len(ACTION_NAMES):
-                raise TaccorlError(f"{path}:{k}: expected {len(ACTION_NAMES)} numbers, found {str(row)[:60]}")
-        actions = np.array(rows, np.float32).reshape(-1, len(ACTION_NAMES))
+            if not isinstance(row, list) or len(row) != len(ROBOT.action_names):
+                raise TaccorlError(f"{path}:{k}: expected {len(ROBOT.action_names)} numbers, found {str(row)[:60]}")
+        actions = np.array(rows, np.float32).reshape(-1, len(ROBOT.action_names))
         return cls(Path(path), header, actions, last.get("end"), last.get("outcome"))
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.se3 import between, rotvec, turn
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
-from taccorl.sim.robot import ARMS, RobotConfig
+from taccorl.robots import ROBOT
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
@@ -62,6 +62,7 @@ class Axis(NamedTuple):
     meaning: str
 
 
+_GRIPPER = 6  # index in a wish
 # Keys that MuJoCo's viewer leaves free: it takes all letters, 0–5, F1–F7 and most punctuation (tests/demos/test_teleop.py).
 AXES = (
     Axis("Up      Down", (265, 328), (264, 322), 0, "away from the arms / towards them (also keypad 8 2)"),
@@ -70,7 +71,7 @@ AXES = (
     Axis("6       7", (ord("6"),), (ord("7"),), 5, "turn + / − about the approach direction"),
     Axis("8       9", (ord("8"),), (ord("9"),), 4, "turn + / − about the fingers' closing direction"),
     Axis("-       =", (ord("-"),), (ord("="),), 3, "turn + / − about the hand's third axis"),
-    Axis("Insert  Delete", (260,), (261,), 6, "open / close the gripper"),
+    Axis("Insert  Delete", (260,), (261,), _GRIPPER, "open / close the gripper"),
 )
 COMMAND_KEYS = {
     ord(" "): ("Space", Command.SWITCH_ARM),
@@ -126,7 +127,7 @@ class Keyboard:
             taps: codes of the keys pressed since the last control step, in order.
             held: codes of the keys that are down now.
         """
-        wish, commands = np.zeros(7), []
+        wish, commands = np.zeros(len(AXES)), []
         for code in taps:
             if code in _WISHES:
                 index, sign = _WISHES[code]
@@ -189,22 +190,23 @@ class Jogger:
 
     def __init__(self, sim: Simulation, kinematics: dict[str, ArmKinematics] | None = None) -> None:
         self.sim = sim
-        self.kinematics = kinematics or {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
-        self.arm = ARMS[0]
+        self.kinematics = kinematics or {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
+        self.arm = ROBOT.arms[0]
         self.size = STEP_SIZES[1]
         self.notice = ""
         """Why the newest wish was refused; empty if it was not."""
         reported, targets = sim.proprioception()[0], sim.targets[0]
         self.hands = {}
-        for a, arm in enumerate(ARMS):
-            joints = reported[7 * a : 7 * a + 6].copy()
+        for arm in ROBOT.arms:
+            own = ROBOT.joint_slice(arm)
+            joints = reported[own].copy()
             pose = self.kinematics[arm].pose(joints)
-            bias = joints - targets[7 * a : 7 * a + 6]
-            self.hands[arm] = JoggedHand(pose, pose, joints, bias, float(targets[7 * a + 6]))
+            bias = joints - targets[own]
+            self.hands[arm] = JoggedHand(pose, pose, joints, bias, float(targets[ROBOT.gripper_index(arm)]))
 
     def switch_arm(self) -> None:
         """The next wishes are the other hand's."""
-        self.arm = ARMS[1 - ARMS.index(self.arm)]
+        self.arm = ROBOT.arms[1 - ROBOT.arms.index(self.arm)]
         self.notice = ""
 
     def next_size(self) -> None:
@@ -216,9 +218,9 @@ class Jogger:
         if not wish.any():
             return
         hand, self.notice = self.hands[self.arm], ""
-        if wish[6]:
-            hand.opening_m = self._opening(hand.opening_m + wish[6] * GRIP_STEP_M)
-        if not wish[:6].any():
+        if wish[_GRIPPER]:
+            hand.opening_m = self._opening(hand.opening_m + wish[_GRIPPER] * GRIP_STEP_M)
+        if not wish[:_GRIPPER].any():
             return
         goal = hand.goal @ turn(wish[3:6] * self.size.turn_rad)
         goal[:3, 3] += wish[:3] * self.size.move_m
@@ -230,22 +232,22 @@ class Jogger:
 
     def _opening(self, wanted_m: float) -> float:
         """Within the gripper's range, and no farther below what it has reached than ``GRIP_N`` takes."""
-        measured_m = float(self.sim.proprioception()[0, 7 * ARMS.index(self.arm) + 6])
-        return float(np.clip(wanted_m, max(0.0, measured_m - squeeze_m(self.sim.config.robot)), OPEN_M))
+        measured_m = float(self.sim.proprioception()[0, ROBOT.gripper_index(self.arm)])
+        return float(np.clip(wanted_m, max(0.0, measured_m - squeeze_m(self.sim.config.robot)), ROBOT.opening_max_m))
 
     def act(self) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m] of the next control step."""
-        action = np.empty(14)
-        for a, arm in enumerate(ARMS):
+        action = np.empty(ROBOT.num_actions)
+        for arm in ROBOT.arms:
             hand = self.hands[arm]
             away_m = float(np.linalg.norm(hand.goal[:3, 3] - hand.pose[:3, 3]))
             away_rad = float(np.linalg.norm(rotvec(hand.pose, hand.goal)))
             longest = max(away_m / _FASTEST_MPS, away_rad / _FASTEST_RADPS) * CONTROL_HZ
             hand.pose = between(hand.pose, hand.goal, 1 / longest) if longest > 1 else hand.goal
             hand.joints_rad, _ = self.kinematics[arm].solve(hand.pose, hand.joints_rad)
-            action[7 * a : 7 * a + 6] = hand.joints_rad - hand.bias_rad
-            action[7 * a + 6] = hand.opening_m
-        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+            action[ROBOT.joint_slice(arm)] = hand.joints_rad - hand.bias_rad
+            action[ROBOT.gripper_index(arm)] = hand.opening_m
+        return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
 
 class JogHands:

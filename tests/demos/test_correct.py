@@ -27,7 +27,7 @@ from taccorl.demos.mimicgen.stored_actions import CORRECTION, read_stored, write
 from taccorl.errors import DatasetError, InTheWayError, LostError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 
@@ -76,7 +76,11 @@ def pushed_expert(sim: Simulation, seed: int, after: int) -> PolicyEpisode:
         if not held_at and (sim.judge.subtask[0] >= 1).all():
             held_at.append(t)
         since = t - held_at[0] - after if held_at else 0
-        return None if since > 10 else np.clip(expert.act() + np.clip(since / 10, 0, 1) * push, ACTION_LOW, ACTION_HIGH)
+        return (
+            None
+            if since > 10
+            else np.clip(expert.act() + np.clip(since / 10, 0, 1) * push, ROBOT.action_low, ROBOT.action_high)
+        )
 
     return acted(sim, seed, act)
 

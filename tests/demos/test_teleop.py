@@ -28,7 +28,7 @@ from taccorl.demos.teleop import GamepadSource, KeyboardSource, LeaderHands, Lea
 from taccorl.demos.teleop_actions import ActionFile, ActionLog, ActionsSource, find_finished, scene_of
 from taccorl.demos.teleop_jog import AXES, COMMAND_KEYS, Command, Gamepad, GlfwGamepad, Jogger, Keyboard, key_map
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 
@@ -153,7 +153,7 @@ def test_held_key_goes_on_at_eight_steps_a_second_after_a_quarter() -> None:
 def test_gripper_stays_in_its_range_and_squeezes_with_no_more_than_30_n(sim: Simulation, jogger: Jogger) -> None:
     hand = jogger.hands["left"]
     tap(jogger, *[INSERT] * 3)
-    assert hand.opening_m == OPEN_M
+    assert hand.opening_m == ROBOT.opening_max_m
     tap(jogger, *[DELETE] * 14)
     # 30 N / 2000 N/m = 15 mm below what the gripper has reached, whatever is asked for
     assert hand.opening_m == pytest.approx(sim.proprioception()[0, 6] - 0.015)
@@ -162,7 +162,7 @@ def test_gripper_stays_in_its_range_and_squeezes_with_no_more_than_30_n(sim: Sim
         sim.step(jogger.act()[None])
     assert hand.opening_m == 0.0
     assert sim.proprioception()[0, 6] == pytest.approx(0.0, abs=1e-3)
-    assert sim.proprioception()[0, 13] == pytest.approx(OPEN_M, abs=1e-3), "the other one is still open"
+    assert sim.proprioception()[0, 13] == pytest.approx(ROBOT.opening_max_m, abs=1e-3), "the other one is still open"
 
 
 def test_target_out_of_reach_is_refused_with_its_error_and_does_not_run_away(jogger: Jogger) -> None:
@@ -472,7 +472,7 @@ def write(folder: Path, sim: Simulation, actions: np.ndarray, end: str | None, o
 
 
 def random_actions(num: int) -> np.ndarray:
-    return np.random.default_rng(0).uniform(ACTION_LOW, ACTION_HIGH, (num, 14)).astype(np.float32)
+    return np.random.default_rng(0).uniform(ROBOT.action_low, ROBOT.action_high, (num, 14)).astype(np.float32)
 
 
 def test_float32_actions_come_back_bit_for_bit_wherever_the_file_is_cut(tmp_path: Path, sim: Simulation) -> None:
@@ -777,7 +777,7 @@ def test_arms_catch_up_with_the_leader_slowly_and_then_follow_at_once(sim: Simul
     leader.target = leader.target + np.eye(14)[0] * 0.3
     np.testing.assert_allclose(hands.act([])[0], leader.target, atol=1e-6)
     leader.target = leader.target + np.eye(14)[1] * 2.0  # beyond the joint's limit
-    assert hands.act([])[0][1] == np.float32(ACTION_HIGH[1])
+    assert hands.act([])[0][1] == np.float32(ROBOT.action_high[1])
     assert "beyond the twin's range: left_joint2" in hands.lines()[0]
 
 

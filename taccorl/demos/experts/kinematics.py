@@ -10,7 +10,8 @@ import numpy as np
 
 from taccorl.demos.experts.se3 import rotvec
 from taccorl.errors import UnreachableError
-from taccorl.sim.robot import JOINTS, RobotConfig, add_arm
+from taccorl.robots import ROBOT
+from taccorl.sim.robot import RobotConfig, add_arm
 
 _METRES_PER_RAD = 0.15  # how an orientation error weighs against a position error: the hand's own length
 _ITERATIONS = 20
@@ -27,7 +28,7 @@ class ArmKinematics:
         spec.compiler.degree = False
         add_arm(spec, arm, robot)
         self.arm, self.model = arm, spec.compile()
-        self._joints = np.array([self.model.joint(f"{arm}_{j}").qposadr[0] for j in JOINTS])
+        self._joints = np.array([self.model.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints])
         self.model.jnt_range[self._joints] += [_MARGIN_RAD, -_MARGIN_RAD]
         self._low, self._high = self.model.jnt_range[self._joints].T
         self._data, self._site = mujoco.MjData(self.model), self.model.site(f"{arm}_tcp").id

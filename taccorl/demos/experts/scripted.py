@@ -20,9 +20,8 @@ from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.mating import Aim, Mating, deflection
 from taccorl.demos.experts.se3 import between, inverse, rotvec, transform, turn
 from taccorl.errors import LostError, TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
+from taccorl.robots import ROBOT
 from taccorl.sim.part import Part
-from taccorl.sim.robot import ARMS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
@@ -124,8 +123,8 @@ class ScriptedExpert(ABC):
         if sim.num_sims != 1:
             raise TaccorlError(f"an expert drives one simulation, not {sim.num_sims}")
         self.sim, self.rng, self.config = sim, rng, config or ScriptedExpertConfig()
-        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
-        gains = {arm: sim.config.controller_of(arm) for arm in ARMS}
+        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
+        gains = {arm: sim.config.controller_of(arm) for arm in ROBOT.arms}
         self._lag_s = {arm: np.divide(g.kd_nms_per_rad, g.kp_nm_per_rad) for arm, g in gains.items()}
         # Of its own, so that what a hand decides does not depend on how many control steps went before.
         self._tremor_rng = rng.spawn(1)[0]
@@ -158,21 +157,22 @@ class ScriptedExpert(ABC):
     def start(self) -> None:
         """After a reset of the simulation."""
         self.stand_by()
-        self._scripts = {arm: self.script(arm) for arm in ARMS}
-        self.running = set(ARMS)
+        self._scripts = {arm: self.script(arm) for arm in ROBOT.arms}
+        self.running = set(ROBOT.arms)
 
     def stand_by(self) -> None:
         """After a reset of the simulation, where another moves the arms until ``take_over``."""
         command = self.sim.arrays["ctrl"][0, self.sim.action_actuators]
         self.hands = {}
-        for a, arm in enumerate(ARMS):
-            joints = self.sim.proprioception()[0, 7 * a : 7 * a + 6].copy()
+        for arm in ROBOT.arms:
+            own = ROBOT.joint_slice(arm)
+            joints = self.sim.proprioception()[0, own].copy()
             pose = self.kinematics[arm].pose(joints)
             self.hands[arm] = Hand(
                 pose=pose,
-                opening_m=float(command[7 * a + 6]),
+                opening_m=float(command[ROBOT.gripper_index(arm)]),
                 joints_rad=joints,
-                bias_rad=joints - command[7 * a : 7 * a + 6],
+                bias_rad=joints - command[own],
                 predicted_rad=joints,
                 goal=pose,
             )
@@ -184,12 +184,12 @@ class ScriptedExpert(ABC):
 
     def take_over(self, arm: str, subtask: str, pose: np.ndarray, opening_m: float) -> None:
         """Finish ``subtask`` with an arm that another has sent to ``pose`` (4, 4) last, in free motion."""
-        joints = self.sim.proprioception()[0, 7 * ARMS.index(arm) :][:6].copy()
+        joints = self.sim.proprioception()[0, ROBOT.joint_slice(arm)].copy()
         self.hands[arm] = Hand(
             pose=pose,
             opening_m=opening_m,
             joints_rad=self.kinematics[arm].solve(pose, joints)[0],
-            bias_rad=np.zeros(6),
+            bias_rad=np.zeros(ROBOT.num_joints),
             predicted_rad=joints,
             goal=pose,
         )
@@ -219,8 +219,8 @@ class ScriptedExpert(ABC):
             LostError, TaccorlError: as ``remaining``.
         """
         self.stand_by()
-        self._scripts = {arm: self.remaining(arm) for arm in ARMS}
-        self.running = set(ARMS)
+        self._scripts = {arm: self.remaining(arm) for arm in ROBOT.arms}
+        self.running = set(ROBOT.arms)
 
     @property
     def done(self) -> bool:
@@ -229,21 +229,21 @@ class ScriptedExpert(ABC):
 
     def act(self) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m] of the next control step."""
-        action = np.empty(14)
-        for a, arm in enumerate(ARMS):
+        action = np.empty(ROBOT.num_actions)
+        for arm in ROBOT.arms:
             if arm in self.running:
                 try:
                     next(self._scripts[arm])
                 except StopIteration:
                     self.running.discard(arm)
-            action[7 * a : 7 * a + 6] = self._joints(a, arm)
-            action[7 * a + 6] = self.hands[arm].opening_m
+            action[ROBOT.joint_slice(arm)] = self._joints(arm)
+            action[ROBOT.gripper_index(arm)] = self.hands[arm].opening_m
         self.step_count += 1
-        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+        return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
-    def _joints(self, a: int, arm: str) -> np.ndarray:
-        """(6,) targets that bring the hand, with its tremor, to where it wants to be."""
-        hand, actual = self.hands[arm], self.sim.proprioception()[0, 7 * a : 7 * a + 6]
+    def _joints(self, arm: str) -> np.ndarray:
+        """(J,) targets that bring the hand, with its tremor, to where it wants to be."""
+        hand, actual = self.hands[arm], self.sim.proprioception()[0, ROBOT.joint_slice(arm)]
         if hand.learns:
             hand.bias_rad = hand.bias_rad + _LEARNED * (actual - hand.predicted_rad)
         hand.goal = self._shaken(hand)
@@ -325,7 +325,7 @@ class ScriptedExpert(ABC):
 
     def free(self, arm: str) -> Script:
         """Open a hand that holds nothing, unless it is open."""
-        if self.hands[arm].opening_m < OPEN_M - _OPEN_ENOUGH_M:
+        if self.hands[arm].opening_m < ROBOT.opening_max_m - _OPEN_ENOUGH_M:
             yield from self.open(arm)
 
     def rise(self, arm: str, height_m: float, speed_mps: float = 0.12) -> Script:
@@ -334,9 +334,9 @@ class ScriptedExpert(ABC):
         up[2, 3] += height_m
         yield from self.move(arm, up, speed_mps=speed_mps)
 
-    def open(self, arm: str, width_m: float = OPEN_M) -> Script:
+    def open(self, arm: str, width_m: float = ROBOT.opening_max_m) -> Script:
         """Open to ``width_m`` between the pads."""
-        yield from self._grip(arm, min(width_m, OPEN_M), 0.3)
+        yield from self._grip(arm, min(width_m, ROBOT.opening_max_m), 0.3)
 
     def _grip(self, arm: str, opening_m: float, duration_s: float) -> Script:
         hand, start = self.hands[arm], self.hands[arm].opening_m
@@ -476,8 +476,8 @@ class ScriptedExpert(ABC):
 
     def holds(self, arm: str, part: Part) -> bool:
         """Whether both pads of the hand touch the part."""
-        pads = 2 * ARMS.index(arm)
-        return bool(self.sim.pads_touching(part.name)[0, pads : pads + 2].all())
+        first = len(ROBOT.fingers) * ROBOT.arms.index(arm)
+        return bool(self.sim.pads_touching(part.name)[0, first : first + len(ROBOT.fingers)].all())
 
     def require_lying(self, arm: str, part: Part) -> None:
         """
@@ -497,7 +497,7 @@ class ScriptedExpert(ABC):
         Raises:
             LostError: it is.
         """
-        if any(self.holds(other, part) for other in ARMS if other != arm):
+        if any(self.holds(other, part) for other in ROBOT.arms if other != arm):
             raise LostError(f"{part.name} is in the other hand")
 
     def body(self, name: str) -> np.ndarray:

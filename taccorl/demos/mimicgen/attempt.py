@@ -22,8 +22,7 @@ from taccorl.demos.mimicgen.schedule import DeadlockError
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import check_closed_loop
 from taccorl.demos.mimicgen.touching import Touching
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.task import HOLD_S
 from taccorl.sim.twin import CONTROL_HZ
@@ -51,7 +50,7 @@ class Attempted:
     """``success``; a failure's category of the task; ``timeout``, ``diverged``, ``unfinished``: nothing failed, but nothing was
     reached; ``unreachable``; ``deadlock``; or the gate that a success did not pass."""
     reason: str = ""
-    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 14), np.float32))
+    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
     """(T, 14) float32 as they were executed."""
     intended: np.ndarray | None = None
     """(T, 14) float32 what an attempt that is disturbed was to do; None: what it did."""
@@ -107,25 +106,25 @@ class Hands:
         self._max_step_rad = max_joint_speed_radps / CONTROL_HZ
         self.sim, self.kinematics, self.learn = sim, kinematics, learn
         self.joints_rad, self._rest = {}, {}
-        self._joints = {arm: joint_addresses(sim.model, arm) for arm in ARMS}
+        self._joints = {arm: joint_addresses(sim.model, arm) for arm in ROBOT.arms}
         self._touching = Touching(sim)
         self.unreached_m, self.unreached = 0.0, ""
         command = sim.arrays["ctrl"][0, sim.action_actuators]
-        for a, arm in enumerate(ARMS):
+        for arm in ROBOT.arms:
             gains = sim.config.controller_of(arm)
             joints = sim.arrays["qpos"][0, self._joints[arm]]
             lag_s = np.divide(gains.kd_nms_per_rad, gains.kp_nm_per_rad)
             self.joints_rad[arm] = joints
-            self._rest[arm] = RestOffset(joints, command[7 * a : 7 * a + 6].copy(), lag_s)
+            self._rest[arm] = RestOffset(joints, command[ROBOT.joint_slice(arm)].copy(), lag_s)
 
     def action(self, wishes: Mapping[str, Wish], pushed: Collection[str] = ()) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m]. Of arms that are ``pushed`` off their way no rest is learnt."""
-        action, qpos = np.empty(14), self.sim.arrays["qpos"][0]
-        may_learn = [arm for arm in ARMS if self.learn and arm not in pushed and not wishes[arm].contact]
+        action, qpos = np.empty(ROBOT.num_actions), self.sim.arrays["qpos"][0]
+        may_learn = [arm for arm in ROBOT.arms if self.learn and arm not in pushed and not wishes[arm].contact]
         still = [arm for arm in may_learn if self._rest[arm].is_still]
         if still:
             self._touching.look(self.sim.state_rows()[0])
-        for a, arm in enumerate(ARMS):
+        for arm in ROBOT.arms:
             wish, rest = wishes[arm], self._rest[arm]
             if arm in still and not self._touching.holds_fast(arm):
                 rest.see(qpos[self._joints[arm]])
@@ -140,9 +139,9 @@ class Hands:
                 joints = wish.joints_rad
             last = self.joints_rad[arm]
             self.joints_rad[arm] = joints = last + np.clip(joints - last, -self._max_step_rad, self._max_step_rad)
-            action[7 * a : 7 * a + 6] = rest.command(joints) if self.learn else joints
-            action[7 * a + 6] = wish.opening_m
-        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+            action[ROBOT.joint_slice(arm)] = rest.command(joints) if self.learn else joints
+            action[ROBOT.gripper_index(arm)] = wish.opening_m
+        return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
 
 class Attempts:
@@ -150,7 +149,7 @@ class Attempts:
 
     def __init__(self, pool: SourcePool, sim: Simulation, seed: int) -> None:
         self.pool, self.spec, self.sim, self.seed = pool, pool.spec, sim, seed
-        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
         self._feels = self.spec.datagen_config.contact_mode == "closed_loop_expert"
         self._disturbs = self.spec.datagen_config.disturbance.joint_rad > 0
         if self._feels:
@@ -166,7 +165,7 @@ class Attempts:
         hands = Hands(sim, self.kinematics, max_joint_speed_radps=max_speed, learn=not commanded)
         scene = TwinScene(sim)
         command = sim.arrays["ctrl"][0, sim.action_actuators]
-        openings = {arm: float(command[7 * a + 6]) for a, arm in enumerate(ARMS)}
+        openings = {arm: float(command[ROBOT.gripper_index(arm)]) for arm in ROBOT.arms}
         director = Director(
             self.pool,
             scene,
@@ -188,7 +187,7 @@ class Attempts:
                 done.outcome, done.reason = "deadlock", str(error)
                 break
             if disturbance is not None and exact is not None:
-                disturbance.update(wishes, {arm: director.ahead(arm) for arm in ARMS}, exact.look())
+                disturbance.update(wishes, {arm: director.ahead(arm) for arm in ROBOT.arms}, exact.look())
             action = hands.action(wishes, disturbance.pushed if disturbance else ())
             if hands.unreached_m > _UNREACHABLE_M:
                 done.outcome = "unreachable"
@@ -199,9 +198,9 @@ class Attempts:
             states.append(sim.state_rows()[0])
             sim.step(actions[-1][None].astype(np.float64), watch=gates.watch())
             after += director.done
-        done.actions = np.array(actions, np.float32).reshape(-1, 14)
+        done.actions = np.array(actions, np.float32).reshape(-1, ROBOT.num_actions)
         if disturbance:
-            done.intended = np.array(intended, np.float32).reshape(-1, 14)
+            done.intended = np.array(intended, np.float32).reshape(-1, ROBOT.num_actions)
         outcome = sim.judge.outcome
         if outcome.over[0]:
             done.outcome = "success" if outcome.success[0] else str(outcome.failure[0])

@@ -20,8 +20,7 @@ import numpy as np
 from taccorl.demos.mimicgen.director import Ahead, Wish
 from taccorl.demos.mimicgen.spec import DisturbanceSpec
 from taccorl.demos.mimicgen.touching import Touching
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
@@ -31,7 +30,6 @@ _APPROACH_STEPS = (
 )
 _RAMP_STEPS = 12
 _MOVES_M = 2e-4  # of an opening in a step
-_JOINTS, _PER_ARM = 6, 7
 
 
 class Disturbance:
@@ -39,18 +37,18 @@ class Disturbance:
 
     def __init__(self, spec: DisturbanceSpec, rng: np.random.Generator) -> None:
         self._spec, self._rng = spec, rng
-        self._off_rad = np.zeros(_JOINTS * len(ARMS))
-        self._since = np.full(len(ARMS), np.inf)
+        self._off_rad = np.zeros(len(ROBOT.joint_indices))
+        self._since = np.full(len(ROBOT.arms), np.inf)
         """(2,) steps since an arm had to be exact."""
         self._opening_m: dict[str, float] = {}
-        self.strength = np.zeros(len(ARMS))
+        self.strength = np.zeros(len(ROBOT.arms))
         """(2,) of each arm now, 0 … 1."""
         self._is_first = True
 
     @property
     def pushed(self) -> list[str]:
         """Arms that are pushed off their way now."""
-        return [arm for arm, strength in zip(ARMS, self.strength, strict=True) if strength > 0]
+        return [arm for arm, strength in zip(ROBOT.arms, self.strength, strict=True) if strength > 0]
 
     def update(self, wishes: Mapping[str, Wish], ahead: Mapping[str, Ahead], is_exact: np.ndarray) -> None:
         """
@@ -60,8 +58,8 @@ class Disturbance:
             is_exact: (2,) of each arm now (``Exact``).
         """
         contact = min(each.contact for each in ahead.values())
-        before = np.empty(len(ARMS))
-        for a, arm in enumerate(ARMS):
+        before = np.empty(len(ROBOT.arms))
+        for a, arm in enumerate(ROBOT.arms):
             opening_m = wishes[arm].opening_m
             moves = abs(opening_m - self._opening_m.get(arm, opening_m)) > _MOVES_M
             self._opening_m[arm] = opening_m
@@ -76,10 +74,8 @@ class Disturbance:
     def executed(self, intended: np.ndarray) -> np.ndarray:
         """(14,) float32 within the limits of actions: joints of ``intended`` (14,) [rad] drift, openings [m] do not."""
         executed = intended.astype(float)
-        for a in range(len(ARMS)):
-            joints = slice(_PER_ARM * a, _PER_ARM * a + _JOINTS)
-            executed[joints] += self.strength[a] * self._off_rad[_JOINTS * a : _JOINTS * (a + 1)]
-        return np.clip(executed, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+        executed[ROBOT.joint_indices] += np.repeat(self.strength, ROBOT.num_joints) * self._off_rad
+        return np.clip(executed, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
 
 class Exact:
@@ -96,9 +92,9 @@ class Exact:
         sim = self._sim
         self._touching.look(sim.state_rows()[0])
         for i, pair in enumerate(sim.task.mating):
-            is_held = any({arm, part} in self._touching.pairs for arm in ARMS for part in pair)
+            is_held = any({arm, part} in self._touching.pairs for arm in ROBOT.arms for part in pair)
             self._have_met[i] = is_held and (self._have_met[i] or sim.contact(*pair).touching[0])
-        return np.array([self._have_met.any() or self._touching.holds_fast(arm) for arm in ARMS])
+        return np.array([self._have_met.any() or self._touching.holds_fast(arm) for arm in ROBOT.arms])
 
 
 def drifted(off_rad: np.ndarray, spec: DisturbanceSpec, rng: np.random.Generator) -> np.ndarray:

@@ -20,7 +20,7 @@ from taccorl.demos.mimicgen.source import ArmTrack, Source
 from taccorl.demos.mimicgen.spec import MimicSpec
 from taccorl.demos.mimicgen.touching import Touching
 from taccorl.errors import DatasetError
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 from taccorl.sim.twin_file import load_twin
@@ -94,7 +94,7 @@ class SourceReader:
 
     def __init__(self, sim: Simulation) -> None:
         self.sim = sim
-        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
         self._touching = Touching(sim)
 
     def read(self, episode: Episode) -> Source:
@@ -118,18 +118,19 @@ class SourceReader:
         touched = np.logical_or.accumulate(np.logical_or.reduce(list(mated.values())))
         rest_command = self._command(states[0])
         arms = {}
-        for a, arm in enumerate(ARMS):
-            commands = actions[:, 7 * a : 7 * a + 6]
+        for arm in ROBOT.arms:
+            own = ROBOT.joint_slice(arm)
+            commands = actions[:, own]
             joints = np.stack([look.joints_rad[arm] for look in seen])
             held_back = touched | np.array([look.holds_fast[arm] for look in seen])
-            goals = self._goals(arm, joints, commands, rest_command[7 * a : 7 * a + 6], held_back)
+            goals = self._goals(arm, joints, commands, rest_command[own], held_back)
             goal, command = (np.stack([self.kinematics[arm].pose(row) for row in rows]) for rows in (goals, commands))
             tcp = np.stack([look.tcp[arm] for look in seen])
-            arms[arm] = ArmTrack(tcp, goal, goals, actions[:, 7 * a + 6], command, commands)
+            arms[arm] = ArmTrack(tcp, goal, goals, actions[:, ROBOT.gripper_index(arm)], command, commands)
         subtask = episode.arrays["sim.subtask"]
         signals = {
             arm: {s.name: subtask[:, a] > k for k, s in enumerate(self.sim.task.subtasks()[arm])}
-            for a, arm in enumerate(ARMS)
+            for a, arm in enumerate(ROBOT.arms)
         }
         return Source(episode.name, arms, objects, signals, mated, free)
 
@@ -141,11 +142,11 @@ class SourceReader:
         mated = {name for pair in task.mating if set(pair) in touching.pairs for name in pair}
         return _Look(
             poses={name: _pose(data.body(name).xpos, data.body(name).xmat) for name in names},
-            tcp={arm: _pose(data.site(f"{arm}_tcp").xpos, data.site(f"{arm}_tcp").xmat) for arm in ARMS},
-            joints_rad={arm: data.qpos[joint_addresses(model, arm)] for arm in ARMS},
+            tcp={arm: _pose(data.site(f"{arm}_tcp").xpos, data.site(f"{arm}_tcp").xmat) for arm in ROBOT.arms},
+            joints_rad={arm: data.qpos[joint_addresses(model, arm)] for arm in ROBOT.arms},
             mated={name: name in mated for name in task.parts},
             free={name: touching.free(name) for name in task.parts},
-            holds_fast={arm: touching.holds_fast(arm) for arm in ARMS},
+            holds_fast={arm: touching.holds_fast(arm) for arm in ROBOT.arms},
         )
 
     def _command(self, row: np.ndarray) -> np.ndarray:

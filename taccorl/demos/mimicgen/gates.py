@@ -6,12 +6,11 @@ import mujoco
 import numpy as np
 
 from taccorl.demos.mimicgen.spec import GatesSpec
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
-from taccorl.sim.robot import ARMS, JOINTS, PADS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation, Watch
 
 _EVERY = 5  # physics steps between looks: peaks last some milliseconds
-_JOINTS = np.array([not name.endswith("gripper") for name in ACTION_NAMES])
+_JOINTS = np.array([not name.endswith("gripper") for name in ROBOT.action_names])
 
 
 @dataclass
@@ -51,7 +50,7 @@ class GateKeeper:
     measured: Measured = field(default_factory=Measured)
 
     def __post_init__(self) -> None:
-        names = [f"{arm}_{joint}" for arm in ARMS for joint in JOINTS]
+        names = [f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints]
         self._joints = [self.sim.model.joint(name).dofadr[0] for name in names]
 
     def watch(self) -> Watch:
@@ -69,8 +68,8 @@ class GateKeeper:
 
     def see_actions(self, actions: np.ndarray) -> None:
         """All of them (T, 14)."""
-        at_limit = ((actions <= ACTION_LOW) | (actions >= ACTION_HIGH)).any(0) & _JOINTS
-        self.measured.at_limit = ", ".join(np.array(ACTION_NAMES)[at_limit].tolist())
+        at_limit = ((actions <= ROBOT.action_low) | (actions >= ROBOT.action_high)).any(0) & _JOINTS
+        self.measured.at_limit = ", ".join(np.array(ROBOT.action_names)[at_limit].tolist())
 
 
 def foreign_contact(sim: Simulation, states: np.ndarray) -> tuple[str, str] | None:
@@ -92,9 +91,9 @@ def foreign_contact(sim: Simulation, states: np.ndarray) -> tuple[str, str] | No
 def _owner(sim: Simulation, body: int) -> tuple[str, str]:
     """(kind, name) of a body: arm, finger, part or table."""
     name = sim.model.body(body).name
-    arm = next((arm for arm in ARMS if name.startswith(f"{arm}_")), None)
+    arm = next((arm for arm in ROBOT.arms if name.startswith(f"{arm}_")), None)
     if arm:
-        return ("finger" if "finger" in name or "pad" in name or name in PADS else "arm"), name
+        return ("finger" if "finger" in name or "pad" in name or name in ROBOT.pads else "arm"), name
     return ("part", name) if name in (*sim.task.parts, *sim.task.clamped) else ("table", "table")
 
 

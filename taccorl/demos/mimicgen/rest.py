@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from taccorl.demos.experts.scripted import follow
-from taccorl.sim.robot import JOINTS
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import CONTROL_HZ
 
 _LEARNED = 1 - math.exp(
@@ -22,7 +22,7 @@ _STILL_RAD = 0.001  # of a joint in a control step: what a tremor makes; 12 mm/s
 
 def joint_addresses(model: mujoco.MjModel, arm: str) -> np.ndarray:
     """(6,) where an arm's joints are in ``qpos``."""
-    return np.array([model.joint(f"{arm}_{joint}").qposadr[0] for joint in JOINTS])
+    return np.array([model.joint(f"{arm}_{joint}").qposadr[0] for joint in ROBOT.joints])
 
 
 class RestOffset:

@@ -16,7 +16,7 @@ from taccorl.data.strict_yaml import Document
 from taccorl.demos.experts import experts
 from taccorl.demos.mimicgen.schedule import Constraint, DeadlockError, rehearse
 from taccorl.errors import SpecError, TaccorlError, nearest
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.tasks.task import Task
 
 UNTIL_THE_END = "until the end"
@@ -230,9 +230,9 @@ def load_mimic_spec(name: str | Path) -> MimicSpec:
 def _mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
     """(key, what is wrong) of a spec that parses."""
     for arm in spec.subtask_configs:
-        if arm not in ARMS:
-            yield f"subtask_configs/{arm}", f"no arm {arm!r}; {nearest(arm, ARMS)}"
-    for arm in ARMS:
+        if arm not in ROBOT.arms:
+            yield f"subtask_configs/{arm}", f"no arm {arm!r}; {nearest(arm, ROBOT.arms)}"
+    for arm in ROBOT.arms:
         if not spec.subtask_configs.get(arm):
             yield "subtask_configs", f"the {arm} arm has no subtasks"
     for arm, subtasks in spec.subtask_configs.items():

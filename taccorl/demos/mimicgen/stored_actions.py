@@ -23,6 +23,7 @@ from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.mimicgen.execution import Demonstration
 from taccorl.demos.mimicgen.spec import GatesSpec
 from taccorl.errors import DatasetError
+from taccorl.robots import ROBOT
 
 FORMAT = 2
 _FORMATS = (1, FORMAT)  # 1: without kind and first_row
@@ -30,7 +31,6 @@ META, ACTIONS, INTENDED = "meta.json", "actions.npy", "intended.npy"
 SIMULATION = ("task", "difficulty", "twin", "randomization", "origin", "root_seed", "mujoco", "taccorl", "sources")
 """What the episodes of a folder have in common, as an episode's provenance has it."""
 MIMICGEN, CORRECTION = "mimicgen", "correction"
-_ACTION_SIZE = 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,9 +152,9 @@ def _read_actions(path: Path, num_rows: int) -> np.ndarray:
         raise DatasetError(
             f"{path}: cannot be read ({type(error).__name__}: {error}): copy the folder whole"
         ) from error
-    if actions.shape != (num_rows, _ACTION_SIZE) or actions.dtype != np.float32:
+    if actions.shape != (num_rows, ROBOT.num_actions) or actions.dtype != np.float32:
         raise DatasetError(
-            f"{path}: {actions.dtype} {list(actions.shape)}, {META} says float32 [{num_rows}, {_ACTION_SIZE}]: copy the folder "
-            "whole"
+            f"{path}: {actions.dtype} {list(actions.shape)}, {META} says float32 [{num_rows}, {ROBOT.num_actions}]: "
+            "copy the folder whole"
         )
     return actions

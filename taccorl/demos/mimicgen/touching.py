@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 
 
@@ -13,7 +13,7 @@ class Touching:
     def __init__(self, sim: Simulation) -> None:
         self.model, self.data, self._size = sim.model, mujoco.MjData(sim.model), sim.batch.nstate
         bodies = [sim.model.body(i).name for i in sim.model.geom_bodyid]
-        self._owner = [next((arm for arm in ARMS if name.startswith(arm)), name) for name in bodies]
+        self._owner = [next((arm for arm in ROBOT.arms if name.startswith(arm)), name) for name in bodies]
         """Of each geom: an arm, a part, a clamped body, or the table (its name is world)."""
         self._parts = sim.task.parts
         self.pairs: set[frozenset[str]] = set()
@@ -27,7 +27,7 @@ class Touching:
 
     def free(self, part: str) -> bool:
         """Touches nothing but arms."""
-        return all(pair & set(ARMS) for pair in self.pairs if part in pair)
+        return all(pair & set(ROBOT.arms) for pair in self.pairs if part in pair)
 
     def holds_fast(self, arm: str) -> bool:
         """Whether the arm touches a part that something else touches, too: a hand that wants to be elsewhere stays where it is,

@@ -6,9 +6,10 @@ import pytest
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.se3 import rotvec, transform, turn
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import LINKS, TCP_FROM_LINK6_M, RobotConfig, link_poses
+from taccorl.robots import ROBOT
+from taccorl.sim.robot import RobotConfig, link_poses
 
-LOW, HIGH = np.array([link.range_rad for link in LINKS]).T
+LOW, HIGH = np.array([link.range_rad for link in ROBOT.links]).T
 HOME_RAD = np.array((0.003, 1.732, -0.883, -0.528, 0.884, -1.213))
 
 
@@ -30,7 +31,7 @@ def test_the_tcp_is_where_plain_matrix_products_put_it(arm, y_m):
     kinematics, rng = ArmKinematics(arm, RobotConfig(mount_height_m=0.15)), np.random.default_rng(0)
     for _ in range(10):
         joints = drawn_joints(rng)
-        by_hand = transform((0, y_m, 0.15)) @ link_poses(joints)[-1] @ transform((0, 0, TCP_FROM_LINK6_M))
+        by_hand = transform((0, y_m, 0.15)) @ link_poses(joints)[-1] @ transform((0, 0, ROBOT.tcp_from_hand_m))
         np.testing.assert_allclose(kinematics.pose(joints), by_hand, atol=1e-9)
 
 

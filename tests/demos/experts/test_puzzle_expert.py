@@ -10,7 +10,8 @@ from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.puzzle import PuzzleExpert
 from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
 from taccorl.demos.experts.se3 import transform, turn
-from taccorl.sim.robot import ARMS, LINKS, RobotConfig
+from taccorl.robots import ROBOT
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.puzzle import PIECES_AT_M, TRAY_AT_M, Puzzle
 
@@ -35,7 +36,7 @@ class Episode:
             sim.step(self.expert.act()[None])
             deepest = max(sim.contact(*pair).penetration_m[0] for pair in sim.task.mating)
             self.penetration_m = max(self.penetration_m, deepest)
-            self.hands_m.append([sim.tcp(arm)[0, :3, 3] for arm in ARMS])
+            self.hands_m.append([sim.tcp(arm)[0, :3, 3] for arm in ROBOT.arms])
             self.lost_steps = max(self.lost_steps, sim.judge.lasted[0].max())
         self.outcome, self.subtask = sim.judge.outcome, sim.judge.subtask[0].tolist()
         self.duration_s = len(self.hands_m) / 30
@@ -60,9 +61,9 @@ def places() -> list[tuple[str, tuple[float, float, float]]]:
 
 
 def test_every_place_is_a_fifth_of_a_radian_from_the_joint_limits():
-    low, high = np.array([link.range_rad for link in LINKS]).T
+    low, high = np.array([link.range_rad for link in ROBOT.links]).T
     down = np.diag([-1.0, 1, -1])
-    arms = {arm: ArmKinematics(arm, RobotConfig()) for arm in ARMS}
+    arms = {arm: ArmKinematics(arm, RobotConfig()) for arm in ROBOT.arms}
     for arm, pos in places():
         for yaw_rad in np.deg2rad((-15, 15)):  # of a piece and the tray together
             joints = arms[arm].search(transform(pos, down) @ turn((0, 0, yaw_rad)), np.random.default_rng(0), tries=8)
@@ -71,8 +72,8 @@ def test_every_place_is_a_fifth_of_a_radian_from_the_joint_limits():
 
 
 def test_home_is_a_fifth_of_a_radian_from_the_joint_limits():
-    low, high = np.array([link.range_rad for link in LINKS]).T
-    for arm in ARMS:
+    low, high = np.array([link.range_rad for link in ROBOT.links]).T
+    for arm in ROBOT.arms:
         home = np.array(Puzzle.home_rad[arm])
         assert np.minimum(home - low, high - home).min() > 0.2
 

@@ -18,8 +18,7 @@ from taccorl.demos.experts.scripted import (
 )
 from taccorl.demos.experts.se3 import inverse, rotvec, transform, turn
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.robots import ROBOT
 from taccorl.sim.part import Part
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.assembly_1 import Assembly1
@@ -81,7 +80,7 @@ def test_the_hand_learns_how_far_its_joints_rest_from_their_targets(sim):
     expert = OneHand(sim, forgetful(learns=True))
     run(expert)
     assert off_m(expert) < 5e-4
-    rest = np.array(TORQUE_FF_NM) / KP_NM_PER_RAD
+    rest = np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad
     assert rest[4] == pytest.approx(0.01145, abs=1e-5)
     # What is left after a settle may still be 0.4 mm over a lever of 0.26 m.
     np.testing.assert_allclose(expert.hands["left"].bias_rad, rest, atol=0.002)
@@ -97,7 +96,7 @@ def test_a_hand_that_learns_nothing_rests_where_joint_5_leaves_it(sim):
 def test_it_starts_with_what_the_resting_robot_shows(sim):
     expert = OneHand(sim, lambda expert: expert.pause("left"))
     for hand in expert.hands.values():
-        np.testing.assert_allclose(hand.bias_rad, np.array(TORQUE_FF_NM) / KP_NM_PER_RAD, atol=1e-5)
+        np.testing.assert_allclose(hand.bias_rad, np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-5)
 
 
 # moving -----------------------------------------------------------------------------------------------------------------
@@ -234,8 +233,8 @@ def test_actions_stay_within_the_limits_whatever_is_asked(sim):
     expert = OneHand(sim, work)
     made = np.array(run(expert, expert.act))
     assert made.dtype == np.float32
-    assert (made >= ACTION_LOW).all()
-    assert (made <= ACTION_HIGH).all()
+    assert (made >= ROBOT.action_low).all()
+    assert (made <= ROBOT.action_high).all()
     assert not sim.clipped.any()
     assert expert.unreachable_m > 0.1  # and what could not be reached is told
 
@@ -244,7 +243,7 @@ def test_actions_stay_within_the_limits_whatever_is_asked(sim):
 
 
 def test_a_lag_follows_a_ramp_as_its_differential_equation_says():
-    lag_s, num = np.array(KD_NMS_PER_RAD) / KP_NM_PER_RAD, 20_000
+    lag_s, num = np.array(ROBOT.kd_nms_per_rad) / ROBOT.kp_nm_per_rad, 20_000
     start, before, after = np.full(6, 0.1), np.full(6, 0.15), np.full(6, 0.25)
     x = start.copy()
     for k in range(num):  # Euler: wrong by some 1 / num of the way
@@ -284,7 +283,7 @@ def test_a_known_force_is_felt_in_its_direction_and_size(sim, axis):
     for j, nudge in enumerate(np.eye(6) * 1e-6):
         plus, minus = kinematics.pose(joints + nudge), kinematics.pose(joints - nudge)
         columns[:, j], tcp_columns[:, j] = ((plus - minus) @ com)[:3] / 2e-6, (plus - minus)[:3, 3] / 2e-6
-    expected = tcp_columns @ (columns.T @ force_n[:3] / KP_NM_PER_RAD)
+    expected = tcp_columns @ (columns.T @ force_n[:3] / ROBOT.kp_nm_per_rad)
     pushed = expert.pushed("left")[:3]
     assert pushed[axis] > 2e-4
     np.testing.assert_allclose(pushed, expected, atol=5e-5)

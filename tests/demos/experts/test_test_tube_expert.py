@@ -12,11 +12,11 @@ from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
 from taccorl.demos.experts.se3 import transform, turn
 from taccorl.demos.experts.test_tube import TestTubeExpert
-from taccorl.sim.robot import LINKS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.test_tube import TestTube
 
-JOINT_LOW, JOINT_HIGH = np.array([link.range_rad for link in LINKS]).T
+JOINT_LOW, JOINT_HIGH = np.array([link.range_rad for link in ROBOT.links]).T
 MARGIN_RAD = 0.1
 FASTEST_RADPS = 3.0  # of a joint's target; the arm's slowest joint is rated for 3.14 rad/s
 

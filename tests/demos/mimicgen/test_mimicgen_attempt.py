@@ -25,7 +25,7 @@ from taccorl.demos.mimicgen.spec import GatesSpec, load_mimic_spec, with_options
 from taccorl.demos.mimicgen.touching import Touching
 from taccorl.demos.recorder import EpisodeRecorder, with_simulator
 from taccorl.errors import DatasetError
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.assembly_2 import Assembly2
 
@@ -73,7 +73,7 @@ def test_poses_of_a_source_are_the_simulators_own(collected, pool, sim):
         sim.restore_rows(episode.arrays["sim.state"][[row]], episode.arrays["sim.seed"][row])
         for body in ("plug", "cradle"):
             np.testing.assert_array_equal(source.objects[body][row], sim.poses(body)[0])
-        for arm in ARMS:
+        for arm in ROBOT.arms:
             np.testing.assert_array_equal(source.arms[arm].tcp[row], sim.tcp(arm)[0])
         assert source.mated["plug"][row] == sim.contact("plug", "cradle").touching[0]
     np.testing.assert_array_equal(source.arms["left"].opening_m, episode.arrays["action"][:, 6])
@@ -119,7 +119,7 @@ def test_what_an_arm_rests_off_is_learnt_when_it_stands_still():
 def hands_at(collected):
     """row → a simulation in that row of a demonstration, and hands in it."""
     episode, sim = Dataset(collected).episode(1), Simulation(Assembly2())
-    kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ARMS}
+    kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
 
     def make(row):
         sim.restore_rows(episode.arrays["sim.state"][[row]], episode.arrays["sim.seed"][row])
@@ -156,14 +156,14 @@ def test_a_hand_that_grips_what_stands_on_the_table_holds_it_fast_and_one_that_c
 def test_nothing_is_learnt_of_an_arms_rest_while_it_holds_something_fast(hands_at, gripped_and_lifted, is_gripped):
     """Else a hand that is to be lower than the table lets it would push ever harder."""
     sim, hands = hands_at(gripped_and_lifted[0 if is_gripped else 1])
-    lower = {arm: sim.tcp(arm)[0].copy() for arm in ARMS}
+    lower = {arm: sim.tcp(arm)[0].copy() for arm in ROBOT.arms}
     lower["right"][2, 3] -= 0.004
-    opening_m = {arm: float(sim.arrays["ctrl"][0, sim.action_actuators][7 * a + 6]) for a, arm in enumerate(ARMS)}
+    opening_m = {arm: float(sim.arrays["ctrl"][0, sim.action_actuators][7 * a + 6]) for a, arm in enumerate(ROBOT.arms)}
     before = np.zeros(6)
     for k in range(35):
         if k == 5:  # the first of them take what is held a little off the table
             before = hands._rest["right"].offset_rad
-        action = hands.action({arm: Wish(goal=lower[arm], opening_m=opening_m[arm]) for arm in ARMS})
+        action = hands.action({arm: Wish(goal=lower[arm], opening_m=opening_m[arm]) for arm in ROBOT.arms})
         sim.step(action[None].astype(np.float64))
     learnt_rad = np.abs(hands._rest["right"].offset_rad - before).max()
     assert learnt_rad == 0 if is_gripped else learnt_rad > 1e-4
@@ -172,8 +172,10 @@ def test_nothing_is_learnt_of_an_arms_rest_while_it_holds_something_fast(hands_a
 def test_no_joint_is_sent_faster_than_it_may_turn_and_it_still_arrives(hands_at):
     sim, hands = hands_at(0)
     start, last = hands.joints_rad["left"], None
-    goal = {arm: hands.joints_rad[arm] + (0.35 * np.r_[1, 1, -1, 1, -1, 1] if arm == "left" else 0.0) for arm in ARMS}
-    wishes = {arm: Wish(goal=sim.tcp(arm)[0], opening_m=0.05, joints_rad=goal[arm], contact=True) for arm in ARMS}
+    goal = {
+        arm: hands.joints_rad[arm] + (0.35 * np.r_[1, 1, -1, 1, -1, 1] if arm == "left" else 0.0) for arm in ROBOT.arms
+    }
+    wishes = {arm: Wish(goal=sim.tcp(arm)[0], opening_m=0.05, joints_rad=goal[arm], contact=True) for arm in ROBOT.arms}
     for k in range(4):  # 3 rad/s at 30 Hz: 0.1 rad a step
         last = hands.action(wishes)
         np.testing.assert_allclose(np.abs(hands.joints_rad["left"] - start), min(0.1 * (k + 1), 0.35), atol=1e-12)

@@ -18,8 +18,7 @@ from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import DisturbanceSpec, load_mimic_spec, with_options
 from taccorl.errors import DatasetError
 from taccorl.lineage.store import Store
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.assembly_2 import Assembly2
 
@@ -31,7 +30,7 @@ FREE = Ahead(math.inf, math.inf)
 
 
 def wishes(left_m: float = 0.05, right_m: float = 0.05) -> dict[str, Wish]:
-    return {arm: Wish(goal=np.eye(4), opening_m=m) for arm, m in zip(ARMS, (left_m, right_m), strict=True)}
+    return {arm: Wish(goal=np.eye(4), opening_m=m) for arm, m in zip(ROBOT.arms, (left_m, right_m), strict=True)}
 
 
 def strengths_of(steps) -> np.ndarray:
@@ -84,7 +83,7 @@ def test_a_drift_has_the_spread_and_the_time_that_were_asked_for():
 def executed(joint_rad: float, exact=(False, False)) -> tuple[np.ndarray, np.ndarray]:
     """(60, 14) what is sent, and (14,) what was intended in each row."""
     disturbance, intended = Disturbance(DisturbanceSpec(joint_rad=joint_rad), np.random.default_rng(1)), None
-    intended = ((ACTION_LOW + ACTION_HIGH) / 2).astype(np.float32)
+    intended = ((ROBOT.action_low + ROBOT.action_high) / 2).astype(np.float32)
     sent = []
     for _ in range(60):
         disturbance.update(wishes(), {"left": FREE, "right": FREE}, np.array(exact))
@@ -102,7 +101,7 @@ def test_joints_are_pushed_and_openings_are_not():
     assert (one[:, LEFT] == intended[LEFT]).all()
     np.testing.assert_array_equal(one[:, RIGHT], sent[:, RIGHT])
     far, _ = executed(50.0)
-    assert ((far >= ACTION_LOW.astype(np.float32)) & (far <= ACTION_HIGH.astype(np.float32))).all()
+    assert ((far >= ROBOT.action_low.astype(np.float32)) & (far <= ROBOT.action_high.astype(np.float32))).all()
 
 
 def test_an_arm_is_exact_that_grips_on_the_table_and_both_are_once_parts_have_met(collected):
