@@ -6,23 +6,22 @@
 import copy
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects.added import AddedEffects, present
-from taccorl.sim.effects.effect import CHANNELS, ArmEffect, Effect, JointEffect
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.effects.payload import Payload
-from taccorl.sim.robot import ARMS, JOINTS, TCP_FROM_LINK6_M
 from taccorl.sim.twin import TwinConfig, empty_bench
 
-ArmName = Literal["left", "right"]
 Position = tuple[float, float, float]
-AT_TCP: Position = (0.0, 0.0, TCP_FROM_LINK6_M)
+AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 """m, in link 6's frame: the middle between the pads, where a gripper holds what it carries."""
 _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
 
@@ -38,20 +37,21 @@ class Rigid(NamedTuple):
     compensation_cos: float = 0.0
 
 
-def split_signal(signal: str) -> tuple[ArmName, str]:
+def split_signal(signal: str) -> tuple[str, str]:
     """``left_joint5`` → ``left``, ``joint5``.
 
     Raises:
         TaccorlError: no joint of the arms; grippers have no model of one joint.
     """
     arm, _, joint = signal.partition("_")
-    if arm in ARMS and joint == "gripper":
+    if arm in ROBOT.arms and joint == "gripper":
         raise TaccorlError(
             f"{signal}: a gripper is a motor with two fingers and has no model of one joint; take a joint"
         )
-    if arm not in ARMS or joint not in JOINTS:
-        raise TaccorlError(f"{signal!r} is no joint of the arms; those are left_joint1 … right_joint6")
-    return "left" if arm == "left" else "right", joint
+    if arm not in ROBOT.arms or joint not in ROBOT.joints:
+        first, last = (ROBOT.action_names[k] for k in (ROBOT.joint_indices[0], ROBOT.joint_indices[-1]))
+        raise TaccorlError(f"{signal!r} is no joint of the arms; those are {first} … {last}")
+    return arm, joint
 
 
 def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
@@ -70,19 +70,21 @@ def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
 
 def arm_spec(
     config: TwinConfig,
-    arm: ArmName,
+    arm: str,
     pose: np.ndarray,
     free: Sequence[str],
     payload_kg: float = 0.0,
     payload_at_m: Position = AT_TCP,
 ) -> mujoco.MjSpec:
-    """One arm, its joints ``free`` with their motors and encoders, the others and the gripper held at ``pose`` (7,) [rad, m].
+    """One arm, its joints ``free`` with their motors and encoders, the others and the gripper held at ``pose``.
+
+    ``pose`` holds the arm's joints [rad] and its opening [m].
 
     Args:
         payload_at_m: centre of mass of the known payload, in link 6's frame.
     """
     spec = empty_bench(config)
-    for other in ARMS:
+    for other in ROBOT.arms:
         if other != arm:
             spec.delete(spec.body(f"{other}_base_link"))
     for things in (spec.geoms, spec.equalities, spec.tendons):
@@ -92,16 +94,16 @@ def arm_spec(
     for actuator in list(spec.actuators):
         if actuator.name not in names:
             spec.delete(actuator)
-    for joint, angle in zip(JOINTS, pose, strict=False):
+    for joint, link, angle in zip(ROBOT.joints, ROBOT.links, pose, strict=False):
         if joint not in free:
-            body = spec.body(f"{arm}_link{joint[-1]}")
+            body = spec.body(f"{arm}_{link.name}")
             turn = np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
             quat = np.empty(4)
             mujoco.mju_mulQuat(quat, np.asarray(body.quat), turn)
             body.quat = quat
-    for finger, side in (("a", 1.0), ("b", -1.0)):
+    for finger, side in zip(ROBOT.fingers, (1.0, -1.0), strict=True):
         body = spec.body(f"{arm}_finger_{finger}")
-        body.pos[1] += side * pose[6] / 2
+        body.pos[1] += side * pose[ROBOT.num_joints] / 2
     for joint in list(spec.joints):
         if joint.name not in names:
             spec.delete(joint)
@@ -120,7 +122,7 @@ def arm_spec(
     return spec
 
 
-def held_payload(arm: ArmName, mass_kg: float, at_m: Position = AT_TCP) -> Payload:
+def held_payload(arm: str, mass_kg: float, at_m: Position = AT_TCP) -> Payload:
     """A known mass in the gripper, at ``at_m`` in link 6's frame."""
     x_m, y_m, z_m = at_m
     return Payload(arm=arm, mass_kg=mass_kg, x_link6_m=x_m, y_link6_m=y_m, z_link6_m=z_m)
@@ -183,14 +185,18 @@ def run(
     for effect in effects:
         effect.edit(spec, config)
     model = spec.compile()
-    column, motor_id, encoder = CHANNELS.index(signal), model.actuator(signal).id, model.sensor(f"{signal}_pos").adr[0]
+    column, motor_id, encoder = (
+        ROBOT.action_names.index(signal),
+        model.actuator(signal).id,
+        model.sensor(f"{signal}_pos").adr[0],
+    )
     batch = Batch(model, 1, 1)
     for name in ("sensordata", "actuator_force"):
         batch.bind(name)  # from now on each forward pass fills it
     hooks = AddedEffects(effects, batch.bind("time"), batch)
 
     def reports(angles: np.ndarray) -> np.ndarray:
-        rows = np.zeros((len(angles), len(CHANNELS)))
+        rows = np.zeros((len(angles), len(ROBOT.action_names)))
         rows[:, column] = angles
         return hooks.encoder(rows)[:, column]
 
@@ -199,7 +205,7 @@ def run(
         angle += start - reports(angle)
     batch.bind("qpos")[0] = _hanging(model, signal, angle[0])
     batch.bind("ctrl")[0, motor_id] = sent[0]
-    targets = np.zeros((1, len(CHANNELS)))
+    targets = np.zeros((1, len(ROBOT.action_names)))
     targets[0, column] = sent[0]
     only = np.array([0])
     hooks.reset(only, targets)

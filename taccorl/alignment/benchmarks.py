@@ -22,11 +22,10 @@ from taccorl.alignment.joint_motion import JointMotion, joint_motion
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.sweep_range import SWEEP_HZ, SWEEP_S
 from taccorl.benchmark import Row, against_reference, benchmark, spread
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect, JointEffect
-from taccorl.sim.robot import JOINTS
 from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
@@ -41,8 +40,8 @@ def sweep(signal: str, config: TwinConfig) -> tuple[JointMotion, np.ndarray]:
         the motion, and (T,) what MuJoCo says without noise.
     """
     time_s = np.arange(round(SWEEP_S * RATE_HZ)) / RATE_HZ
-    home = np.array([*Bench().home_rad["left"], 0.06, *Bench().home_rad["right"], 0.06])
-    target, column = np.tile(home, (len(time_s), 1)), ACTION_NAMES.index(signal)
+    home = np.concatenate([[*Bench().home_rad[arm], 0.06] for arm in ROBOT.arms])
+    target, column = np.tile(home, (len(time_s), 1)), ROBOT.action_names.index(signal)
     phase = 2 * np.pi * (SWEEP_HZ[0] * time_s + (SWEEP_HZ[1] - SWEEP_HZ[0]) * time_s**2 / (2 * SWEEP_S))
     target[:, column] += 0.25 * np.clip((time_s - 0.5) / 0.5, 0, 1) * np.sin(phase)
     gains = JointModel(config, signal).gains
@@ -139,11 +138,13 @@ def controller_sysid() -> Iterator[Row]:
     config = TwinConfig()
     unknowing = TwinConfig(
         controller=ControllerConfig(
-            kp_nm_per_rad=[REFERENCE.kp] * 6, kd_nms_per_rad=[REFERENCE.kd] * 6, torque_ff_nm=[REFERENCE.torque_ff] * 6
+            kp_nm_per_rad=[REFERENCE.kp] * ROBOT.num_joints,
+            kd_nms_per_rad=[REFERENCE.kd] * ROBOT.num_joints,
+            torque_ff_nm=[REFERENCE.torque_ff] * ROBOT.num_joints,
         )
     )
     cost, ratio, rival_cost, rival_ratio, spsa_ratio, spsa_cost, kp_off, spsa_kp_off = ([] for _ in range(8))
-    for joint in JOINTS:
+    for joint in ROBOT.joints:
         signal = f"left_{joint}"
         truth = JointModel(config, signal).gains
         motion, _ = sweep(signal, config)

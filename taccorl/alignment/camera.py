@@ -35,7 +35,7 @@ from taccorl.alignment.camera_interval import Covariance, covariance
 from taccorl.alignment.camera_overlay import overlay
 from taccorl.alignment.camera_view import TwinView, as_offset
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.cameras import CameraConfig
 from taccorl.sim.twin import TwinConfig
 
@@ -74,10 +74,10 @@ class CameraFrames:
                 f"{self.name}: pictures are {self.pictures.dtype} {self.pictures.shape}; wanted are uint8 (F, rows, "
                 "columns, 3), all of one size"
             )
-        if self.joints.shape != (len(self.pictures), len(ACTION_NAMES)) or not np.isfinite(self.joints).all():
+        if self.joints.shape != (len(self.pictures), ROBOT.num_actions) or not np.isfinite(self.joints).all():
             raise TaccorlError(
                 f"{self.name}: joints are {self.joints.shape} for {len(self.pictures)} pictures; wanted are as many rows of "
-                f"{len(ACTION_NAMES)} finite numbers [rad, m], in the order of actions"
+                f"{ROBOT.num_actions} finite numbers [rad, m], in the order of actions"
             )
         if any(not 0 <= frame < len(self.pictures) for frame in self.stages.values()):
             raise TaccorlError(

@@ -18,9 +18,9 @@ from taccorl.alignment.camera_light import camera_light
 from taccorl.alignment.camera_timing import camera_latency
 from taccorl.alignment.camera_view import TwinView, as_offset
 from taccorl.benchmark import Row, benchmark, cpu_s, spread
+from taccorl.robots import ROBOT
 from taccorl.sim.effects.camera_exposure import blurred, toned
 from taccorl.sim.rendering import Renderer
-from taccorl.sim.robot import ARMS, FINGERS, JOINTS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks import tasks
 from taccorl.sim.twin import TwinConfig
@@ -31,8 +31,12 @@ OFF_RAD, OFF_M = np.deg2rad(2.7), 0.025
 _AMPLITUDE_RAD = np.array([0.35, 0.21, 0.21, 0.175, 0.175, 0.175])
 _FIRST_SEED = 1000  # none below was used while this was written
 _OFFSETS = 12
-_CAMERAS = ("front", "left_wrist")
-_BODIES = [f"{arm}_{body}" for arm in ARMS for body in ("base_link", "link5", "link6", "finger_a", "finger_b")]
+_CAMERAS = ROBOT.cameras[:2]  # the fixed one, and one that an arm carries
+_BODIES = [
+    f"{arm}_{body}"
+    for arm in ROBOT.arms
+    for body in ("base_link", ROBOT.links[-2].name, ROBOT.hand, *(f"finger_{f}" for f in ROBOT.fingers))
+]
 
 
 def random_offset(rng: np.random.Generator, angle_rad: float = OFF_RAD, length_m: float = OFF_M) -> np.ndarray:
@@ -46,7 +50,10 @@ def random_poses(rng: np.random.Generator, num_frames: int) -> np.ndarray:
     home = tasks.get("assembly_1").home_rad
     rows = []
     for _ in range(num_frames):
-        arms = [np.r_[home[arm] + rng.uniform(-1, 1, 6) * _AMPLITUDE_RAD, rng.uniform(0, 0.07)] for arm in ARMS]
+        arms = [
+            np.r_[home[arm] + rng.uniform(-1, 1, ROBOT.num_joints) * _AMPLITUDE_RAD, rng.uniform(0, 0.07)]
+            for arm in ROBOT.arms
+        ]
         rows.append(np.concatenate(arms))
     return np.array(rows)
 
@@ -83,16 +90,16 @@ def surrogate_pictures(
         tint = rng.uniform(0.8, 1.2, (model.ngeom, 3)), rng.normal(0, 0.04, (model.ngeom, 3))
         model.geom_rgba[:, :3] = np.clip(model.geom_rgba[:, :3] * tint[0] + tint[1], 0, 1)
     model.geom_pos[:] += rng.normal(0, shape_m, (model.nbody, 3))[model.geom_bodyid] if shape_m else 0.0
-    zeros = rng.normal(0, joint_zero_rad, 14) * np.tile([1.0] * 6 + [0.0], 2) if joint_zero_rad else np.zeros(14)
+    zeros = rng.normal(0, joint_zero_rad, ROBOT.num_actions) * ROBOT.per_action(1.0, 0.0) if joint_zero_rad else 0.0
     pictures = []
     with Renderer(model, [camera], *size) as renderer:
         for row in joints + zeros:
             data.qpos[:] = start
-            for arm, values in zip(ARMS, row.reshape(2, 7), strict=True):
-                for name, value in zip(JOINTS, values[:6], strict=True):
+            for arm in ROBOT.arms:
+                for name, value in zip(ROBOT.joints, row[ROBOT.joint_slice(arm)], strict=True):
                     data.joint(f"{arm}_{name}").qpos = value
-                for finger in FINGERS:
-                    data.joint(f"{arm}_finger_{finger}").qpos = values[6] / 2
+                for finger in ROBOT.fingers:
+                    data.joint(f"{arm}_finger_{finger}").qpos = row[ROBOT.gripper_index(arm)] / 2
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)
@@ -216,9 +223,9 @@ def _twin_is_off(camera: str) -> Iterator[Row]:
 def moving_joints(rng: np.random.Generator, time_s: np.ndarray) -> np.ndarray:
     """(T, 14) of both arms going to and fro, each joint with frequencies of its own."""
     home = tasks.get("assembly_1").home_rad
-    middle = np.r_[home["left"], 0.04, home["right"], 0.04]
-    swing = np.tile(np.r_[_AMPLITUDE_RAD * 0.8, 0.0], 2) / 2
-    rates, phases = rng.uniform(0.15, 0.5, (14, 2)), rng.uniform(0, 2 * np.pi, (14, 2))
+    middle = np.concatenate([[*home[arm], 0.04] for arm in ROBOT.arms])
+    swing = np.tile(np.r_[_AMPLITUDE_RAD * 0.8, 0.0], len(ROBOT.arms)) / 2
+    rates, phases = (rng.uniform(*ends, (ROBOT.num_actions, 2)) for ends in ((0.15, 0.5), (0, 2 * np.pi)))
     return middle + swing * np.sin(2 * np.pi * rates * time_s[:, None, None] + phases).sum(-1)
 
 

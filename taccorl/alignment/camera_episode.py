@@ -12,12 +12,12 @@ from taccorl.alignment.recorded import signal_names
 from taccorl.data.arms import STATE
 from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.actions import ACTION_NAMES, OPEN_M
+from taccorl.robots import ROBOT
 from taccorl.sim.robot import link_poses
 
 PICTURE = "observation.images."
 _SLOW = 0.5  # share of the rows, the slowest, that are taken from
-_GRIPPER_RAD = 0.5 / OPEN_M  # a gripper from end to end counts as half a radian
+_GRIPPER_RAD = 0.5 / ROBOT.opening_max_m  # a gripper from end to end counts as half a radian
 
 
 def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s: float = 0.0) -> CameraFrames:
@@ -27,7 +27,7 @@ def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s
         latency_s: what a picture shows is that much older than its row; 0 where ingest has taken it off already.
 
     Raises:
-        TaccorlError: no such camera, or a state that is not the robot's 14 joints and grippers.
+        TaccorlError: no such camera, or a state that is not the robot's joints and grippers.
     """
     joints = joint_rows(episode)
     time_s = episode.time_s
@@ -53,22 +53,24 @@ def joint_rows(episode: Episode) -> np.ndarray:
         TaccorlError: the state lacks one of them.
     """
     names = signal_names(episode.spec)
-    if missing := [name for name in ACTION_NAMES if name not in names]:
+    if missing := [name for name in ROBOT.action_names if name not in names]:
         raise TaccorlError(
             f"{episode.name}: {STATE} has no {', '.join(missing[:3])}{' …' if len(missing) > 3 else ''}; camera "
-            f"calibration needs all {len(ACTION_NAMES)} joints and grippers"
+            f"calibration needs all {ROBOT.num_actions} joints and grippers"
         )
-    return episode.arrays[STATE].astype(float)[:, [names.index(name) for name in ACTION_NAMES]]
+    return episode.arrays[STATE].astype(float)[:, [names.index(name) for name in ROBOT.action_names]]
 
 
 def stage_rows(joints: np.ndarray) -> dict[str, int]:
     """Rows of the paper's figure, from joints (T, 14) alone: the start, hands just closed, and hands closest together."""
     stages = {"initial": 0}
-    openings = joints[:, [6, 13]]
-    closed = (openings < openings.min(0) + 0.25 * np.ptp(openings, axis=0)) & (np.ptp(openings, axis=0) > 0.2 * OPEN_M)
+    openings = joints[:, ROBOT.gripper_indices]
+    closed = (openings < openings.min(0) + 0.25 * np.ptp(openings, axis=0)) & (
+        np.ptp(openings, axis=0) > 0.2 * ROBOT.opening_max_m
+    )
     if closed.any():
         stages["grasp"] = int(np.argmax(closed.any(1)))
-    hands = [link_poses(joints[:, k : k + 6])[:, -1, :3, 3] for k in (0, 7)]
+    hands = [link_poses(joints[:, ROBOT.joint_slice(arm)])[:, -1, :3, 3] for arm in ROBOT.arms]
     # Bases stand side by side, along y; how far apart does not change which row it is by much.
     apart = np.linalg.norm((hands[0] - hands[1]) + [0.0, 0.6, 0.0], axis=1)
     stages["insertion"] = int(len(apart) - 1 - np.argmin(apart[::-1]))
@@ -77,7 +79,7 @@ def stage_rows(joints: np.ndarray) -> dict[str, int]:
 
 def _different(joints: np.ndarray, num_frames: int) -> list[int]:
     """Rows among the slower ones, each as far as can be from those before it."""
-    scaled = joints * np.tile([1.0] * 6 + [_GRIPPER_RAD], 2)
+    scaled = joints * ROBOT.per_action(1.0, _GRIPPER_RAD)
     speed = np.linalg.norm(np.gradient(scaled, axis=0), axis=1)
     slow = np.flatnonzero(speed <= np.quantile(speed, _SLOW))
     chosen = [int(slow[0])]

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.alignment.camera_fit import Level, Solution, distances, moved, seen_from, slopes, space_slopes, weights
 from taccorl.alignment.camera_view import TwinView
-from taccorl.sim.robot import ARMS, JOINTS
+from taccorl.robots import ROBOT
 
 AXES = ("turn about right", "turn about up", "turn about back", "shift right", "shift up", "shift back")
 """The six numbers of a pose: rotation vector [rad] about, and shift [m] along the nominal camera's x, y, z."""
@@ -101,8 +101,8 @@ def _shifts(
     mount = model.body(view.camera.body).id
     position, turn = view.pose(offset)
     owners = np.unique(bodies)
-    found = np.zeros((3 * len(owners) + len(ARMS) * len(JOINTS), len(seen), 3))
-    names = [f"{arm}_{joint}" for arm in ARMS for joint in JOINTS]
+    found = np.zeros((3 * len(owners) + len(ROBOT.arms) * len(ROBOT.joints), len(seen), 3))
+    names = [f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints]
     for frame, row in enumerate(joints):
         view.place(row)
         mounted = Rotation.from_matrix(data.xmat[mount].reshape(3, 3))

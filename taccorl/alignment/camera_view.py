@@ -12,10 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
 from taccorl.sim.cameras import CameraConfig, CameraOffset, Window, add_cameras, letterbox_window, offset_pose
 from taccorl.sim.effects.added import AddedEffects, present
 from taccorl.sim.rendering import Renderer, style
-from taccorl.sim.robot import ARMS, FINGERS, JOINTS
 from taccorl.sim.twin import TwinConfig, empty_bench
 
 _BAR = 24  # counts: JPEG and video leave black bars this dark
@@ -49,14 +49,14 @@ class TwinView:
         self.model.cam_resolution[0] = 1  # not said: the view fills its frame, there are no bars
         self.data = mujoco.MjData(self.model)
         self._encoder = AddedEffects(config.effects, self.data.time * np.ones(1)).encoder
-        self._joints = [self._qpos(f"{arm}_{joint}") for arm in ARMS for joint in JOINTS]
-        self._fingers = [[self._qpos(f"{arm}_finger_{finger}") for finger in FINGERS] for arm in ARMS]
+        self._joints = [self._qpos(f"{arm}_{joint}") for arm in ROBOT.arms for joint in ROBOT.joints]
+        self._fingers = [[self._qpos(f"{arm}_finger_{finger}") for finger in ROBOT.fingers] for arm in ROBOT.arms]
         bare = dataclasses.replace(self.camera, offset=CameraOffset())
         self._nominal = bare.pose()
         turn = Rotation.from_quat(self.model.cam_quat[0], scalar_first=True).as_matrix()
         self.start = self.offset_of(self.model.cam_pos[0].copy(), turn)
         """(6,) where the twin has it: its offset, and what effects add to it."""
-        self.robot = np.array([self.model.body(i).name.startswith(ARMS) for i in range(self.model.nbody)])
+        self.robot = np.array([self.model.body(i).name.startswith(ROBOT.arms) for i in range(self.model.nbody)])
         """(bodies,) bool: of an arm."""
         self._renderers: dict[tuple[int, int], Renderer] = {}
 
@@ -74,9 +74,8 @@ class TwinView:
     def place(self, joints: np.ndarray) -> None:
         """Arms and fingers where ``joints`` (14,) [rad, m] are reported: effects on the encoders are taken off again."""
         joints = joints - (self._encoder(joints[None])[0] - joints)
-        arms = joints.reshape(2, 7)
-        self.data.qpos[self._joints] = arms[:, :6].ravel()
-        self.data.qpos[self._fingers] = arms[:, 6:] / 2
+        self.data.qpos[self._joints] = joints[ROBOT.joint_indices]
+        self.data.qpos[self._fingers] = joints[ROBOT.gripper_indices, None] / 2
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
 

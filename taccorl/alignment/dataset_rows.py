@@ -12,6 +12,7 @@ from taccorl.data.arms import ACTION, STATE
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode
 from taccorl.errors import RecordingError, TaccorlError
+from taccorl.robots import ROBOT
 
 
 def read_dataset(root: Path) -> list[Measurement]:
@@ -50,7 +51,7 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
     if TACTILE in episode.arrays:
         counts = episode.arrays[TACTILE][1:].astype(np.int16)
         baseline = np.asarray(episode.baselines.get(TACTILE, np.zeros(counts.shape[1])))
-        touch = Touch(time_s=np.repeat(time_s[:, None], 4, axis=1), counts=counts, baseline=baseline)
+        touch = Touch(time_s=np.repeat(time_s[:, None], len(ROBOT.pads), axis=1), counts=counts, baseline=baseline)
     ages = [t.age_max_s for t in episode.timing if t.feature in (STATE, ACTION) and math.isfinite(t.age_max_s)]
     return Measurement(
         name=f"{root.name}/episode_{k}",

@@ -19,8 +19,8 @@ from taccorl.alignment.joint_kernel import Drive, simulate
 from taccorl.alignment.joint_motion import JointMotion as JointMotion
 from taccorl.alignment.joint_motion import joint_motion as joint_motion
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.robot import JOINTS
 from taccorl.sim.twin import TwinConfig
 
 GRAVITY_M_PER_S2 = 9.81
@@ -80,7 +80,7 @@ class JointModel:
 
     def __init__(self, config: TwinConfig, signal: str) -> None:
         arm, joint = split_signal(signal)
-        k = JOINTS.index(joint)
+        k = ROBOT.joints.index(joint)
         control = config.controller_of(arm)
         self.signal = signal
         self.unit: Literal["rad", "m"] = "rad"

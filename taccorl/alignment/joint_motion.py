@@ -14,7 +14,7 @@ from taccorl.alignment import arm_bench
 from taccorl.alignment.arm_bench import split_signal
 from taccorl.alignment.measurement import Measurement
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import JOINTS
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
 _START_S = 0.1  # of a rest at the start is averaged
@@ -41,7 +41,7 @@ class JointMotion:
     start: float
     """rad: reported at rest before the first command."""
     pose: np.ndarray
-    """(7,) rad, m: where the arm's joints and its gripper are; the joint's own is not used."""
+    """Rad, m: where the arm's joints and its gripper are; the joint's own is not used."""
     kp_scale: float = 1.0
     """Gains of this recording over those that are asked for: commanded ones, where known, over the twin's; else over those of
     the other recordings (``Measurement.gain_scale``)."""
@@ -83,16 +83,16 @@ def joint_motion(measurement: Measurement, config: TwinConfig | None, signal: st
         )
     start = _start(m, j)
     if config is None:
-        pose, coupling, payload, commanded = np.zeros(7), np.zeros(m.num_rows), 0.0, {}
+        pose, coupling, payload, commanded = np.zeros(ROBOT.num_per_arm), np.zeros(m.num_rows), 0.0, {}
         payload_at_m, known_place = arm_bench.AT_TCP, False
     else:
         arm, joint = split_signal(signal)
-        names = [f"{arm}_{name}" for name in (*JOINTS, "gripper")]
+        names = ROBOT.action_names[ROBOT.arm_slice(arm)]
         pose = np.array([_start(m, m.column(name)) if name in m.signals else 0.0 for name in names])
         payload = m.payload_kg.get(arm, 0.0)
         payload_at_m, known_place = m.payload_position_m.get(arm, arm_bench.AT_TCP), arm in m.payload_position_m
         coupling = _coupling(m, config, signal, pose, payload, payload_at_m)
-        k, control = JOINTS.index(joint), config.controller_of(arm)
+        k, control = ROBOT.joints.index(joint), config.controller_of(arm)
         commanded = {
             "kp": m.kp.get(signal, math.nan) / control.kp_nm_per_rad[k],
             "kd": m.kd.get(signal, math.nan) / max(control.kd_nms_per_rad[k], 1e-9),
@@ -144,7 +144,7 @@ def _coupling(
     arm, joint = split_signal(signal)
     moving = [joint]
     angles = {joint: _smooth(m.measured[:, m.column(signal)], m.rate_hz)}
-    for other in JOINTS:
+    for other in ROBOT.joints:
         name = f"{arm}_{other}"
         if other == joint or name not in m.signals:
             continue
@@ -160,7 +160,7 @@ def _coupling(
         model = arm_bench.arm_spec(config, arm, pose, free, payload_kg, payload_at_m).compile()
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         data, dof = mujoco.MjData(model), model.joint(f"{arm}_{joint}").dofadr[0]
-        q = np.column_stack([angles[name] for name in JOINTS if name in free])
+        q = np.column_stack([angles[name] for name in ROBOT.joints if name in free])
         v = np.gradient(q, m.period_s, axis=0)
         a = np.gradient(v, m.period_s, axis=0)
         torque, needed = np.empty(m.num_rows), np.empty(model.nv)

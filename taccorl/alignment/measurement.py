@@ -4,7 +4,7 @@ The rule of every row, and of every reader: **the target of row k is in force fr
 where the joint was at time k**, before that target could act. ``taccorl.sim.replay`` answers by the same rule. One row off (5 ms)
 turned K_p 151 into 690 in an identification (MuJoCo's sensordata after a step is the state before it).
 
-Letters in shapes: T rows, J signals (14 for the robot, in the order of actions), N touch frames, K taxels.
+Letters in shapes: T rows, J signals (of the robot: in the order of actions), N touch frames, K taxels.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import numpy as np
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 
 if TYPE_CHECKING:
     from taccorl.alignment.touch_motion import PressedObject
@@ -27,11 +27,11 @@ UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}
 
 
 def unit_of(name: str) -> str:
-    """Unit of one of the robot's 14 signals."""
+    """Unit of one of the robot's signals."""
     return "m" if name.endswith("gripper") else "rad"
 
 
-ROBOT_UNITS = tuple(unit_of(name) for name in ACTION_NAMES)
+ROBOT_UNITS = tuple(unit_of(name) for name in ROBOT.action_names)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,9 +40,9 @@ class Touch:
 
     time_s: np.ndarray
     """(N, 4) when each pad's frame had been scanned to its end, on the measurement's clock, in the order of
-    ``taccorl.sim.robot.PADS``."""
+    ``ROBOT.pads``."""
     counts: np.ndarray
-    """(N, K) int16 counts above baseline, unclipped; K = 1536."""
+    """(N, K) int16 counts above baseline, unclipped."""
     baseline: np.ndarray
     """(K,) counts that were subtracted."""
 
@@ -66,7 +66,7 @@ class Measurement:
     """(T, J) rad/s, m/s as the driver reports it; NaN where it does not."""
     effort: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) N·m, N as the driver reports it; NaN where it does not. PiPER firmware may report another scale."""
-    signals: tuple[str, ...] = ACTION_NAMES
+    signals: tuple[str, ...] = ROBOT.action_names
     units: tuple[str, ...] = ROBOT_UNITS
     """Of positions, one per signal: rad or m."""
     quantum: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -164,29 +164,29 @@ class Measurement:
         return dataclasses.replace(self, time_s=time_s, **columns)
 
     def on_robot(self, rest: np.ndarray) -> "Measurement":
-        """All 14 signals in the order of actions: those that it lacks stay at ``rest`` (14,) and were not measured.
+        """All signals of the robot in the order of actions: those that it lacks stay at ``rest`` (J,) and were not measured.
 
         Raises:
             TaccorlError: a signal that the robot does not have, or has in another unit.
         """
         for name, unit in zip(self.signals, self.units, strict=True):
-            if name not in ACTION_NAMES:
+            if name not in ROBOT.action_names:
                 raise TaccorlError(
-                    f"{self.name}: the robot has no signal {name!r}; {nearest(name, ACTION_NAMES)}. Rename it in "
+                    f"{self.name}: the robot has no signal {name!r}; {nearest(name, ROBOT.action_names)}. Rename it in "
                     "the columns file"
                 )
             if unit != unit_of(name):
                 raise TaccorlError(f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}")
-        at = [ACTION_NAMES.index(name) for name in self.signals]
+        at = [ROBOT.action_names.index(name) for name in self.signals]
         arrays: dict[str, np.ndarray] = {
-            name: np.full((self.num_rows, len(ACTION_NAMES)), np.nan) for name in ("measured", "velocity", "effort")
+            name: np.full((self.num_rows, ROBOT.num_actions), np.nan) for name in ("measured", "velocity", "effort")
         }
         arrays["target"] = np.tile(np.asarray(rest, dtype=float), (self.num_rows, 1))
         for name, values in arrays.items():
             values[:, at] = getattr(self, name)
-        quantum = np.zeros(len(ACTION_NAMES))
+        quantum = np.zeros(ROBOT.num_actions)
         quantum[at] = self.quantum
-        return dataclasses.replace(self, **arrays, quantum=quantum, signals=ACTION_NAMES, units=ROBOT_UNITS)
+        return dataclasses.replace(self, **arrays, quantum=quantum, signals=ROBOT.action_names, units=ROBOT_UNITS)
 
 
 def other_arm(signal: str) -> str:

@@ -24,7 +24,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -38,13 +38,16 @@ from taccorl.data.recording import find_sources
 from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_recording_specs
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, TaccorlError, nearest
-from taccorl.sim.actions import OPEN_M
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 
 INDEX = "measurements.yaml"
 FARTHEST_PAYLOAD_M = 1.0
 """Of a payload's centre of mass from the flange: the arm itself reaches 0.63 m (PiPER manual)."""
 Use = Literal["fit", "validation", "test"]
+if TYPE_CHECKING:
+    ArmName = str
+else:  # the names that a measurements.yaml may give: others are an error with its line
+    ArmName = Literal[*ROBOT.arms]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +56,7 @@ class PressedNote:
 
     shape: Literal["sphere", "rod"]
     radius_m: float
-    arm: Literal["left", "right"]
+    arm: ArmName
     length_m: float | None = None
     """Of a rod, which has flat ends; a sphere has none."""
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -246,7 +249,7 @@ def _load_index(folder: Path) -> MeasurementIndex:
             if bad:
                 raise document.error(f"recordings/{name}/{key}/{bad}", f"{getattr(note, key)[bad]:g} is below 0")
         for key in ("payload_kg", "payload_position_m"):
-            arm = next((a for a in getattr(note, key) if a not in ARMS), None)
+            arm = next((a for a in getattr(note, key) if a not in ROBOT.arms), None)
             if arm:
                 raise document.error(f"recordings/{name}/{key}/{arm}", f"no arm {arm!r}; left, right")
         _check_payload_positions(document, f"recordings/{name}/payload_position_m", note)
@@ -272,9 +275,10 @@ def _check_pressed(document: Document[MeasurementIndex], key: str, pressed: Pres
         size = getattr(pressed, name)
         if size is not None and not 0 < size < math.inf:
             raise document.error(f"{key}/{name}", f"{size:g} is not above 0")
-    if 2 * pressed.radius_m > OPEN_M:
+    if 2 * pressed.radius_m > ROBOT.opening_max_m:
         text = (
-            f"{pressed.radius_m:g} m does not fit between the fingers, which open {OPEN_M:g} m; is it in millimetres?"
+            f"{pressed.radius_m:g} m does not fit between the fingers, which open {ROBOT.opening_max_m:g} m; "
+            "is it in millimetres?"
         )
         raise document.error(f"{key}/radius_m", text)
 

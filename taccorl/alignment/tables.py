@@ -28,7 +28,7 @@ from taccorl.alignment.measurement import Measurement, unit_of
 from taccorl.alignment.quantisation import find_quantum
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 
 SUFFIXES = (".csv", ".parquet")
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
@@ -124,7 +124,7 @@ def load_table_spec(path: Path) -> TableSpec:
         if len(kinds) > 1:
             raise document.error(f"signals/{name}", f"{' and '.join(kinds.values())}: does it turn or slide?")
         unit = POSITION[signal.q.unit][0]
-        if name in ACTION_NAMES and unit != unit_of(name):
+        if name in ROBOT.action_names and unit != unit_of(name):
             raise document.error(
                 f"signals/{name}/q/unit", f"{signal.q.unit!r}: {name} is in {unit_of(name)} or a part of it"
             )
@@ -159,13 +159,13 @@ def own_spec(path: Path, header: list[str]) -> TableSpec:
         if column == "t":
             continue
         if key not in _CONVERSIONS or not name:
-            own = [f"{n}.{key}" for n in ACTION_NAMES for key in _CONVERSIONS]
+            own = [f"{n}.{key}" for n in ROBOT.action_names for key in _CONVERSIONS]
             raise RecordingError(
                 f"{path}: column {k + 1} {column!r} is not NAME.q, .q_target, .qd or .tau; {nearest(column, own)}"
             )
-        if name not in ACTION_NAMES:
+        if name not in ROBOT.action_names:
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r}: the robot has no {name!r}; {nearest(name, ACTION_NAMES)}. "
+                f"{path}: column {k + 1} {column!r}: the robot has no {name!r}; {nearest(name, ROBOT.action_names)}. "
                 "Signals of other machines need a columns file, which states their units"
             )
         parts.setdefault(name, set()).add(key)
@@ -183,7 +183,7 @@ def own_spec(path: Path, header: list[str]) -> TableSpec:
         name: SignalColumns(
             **{key: Column(column=f"{name}.{key}", unit=units[unit_of(name)][key]) for key in parts[name]}
         )
-        for name in sorted(parts, key=ACTION_NAMES.index)
+        for name in sorted(parts, key=ROBOT.action_names.index)
     }
     if not signals:
         raise RecordingError(f"{path}: it holds times and no signal")

@@ -30,6 +30,7 @@ from taccorl.alignment.wiring_checks import check_wiring
 from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
 
 MOVED = {"rad": 0.02, "m": 0.002}
 """A command that stays within this has not moved its joint."""
@@ -149,7 +150,7 @@ def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
         )
         return Finding("same_motion", "note", "", text)
     rms, noise = ratios[worst]
-    arm = next((arm for arm in ("left", "right") if worst.startswith(arm)), "left")
+    arm = next((arm for arm in ROBOT.arms if worst.startswith(arm)), ROBOT.arms[0])
     text = (
         f"{b.name} was given the same commands as {a.name}, but {worst} moved differently: by {rms:.2g} "
         f"{a.units[a.column(worst)]} (RMS), {rms / noise:.0f} times what noise allows. Had it other gains? Write `{b.name}: "

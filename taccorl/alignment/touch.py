@@ -21,7 +21,7 @@ from scipy.stats import norm, wasserstein_distance
 from taccorl.alignment.touch_model import TouchModel
 from taccorl.alignment.touch_motion import TouchMotion
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import PAD_TAXELS, PADS, TAXEL_PITCH_M
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
 QUANTILE = 0.999
@@ -273,7 +273,7 @@ def _centroids(counts: np.ndarray, active: np.ndarray) -> np.ndarray:
     """(T, P, 2) m of the active taxels' counts; NaN where none is active."""
     weight = np.where(active, counts, 0.0)
     total = weight.sum(axis=(2, 3))
-    rows, columns = (np.arange(n) * TAXEL_PITCH_M for n in PAD_TAXELS)
+    rows, columns = (np.arange(n) * ROBOT.pad.pitch_m for n in ROBOT.pad.shape)
     with np.errstate(invalid="ignore"):
         y = (weight.sum(axis=3) @ rows) / total
         x = (weight.sum(axis=2) @ columns) / total
@@ -296,7 +296,8 @@ def _pads(motions: Sequence[TouchMotion]) -> tuple[str, ...]:
     other = next((m for m in motions if m.pads != pads), None)
     if other:
         raise TaccorlError(
-            f"touch: {motions[0].name} touches {', '.join(pads)} and {other.name} {', '.join(other.pads)}, of {', '.join(PADS)}; "
+            f"touch: {motions[0].name} touches {', '.join(pads)} and {other.name} {', '.join(other.pads)}, of "
+            f"{', '.join(ROBOT.pads)}; "
             "calibrate them apart"
         )
     return pads

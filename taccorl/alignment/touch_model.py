@@ -23,9 +23,7 @@ from taccorl.sim.effects.touch_memory import RememberingEffect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig, normal_reading
 from taccorl.sim.twin import TwinConfig
 
-_TAXELS_AT_ONCE = (
-    64 * len(ROBOT.pads) * math.prod(ROBOT.pad.shape)
-)  # 0.4 MB: a core's cache holds what is being worked on
+_TAXELS_AT_ONCE = 64 * ROBOT.num_taxels  # 0.4 MB: a core's cache holds what is being worked on
 
 
 class TouchModel:
@@ -65,13 +63,13 @@ class TouchModel:
         depth, rate = motion.depth(_offsets(acting, motion.pads))
         shape = depth.shape[2:]
         acting = [e for e in acting if _reads(e)]
-        if shape != ROBOT.pad.shape:
+        if shape != motion.layout.shape:
             acting = [_within(e, motion.window) for e in acting]
         slots = [ROBOT.pads.index(pad) for pad in motion.pads]
         time_s = motion.time_s.mean(axis=1)
         time_s = time_s - (time_s[0] if start_s is None else start_s)
         dt_s = np.diff(time_s, prepend=time_s[0])
-        memories = [_memory(effect, motion.window) for effect in acting]
+        memories = [_memory(effect, motion) for effect in acting]
         seen = np.empty(depth.shape, np.float32)
         at_once = _TAXELS_AT_ONCE // (len(ROBOT.pads) * math.prod(shape))
         for start in range(0, len(time_s), at_once):
@@ -95,7 +93,8 @@ class TouchModel:
 
     def remembers(self, effects: Sequence[Effect]) -> bool:
         """Whether a frame's readings hang on the frames before it."""
-        return any(bool(e.memory(1, ROBOT.pad.shape)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
+        shape = self.spec.rows, self.spec.columns
+        return any(bool(e.memory(1, shape)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
 
     def counts(self, motion: TouchMotion, reading: np.ndarray) -> np.ndarray:
         """(T, P, R, C) counts above baseline, without noise and rounding; the converter's ends are kept."""
@@ -116,11 +115,12 @@ def _within(effect: Effect, window: tuple[slice, slice]) -> Effect:
     return found
 
 
-def _memory(effect: Effect, window: tuple[slice, slice]) -> Memory:
-    """As before the first scan, of the taxels in the window."""
+def _memory(effect: Effect, motion: TouchMotion) -> Memory:
+    """As before the first scan, of the taxels in the motion's window."""
+    shape = motion.layout.shape
     return {
-        name: np.ascontiguousarray(array[..., *window]) if array.shape[-2:] == ROBOT.pad.shape else array
-        for name, array in effect.memory(1, ROBOT.pad.shape).items()
+        name: np.ascontiguousarray(array[..., *motion.window]) if array.shape[-2:] == shape else array
+        for name, array in effect.memory(1, shape).items()
     }
 
 
@@ -136,7 +136,7 @@ def _offsets(effects: Sequence[Effect], pads: Sequence[str]) -> tuple[tuple[floa
 
 
 def _through(effect: Effect, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-    """Frames (B, 4, R, C) as they come out of an effect; its memory goes on."""
+    """Frames (B, P, R, C) of all pads as they come out of an effect; its memory goes on."""
     if not memory:
         return effect.reading(reading, memory, time_s, dt_s)
     if isinstance(effect, RememberingEffect):

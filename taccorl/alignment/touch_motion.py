@@ -25,19 +25,9 @@ from taccorl.alignment.felt_solids import shapes_in_object
 from taccorl.alignment.measurement import Measurement
 from taccorl.data.spec import SensorSpec, find_spec, load_sensor_spec
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.robot import (
-    ARMS,
-    FINGERS,
-    JOINTS,
-    PAD_LENGTH_M,
-    PAD_TAXELS,
-    PAD_WIDTH_M,
-    PADS,
-    TAXEL_PITCH_M,
-    TCP_FROM_LINK6_M,
-    RobotConfig,
-    link_poses,
-)
+from taccorl.robots import ROBOT
+from taccorl.robots.robot_spec import PadLayout
+from taccorl.sim.robot import RobotConfig, link_poses, mount_pos_world_m
 from taccorl.sim.sensors import as_wire
 from taccorl.sim.sensors.flexitac import scan_instants_s
 from taccorl.sim.shapes import Capsule, Cylinder, Solid
@@ -64,8 +54,8 @@ class PressedObject:
     frame: Literal["tcp", "world"] = "tcp"
 
     def __post_init__(self) -> None:
-        if self.arm not in ARMS:
-            raise TaccorlError(f"pressed object: no arm {self.arm!r}; {nearest(self.arm, ARMS)}")
+        if self.arm not in ROBOT.arms:
+            raise TaccorlError(f"pressed object: no arm {self.arm!r}; {nearest(self.arm, ROBOT.arms)}")
         if self.frame not in ("tcp", "world"):
             raise TaccorlError(f"pressed object: frame {self.frame!r} is neither 'tcp' nor 'world'")
         pose = np.asarray(self.pose, float)
@@ -131,7 +121,9 @@ class TouchMotion:
     shapes: tuple[Shapes, ...]
     clearance_m: np.ndarray
     """(T, P, I) the object is at least so far out of the plane of the taxels; below 0 it may reach through."""
-    window: tuple[slice, slice] = (slice(0, PAD_TAXELS[0]), slice(0, PAD_TAXELS[1]))
+    layout: PadLayout
+    """Of the whole pads."""
+    window: tuple[slice, slice] = (slice(None), slice(None))
     """Rows and columns of the pads that R × C are: all but for a ``cut``."""
 
     @property
@@ -160,7 +152,7 @@ class TouchMotion:
         Args:
             frames: (T,) bool.
         """
-        number = np.arange(math.prod(PAD_TAXELS)).reshape(PAD_TAXELS)
+        number = np.arange(self.layout.num_taxels).reshape(self.layout.shape)
         local = np.full(number.size, -1)
         local[number[window].ravel()] = np.arange(number[window].size)
         groups = local[self.groups]
@@ -184,7 +176,7 @@ class TouchMotion:
 
     def _depth(self, offsets_m: tuple[tuple[float, float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
         offset = np.array(offsets_m or [(0.0, 0.0, 0.0)] * len(self.pads))
-        taxel_xy = _TAXEL_XY[self.window]
+        taxel_xy = _taxel_xy(self.layout)[self.window]
         xyz = np.append(taxel_xy.reshape(-1, 2), np.zeros((taxel_xy.size // 2, 1)), axis=1)
         # Taxels of a group lie in a line: what is common to them goes into the position, what differs into the grid.
         first = xyz[self.groups[:, 0]]
@@ -239,7 +231,7 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
         raise TaccorlError(f"{measurement.name}: it holds no frames of the pads; record them, or leave this one out")
     spec = load_sensor_spec(find_spec(config.sensor.spec if hasattr(config.sensor, "spec") else "flexitac_v2"))  # pyright: ignore[reportAttributeAccessIssue]
     instants_s, groups = _scan_groups(spec)
-    slots = [PADS.index(f"{pressed.arm}_{finger}") for finger in FINGERS]
+    slots = [ROBOT.pads.index(f"{pressed.arm}_{finger}") for finger in ROBOT.fingers]
     stamps = measurement.touch.time_s
     covered = (stamps[:, slots] + instants_s[0] >= measurement.time_s[0]) & (stamps[:, slots] <= measurement.time_s[-1])
     frames = covered.all(axis=1)
@@ -253,10 +245,11 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
     times = stamps[:, :, None] + instants_s
     pose, later, earlier = (moving.object_from_pad(times + shift) for shift in (0.0, _STEP_S, -_STEP_S))
     shapes, corners_m = shapes_in_object(pressed.solids)
-    whole = (-1, len(PADS), *PAD_TAXELS)
+    layout = dataclasses.replace(ROBOT.pad, rows=spec.rows, columns=spec.columns)
+    whole = (-1, len(ROBOT.pads), *layout.shape)
     motion = TouchMotion(
         measurement=measurement,
-        pads=tuple(PADS[s] for s in slots),
+        pads=tuple(ROBOT.pads[s] for s in slots),
         time_s=stamps,
         measured=measurement.touch.counts.reshape(whole)[frames][:, slots],
         baseline=measurement.touch.baseline.reshape(whole)[0, slots],
@@ -264,6 +257,7 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
         velocity=(later - earlier) / (2 * _STEP_S),
         groups=groups,
         shapes=tuple(shapes),
+        layout=layout,
         clearance_m=((corners_m - pose[..., None, :, 3]) @ pose[..., :, 2, None])[..., 0].min(axis=-1),
     )
     comes_near = motion.near(_NEAR_M).any(axis=(0, 2, 3))
@@ -288,19 +282,16 @@ def _only(motion: TouchMotion, pads: np.ndarray) -> TouchMotion:
         baseline=motion.baseline[pads],
         groups=motion.groups,
         shapes=motion.shapes,
+        layout=motion.layout,
         **arrays,
     )
 
 
-def _taxel_xy() -> np.ndarray:
+def _taxel_xy(layout: PadLayout) -> np.ndarray:
     """(R, C, 2) m in the pad's frame, as ``PadArray`` has them."""
-    rows, columns = PAD_TAXELS
-    x = (np.arange(columns) + 0.5) * TAXEL_PITCH_M - PAD_WIDTH_M / 2
-    y = (np.arange(rows) + 0.5) * TAXEL_PITCH_M - PAD_LENGTH_M / 2
+    x = (np.arange(layout.columns) + 0.5) * layout.pitch_m - layout.width_m / 2
+    y = (np.arange(layout.rows) + 0.5) * layout.pitch_m - layout.length_m / 2
     return np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=2)
-
-
-_TAXEL_XY = _taxel_xy()
 
 
 def _scan_groups(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
@@ -315,7 +306,7 @@ class _Fingers:
     def __init__(self, measurement: Measurement, robot: RobotConfig, pressed: PressedObject) -> None:
         names = [f"{pressed.arm}_gripper"]
         if pressed.frame == "world":
-            names += [f"{pressed.arm}_{joint}" for joint in JOINTS]
+            names += [f"{pressed.arm}_{joint}" for joint in ROBOT.joints]
         rows = measurement.measured[:, [measurement.column(name) for name in names]]
         there = np.isfinite(rows).all(axis=1)
         if there.mean() < 0.5:
@@ -329,7 +320,6 @@ class _Fingers:
         even = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in rows.T])
         self._rows = CubicSpline(time_s, savgol_filter(even, window, SMOOTH_ORDER, axis=0))
         self._pressed, self._robot = pressed, robot
-        self._arm_side = 0.5 if pressed.arm == "left" else -0.5
         self.opening_m = even[:, 0]
 
     def object_from_pad(self, time_s: np.ndarray) -> np.ndarray:
@@ -343,9 +333,9 @@ class _Fingers:
         object_from_frame = np.linalg.inv(self._pressed.pose)
         if self._pressed.frame == "tcp":
             return _compose(object_from_frame, tcp_from_pad)
-        tcp = link_poses(rows[..., 1:])[..., 5, :, :]
-        tcp[..., :3, 3] += TCP_FROM_LINK6_M * tcp[..., :3, 2]
-        tcp[..., :3, 3] += [0.0, self._arm_side * self._robot.mount_spacing_m, self._robot.mount_height_m]
+        tcp = link_poses(rows[..., 1:])[..., -1, :, :]
+        tcp[..., :3, 3] += ROBOT.tcp_from_hand_m * tcp[..., :3, 2]
+        tcp[..., :3, 3] += mount_pos_world_m(self._pressed.arm, self._robot)
         return _compose(object_from_frame @ tcp, tcp_from_pad)
 
 

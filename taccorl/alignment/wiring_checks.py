@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from taccorl.alignment.clock_checks import moving_signals
 from taccorl.alignment.measurement import Measurement, other_arm
 from taccorl.data.finding import Finding, listed
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.robots import ROBOT
 
 USUAL_LAG_S = 0.1
 FOLLOWS, FOLLOWS_NOT = 0.8, 0.5
@@ -148,17 +148,17 @@ def _check_range(m: Measurement) -> list[Finding]:
     """Positions where the robot cannot be: another unit."""
     findings = []
     for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
-        if name not in ACTION_NAMES:
+        if name not in ROBOT.action_names:
             continue
-        k = ACTION_NAMES.index(name)
+        k = ROBOT.action_names.index(name)
         for what, values in (("measured", m.measured[:, j]), ("commanded", m.target[:, j])):
-            beyond = np.nan_to_num(np.maximum(values - ACTION_HIGH[k], ACTION_LOW[k] - values))
+            beyond = np.nan_to_num(np.maximum(values - ROBOT.action_high[k], ROBOT.action_low[k] - values))
             row = int(np.argmax(beyond))
             if beyond[row] > BEYOND[unit]:
                 other = "degrees" if unit == "rad" else "mm"
                 text = (
                     f"{name} is {what} at {values[row]:.4g} {unit} at row {row} ({m.time_s[row]:.2f} s), its limits "
-                    f"are [{ACTION_LOW[k]:.3g}, {ACTION_HIGH[k]:.3g}]: in {other}? "
+                    f"are [{ROBOT.action_low[k]:.3g}, {ROBOT.action_high[k]:.3g}]: in {other}? "
                     f"{_UNIT_WAY_OUT[0].upper()}{_UNIT_WAY_OUT[1:]}"
                 )
                 findings.append(Finding("unit", "error", name, text, (row, row + 1)))

@@ -102,15 +102,20 @@ def link_poses(joints_rad: np.ndarray) -> np.ndarray:
     return poses
 
 
-_SIDE_BIT = {"left": 2, "right": 4}  # an arm touches parts, table and the other arm, never itself
+_SIDE_BIT = {arm: 2 << a for a, arm in enumerate(ROBOT.arms)}  # an arm touches parts, table, other arms, never itself
 PART_BIT = 1
+
+
+def mount_pos_world_m(arm: str, config: RobotConfig) -> tuple[float, float, float]:
+    """Origin of an arm's base. Bases stand side by side along y, the first arm on the left."""
+    side = (len(ROBOT.arms) - 1) / 2 - ROBOT.arms.index(arm)
+    return 0.0, side * config.mount_spacing_m, config.mount_height_m
 
 
 def add_arm(spec: mujoco.MjSpec, arm: str, config: RobotConfig) -> None:
     """One arm at its mount. Names: ``left_link1`` … ``left_link6``, joints ``left_joint1`` …, ``left_finger_a``, pads
     ``left_a``, site ``left_tcp``; each taxel frame is the site named like its pad, at the undeformed pad's surface."""
-    y = (0.5 if arm == "left" else -0.5) * config.mount_spacing_m
-    base = spec.worldbody.add_body(name=f"{arm}_base_link", pos=[0, y, config.mount_height_m])
+    base = spec.worldbody.add_body(name=f"{arm}_base_link", pos=mount_pos_world_m(arm, config))
     _geom(base, arm, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.055, 0.035, 0], pos=[0, 0, 0.035], rgba=STEEL)
     if config.mount_height_m > 0:
         half = config.mount_height_m / 2
@@ -145,8 +150,8 @@ def add_arm(spec: mujoco.MjSpec, arm: str, config: RobotConfig) -> None:
 
 
 def _geom(body: mujoco.MjsBody, arm: str, **settings) -> None:
-    other = _SIDE_BIT["right" if arm == "left" else "left"]
-    body.add_geom(contype=_SIDE_BIT[arm], conaffinity=PART_BIT | other, mass=0, **settings)
+    others = sum(bit for other, bit in _SIDE_BIT.items() if other != arm)
+    body.add_geom(contype=_SIDE_BIT[arm], conaffinity=PART_BIT | others, mass=0, **settings)
 
 
 def _add_finger(spec: mujoco.MjSpec, hand: mujoco.MjsBody, arm: str, finger: str, config: RobotConfig) -> None:

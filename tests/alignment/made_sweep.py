@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.alignment.measurement import Measurement
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.robots import ROBOT
 
 RATE_HZ = 200
 PARTS = 5  # integration steps a row
@@ -45,9 +45,9 @@ def answer(
 
     At ``highest_rad`` a joint hits a rigid stop and loses its speed.
     """
-    kp = np.array([*KP_NM_PER_RAD, 1500.0] * 2)
-    kd = damping * np.array([*KD_NMS_PER_RAD, 40.0] * 2)
-    torque = np.array([*TORQUE_FF_NM, 0.0] * 2)
+    kp = np.array([*ROBOT.kp_nm_per_rad, 1500.0] * 2)
+    kd = damping * np.array([*ROBOT.kd_nms_per_rad, 40.0] * 2)
+    torque = np.array([*ROBOT.torque_ff_nm, 0.0] * 2)
     step, late = 1.0 / (RATE_HZ * PARTS), round(delay_s * RATE_HZ * PARTS)
     q, v = target[0] + torque / kp, np.zeros(14)
     held = np.concatenate([np.repeat(target[:1], late, axis=0), np.repeat(target, PARTS, axis=0)])

@@ -9,7 +9,7 @@ from taccorl.alignment.arm_bench import of_joint
 from taccorl.alignment.joint_model import Gains, JointModel, JointResponse
 from taccorl.alignment.joint_motion import JointMotion, joint_motion
 from taccorl.alignment.measurement import Measurement
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
@@ -29,7 +29,7 @@ def chirp(
     time_s = np.arange(round(seconds * rate_hz)) / rate_hz
     phase = 2 * np.pi * (0.1 * time_s + (high_hz - 0.1) * time_s**2 / (2 * seconds))
     target = np.tile(HOME, (len(time_s), 1))
-    target[:, ACTION_NAMES.index(signal)] += amplitude * np.clip((time_s - 0.5) / 0.5, 0, 1) * np.sin(phase)
+    target[:, ROBOT.action_names.index(signal)] += amplitude * np.clip((time_s - 0.5) / 0.5, 0, 1) * np.sin(phase)
     return Measurement(
         name=f"chirp to {high_hz:g} Hz", time_s=time_s, target=target, measured=target.copy(), origin="simulated"
     )

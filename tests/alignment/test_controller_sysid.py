@@ -13,12 +13,12 @@ from taccorl.alignment.controller import identify_controller, paper_loss
 from taccorl.alignment.joint_model import Gains, JointModel
 from taccorl.alignment.joint_motion import JointMotion, joint_motion
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
-from taccorl.sim.robot import JOINTS
 from taccorl.sim.twin import TwinConfig
 
 ELBOW = "left_joint5"
-TRUTH = {f"left_{joint}": JointModel(TWIN, f"left_{joint}").gains for joint in JOINTS}
+TRUTH = {f"left_{joint}": JointModel(TWIN, f"left_{joint}").gains for joint in ROBOT.joints}
 
 
 def motion_of(signal: str, seed: int = 0, *effects, config: TwinConfig = REFERENCE_TWIN, **options) -> JointMotion:

@@ -11,12 +11,10 @@ from taccorl.alignment.joint_kernel import Drive, simulate
 from taccorl.alignment.joint_model import Gains, JointModel
 from taccorl.alignment.joint_motion import joint_motion
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_NAMES
-from taccorl.sim.controller import KP_NM_PER_RAD, TORQUE_FF_NM
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.replay import replay
-from taccorl.sim.robot import JOINTS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
@@ -52,7 +50,7 @@ def typical(name: str, signal: str) -> Effect:
     return make_effect(name, **where, **values)
 
 
-@pytest.mark.parametrize("joint", JOINTS)
+@pytest.mark.parametrize("joint", ROBOT.joints)
 def test_a_plain_joint_moves_as_in_mujoco(joint: str) -> None:
     signal = f"right_{joint}"
     model = JointModel(TWIN, signal)
@@ -207,12 +205,12 @@ def test_the_whole_twin_agrees_with_its_joints_one_by_one() -> None:
         m.target[:, j] += 0.25 * fade * np.sin(2 * np.pi * (0.3 + 0.25 * j) * m.time_s + rng.uniform(0, 6))
     sim = Simulation(Bench())
     sim.reset([0])
-    offset = np.array([*(np.array(TORQUE_FF_NM) / KP_NM_PER_RAD), 0.0] * 2)
+    offset = np.array([*(np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad), 0.0] * 2)
     done = replay(sim, m.target, 200.0, HOME + offset)
     effort = np.concatenate([done.effort[:1], done.effort[:-1]])  # of the row before: the time of this one
     measured = dataclasses.replace(m, measured=done.reported, effort=effort)
     for j in range(6):
-        signal = ACTION_NAMES[j]
+        signal = ROBOT.action_names[j]
         model, motion = JointModel(TWIN, signal), joint_motion(measured, TWIN, signal)
         answer = model.simulate(motion, model.gains)
         away = answer.reported - done.reported[:, j]

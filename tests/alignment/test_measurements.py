@@ -9,7 +9,7 @@ from made_sweep import sweep
 from taccorl.alignment.measurement import Measurement, other_arm
 from taccorl.alignment.measurements import motions, read_measurements, split
 from taccorl.errors import RecordingError, SpecError, TaccorlError
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 
 
 def made(*names: str, **repeats: str) -> list[Measurement]:
@@ -239,7 +239,7 @@ def test_a_recording_of_one_joint_becomes_one_of_the_robot():
     )
     rest = np.arange(14.0)
     whole = m.on_robot(rest)
-    assert whole.signals == ACTION_NAMES
+    assert whole.signals == ROBOT.action_names
     np.testing.assert_array_equal(whole.target[0], np.where(np.arange(14) == 4, 0.2, rest))
     assert np.isfinite(whole.measured).sum() == 3
     wrong = dataclasses.replace(m, units=("m",))

@@ -28,7 +28,7 @@ from taccorl.demos.stand_in import START_UNIX_NS, StandInConfig, publish, write_
 from taccorl.demos.stand_in_streams import Streams
 from taccorl.demos.twin_recording import LEAD_S, TwinStory
 from taccorl.errors import RecordingError
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.bench import Bench
@@ -114,7 +114,7 @@ def truth_rows(m: Measurement, trajectory: Trajectory) -> tuple[np.ndarray, np.n
 
 def test_mcap_is_read_at_the_command_s_own_200_hz(recorded, moved):
     assert recorded.rate_hz == 200.0
-    assert recorded.signals == ACTION_NAMES
+    assert recorded.signals == ROBOT.action_names
     assert recorded.instruction == NO_LOSS.instruction  # of the first start marker
     assert recorded.origin == "surrogate recording"
     assert recorded.time_s[-1] > SECONDS + LEAD_S  # rests included
@@ -186,7 +186,7 @@ def test_replay_of_the_recording_gives_the_recording_and_one_row_off_does_not(dr
     assert len(early) == 12
 
 
-FLOOR = dict.fromkeys(ACTION_NAMES, 1e-5)
+FLOOR = dict.fromkeys(ROBOT.action_names, 1e-5)
 
 
 def m_rows(m: Measurement, first: int, late: int = 0) -> Measurement:
@@ -371,7 +371,7 @@ def test_rows_of_an_ingested_dataset_are_the_twins_and_tell_their_age():
 def test_hdf5_of_cobot_magic_has_effort_and_owns_that_it_has_no_clock(tmp_path):
     truth = write_cobot_magic_hdf5(tmp_path / "episode_0.hdf5", StandInConfig(duration_s=3.0, camera_size=(96, 128)))
     m = read_measurements(tmp_path).fit[0]
-    assert (m.rate_hz, m.signals) == (30.0, ACTION_NAMES)
+    assert (m.rate_hz, m.signals) == (30.0, ROBOT.action_names)
     assert m.time_error_s == pytest.approx(1 / 30, rel=1e-6)
     # Row k of the file's action is the command of frame k + 1: in force at row k is the one before.
     time_s = 1 / 30 + m.time_s

@@ -11,12 +11,12 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.touch_model import TouchModel
 from taccorl.alignment.touch_motion import PressedObject, TouchMotion, indenter, touch_motion
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.added import AddedEffects
 from taccorl.sim.effects.effect import Effect, Memory, TouchEffect, parameter
 from taccorl.sim.grip_rig import HOME_RAD, gripped
 from taccorl.sim.pad import OneSim, PadArray
-from taccorl.sim.robot import PAD_TAXELS, PADS
 from taccorl.sim.shapes import Box
 from taccorl.sim.twin import TwinConfig
 
@@ -86,7 +86,7 @@ def as_measured(opening_m: np.ndarray, arms: np.ndarray, time_s: np.ndarray) -> 
 def test_depths_in_a_part_are_those_of_the_twins_own_pads(frame: str) -> None:
     """A gripped part in MuJoCo, pressed in and tilted as it came to lie: the same depths from joints and opening alone."""
     model, data = gripped(0.1, 20.0)
-    expected = PadArray(model, PADS).penetration(OneSim(data)).depth_m[0]
+    expected = PadArray(model, ROBOT.pads).penetration(OneSim(data)).depth_m[0]
     assert expected[2:].max() > 1e-3
     arms = np.array([data.joint(f"right_joint{k + 1}").qpos[0] for k in range(6)])
     opening = sum(data.joint(f"right_finger_{f}").qpos[0] for f in "ab")
@@ -130,7 +130,7 @@ class Fades(TouchEffect):
     rate: float = parameter(unit="1", symbol="a", absent=0.0, low=0.0, high=1.0, typical=0.2, source="planted")
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {"sum": np.zeros((num_sims, len(PADS), *pad_shape), np.float32)}
+        return {"sum": np.zeros((num_sims, len(ROBOT.pads), *pad_shape), np.float32)}
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         memory["sum"] += reading * dt_s[:, None, None, None].astype(np.float32)
@@ -158,7 +158,7 @@ def test_effects_act_as_in_the_simulation_scan_by_scan(motion: TouchMotion, effe
     time_s = motion.time_s.mean(axis=1)
     for k in range(330):  # over the first presses
         clock[:] = time_s[k] - time_s[0]
-        ideal = np.zeros((1, len(PADS), *PAD_TAXELS), np.float32)
+        ideal = np.zeros((1, len(ROBOT.pads), *ROBOT.pad.shape), np.float32)
         ideal[0, :2] = plain[k]
         np.testing.assert_allclose(added(ideal)[0, :2], seen[k], atol=2e-6, err_msg=f"frame {k}")
         added.scan(ideal, np.arange(1))

@@ -42,6 +42,10 @@ if TYPE_CHECKING:
     from taccorl.sim.effects.live_model import LiveModel
     from taccorl.sim.twin import TwinConfig
 
+    ArmChoice = str
+else:  # the names that a twin.yaml may give: others are an error with its line
+    ArmChoice = Literal[*ROBOT.arms, "both"]
+
 CHANNELS = ROBOT.action_names  # other packages still take these from here
 Memory = dict[str, np.ndarray]
 """Name → array (N, …), changed in place."""
@@ -279,7 +283,8 @@ class ArmEffect(Effect):
     """An effect of a whole arm."""
 
     layer: ClassVar = "robot"
-    arm: Literal["left", "right", "both"] = "both"
+    arm: ArmChoice = "both"
+    """One arm of the robot, or ``both`` for all of them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
