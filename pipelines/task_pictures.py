@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 
 from taccorl.demos.collect import ExpertSource, Plan
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 
 TASKS = ("test_tube", "puzzle", "assembly_1", "assembly_2")
+VIEWS = (ROBOT.cameras[0], ROBOT.cameras[-1])
 MOMENTS = (0.0, 0.4, 0.75, 1.0)  # shares of the episode
 SIZE = (240, 320)  # rows, columns of a picture
 OUT = Path("docs")
@@ -30,15 +32,15 @@ def episode(sim: Simulation, plan: Plan, seed: int) -> np.ndarray:
 
 
 def main() -> None:
-    """One strip a task: front and right wrist camera at four moments."""
+    """One strip a task: ``VIEWS`` at four moments."""
     for task in TASKS:
         plan = Plan(task=task, source=ExpertSource())
         sim = plan.make()
         states = episode(sim, plan, seed=1)
         chosen = states[[round(m * (len(states) - 1)) for m in MOMENTS]]
         rows = [[], []]
-        for pictures in sim.render_states(chosen, ["front", "right_wrist"], size=SIZE):
-            for row, name in zip(rows, ("front", "right_wrist"), strict=True):
+        for pictures in sim.render_states(chosen, VIEWS, size=SIZE):
+            for row, name in zip(rows, VIEWS, strict=True):
                 row.append(pictures[name])
         strip = np.concatenate([np.concatenate(row, axis=1) for row in rows])
         path = OUT / f"task_{task}.png"

@@ -102,15 +102,15 @@ def _by_hand(config: AddEffectConfig) -> list[Entry]:
     from taccorl.cli.diagnose import joints_named
     from taccorl.diagnosis.joint_problem import selectors
     from taccorl.diagnosis.joints import SIGNALS
+    from taccorl.robots import ROBOT
     from taccorl.sim.effects import effects, make_effect
-    from taccorl.sim.robot import ARMS, FINGERS
 
     found = []
     kind = effects.get(config.effect)
     if all(selectors(kind, signal) is None for signal in SIGNALS):
         if config.joints:
             raise TaccorlError(f"{config.effect} is no effect of joints; leave --joints out")
-        where = {"pads": [f"{arm}_{finger}" for arm in _arms(config.pads, ARMS) for finger in FINGERS]}
+        where = {"pads": [f"{arm}_{finger}" for arm in _arms(config.pads, ROBOT.arms) for finger in ROBOT.fingers]}
         part = " and ".join(config.pads or ["all"]) + " pads"
         return [Entry(part, [make_effect(config.effect, **where, **config.values, evidence="by hand")], {}, {})]
     if config.pads:

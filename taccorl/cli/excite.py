@@ -83,7 +83,7 @@ def _part(config: ExciteConfig) -> str:
     """``left_joint5`` or ``left pads``."""
     from taccorl.diagnosis.motions import joint_number
     from taccorl.errors import nearest
-    from taccorl.sim.robot import ARMS
+    from taccorl.robots import ROBOT
 
     if config.joint is not None and config.pads is not None:
         raise TaccorlError(f"excite: {config.joint} or --pads={config.pads}: one at a time")
@@ -92,8 +92,8 @@ def _part(config: ExciteConfig) -> str:
         return config.joint
     if config.pads is None:
         raise TaccorlError("excite: missing --joint=left_joint5, or --pads=left for the pads of that arm")
-    if config.pads not in ARMS:
-        raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ARMS)}")
+    if config.pads not in ROBOT.arms:
+        raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ROBOT.arms)}")
     for name in ("gains", "floor_rad"):
         if getattr(config, name) != getattr(ExciteConfig(), name):
             raise TaccorlError(f"--{name} is of joints; leave it out with --pads={config.pads}")

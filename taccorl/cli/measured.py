@@ -72,13 +72,13 @@ def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
 def _pose_unknown(m: "Measurement") -> list["Finding"]:
     """A table without an arm's other joints: inertia and weight are then those of the bench's pose."""
     from taccorl.data.finding import Finding
-    from taccorl.sim.robot import ARMS, JOINTS
+    from taccorl.robots import ROBOT
 
     found = []
-    for arm in ARMS:
-        there = [j for j in JOINTS if f"{arm}_{j}" in m.signals]
-        if there and len(there) < len(JOINTS):
-            lacking = ", ".join(f"{arm}_{j}" for j in JOINTS if j not in there)
+    for arm in ROBOT.arms:
+        there = [j for j in ROBOT.joints if f"{arm}_{j}" in m.signals]
+        if there and len(there) < len(ROBOT.joints):
+            lacking = ", ".join(f"{arm}_{j}" for j in ROBOT.joints if j not in there)
             text = (
                 f"it lacks {lacking}: they are taken to stand as on the bench, and inertia and weight of what moves follow from "
                 "that; add their columns, constant ones will do"

@@ -10,6 +10,7 @@ from taccorl.benchmark import Row, against_reference, benchmark, spread
 from taccorl.diagnosis.study import Job, run, run_touch
 from taccorl.diagnosis.surrogate.cases import draw_case
 from taccorl.diagnosis.surrogate.recordings import recordings
+from taccorl.robots import ROBOT
 
 HIDDEN = ("coulomb_friction", "backlash", "command_delay", "gravity_mismatch", "cogging")
 
@@ -29,7 +30,7 @@ def diagnosis() -> Iterator[Row]:
     )
     walls = []
     for seed in (410, 420):
-        arm = [(f"left_joint{joint}", seed + joint) for joint in range(1, 7)]
+        arm = [(f"left_joint{joint}", seed + joint) for joint in range(1, ROBOT.num_joints + 1)]
         before = time.perf_counter()
         with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
             made = sum(pool.map(_one_of_an_arm, arm))

@@ -21,10 +21,10 @@ from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison import USES, Comparison, Kind, TouchTrace, Trace
 from taccorl.diagnosis.replays import BENCH_REST, Response, in_contact, matched_contact, replay_joints, replay_whole
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import ARMS, PAD_TAXELS, PADS
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
-GRIPPERS = tuple(f"{arm}_gripper" for arm in ARMS)
+GRIPPERS = tuple(f"{arm}_gripper" for arm in ROBOT.arms)
 
 
 def compare(
@@ -116,7 +116,7 @@ def compared(m: Measurement) -> list[str]:
 def held_up(m: Measurement) -> list[str]:
     """Grippers of arms that press something, as the recording or its pads say: the twin's would close further."""
     touched = np.asarray(in_contact(m).any(axis=0))
-    stated = [m.pressed is not None and m.pressed.arm == arm for arm in ARMS]
+    stated = [m.pressed is not None and m.pressed.arm == arm for arm in ROBOT.arms]
     return [signal for signal, held, said in zip(GRIPPERS, touched, stated, strict=True) if held or said]
 
 
@@ -150,7 +150,7 @@ def _traces(m: Measurement, use: Use, response: Response, floors: dict[Kind, dic
                     measured=measured,
                     replayed=replayed,
                     torque=response.effort[:, j],
-                    touched=touched[:, int(signal.startswith("right"))],
+                    touched=touched[:, ROBOT.arms.index(signal.split("_", 1)[0])],
                     floor=floors[kind][signal],
                     origin=m.origin,
                 )
@@ -176,7 +176,7 @@ def _touches(
     floor = touch_floor([m for _, m in felt])
     if floor is None:
         return [], [f"touch of {', '.join(m.name for _, m in felt)}: too few frames for a noise floor"]
-    floor = floor.reshape(len(PADS), *PAD_TAXELS)
+    floor = floor.reshape(len(ROBOT.pads), *ROBOT.pad.shape)
     for use, m in felt:
         solid = m.pressed or pressed
         if solid is None:
@@ -197,7 +197,7 @@ def _touches(
                 time_s=motion.time_s,
                 measured=motion.measured,
                 replayed=model.counts(motion, reading),
-                floor=floor[[PADS.index(pad) for pad in motion.pads]],
+                floor=floor[[ROBOT.pads.index(pad) for pad in motion.pads]],
                 origin=m.origin,
                 touched=np.asarray((motion.depth()[0] > 0).any(axis=(2, 3))),
             )

@@ -18,8 +18,7 @@ from taccorl.alignment.measurements import Use
 from taccorl.alignment.noise_floor import SignalFloor
 from taccorl.data.finding import Finding
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.actions import ACTION_NAMES
-from taccorl.sim.robot import PADS
+from taccorl.robots import ROBOT
 
 Kind = Literal["position", "effort"]
 Way = Literal["joint", "twin"]
@@ -182,7 +181,7 @@ class Comparison:
 
     def pad_scores(self) -> list[Score]:
         """Every pad and use."""
-        pads = [pad for pad in PADS if any(pad in t.pads for t in self.touches)]
+        pads = [pad for pad in ROBOT.pads if any(pad in t.pads for t in self.touches)]
         found = [_touch_score([t for t in self.touches if t.use == use], pad) for pad in pads for use in self.uses]
         return [s for s in found if s is not None]
 
@@ -293,7 +292,7 @@ def shown(value: float, unit: str) -> str:
 
 
 def _order(signal: str) -> int:
-    return ACTION_NAMES.index(signal)
+    return ROBOT.action_names.index(signal)
 
 
 def only(comparison: Comparison, signals: Iterable[str]) -> Comparison:

@@ -24,9 +24,8 @@ from taccorl.diagnosis.joints import moves
 from taccorl.diagnosis.motions import LIBRARY, OPENING_M, POSES, RATE_HZ, TORQUE_NM, Motion, Room, joint_number
 from taccorl.diagnosis.problem import Problem, Recording, Values, chosen
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.robot import JOINTS
 from taccorl.sim.twin import TwinConfig
 
 TELLS = 1.25
@@ -131,8 +130,8 @@ def plan(
         target = motion.target(room)
         peak = peak_torque_nm(config, signal, pose, motion, target)
         limit = TORQUE_NM[joint_number(signal) - 1]
-        column = ACTION_NAMES.index(signal)
-        if target.min() < ACTION_LOW[column] or target.max() > ACTION_HIGH[column]:
+        column = ROBOT.action_names.index(signal)
+        if target.min() < ROBOT.action_low[column] or target.max() > ROBOT.action_high[column]:
             refused[motion.name] = f"goes to {target.min():.2f} … {target.max():.2f} rad, beyond the joint's limits"
         elif peak > limit:
             refused[motion.name] = f"needs {peak:.1f} N·m of {limit:g}"
@@ -153,7 +152,7 @@ def plan(
 def other_joints(signal: str, pose: np.ndarray) -> dict[str, float]:
     """``pose`` (7,) by name, without the joint under test."""
     arm = signal.split("_", 1)[0]
-    names = [f"{arm}_{joint}" for joint in (*JOINTS, "gripper")]
+    names = [f"{arm}_{joint}" for joint in (*ROBOT.joints, "gripper")]
     return {name: round(float(value), 4) for name, value in zip(names, pose, strict=True) if name != signal}
 
 
@@ -186,7 +185,7 @@ def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
     arm, number = signal.split("_", 1)[0], joint_number(signal)
     swept = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
     pose = np.array([*POSES[number - 1], OPENING_M])
-    for k, name in enumerate([f"{arm}_{joint}" for joint in (*JOINTS, "gripper")]):
+    for k, name in enumerate([f"{arm}_{joint}" for joint in (*ROBOT.joints, "gripper")]):
         if swept and name in swept[0].signals:
             pose[k] = swept[0].target[0, swept[0].column(name)]
     return pose
@@ -196,11 +195,10 @@ def imagined(
     config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray, floor_rad: float
 ) -> Measurement:
     """What the twin itself would measure on a motion, with noise: a stand-in for a recording that is not made yet."""
-    j = ACTION_NAMES.index(signal)
+    j = ROBOT.action_names.index(signal)
     arm = signal.split("_", 1)[0]
-    first = ACTION_NAMES.index(f"{arm}_joint1")
-    targets = np.zeros((len(target), len(ACTION_NAMES)))
-    targets[:, first : first + 7] = pose
+    targets = np.zeros((len(target), len(ROBOT.action_names)))
+    targets[:, ROBOT.arm_slice(arm)] = pose
     targets[:, j] = target
     k = joint_number(signal) - 1
     control = config.controller_of(arm)
@@ -246,7 +244,7 @@ def _apart(
     """Pair → floors between the two on this motion, each being the truth."""
     new = imagined(config, signal, pose, motion, target, floor_rad)
     known = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
-    known = [m if m.signals == ACTION_NAMES else m.on_robot(new.target[0]) for m in known]
+    known = [m if m.signals == ROBOT.action_names else m.on_robot(new.target[0]) for m in known]
     problem = JointProblem(config, signal, Measurements((*known, new)), gains=gains, effort=False)
     recordings = [dataclasses.replace(r, floor=np.array([floor_rad])) for r in problem.fit]
     present = [problem.candidates[name].make(problem.start) for name in problem.present]

@@ -20,7 +20,7 @@ from taccorl.diagnosis.identifiable import TIMING_S
 from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.diagnosis.replays import BENCH_REST
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.effects.speed_delay import SpeedDelay
@@ -230,7 +230,7 @@ class JointProblem:
 
 def _on_robot(m: Measurement) -> Measurement:
     """With all 14 signals: joints that a table lacks rest where the bench has them."""
-    return m if m.signals == ACTION_NAMES else m.on_robot(BENCH_REST)
+    return m if m.signals == ROBOT.action_names else m.on_robot(BENCH_REST)
 
 
 def _acts_on(effect: ArmEffect, signal: str) -> bool:

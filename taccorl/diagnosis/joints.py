@@ -20,14 +20,14 @@ from taccorl.diagnosis.joint_problem import PAYLOAD_PLACE, GainsAre, JointProble
 from taccorl.diagnosis.problem import split_rows
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, TouchEffect
-from taccorl.sim.robot import ARMS, JOINTS
 from taccorl.sim.twin import TwinConfig
 
 MOVES_RAD = 2e-3
 """A joint whose target moves by more is swept."""
-SIGNALS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in JOINTS)
+SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +245,7 @@ def set_numbers(
     """
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
-    k = JOINTS.index(joint)
+    k = ROBOT.joints.index(joint)
     fields = {"kp": control.kp_nm_per_rad, "kd": control.kd_nms_per_rad, "torque_ff": control.torque_ff_nm}
     for name, values in fields.items():
         if name in base:
@@ -270,7 +270,7 @@ def _elsewhere(effect: Effect, taken: set[str]) -> list[Effect]:
     """Entries that do what ``effect`` does, but not to ``taken``."""
     rest = [thing for thing in effect.acts_on() if thing not in taken]
     if isinstance(effect, JointEffect):
-        arms = {arm: [t.removeprefix(f"{arm}_") for t in rest if t.startswith(f"{arm}_")] for arm in ARMS}
+        arms = {arm: [t.removeprefix(f"{arm}_") for t in rest if t.startswith(f"{arm}_")] for arm in ROBOT.arms}
         return [dataclasses.replace(effect, arm=arm, joints=joints) for arm, joints in arms.items() if joints]
     if isinstance(effect, ArmEffect):
         return [dataclasses.replace(effect, arm=arm) for arm in rest]

@@ -14,7 +14,7 @@ from taccorl.data.timing import runs
 from taccorl.diagnosis.comparison import TouchTrace
 from taccorl.diagnosis.localise import LEAST_SHARE, Cell
 from taccorl.diagnosis.replays import CONTACT_COUNTS
-from taccorl.sim.robot import PAD_TAXELS
+from taccorl.robots import ROBOT
 
 PHASES = {
     "loading": "the pad's sum rises",
@@ -54,11 +54,11 @@ def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
 
 def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Regime → its frames (N,) and its taxels (R, C), bool."""
-    everywhere = np.ones(PAD_TAXELS, dtype=bool)
+    everywhere = np.ones(ROBOT.pad.shape, dtype=bool)
     always = np.ones(len(trace.measured), dtype=bool)
     found = phases(trace, pad)
     quiet = found["just released"] | found["untouched"]
-    third = np.arange(PAD_TAXELS[0])[:, None] * len(THIRDS) // PAD_TAXELS[0]
+    third = np.arange(ROBOT.pad.shape[0])[:, None] * len(THIRDS) // ROBOT.pad.shape[0]
     return {
         "in contact": (~quiet, everywhere),
         "no contact": (quiet, everywhere),

@@ -20,7 +20,7 @@ import numpy as np
 
 from taccorl.alignment.sweep_range import SWEEP_HZ, SWEEP_S
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.robot import ARMS, JOINTS, LINKS
+from taccorl.robots import ROBOT
 
 RATE_HZ = 200
 REST_S = 1.0
@@ -79,7 +79,7 @@ class Room:
     @classmethod
     def of(cls, joint: int, middle_rad: float, inertia_kgm2: float, weight_nm: float) -> "Room":
         """Of joint 1 to 6 with this inertia and weight."""
-        low, high = LINKS[joint - 1].range_rad
+        low, high = ROBOT.links[joint - 1].range_rad
         wide = min(WIDE_RAD[joint - 1], middle_rad - low - MARGIN_RAD, high - middle_rad - MARGIN_RAD)
         left_nm = max(TORQUE_NM[joint - 1] - abs(weight_nm), 0.2 * TORQUE_NM[joint - 1])
         sweep = min(SWEEP_RAD, left_nm / (inertia_kgm2 * (2 * math.pi * FAST_HZ) ** 2 * 0.6))
@@ -205,6 +205,8 @@ def joint_number(signal: str) -> int:
         TaccorlError: no such joint.
     """
     arm, _, joint = signal.partition("_")
-    if arm not in ARMS or joint not in JOINTS:
-        raise TaccorlError(f"no joint {signal!r}; {nearest(signal, [f'{a}_{j}' for a in ARMS for j in JOINTS])}")
-    return JOINTS.index(joint) + 1
+    if arm not in ROBOT.arms or joint not in ROBOT.joints:
+        raise TaccorlError(
+            f"no joint {signal!r}; {nearest(signal, [f'{a}_{j}' for a in ROBOT.arms for j in ROBOT.joints])}"
+        )
+    return ROBOT.joints.index(joint) + 1

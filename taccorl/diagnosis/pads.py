@@ -25,8 +25,8 @@ from taccorl.diagnosis.replays import matched_contact
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose, gain_of
 from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
-from taccorl.sim.robot import ARMS
 from taccorl.sim.twin import TwinConfig
 
 FIELDS = {"k_n": "normal_stiffness_per_m", "k_d": "normal_damping_s_per_m"}
@@ -96,7 +96,7 @@ def presses(m: Measurement, arm: str) -> bool:
 
 def pressed_arms(measurements: Measurements) -> tuple[str, ...]:
     """Arms whose pads press a known object in at least one fit recording."""
-    return tuple(arm for arm in ARMS if any(presses(m, arm) for m in measurements.fit))
+    return tuple(arm for arm in ROBOT.arms if any(presses(m, arm) for m in measurements.fit))
 
 
 def diagnose_arm(

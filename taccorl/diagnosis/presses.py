@@ -42,11 +42,11 @@ from taccorl.diagnosis.problem import Values
 from taccorl.diagnosis.replays import matched_contact
 from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, TouchProblem
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.actions import OPEN_M
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect, TouchEffect
 from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
-from taccorl.sim.robot import ARMS, PAD_TAXELS, PAD_THICKNESS_M, PADS, RobotConfig
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
@@ -163,8 +163,8 @@ def plan_presses(
         TaccorlError: less than two rivals, or one that pads do not show or have already; no such arm; recordings of which none
             says what these pads pressed; another sensor than FlexiTac.
     """
-    if arm not in ARMS:
-        raise TaccorlError(f"excite: no pads of an arm {arm!r}; {nearest(arm, ARMS)}")
+    if arm not in ROBOT.arms:
+        raise TaccorlError(f"excite: no pads of an arm {arm!r}; {nearest(arm, ROBOT.arms)}")
     check_rivals(rivals)
     for name in rivals:
         _check_of_pads(name)
@@ -206,7 +206,8 @@ def grip(robot: RobotConfig, press: Press) -> tuple[np.ndarray, np.ndarray]:
 def travel_m(robot: RobotConfig) -> float:
     """How deep a pad can be pressed: as far as the gripper's force goes, and never through its rubber."""
     return min(
-        PAD_THICKNESS_M, robot.grip_force_max_n / robot.pad_stiffness_n_per_m if robot.pads == "sprung" else np.inf
+        ROBOT.pad_thickness_m,
+        robot.grip_force_max_n / robot.pad_stiffness_n_per_m if robot.pads == "sprung" else np.inf,
     )
 
 
@@ -216,10 +217,10 @@ def _refusal(robot: RobotConfig, press: Press, target_m: np.ndarray) -> str:
     fastest = float(np.abs(np.diff(opening)).max()) * RATE_HZ / 2
     if deepest > travel_m(robot) + 1e-9:
         return f"goes {1e3 * deepest:.2f} mm deep, the pads' travel is {1e3 * travel_m(robot):.2f} mm"
-    if min(target_m.min(), opening.min()) < 0 or opening.max() > OPEN_M:
+    if min(target_m.min(), opening.min()) < 0 or opening.max() > ROBOT.opening_max_m:
         return (
             f"needs commands of {1e3 * target_m.min():.1f} … {1e3 * target_m.max():.1f} mm, the gripper takes "
-            f"0 … {1e3 * OPEN_M:g} mm"
+            f"0 … {1e3 * ROBOT.opening_max_m:g} mm"
         )
     if fastest > FINGER_SPEED_M_PER_S:
         return f"moves each finger at {1e3 * fastest:.0f} mm/s of {1e3 * FINGER_SPEED_M_PER_S:g}"
@@ -230,13 +231,13 @@ def imagined_press(config: TwinConfig, arm: str, press: Press) -> TouchMotion:
     """What the twin itself would send in a press, with noise: a stand-in for a recording that is not made yet."""
     opening = press.opening_m()
     time_s = np.arange(len(opening)) / RATE_HZ
-    target = np.tile([*REST_POSE, OPEN_M] * 2, (len(opening), 1))
-    target[:, 7 * ARMS.index(arm) + 6] = opening
+    target = np.tile([*REST_POSE, ROBOT.opening_max_m] * len(ROBOT.arms), (len(opening), 1))
+    target[:, ROBOT.gripper_index(arm)] = opening
     stamps = np.arange(2 * FRAME_S, time_s[-1], FRAME_S)
-    num_taxels = len(PADS) * math.prod(PAD_TAXELS)
+    num_taxels = ROBOT.num_taxels
     sensor = _flexitac(config)
     touch = Touch(
-        time_s=np.tile(stamps[:, None], (1, len(PADS))),
+        time_s=np.tile(stamps[:, None], (1, len(ROBOT.pads))),
         counts=np.zeros((len(stamps), num_taxels), np.int16),
         baseline=np.full(num_taxels, np.mean(sensor.resting_count)),
     )
@@ -297,7 +298,7 @@ def _mapped(e: Explanation, pads: Sequence[str]) -> Explanation:
     """A gain map has no typical one: some gains are drawn."""
     if not isinstance(e.effect, TaxelGainMap):
         return e
-    gains = 1.0 + GAIN_SPREAD * np.random.default_rng(0).standard_normal((len(pads), *PAD_TAXELS))
+    gains = 1.0 + GAIN_SPREAD * np.random.default_rng(0).standard_normal((len(pads), *ROBOT.pad.shape))
     return dataclasses.replace(e, effect=TaxelGainMap.of(np.clip(gains, 0.0, None), pads))
 
 

@@ -16,9 +16,8 @@ from taccorl.alignment.joint_model import JointModel, joint_motion
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.touch_motion import PressedObject, TouchMotion, touch_motion
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.replay import replay
-from taccorl.sim.robot import ARMS, JOINTS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
@@ -36,7 +35,7 @@ class Response:
     """What the twin did."""
 
     measurement: Measurement
-    """As it was replayed: all 14 signals, at an even rate that is a whole number of physics steps."""
+    """As it was replayed: all signals of the robot, at an even rate that is a whole number of physics steps."""
     way: Literal["joint", "twin"]
     reported: np.ndarray
     """(T, 14) rad, m; NaN for signals that were not replayed."""
@@ -44,14 +43,14 @@ class Response:
     """(T, 14) N·m, N that the motors give at the time of each row; NaN where not known."""
 
 
-BENCH_REST = np.concatenate([[*Bench.home_rad[arm], 0.0] for arm in ("left", "right")])
+BENCH_REST = np.concatenate([[*Bench.home_rad[arm], 0.0] for arm in ROBOT.arms])
 """(14,) where joints are that a table does not tell."""
 
 
 def replay_joints(config: TwinConfig, m: Measurement, signals: Sequence[str]) -> Response:
     """Each of ``signals`` alone, the others as they were measured; gains and payloads as the recording knows them."""
     m = evened(m, config)
-    reported, effort = np.full((2, m.num_rows, len(ACTION_NAMES)), np.nan)
+    reported, effort = np.full((2, m.num_rows, len(ROBOT.action_names)), np.nan)
     for signal in signals:
         model, j = JointModel(config, signal), m.column(signal)
         done = model.simulate(joint_motion(m, config, signal), model.gains)
@@ -72,25 +71,24 @@ def replay_whole(config: TwinConfig, m: Measurement) -> Response:
     if sim.diverged[0] or not np.isfinite(done.reported).all():
         raise TaccorlError(f"{m.name}: the twin diverged in its replay; look at its gains and effects")
     # ``Replay.effort`` is at the end of each command's stretch: the time of the next row.
-    effort = np.concatenate([np.full((1, len(ACTION_NAMES)), np.nan), done.effort[:-1]])
+    effort = np.concatenate([np.full((1, len(ROBOT.action_names)), np.nan), done.effort[:-1]])
     return Response(m, "twin", done.reported, effort)
 
 
 def _as_recorded(config: TwinConfig, m: Measurement) -> TwinConfig:
     """With the gains that were commanded and the masses that were held, where the recording knows them."""
     controllers = {}
-    for arm in ARMS:
+    for arm in ROBOT.arms:
         control = config.controller_of(arm)
         for key, known in (("kp_nm_per_rad", m.kp), ("kd_nms_per_rad", m.kd)):
             values = [
-                known.get(f"{arm}_{joint}", value) for joint, value in zip(JOINTS, getattr(control, key), strict=True)
+                known.get(f"{arm}_{joint}", value)
+                for joint, value in zip(ROBOT.joints, getattr(control, key), strict=True)
             ]
             control = dataclasses.replace(control, **{key: values})
         controllers[arm] = control
     held = [
-        held_payload("left" if arm == "left" else "right", mass, m.payload_position_m.get(arm, AT_TCP))
-        for arm, mass in m.payload_kg.items()
-        if mass > 0
+        held_payload(arm, mass, m.payload_position_m.get(arm, AT_TCP)) for arm, mass in m.payload_kg.items() if mass > 0
     ]
     return dataclasses.replace(config, arm_controllers=controllers, effects=[*config.effects, *held])
 
@@ -117,16 +115,18 @@ def _start(m: Measurement) -> np.ndarray:
     seen = np.isfinite(rows).any(axis=0)
     start = m.target[0].copy()
     start[seen] = np.nanmean(rows[:, seen], axis=0)
-    return np.clip(start, ACTION_LOW, ACTION_HIGH)
+    return np.clip(start, ROBOT.action_low, ROBOT.action_high)
 
 
 def in_contact(m: Measurement) -> np.ndarray:
-    """(T, 2) bool: a pad of the left, right arm is in contact at the time of each row; False without pads."""
+    """(T, arms) bool: a pad of the arm is in contact at the time of each row; False without pads."""
     if m.touch is None:
-        return np.zeros((m.num_rows, 2), dtype=bool)
-    beyond = np.asarray((m.touch.counts.reshape(len(m.touch.counts), 4, -1) > CONTACT_COUNTS).any(axis=2))
-    felt = [np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5 for p in range(4)]
-    return np.stack([felt[0] | felt[1], felt[2] | felt[3]], axis=1)
+        return np.zeros((m.num_rows, len(ROBOT.arms)), dtype=bool)
+    pads = len(ROBOT.pads)
+    beyond = np.asarray((m.touch.counts.reshape(len(m.touch.counts), pads, -1) > CONTACT_COUNTS).any(axis=2))
+    felt = [np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5 for p in range(pads)]
+    by_arm = np.reshape(felt, (len(ROBOT.arms), len(ROBOT.fingers), -1))
+    return np.asarray(by_arm.any(axis=1)).T
 
 
 def matched_contact(m: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:

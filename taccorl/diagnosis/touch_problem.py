@@ -27,11 +27,11 @@ from taccorl.alignment.touch_model import TouchModel
 from taccorl.alignment.touch_motion import TouchMotion
 from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import BoardEffect, Effect, TouchEffect
 from taccorl.sim.effects.pad_frame import PadFrameEffect
 from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
-from taccorl.sim.robot import PAD_TAXELS
 from taccorl.sim.twin import TwinConfig
 
 MAX_CHANNELS = 64
@@ -52,7 +52,7 @@ FEWEST_SHARED = 8
 """Pressed taxels that a validation recording must share with the fit recordings for a map of gains to be judged on it."""
 _WINDOW_M = 1e-3  # taxels that the object comes so near to are simulated,
 _RIM = 1  # and so many rows and columns around them
-_TAXELS = math.prod(PAD_TAXELS)
+_TAXELS = math.prod(ROBOT.pad.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +231,8 @@ class TouchProblem:
     def _chosen(self, motion: TouchMotion, rows: np.ndarray, taxels: np.ndarray) -> _Chosen:
         matters = motion.near(_WINDOW_M).any(axis=0)
         matters.reshape(-1)[taxels] = True
-        rows_there, columns_there = np.divmod(np.flatnonzero(matters) % _TAXELS, PAD_TAXELS[1])
-        rectangle = (_span(rows_there, PAD_TAXELS[0]), _span(columns_there, PAD_TAXELS[1]))
+        rows_there, columns_there = np.divmod(np.flatnonzero(matters) % _TAXELS, ROBOT.pad.shape[1])
+        rectangle = (_span(rows_there, ROBOT.pad.shape[0]), _span(columns_there, ROBOT.pad.shape[1]))
         number = np.arange(matters.size).reshape(matters.shape)
         window = number[:, *rectangle].ravel()
         every = np.ones(len(motion.time_s), dtype=bool)

@@ -10,7 +10,7 @@ import yaml
 
 from taccorl.alignment.measurements import Measurements
 from taccorl.cli.main import main
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         recorded(truth, m, k, signal=SIGNAL, stated=False, effort=True)
         for k, m in enumerate((QUICK_CHIRP, QUICK_AGAIN, QUICK_VALIDATION))
     ]
-    write_folder(path / "sweeps", Measurements(tuple(made[:2]), (made[2],)), ACTION_NAMES[:7])
+    write_folder(path / "sweeps", Measurements(tuple(made[:2]), (made[2],)), ROBOT.action_names[:7])
     save_twin(TwinConfig(), path / "twin.yaml")
     without = ",".join(name for name in effects if name not in KEPT)
     words = [f"--twin={path / 'twin.yaml'}", f"--out={path / 'diagnosis'}", f"--without=[{without}]"]

@@ -15,7 +15,7 @@ from taccorl.cli.main import main
 from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.diagnosis.surrogate.cases import draw_case
 from taccorl.diagnosis.surrogate.recordings import record
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.twin_file import load_twin, save_twin
 
@@ -41,7 +41,7 @@ def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     chirp, again, held = (record(case, motion) for motion in (CHIRP, AGAIN, VALIDATION[0]))
     folder = tmp_path_factory.mktemp("sweeps")
     save_twin(case.twin, folder / "twin.yaml")
-    write_folder(folder / "sweeps", Measurements((chirp, again), (held,)), ACTION_NAMES[:7])
+    write_folder(folder / "sweeps", Measurements((chirp, again), (held,)), ROBOT.action_names[:7])
     path = folder / "sweeps" / "measurements.yaml"
     index = yaml.safe_load(path.read_text())
     for note in index["recordings"].values():

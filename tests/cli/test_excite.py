@@ -13,7 +13,7 @@ import yaml
 from taccorl.alignment.measurements import Measurements, read_measurements
 from taccorl.cli.main import main
 from taccorl.diagnosis.motions import AGAIN, CHIRP, RATE_HZ, SPEED_RAD_PER_S
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
 sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
@@ -37,7 +37,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> Any:
 @pytest.fixture(scope="module")
 def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = [recorded(TwinConfig(), m, k, noise_rad=2 * NOISE_RAD, effort=True) for k, m in enumerate((CHIRP, AGAIN))]
-    return write_folder(tmp_path_factory.mktemp("excite") / "sweeps", Measurements(tuple(made)), ACTION_NAMES)
+    return write_folder(tmp_path_factory.mktemp("excite") / "sweeps", Measurements(tuple(made)), ROBOT.action_names)
 
 
 def test_a_plan_and_tables_of_targets_that_a_driver_can_send(said: Any, tmp_path: Path):
@@ -50,14 +50,14 @@ def test_a_plan_and_tables_of_targets_that_a_driver_can_send(said: Any, tmp_path
     assert sorted(p.name for p in out.iterdir()) == sorted(["plan.yaml", *(m["table"] for m in plan["motions"])])
     apart = [m["floors_apart"]["command_lag | integral_action"] for m in plan["motions"]]
     assert apart[0] >= apart[1] and apart[0] > 1.25
-    j = ACTION_NAMES.index(SIGNAL)
+    j = ROBOT.action_names.index(SIGNAL)
     for motion in plan["motions"]:
         with (out / motion["table"]).open() as file:
             head, *rows = csv.reader(file)
         assert head == ["t", f"{SIGNAL}.q_target"]
         time_s, target = np.array(rows, dtype=float).T
         assert np.allclose(np.diff(time_s), 1 / RATE_HZ) and len(rows) == round(motion["seconds"] * RATE_HZ)
-        assert ACTION_LOW[j] < target.min() and target.max() < ACTION_HIGH[j]
+        assert ROBOT.action_low[j] < target.min() and target.max() < ROBOT.action_high[j]
         assert np.abs(np.diff(target)).max() * RATE_HZ <= SPEED_RAD_PER_S + 1e-3
         assert np.ptp(target[:RATE_HZ]) == np.ptp(target[-RATE_HZ:]) == 0.0, "at rest at both ends"
         assert motion["range_rad"] == pytest.approx([target.min(), target.max()], abs=1e-3)

@@ -9,7 +9,7 @@ import yaml
 
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
@@ -38,7 +38,7 @@ def chirp(seed: int, seconds: float = 6.0, signals: tuple[str, ...] = (SIGNAL,))
     target = np.tile(sim.targets[0], (len(time_s) + 300, 1))
     for signal in signals:
         wave = rng.uniform(0.15, 0.3) * np.sin(angle + rng.uniform(0, 0.5)) * fade
-        target[200 : 200 + len(time_s), ACTION_NAMES.index(signal)] += wave
+        target[200 : 200 + len(time_s), ROBOT.action_names.index(signal)] += wave
     return target
 
 

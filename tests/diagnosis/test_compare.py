@@ -14,7 +14,7 @@ from taccorl.diagnosis.compare import compare, moving, replay_all
 from taccorl.diagnosis.comparison import only, shown
 from taccorl.diagnosis.replays import evened, replay_joints, replay_whole
 from taccorl.errors import TaccorlError
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
@@ -41,7 +41,7 @@ def test_twin_with_the_hidden_effect_is_at_the_floor_and_without_it_off_by_frict
         assert score.floor == pytest.approx(NOISE_RAD, rel=0.1), "from the repeated recording"
     # Dry friction holds the joint F / K_p behind where the nominal twin is, on the side that it comes from.
     residual = np.concatenate([t.residual for t in nominal.of(SIGNAL)])
-    behind = FRICTION_NM / KP_NM_PER_RAD[4]
+    behind = FRICTION_NM / ROBOT.kp_nm_per_rad[4]
     assert np.quantile(np.abs(residual), 0.99) == pytest.approx(behind, rel=0.08)
     effort = nominal.score(SIGNAL, "effort", "validation")
     assert effort is not None and effort.unit == "N·m" and effort.ratio > 5
@@ -82,8 +82,8 @@ def test_gripper_or_contact_takes_the_whole_twin():
 def test_known_payload_and_commanded_gains_are_those_of_the_recording(gripping):
     k = 4
     gains = {
-        "kp_nm_per_rad": [v * (2 if j == k else 1) for j, v in enumerate(KP_NM_PER_RAD)],
-        "kd_nms_per_rad": [v * (2 if j == k else 1) for j, v in enumerate(KD_NMS_PER_RAD)],
+        "kp_nm_per_rad": [v * (2 if j == k else 1) for j, v in enumerate(ROBOT.kp_nm_per_rad)],
+        "kd_nms_per_rad": [v * (2 if j == k else 1) for j, v in enumerate(ROBOT.kd_nms_per_rad)],
     }
     robot = TwinConfig(effects=[make_effect("payload", arm="left", mass_kg=0.4)])
     robot = dataclasses.replace(robot, controller=dataclasses.replace(robot.controller, **gains))
@@ -93,8 +93,8 @@ def test_known_payload_and_commanded_gains_are_those_of_the_recording(gripping):
     m = recorded(robot, target, 8)
     known = dataclasses.replace(
         m,
-        kp={SIGNAL: 2 * KP_NM_PER_RAD[k]},
-        kd={SIGNAL: 2 * KD_NMS_PER_RAD[k]},
+        kp={SIGNAL: 2 * ROBOT.kp_nm_per_rad[k]},
+        kd={SIGNAL: 2 * ROBOT.kd_nms_per_rad[k]},
         payload_kg={"left": 0.4},
     )
     ratios = []

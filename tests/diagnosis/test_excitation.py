@@ -21,12 +21,12 @@ from taccorl.diagnosis.excitation import (
 )
 from taccorl.diagnosis.motions import CHIRP, LIBRARY, MARGIN_RAD, POSES, REST_S, STIFFER_CHIRP
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
 FLOOR_RAD = 2e-4
 NOMINAL = TwinConfig()
-COLUMN = ACTION_NAMES.index(SIGNAL)
+COLUMN = ROBOT.action_names.index(SIGNAL)
 
 
 def planned(*rivals: str, config: TwinConfig = NOMINAL, signal: str = SIGNAL, **options) -> Plan:
@@ -100,17 +100,17 @@ def test_an_unknown_rival_is_refused_with_the_nearest_name():
 def test_every_target_keeps_the_joint_s_limits_and_rests_at_both_ends(frictions, twins):
     rest = round(REST_S * 200)
     for p in (*frictions.planned, *twins.planned):
-        assert ACTION_LOW[COLUMN] <= p.target.min() and p.target.max() <= ACTION_HIGH[COLUMN]
+        assert ROBOT.action_low[COLUMN] <= p.target.min() and p.target.max() <= ROBOT.action_high[COLUMN]
         assert np.ptp(p.target[:rest]) == np.ptp(p.target[-rest:]) == 0.0
 
 
 @pytest.mark.slow
 def test_near_a_limit_the_room_is_smaller_and_the_limit_is_kept():
     pose = rest_pose(SIGNAL, None)
-    pose[4] = ACTION_HIGH[COLUMN] - 0.2
+    pose[4] = ROBOT.action_high[COLUMN] - 0.2
     found = planned("coulomb_friction", "viscous_friction", gains="commanded", pose=pose)
     assert len(found.planned) == len(LIBRARY)
-    assert all(p.target.max() <= ACTION_HIGH[COLUMN] - MARGIN_RAD + 1e-6 for p in found.planned)
+    assert all(p.target.max() <= ROBOT.action_high[COLUMN] - MARGIN_RAD + 1e-6 for p in found.planned)
 
 
 @pytest.mark.slow
@@ -157,7 +157,7 @@ def test_an_imagined_recording_says_so_and_has_the_noise_that_was_asked_for():
 def test_the_arm_stands_as_in_the_recordings_that_sweep_the_joint():
     assert rest_pose(SIGNAL, None)[:6] == pytest.approx(POSES[4])
     m = recorded(NOMINAL, CHIRP, 0)
-    m.target[:, ACTION_NAMES.index("left_joint2")] += 0.1
+    m.target[:, ROBOT.action_names.index("left_joint2")] += 0.1
     expected = np.array(POSES[4])
     expected[1] += 0.1
     assert rest_pose(SIGNAL, Measurements((m,)))[:6] == pytest.approx(expected)

@@ -23,9 +23,8 @@ from taccorl.diagnosis.joints import (
 from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.diagnosis.search import SearchConfig
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.robot import ARMS, JOINTS, PADS
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin, twin_digest
 
@@ -39,7 +38,7 @@ def still(name: str = "still", **spans: float) -> Measurement:
     """A recording whose targets go from 0 to the spans, as {left_joint5: 0.1}."""
     target = np.zeros((50, 14))
     for signal, span in spans.items():
-        target[25:, ACTION_NAMES.index(signal)] = span
+        target[25:, ROBOT.action_names.index(signal)] = span
     return Measurement(name=name, time_s=np.arange(50) / 200, target=target, measured=target.copy())
 
 
@@ -182,7 +181,7 @@ def test_gains_go_to_one_arm_and_leave_the_other(tmp_path):
 
 
 def friction(torque_nm: float, arm: str, *joints: str):
-    return make_effect("coulomb_friction", torque_nm=torque_nm, arm=arm, joints=list(joints or JOINTS))
+    return make_effect("coulomb_friction", torque_nm=torque_nm, arm=arm, joints=list(joints or ROBOT.joints))
 
 
 def torques(config: TwinConfig) -> dict[str, float]:
@@ -198,7 +197,7 @@ def torques(config: TwinConfig) -> dict[str, float]:
 def test_an_entry_of_all_joints_gives_up_the_one_that_is_replaced(tmp_path):
     twin = TwinConfig(effects=[friction(0.1, "both")])
     add_effect(twin, friction(0.7, "left", "joint5"))
-    expected = {f"{arm}_{joint}": 0.1 for arm in ARMS for joint in JOINTS} | {SIGNAL: 0.7}
+    expected = {f"{arm}_{joint}": 0.1 for arm in ROBOT.arms for joint in ROBOT.joints} | {SIGNAL: 0.7}
     assert torques(twin) == expected
     save_twin(twin, tmp_path / "twin.yaml")
     assert torques(load_twin(tmp_path / "twin.yaml")) == expected
@@ -225,5 +224,5 @@ def test_an_effect_of_pads_leaves_the_other_pads_their_own():
     twin = TwinConfig(effects=[make_effect("touch_lag", time_constant_s=0.02)])
     add_effect(twin, make_effect("touch_lag", time_constant_s=0.05, pads=["left_a", "right_b"]))
     found = {pad: vars(e)["time_constant_s"] for e in twin.effects for pad in e.acts_on()}
-    assert found == dict.fromkeys(PADS, 0.02) | {"left_a": 0.05, "right_b": 0.05}
-    assert sum(len(e.acts_on()) for e in twin.effects) == len(PADS)
+    assert found == dict.fromkeys(ROBOT.pads, 0.02) | {"left_a": 0.05, "right_b": 0.05}
+    assert sum(len(e.acts_on()) for e in twin.effects) == len(ROBOT.pads)

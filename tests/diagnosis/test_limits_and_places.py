@@ -15,7 +15,7 @@ from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.axis_problem import AxisConfig, AxisProblem
 from taccorl.diagnosis.joint_problem import JointProblem
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.dropped_commands import uniform
 from taccorl.sim.twin import TwinConfig
@@ -185,7 +185,7 @@ def test_lost_commands_are_no_candidate_of_a_search_and_stay_in_a_twin_that_has_
         time_s=np.arange(600) / RATE_HZ,
         target=home,
         measured=home + 1e-4 * np.random.default_rng(0).standard_normal(home.shape),
-        signals=ACTION_NAMES,
+        signals=ROBOT.action_names,
         origin="imagined",
     )
     plain, with_drops = (

@@ -22,7 +22,7 @@ from taccorl.diagnosis.presses import (
     travel_m,
 )
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import OPEN_M
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
@@ -98,7 +98,7 @@ def test_a_gain_map_that_nobody_knows_is_drawn():
 def test_every_press_of_the_library_keeps_the_twin_s_limits_and_rests_at_both_ends():
     for p in LIBRARY:
         opening, (force, target) = p.opening_m(), grip(RobotConfig(), p)
-        assert target.min() >= 0 and max(opening.max(), target.max()) <= OPEN_M, p.name
+        assert target.min() >= 0 and max(opening.max(), target.max()) <= ROBOT.opening_max_m, p.name
         assert np.abs(np.diff(opening)).max() * 200 / 2 <= FINGER_SPEED_M_PER_S, p.name
         assert 0 < p.penetration_m().max() < travel_m(RobotConfig()), p.name
         assert force.max() <= 40.0, p.name

@@ -13,17 +13,12 @@ import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from taccorl.sim.robot import (
-    FINGER_FROM_LINK6_M,
-    FINGER_MASS_KG,
-    INERTIAS,
-    LINKS,
-    PAD_THICKNESS_M,
-    TCP_FROM_LINK6_M,
-    RobotConfig,
-)
+from taccorl.robots import ROBOT
+from taccorl.robots.bimanual_piper import FINGER_MASS_KG, INERTIAS
+from taccorl.sim.robot import RobotConfig
 
 GRAVITY = 9.81
+NUM_JOINTS = ROBOT.num_joints
 _BALL_RADIUS_M = 0.02  # of a payload
 
 
@@ -51,27 +46,27 @@ def bodies(config: RobotConfig, opening_m: float, balls: tuple[tuple[float, floa
     inertias = INERTIAS[config.inertias]
     mass = np.array([body.mass_kg for body in inertias])
     moment = np.array([np.multiply(body.mass_kg, body.com_link_m) for body in inertias])
-    inertia = np.empty((6, 3, 3))
+    inertia = np.empty((NUM_JOINTS, 3, 3))
     for k, body in enumerate(inertias):
         xx, yy, zz, xy, xz, yz = body.about_com_kgm2()
         about_com = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         inertia[k] = about_com + _of_point(body.mass_kg, np.array(body.com_link_m))
     for at_kg, at_m, own in (*_hand(config, opening_m), *_balls(balls)):
-        mass[5] += at_kg
-        moment[5] += at_kg * at_m
-        inertia[5] += np.diag(own) + _of_point(at_kg, at_m)
-    turn = np.array([Rotation.from_euler("xyz", link.rpy_parent_rad).as_matrix() for link in LINKS])
-    return Bodies(turn, np.array([link.pos_parent_m for link in LINKS], dtype=float), mass, moment, inertia)
+        mass[-1] += at_kg
+        moment[-1] += at_kg * at_m
+        inertia[-1] += np.diag(own) + _of_point(at_kg, at_m)
+    turn = np.array([Rotation.from_euler("xyz", link.rpy_parent_rad).as_matrix() for link in ROBOT.links])
+    return Bodies(turn, np.array([link.pos_parent_m for link in ROBOT.links], dtype=float), mass, moment, inertia)
 
 
 def _hand(config: RobotConfig, opening_m: float) -> list[tuple[float, np.ndarray, list[float]]]:
     """Fingers and pads: mass, place in link 6, own inertia; as ``taccorl.sim.robot`` states them."""
     parts = []
     for side in (1.0, -1.0):
-        finger = np.array([0.0, side * (0.01 + opening_m / 2), FINGER_FROM_LINK6_M + 0.02])
+        finger = np.array([0.0, side * (0.01 + opening_m / 2), ROBOT.finger_from_hand_m + 0.02])
         parts.append((FINGER_MASS_KG[config.inertias], finger, [2e-5, 2e-5, 5e-6]))
         if config.pads == "sprung":
-            pad = np.array([0.0, side * (PAD_THICKNESS_M + opening_m) / 2, TCP_FROM_LINK6_M])
+            pad = np.array([0.0, side * (ROBOT.pad_thickness_m + opening_m) / 2, ROBOT.tcp_from_hand_m])
             parts.append((0.004, pad, [1.4e-6, 1.4e-6, 2e-7]))
     return parts
 
@@ -96,13 +91,13 @@ def _link_turn(turn, angle, out):
 @numba.njit(cache=True)
 def torques(b: Bodies, q, v, a, gravity):
     """(6,) N·m that the links need to move with ``a`` at ``q``, ``v`` under ``gravity`` (m/s²): recursive Newton–Euler."""
-    rot = np.empty((6, 3, 3))
-    force, couple = np.empty((6, 3)), np.empty((6, 3))
+    rot = np.empty((NUM_JOINTS, 3, 3))
+    force, couple = np.empty((NUM_JOINTS, 3)), np.empty((NUM_JOINTS, 3))
     w = np.zeros(3)
     dw = np.zeros(3)
     acc = np.array([0.0, 0.0, gravity])
     lift, here = np.empty(3), np.empty(3)
-    for i in range(6):
+    for i in range(NUM_JOINTS):
         r = rot[i]
         _link_turn(b.turn[i], q[i], r)
         x, y, z = b.origin[i, 0], b.origin[i, 1], b.origin[i, 2]
@@ -137,7 +132,7 @@ def torques(b: Bodies, q, v, a, gravity):
         couple[i, 0] += w[1] * here[2] - w[2] * here[1] + y * acc[2] - z * acc[1]
         couple[i, 1] += w[2] * here[0] - w[0] * here[2] + z * acc[0] - x * acc[2]
         couple[i, 2] += w[0] * here[1] - w[1] * here[0] + x * acc[1] - y * acc[0]
-    out = np.empty(6)
+    out = np.empty(NUM_JOINTS)
     for i in range(5, -1, -1):
         out[i] = couple[i, 2]
         if i > 0:
@@ -165,10 +160,10 @@ def _to_parent(r, p, force, couple, force_parent, couple_parent):
 @numba.njit(cache=True)
 def mass_matrix(b: Bodies, q):
     """(6, 6) kg·m²: composite rigid bodies. Rotors are not in it."""
-    rot = np.empty((6, 3, 3))
+    rot = np.empty((NUM_JOINTS, 3, 3))
     mass, moment, inertia = b.mass.copy(), b.moment.copy(), b.inertia.copy()
     half, turned = np.empty((3, 3)), np.empty(3)
-    for i in range(6):
+    for i in range(NUM_JOINTS):
         _link_turn(b.turn[i], q[i], rot[i])
     for i in range(5, 0, -1):
         r, p, m = rot[i], b.origin[i], mass[i]
@@ -189,9 +184,9 @@ def mass_matrix(b: Bodies, q):
             inertia[i - 1, k, k] += trace
             moment[i - 1, k] += turned[k] + m * p[k]
         mass[i - 1] += m
-    out = np.empty((6, 6))
-    force, couple = np.zeros((6, 3)), np.zeros((6, 3))
-    for j in range(6):
+    out = np.empty((NUM_JOINTS, NUM_JOINTS))
+    force, couple = np.zeros((NUM_JOINTS, 3)), np.zeros((NUM_JOINTS, 3))
+    for j in range(NUM_JOINTS):
         for i in range(j + 1):
             for k in range(3):
                 force[i, k] = couple[i, k] = 0.0
@@ -209,11 +204,11 @@ def mass_matrix(b: Bodies, q):
 @numba.njit(cache=True)
 def factor(a):
     """Cholesky factor of (6, 6), in place in its lower half."""
-    for j in range(6):
+    for j in range(NUM_JOINTS):
         for k in range(j):
             a[j, j] -= a[j, k] * a[j, k]
         a[j, j] = math.sqrt(a[j, j])
-        for i in range(j + 1, 6):
+        for i in range(j + 1, NUM_JOINTS):
             for k in range(j):
                 a[i, j] -= a[i, k] * a[j, k]
             a[i, j] /= a[j, j]
@@ -222,11 +217,11 @@ def factor(a):
 @numba.njit(cache=True, inline="always")
 def solve(a, x):
     """x (6,) becomes A⁻¹ x."""
-    for i in range(6):
+    for i in range(NUM_JOINTS):
         for k in range(i):
             x[i] -= a[i, k] * x[k]
         x[i] /= a[i, i]
     for i in range(5, -1, -1):
-        for k in range(i + 1, 6):
+        for k in range(i + 1, NUM_JOINTS):
             x[i] -= a[k, i] * x[k]
         x[i] /= a[i, i]

@@ -3,7 +3,7 @@
 How strong a hidden effect is, is said by what it leaves on the recordings after the gains have been refitted: 1 to 30 noise
 floors. Its severity is searched for that, within what a robot could have.
 
-Letters in shapes: T rows, J 14 signals.
+Letters in shapes: T rows, J signals.
 """
 
 import dataclasses
@@ -44,9 +44,9 @@ from taccorl.diagnosis.surrogate.robot import (
 )
 from taccorl.diagnosis.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop, draw_loop, is_stable
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.actions import ACTION_NAMES
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, ControllerConfig
-from taccorl.sim.robot import ARMS, RobotConfig
+from taccorl.robots import ROBOT
+from taccorl.sim.controller import ControllerConfig
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.twin import TwinConfig
 
 SEVERITY_FLOORS = (1.0, 30.0)
@@ -181,12 +181,11 @@ def draw_case(
         raise TaccorlError(f"surrogate: no design {design!r}; {nearest(design, JUDGED_ON)}")
     rng = np.random.default_rng([seed, zlib.crc32("+".join(effect_names).encode())])
     kinds = [kind(name) for name in effect_names]
-    drawn = (
-        f"{rng.choice(ARMS)}_joint{rng.choice([j for j in range(1, 7) if all(j in k.joints for k in kinds)] or [1])}"
-    )
+    possible = [j for j in range(1, ROBOT.num_joints + 1) if all(j in k.joints for k in kinds)]
+    drawn = f"{rng.choice(ROBOT.arms)}_joint{rng.choice(possible or [1])}"
     signal = drawn if signal is None else signal
-    if signal not in ACTION_NAMES or signal.endswith("gripper"):
-        raise TaccorlError(f"surrogate: {signal!r} is no joint of the arms; {nearest(signal, ACTION_NAMES)}")
+    if signal not in ROBOT.action_names or signal.endswith("gripper"):
+        raise TaccorlError(f"surrogate: {signal!r} is no joint of the arms; {nearest(signal, ROBOT.action_names)}")
     joint = joint_number(signal)
     for name, k in zip(effect_names, kinds, strict=True):
         if joint not in k.joints:
@@ -292,8 +291,8 @@ def _draw_gains(rng: np.random.Generator, joint: int, inertia: float, *, stiff: 
     """From a soft drive to, one time in four, something between that and the paper's."""
     omega, zeta = rng.uniform(*OMEGA_RAD_PER_S), rng.uniform(*ZETA)
     share = rng.uniform(0.0, 1.0) * (rng.random() < 0.25) * stiff
-    kp = (inertia * omega**2) ** (1 - share) * KP_NM_PER_RAD[joint - 1] ** share
-    kd = (2 * zeta * omega * inertia) ** (1 - share) * KD_NMS_PER_RAD[joint - 1] ** share
+    kp = (inertia * omega**2) ** (1 - share) * ROBOT.kp_nm_per_rad[joint - 1] ** share
+    kd = (2 * zeta * omega * inertia) ** (1 - share) * ROBOT.kd_nms_per_rad[joint - 1] ** share
     return float(kp), float(kd), float(kp * rng.uniform(-0.02, 0.02))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from taccorl.diagnosis.surrogate.plant import Drive
 from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 
@@ -84,7 +85,7 @@ class Kind:
     plant: Callable[[Values], Change]
     shape: Callable[[np.random.Generator, Scale], Values] = lambda rng, scale: {}
     """Numbers that say what it is like and not how strong it is."""
-    joints: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
+    joints: tuple[int, ...] = tuple(range(1, ROBOT.num_joints + 1))
     """Joints on which it can be seen."""
     stiff: bool = True
     """Whether it can be seen on drives that are as stiff and as damped as the paper's."""

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from taccorl.diagnosis.surrogate.arm import GRAVITY, Bodies, factor, mass_matrix, solve, torques
+from taccorl.diagnosis.surrogate.arm import GRAVITY, NUM_JOINTS, Bodies, factor, mass_matrix, solve, torques
 
 SUBSTEPS = 8
 """Integration steps in a millisecond."""
@@ -176,15 +176,18 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     h = STEP_S
     total = lead_ms + COMMAND_MS * target.shape[0]
     num = total - lead_ms
-    angle, velocity, effort = np.empty((num, 6)), np.empty((num, 6)), np.empty((num, 6))
-    zero = np.zeros(6)
-    q, v = start.copy(), np.zeros(6)
+    angle, velocity, effort = np.empty((num, NUM_JOINTS)), np.empty((num, NUM_JOINTS)), np.empty((num, NUM_JOINTS))
+    zero = np.zeros(NUM_JOINTS)
+    q, v = start.copy(), np.zeros(NUM_JOINTS)
     qm, vm = q[joint], 0.0
     two = d.play > 0.0 or d.compliance > 0.0
     kp, kd = arm.kp.copy(), arm.kd.copy()
     kp[joint], kd[joint] = d.kp, 0.0
-    given = np.zeros(6)
-    held, carried = np.zeros(6), np.zeros(6)  # torques that the controllers hold; damping comes on top
+    given = np.zeros(NUM_JOINTS)
+    held, carried = (
+        np.zeros(NUM_JOINTS),
+        np.zeros(NUM_JOINTS),
+    )  # torques that the controllers hold; damping comes on top
     weight = torques(arm.bodies, q, zero, zero, GRAVITY)[joint]
     carry = arm.carried * torques(arm.believed, q, zero, zero, GRAVITY)[joint]
     # Integral action has done its work long ago.
@@ -204,10 +207,10 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     )  # of friction, for the bristles' stiffness; loads are of 3 N·m
     s0 = most / d.presliding
     s1_rest = 1.4 * math.sqrt(s0 * d.motor_inertia)
-    inverse = np.empty(6)
+    inverse = np.empty(NUM_JOINTS)
     bias = zero
-    a = np.empty((6, 6))
-    kick = np.empty(6)
+    a = np.empty((NUM_JOINTS, NUM_JOINTS))
+    kick = np.empty(NUM_JOINTS)
     torque, most_step = 0.0, 0.0
     stiffness = 0.0
     rub = 0.0
@@ -227,7 +230,7 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             ahead = q + 0.5e-3 * v
             a = mass_matrix(arm.bodies, ahead)
             bias = torques(arm.bodies, ahead, v, zero, GRAVITY)
-            for i in range(6):
+            for i in range(NUM_JOINTS):
                 a[i, i] += (d.motor_inertia * (1.0 - two) if i == joint else arm.armature[i]) + h * kd[i]
             if two and stiffness == 0.0:
                 reduced = 1.0 / (1.0 / d.motor_inertia + 1.0 / a[joint, joint])
@@ -239,19 +242,19 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             solve(a, inverse)
             if ms >= lead_ms:
                 n = ms - lead_ms
-                for i in range(6):
+                for i in range(NUM_JOINTS):
                     angle[n, i], velocity[n, i], effort[n, i] = q[i], v[i], given[i]
                 if two:
                     angle[n, joint], velocity[n, joint] = qm, vm
         if s % SUBSTEPS == SUBSTEPS // 2:  # surely before the next tick
-            for i in range(6):
+            for i in range(NUM_JOINTS):
                 given[i] = held[i] - kd[i] * v[i]
             given[joint] = torque
         if s == next_tick:  # the controller
             ms = tick - lead_ms
             own = qm if two else q[joint]
             load = torques(arm.believed, q, zero, zero, GRAVITY)  # the pose is known well enough for that
-            for i in range(6):
+            for i in range(NUM_JOINTS):
                 carried[i] = arm.carried * load[i]
                 if i != joint:
                     goal = _arrived(target, i, ms, 0.0, 1.0)
@@ -285,7 +288,7 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             held[joint] = d.kp * error + integral + d.kd * (d.feedforward * rate - seen_rate) + d.torque_ff
         ms = s // SUBSTEPS
         time_s = max(0.0, s * h - lead_ms * 1e-3)
-        for i in range(6):
+        for i in range(NUM_JOINTS):
             kick[i] = h * (held[i] + carried[i] - kd[i] * v[i] - bias[i] + disturbance[ms, i])
         kick[joint] = h * (disturbance[ms, joint] - bias[joint])
         if d.hung_inertia > 0.0:
@@ -374,7 +377,7 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             ask, damp = math.copysign(ceiling, torque + lift) - lift, 0.0
         if most > 0.0:
             bristle = (bristle + h * new) / shrink
-        for i in range(6):
+        for i in range(NUM_JOINTS):
             v[i] += kick[i] + h * inverse[i] * passed
             q[i] += h * v[i]
         if two:

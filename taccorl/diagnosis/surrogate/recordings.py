@@ -1,6 +1,6 @@
 """Recordings of a surrogate robot, in memory: what the drivers would have logged, with noise, quantisation and metadata.
 
-Letters in shapes: T rows, J 14 signals.
+Letters in shapes: T rows, J signals.
 """
 
 import math
@@ -17,15 +17,13 @@ from taccorl.diagnosis.surrogate.cases import Case
 from taccorl.diagnosis.surrogate.plant import COMMAND_MS
 from taccorl.diagnosis.surrogate.robot import NOISE_RAD, QUANTUM_RAD
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.controller import KP_NM_PER_RAD, TORQUE_FF_NM
-from taccorl.sim.robot import ARMS
+from taccorl.robots import ROBOT
 
 ORIGIN = "surrogate robot, simulated; not a robot"
 SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
 EFFORT_NOISE_SHARE, EFFORT_NOISE_NM, EFFORT_QUANTUM_NM = 0.01, 0.005, 1e-3
 """Noise of efforts, a choice: share of the largest in the recording, and at least. PiPER reports steps of 1 mN·m."""
 OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
-_GRIPPERS = [6, 13]
 
 
 def recordings(case: Case, design: str | None = None) -> Measurements:
@@ -51,16 +49,15 @@ def record(case: Case, motion: Motion) -> Measurement:
     rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(motion.name.encode())])
     robot, motion = case.robot, case.motion(motion)
     run = robot.run(motion, case.room, rng)
-    first = 7 * robot.arm
-    own = slice(first, first + 6)
+    own = ROBOT.joint_slice(ROBOT.arms[robot.arm])
     num_rows = len(run.angle) // COMMAND_MS
-    target = np.tile([*REST_POSE, OPENING_M] * 2, (num_rows, 1))
+    target = np.tile([*REST_POSE, OPENING_M] * len(ROBOT.arms), (num_rows, 1))
     target[:, own] = robot.pose
-    target[:, first + robot.joint] = motion.target(case.room)
+    target[:, own.start + robot.joint] = motion.target(case.room)
     measured, velocity, effort = target.copy(), np.zeros_like(target), np.zeros_like(target)
-    rest = [k for k in range(14) if k not in _GRIPPERS and not first <= k < first + 6]
+    rest = [k for k in ROBOT.joint_indices if not own.start <= k < own.stop]
     # The other arm rests where its T_ref turns it; its weight is carried.
-    measured[:, rest] += np.array(TORQUE_FF_NM) / np.array(KP_NM_PER_RAD)
+    measured[:, rest] += np.array(ROBOT.torque_ff_nm) / np.array(ROBOT.kp_nm_per_rad)
     measured[:, own] = robot.reported(run)
     velocity[:, own], effort[:, own] = run.velocity[::COMMAND_MS], run.effort[::COMMAND_MS]
     stated = _stated(case, motion)
@@ -76,9 +73,9 @@ def record(case: Case, motion: Motion) -> Measurement:
         origin=f"{ORIGIN}; {case.signal} under test",
         instruction=f"sweep of {case.signal}: {motion.name}",
         repeat_of=motion.repeat_of,
-        payload_kg={ARMS[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
+        payload_kg={ROBOT.arms[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
         # A mass that is held in every recording is one whose place was measured, too.
-        payload_position_m={ARMS[robot.arm]: case.payload_m} if case.payload_kg else {},
+        payload_position_m={ROBOT.arms[robot.arm]: case.payload_m} if case.payload_kg else {},
         kp=stated.get("kp", {}),
         kd=stated.get("kd", {}),
         gain_scale=stated.get("gain_scale", {}),
@@ -97,8 +94,8 @@ def _stated(case: Case, motion: Motion) -> dict[str, dict[str, float]]:
 def _noisy(
     rng: np.random.Generator, values: np.ndarray, joints: float | np.ndarray, grippers: float, colour_s: float = 0.0
 ) -> np.ndarray:
-    size = np.broadcast_to(np.asarray(joints, dtype=float), (14,)).copy()
-    size[_GRIPPERS] = grippers
+    size = np.broadcast_to(np.asarray(joints, dtype=float), ROBOT.num_actions).copy()
+    size[ROBOT.gripper_indices] = grippers
     noise = rng.standard_normal(values.shape)
     if colour_s > 0.0:
         keep = math.exp(-1.0 / (colour_s * RATE_HZ))
@@ -108,12 +105,11 @@ def _noisy(
 
 
 def _effort_noise(effort: np.ndarray) -> np.ndarray:
-    """(14,) N·m."""
+    """(J,) N·m."""
     return np.maximum(EFFORT_NOISE_SHARE * np.abs(effort).max(axis=0), EFFORT_NOISE_NM)
 
 
 def _rounded(values: np.ndarray, joints: float, grippers: float) -> np.ndarray:
     """To the drivers' steps, of joints and of grippers."""
-    step = np.full(14, joints)
-    step[_GRIPPERS] = grippers
+    step = ROBOT.per_action(joints, grippers)
     return np.round(values / step) * step

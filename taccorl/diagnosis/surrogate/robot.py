@@ -14,8 +14,8 @@ from taccorl.diagnosis.surrogate.arm import GRAVITY, bodies, mass_matrix, torque
 from taccorl.diagnosis.surrogate.hidden import Change, changed
 from taccorl.diagnosis.surrogate.plant import COMMAND_MS, SUBSTEPS, Arm, Drive, Run, encoder, simulate
 from taccorl.diagnosis.surrogate.sampled_loop import SampledLoop
-from taccorl.sim.controller import KD_NMS_PER_RAD, KP_NM_PER_RAD, TORQUE_FF_NM
-from taccorl.sim.robot import ARMS, TCP_FROM_LINK6_M, RobotConfig
+from taccorl.robots import ROBOT
+from taccorl.sim.robot import RobotConfig
 from taccorl.sim.twin import PhysicsConfig
 
 LEAD_MS = 1500
@@ -35,7 +35,7 @@ TWIN_LATE_S = 0.5 * PhysicsConfig().timestep_s
 LATE_S = 0.5e-3 + TWIN_LATE_S
 """Gains are stated as the twin would need them. A controller that samples positions a millisecond apart acts half of one late,
 which takes K_p · 0.5 ms of damping (a sampled loop: half of its period); the twin's implicit steps add half a step of K_p."""
-PAYLOAD_LINK6_M = (0.0, 0.0, TCP_FROM_LINK6_M)
+PAYLOAD_LINK6_M = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 """Where a known mass is held: its centre in the middle between the pads …"""
 PAYLOAD_OFF_M = 0.002
 """… but for so much (standard deviation along each axis, of one robot to the next): nobody grips a weight in its very middle."""
@@ -66,7 +66,7 @@ class Robot:
         payload_m: tuple[float, float, float] = PAYLOAD_LINK6_M,
     ) -> None:
         self.joint = joint_number(signal) - 1
-        self.arm = ARMS.index(signal.partition("_")[0])
+        self.arm = ROBOT.arms.index(signal.partition("_")[0])
         self.pose = np.array(pose)
         config = RobotConfig()
         self._config, self._changes = config, list(changes)
@@ -94,7 +94,7 @@ class Robot:
         d = d._replace(kp=d.kp * motion.gain, kd=d.kd * motion.gain)
         total = LEAD_MS + COMMAND_MS * len(target)
         start = target[0].copy()
-        disturbance, jitter = np.zeros((total, 6)), np.zeros(total, np.int64)
+        disturbance, jitter = np.zeros((total, ROBOT.num_joints)), np.zeros(total, np.int64)
         if rng is not None:
             start[self.joint] += APPROACH_RAD * rng.choice([-1.0, 1.0])
             disturbance = _disturbance(rng, total, self._disturbed_nm(room))
@@ -121,23 +121,24 @@ class Robot:
         if motion.payload_kg > 0:
             balls += ((motion.payload_kg, *self._payload_m),)
         carried = math.prod(c.carried for c in self._changes) * self._config.gravity_compensation
-        armature = np.full(6, self._config.armature_kgm2)
-        gains = (np.array(g) for g in (KP_NM_PER_RAD, KD_NMS_PER_RAD, TORQUE_FF_NM))
+        armature = np.full(ROBOT.num_joints, self._config.armature_kgm2)
+        gains = (np.array(g) for g in (ROBOT.kp_nm_per_rad, ROBOT.kd_nms_per_rad, ROBOT.torque_ff_nm))
         return Arm(bodies(self._config, OPENING_M, balls), self._believed, carried, armature, *gains)
 
     def _disturbed_nm(self, room: Room) -> np.ndarray:
-        weight = np.abs(torques(self._believed, self.pose, np.zeros(6), np.zeros(6), GRAVITY))
+        zero = np.zeros(ROBOT.num_joints)
+        weight = np.abs(torques(self._believed, self.pose, zero, zero, GRAVITY))
         inertia = mass_matrix(self._believed, self.pose)[self.joint, self.joint] + self._config.armature_kgm2
         weight[self.joint] += 0.5 * inertia * room.sweep_rad * (2 * np.pi * 1.5) ** 2
         return DISTURBANCE_SHARE * weight
 
     def carried_nm(self, run: Run) -> np.ndarray:
         """(M,) weight of the joint under test that its motor carries."""
-        angle = self.pose.copy()
+        angle, zero = self.pose.copy(), np.zeros(ROBOT.num_joints)
         coarse = np.linspace(run.angle[:, self.joint].min(), run.angle[:, self.joint].max(), 50)
         weight = []
         for angle[self.joint] in coarse:
-            weight.append(torques(self._believed, angle, np.zeros(6), np.zeros(6), GRAVITY)[self.joint])
+            weight.append(torques(self._believed, angle, zero, zero, GRAVITY)[self.joint])
         return np.interp(run.angle[:, self.joint], coarse, weight)
 
     def reported(self, run: Run) -> np.ndarray:
@@ -153,7 +154,7 @@ class Robot:
 
     def _rest(self, arm: Arm, d: Drive, target: np.ndarray) -> float:
         """Where the joint under test balances, from its target; friction aside."""
-        at, zero = target.copy(), np.zeros(6)
+        at, zero = target.copy(), np.zeros(ROBOT.num_joints)
         for _ in range(20):
             weight = torques(arm.bodies, at, zero, zero, GRAVITY)[self.joint]
             carried = d.torque_scale * arm.carried * torques(arm.believed, at, zero, zero, GRAVITY)[self.joint]
@@ -168,19 +169,20 @@ def inertia_and_weight(pose: np.ndarray, joint: int, payload_kg: float = 0.0) ->
     config = RobotConfig()
     arm = bodies(config, OPENING_M, ((payload_kg, *PAYLOAD_LINK6_M),))
     inertia = mass_matrix(arm, pose)[joint - 1, joint - 1] + config.armature_kgm2
-    return float(inertia), float(torques(arm, pose, np.zeros(6), np.zeros(6), GRAVITY)[joint - 1])
+    zero = np.zeros(ROBOT.num_joints)
+    return float(inertia), float(torques(arm, pose, zero, zero, GRAVITY)[joint - 1])
 
 
 def free_inertia(pose: np.ndarray, joint: int) -> float:
     """kg·m² of joint 1 to 6 at ``pose`` while the others give way: what a fast loop moves; 1 / (M⁻¹)_jj."""
     config = RobotConfig()
-    moved = mass_matrix(bodies(config, OPENING_M), pose) + config.armature_kgm2 * np.eye(6)
+    moved = mass_matrix(bodies(config, OPENING_M), pose) + config.armature_kgm2 * np.eye(ROBOT.num_joints)
     return float(1.0 / np.linalg.inv(moved)[joint - 1, joint - 1])
 
 
 def _disturbance(rng: np.random.Generator, milliseconds: int, sizes_nm: np.ndarray) -> np.ndarray:
     """(M, 6) N·m of standard deviations ``sizes_nm`` (6,), in straight lines' worth of ``DISTURBANCE_HZ``."""
     keep = math.exp(-2 * math.pi * DISTURBANCE_HZ * 1e-3)
-    white = rng.standard_normal((milliseconds, 6))
+    white = rng.standard_normal((milliseconds, ROBOT.num_joints))
     white[0] /= math.sqrt(1 - keep**2)
     return sizes_nm * math.sqrt(1 - keep**2) * lfilter([1.0], [1.0, -keep], white, axis=0)

@@ -25,8 +25,8 @@ from taccorl.diagnosis.surrogate.cases import find_severity
 from taccorl.diagnosis.surrogate.hidden import Hidden
 from taccorl.diagnosis.surrogate.recordings import ORIGIN
 from taccorl.diagnosis.surrogate.touch_hidden import MILLISECOND, board, material, spread, touch_kind
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.robot import ARMS, FINGERS, PAD_TAXELS, PADS, TAXEL_PITCH_M
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
@@ -122,7 +122,7 @@ class TouchCase:
 
     @property
     def pads(self) -> list[str]:
-        return [f"{self.arm}_{finger}" for finger in FINGERS]
+        return [f"{self.arm}_{finger}" for finger in ROBOT.fingers]
 
     def truth(self) -> dict[str, object]:
         """For the sealed file."""
@@ -139,7 +139,7 @@ class TouchCase:
     def resting(self) -> np.ndarray:
         """(4, R, C) counts."""
         low, high = RESTING_COUNT
-        return np.random.default_rng([self.seed, 77]).uniform(low, high, (len(PADS), *PAD_TAXELS))
+        return np.random.default_rng([self.seed, 77]).uniform(low, high, (len(ROBOT.pads), *ROBOT.pad.shape))
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def draw_touch_case(
     """
     kinds = [touch_kind(name) for name in effect_names]
     rng = np.random.default_rng([seed, zlib.crc32("+".join(effect_names).encode()), 3])
-    arm = str(rng.choice(ARMS)) if arm is None else arm
+    arm = str(rng.choice(ROBOT.arms)) if arm is None else arm
     k_n = float(np.exp(rng.uniform(*np.log(K_N_PER_M))))
     k_d = k_n * float(rng.uniform(*K_D_S))
     wrong = np.exp(rng.uniform(-1, 1, 2) * np.log([2.0, 3.0]))
@@ -231,8 +231,8 @@ def record_touch(case: TouchCase, press: Press) -> Measurement:
     baseline = np.floor(np.median(wire[: round(1.0 / FRAME_S)], axis=0))
     rows = time_s[:: round(1e3 / RATE_HZ)]
     opening = 2 * (RADIUS_M[press.shape] - depth_m[:: round(1e3 / RATE_HZ)])
-    target = np.tile([*REST_POSE, 0.05] * 2, (len(rows), 1))
-    gripper = 7 * ARMS.index(case.arm) + 6
+    target = np.tile([*REST_POSE, 0.05] * len(ROBOT.arms), (len(rows), 1))
+    gripper = ROBOT.gripper_index(case.arm)
     target[:, gripper] = opening
     measured = target.copy()
     noisy = opening + OPENING_NOISE_M * rng.standard_normal(len(rows))
@@ -243,7 +243,7 @@ def record_touch(case: TouchCase, press: Press) -> Measurement:
         target=target,
         measured=measured,
         touch=Touch(
-            time_s=np.tile(stamps[:, None], (1, len(PADS))),
+            time_s=np.tile(stamps[:, None], (1, len(ROBOT.pads))),
             counts=(wire - baseline).reshape(len(stamps), -1).astype(np.int16),
             baseline=baseline.ravel(),
         ),
@@ -273,9 +273,9 @@ def _depth(case: TouchCase, press: Press, side: float, penetration_m: np.ndarray
     """Signed depths (M, K) of a pad's taxels that come near, and their flat numbers (K,)."""
     place = {k: v for h in case.hidden if touch_kind(h.name).stage == "place" for k, v in h.values.items()}
     radius = RADIUS_M[press.shape]
-    rows, columns = PAD_TAXELS
-    x = (np.arange(columns) - (columns - 1) / 2) * TAXEL_PITCH_M
-    y = (np.arange(rows) - (rows - 1) / 2) * TAXEL_PITCH_M + place.get("along_m", 0.0)
+    rows, columns = ROBOT.pad.shape
+    x = (np.arange(columns) - (columns - 1) / 2) * ROBOT.pad.pitch_m
+    y = (np.arange(rows) - (rows - 1) / 2) * ROBOT.pad.pitch_m + place.get("along_m", 0.0)
     # A pad's x runs along the TCP's on finger a and against it on finger b; its y runs to the tips.
     across = (side * x + place.get("across_m", 0.0) - press.x_m) * (press.shape == "sphere")
     beside = (across[None, :] ** 2 + (y[:, None] - press.z_m) ** 2).ravel()
@@ -288,9 +288,9 @@ def _readings(
     case: TouchCase, press: Press, time_s: np.ndarray, penetration_m: np.ndarray, stamps: np.ndarray
 ) -> np.ndarray:
     """(T, 4, R, C) before gain and noise."""
-    rows, columns = PAD_TAXELS
-    frames = np.zeros((len(stamps), len(PADS), rows, columns))
-    for finger, side in zip(FINGERS, (1.0, -1.0), strict=True):
+    rows, columns = ROBOT.pad.shape
+    frames = np.zeros((len(stamps), len(ROBOT.pads), rows, columns))
+    for finger, side in zip(ROBOT.fingers, (1.0, -1.0), strict=True):
         depth, near = _depth(case, press, side, penetration_m)
         rate = np.gradient(depth, MILLISECOND, axis=0)
         reading = np.where(depth > 0, np.maximum(case.k_n * depth + case.k_d * rate, 0.0), 0.0)
@@ -304,7 +304,9 @@ def _readings(
         taxel, share = np.arange(len(near)), at - before
         pad = np.zeros((len(stamps), rows * columns))
         pad[:, near] = reading[before, taxel] * (1 - share) + reading[before + 1, taxel] * share
-        frames[:, PADS.index(f"{case.arm}_{finger}")] = _wired(case, finger, pad.reshape(-1, rows, columns), stamps)
+        frames[:, ROBOT.pads.index(f"{case.arm}_{finger}")] = _wired(
+            case, finger, pad.reshape(-1, rows, columns), stamps
+        )
     return frames
 
 
@@ -316,12 +318,12 @@ def _wired(case: TouchCase, finger: str, frames: np.ndarray, stamps: np.ndarray)
             frames = spread(h.name, h.values, frames)
         elif stage == "board":
             rng = np.random.default_rng([case.seed, zlib.crc32(f"{h.name} {finger}".encode())])
-            frames = frames * board(h.name, h.values, rng, PAD_TAXELS)
+            frames = frames * board(h.name, h.values, rng, ROBOT.pad.shape)
         elif h.name == "warming_gain":
             frames = frames * np.exp(-h.values["fall_per_min"] / 60.0 * stamps)[:, None, None]
         elif h.name == "baseline_drift":
             rng = np.random.default_rng([case.seed, zlib.crc32(f"{h.name} {finger}".encode())])
-            own = 1.0 + 0.05 * rng.standard_normal(PAD_TAXELS)  # taxels do not drift alike
+            own = 1.0 + 0.05 * rng.standard_normal(ROBOT.pad.shape)  # taxels do not drift alike
             frames = frames + h.values["rate_per_min"] / 60.0 * stamps[:, None, None] * own
     return frames
 
@@ -329,7 +331,7 @@ def _wired(case: TouchCase, finger: str, frames: np.ndarray, stamps: np.ndarray)
 def _left_floors(case: TouchCase) -> float:
     """What is left of the press and the ramp after k_n, k_d and zero have been refitted, linearly."""
     plain = dataclasses.replace(case, hidden=())
-    own = [PADS.index(pad) for pad in case.pads]
+    own = [ROBOT.pads.index(pad) for pad in case.pads]
     seen, model = [], []
     for press in (FIT[0], FIT[2]):
         time_s, depth = _penetration(press)

@@ -33,7 +33,7 @@ from taccorl.diagnosis.surrogate.recordings import recordings
 from taccorl.diagnosis.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
 from taccorl.diagnosis.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import ARMS, PAD_TAXELS
+from taccorl.robots import ROBOT
 from taccorl.sim.shapes import Capsule, Cylinder
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
@@ -98,7 +98,7 @@ class _Sweep(Streams):
         if self._touch is None:
             yield from super()._pad(topic, pad)
             return
-        wire = (self._touch.counts + self._touch.baseline).reshape(-1, len(PADS), *PAD_TAXELS)[:, PADS.index(pad)]
+        wire = (self._touch.counts + self._touch.baseline).reshape(-1, len(PADS), *ROBOT.pad.shape)[:, PADS.index(pad)]
         rows, columns = PAD_WIRE_SHAPE
         dim = [
             {"label": "rows", "size": rows, "stride": rows * columns},
@@ -113,8 +113,8 @@ class _Sweep(Streams):
     def all(self) -> list[Iterator[Event]]:
         """One stream per topic, each in order of log time."""
         return [
-            *(self._joints(STATE_TOPICS[arm], arm, command=False) for arm in ARMS),
-            *(self._joints(COMMAND_TOPICS[arm], arm, command=True) for arm in ARMS),
+            *(self._joints(STATE_TOPICS[arm], arm, command=False) for arm in ROBOT.arms),
+            *(self._joints(COMMAND_TOPICS[arm], arm, command=True) for arm in ROBOT.arms),
             *(self._pad(PAD_TOPICS[pad], pad) for pad in PAD_TOPICS),
         ]
 

@@ -11,16 +11,17 @@ from taccorl.diagnosis.surrogate.cases import PAYLOAD_KG, draw_case
 from taccorl.diagnosis.surrogate.hidden import KINDS, NOT_FITTED, OUTSIDE, REGISTERED, Change
 from taccorl.diagnosis.surrogate.recordings import record
 from taccorl.diagnosis.surrogate.robot import LOST_RUN, NOISE_RAD, PAYLOAD_LINK6_M, Robot, inertia_and_weight
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.robot import TCP_FROM_LINK6_M, link_poses
+from taccorl.sim.robot import link_poses
 
 
 def test_a_known_mass_sits_between_the_pads():
-    assert PAYLOAD_LINK6_M == (0.0, 0.0, TCP_FROM_LINK6_M)
+    assert (0.0, 0.0, ROBOT.tcp_from_hand_m) == PAYLOAD_LINK6_M
     pose = np.array(POSES[4])
     without, held = (inertia_and_weight(pose, 5, kg)[1] for kg in (0.0, 0.3))
     wrist, hand = link_poses(pose)[4], link_poses(pose)[5]
-    lever = hand[:3, 3] + TCP_FROM_LINK6_M * hand[:3, 2] - wrist[:3, 3]
+    lever = hand[:3, 3] + ROBOT.tcp_from_hand_m * hand[:3, 2] - wrist[:3, 3]
     # Torque about the joint's axis z: (r × m g) · z, which the motor holds with the opposite sign.
     weight = np.cross(lever, [0.0, 0.0, -0.3 * GRAVITY]) @ wrist[:3, 2]
     assert held - without == pytest.approx(-weight, rel=1e-9)

@@ -23,8 +23,7 @@ from taccorl.diagnosis.surrogate.cases import draw_case
 from taccorl.diagnosis.surrogate.recordings import recordings
 from taccorl.diagnosis.surrogate.robot import Robot, inertia_and_weight
 from taccorl.errors import TaccorlError
-from taccorl.sim.controller import KP_NM_PER_RAD, TORQUE_FF_NM
-from taccorl.sim.robot import LINKS
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig, empty_bench
 
 MOTIONS = (*DESIGNS["pack"], *VALIDATION, *TEST)
@@ -53,7 +52,7 @@ def test_motions_keep_limits_and_speed_and_begin_and_end_at_rest(motion, joint):
         pose = POSES[joint - 1]
         room = Room.of(joint, pose[joint - 1] + off, *inertia_and_weight(np.array(pose), joint))
         target = motion.target(room)
-        low, high = LINKS[joint - 1].range_rad
+        low, high = ROBOT.links[joint - 1].range_rad
         assert low < target.min() and target.max() < high
         assert (
             np.abs(np.diff(target)).max() * RATE_HZ < 1.3 * SPEED_RAD_PER_S
@@ -133,7 +132,9 @@ def test_the_other_arm_rests_and_the_other_joints_wobble_a_little(measurements):
     m = measurements.fit[0]
     left = slice(0, 6)
     np.testing.assert_allclose(
-        (m.measured[:, left] - m.target[:, left]).mean(axis=0), np.array(TORQUE_FF_NM) / KP_NM_PER_RAD, atol=3e-5
+        (m.measured[:, left] - m.target[:, left]).mean(axis=0),
+        np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad,
+        atol=3e-5,
     )
     case = draw_case([], 3, signal="right_joint5", design="chirp")
     run = case.robot.run(DESIGNS["chirp"][0], case.room)

@@ -11,7 +11,7 @@ from taccorl.diagnosis.surrogate import touch
 from taccorl.diagnosis.surrogate.touch import FIT, TouchCase, draw_touch_case, record_touch, touch_recordings
 from taccorl.diagnosis.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS, board, material, spread
 from taccorl.errors import TaccorlError
-from taccorl.sim.robot import PAD_TAXELS
+from taccorl.robots import ROBOT
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
@@ -104,7 +104,7 @@ def test_delay_and_lag_are_late_by_their_time():
 
 
 def test_what_spreads_is_not_lost():
-    frames = np.zeros((1, *PAD_TAXELS))
+    frames = np.zeros((1, *ROBOT.pad.shape))
     frames[0, 5, 0] = 1.0  # at the edge
     shared = spread("taxel_crosstalk", {"share": 0.4}, frames)
     assert shared.sum() == pytest.approx(1.0, abs=1e-12)
@@ -116,8 +116,10 @@ def test_what_spreads_is_not_lost():
 
 def test_boards_have_the_spread_and_the_dead_taxels_of_their_numbers():
     rng = np.random.default_rng(0)
-    assert np.log(board("taxel_gain_spread", {"log_std": 0.3}, rng, PAD_TAXELS)).std() == pytest.approx(0.3, rel=0.15)
-    assert (board("dead_taxels", {"share": 0.25}, rng, PAD_TAXELS) == 0).mean() == pytest.approx(0.25, abs=0.08)
+    assert np.log(board("taxel_gain_spread", {"log_std": 0.3}, rng, ROBOT.pad.shape)).std() == pytest.approx(
+        0.3, rel=0.15
+    )
+    assert (board("dead_taxels", {"share": 0.25}, rng, ROBOT.pad.shape) == 0).mean() == pytest.approx(0.25, abs=0.08)
 
 
 @pytest.mark.parametrize("name", TOUCH_KINDS)
