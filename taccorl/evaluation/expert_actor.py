@@ -7,7 +7,7 @@ import numpy as np
 from taccorl.demos.collect import ExpertSource
 from taccorl.errors import UnreachableError
 from taccorl.evaluation.rollouts import Acted
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.spaces import Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
@@ -43,7 +43,7 @@ class ExpertActor:
 
     def act(self, observation: Observation) -> Acted:
         """Gives up as ``unreachable`` at a pose that no joint angles reach, as ``unfinished`` at the end of its script."""
-        nothing = np.zeros((1, len(ACTION_NAMES)), dtype=np.float32)
+        nothing = np.zeros((1, len(ROBOT.action_names)), dtype=np.float32)
         try:
             return Acted(np.asarray(next(self._actions), dtype=np.float32)[None])
         except UnreachableError as error:

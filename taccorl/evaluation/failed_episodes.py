@@ -12,8 +12,8 @@ from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.rollouts import Rollout
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.spaces import CAMERAS
 from taccorl.sim.tasks import tasks
 
 NUM_INSTANTS = 6
@@ -76,8 +76,8 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
     pictures = None
     if images:
         columns = [
-            np.concatenate([views[camera] for camera in CAMERAS])
-            for views in sim.render_states(episode.arrays["sim.state"][instants], CAMERAS)
+            np.concatenate([views[camera] for camera in ROBOT.cameras])
+            for views in sim.render_states(episode.arrays["sim.state"][instants], ROBOT.cameras)
         ]
         pictures = np.concatenate(columns, axis=1)
     return FailedEpisode(rollout, episode, pictures, tuple(instants / episode.spec.fps))

@@ -11,9 +11,10 @@ import numpy as np
 
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, check_actions
+from taccorl.robots import ROBOT
+from taccorl.sim.actions import check_actions
 from taccorl.sim.part_poses import PARTS_KEY
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, IMAGE_SHAPE, STATE_KEY, TACTILE_KEY
+from taccorl.sim.spaces import IMAGE_KEYS, IMAGE_SHAPE, STATE_KEY, TACTILE_KEY
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 
 NOT_STATED = "not stated"
@@ -55,11 +56,11 @@ def preflight(policy: PolicyFacts, twin: TwinConfig) -> list[Check]:
     """Both sides, line by line."""
     return [
         _cameras(policy, twin),
-        _same("state", _shape(policy.inputs.get(STATE_KEY)), _shape(ACTION_LOW.shape), optional=True),
+        _same("state", _shape(policy.inputs.get(STATE_KEY)), _shape(ROBOT.action_low.shape), optional=True),
         *_touch(policy),
         *_parts(policy),
         *_other_inputs(policy),
-        _same("action", _shape(policy.action_shape), _shape(ACTION_LOW.shape)),
+        _same("action", _shape(policy.action_shape), _shape(ROBOT.action_low.shape)),
         *_names(policy),
         _same("rate", NOT_STATED if policy.fps is None else f"{policy.fps:g} Hz", f"{CONTROL_HZ} Hz"),
         *(_normalisation(policy, key) for key in ("action", STATE_KEY) if key in policy.ranges),
@@ -92,7 +93,7 @@ def _shape(shape: tuple[int, ...] | None) -> str:
 def _cameras(policy: PolicyFacts, twin: TwinConfig) -> Check:
     """A camera that the policy does not use is no difference."""
     shapes = {k.removeprefix(_IMAGES): s for k, s in policy.inputs.items() if k.startswith(_IMAGES)}
-    there = [camera.name for camera in twin.cameras if camera.name in CAMERAS]
+    there = [camera.name for camera in twin.cameras if camera.name in ROBOT.cameras]
     rows, columns, _ = IMAGE_SHAPE
     wanted = dict.fromkeys(there, (3, rows, columns))
     fits = all(wanted.get(name) == shape for name, shape in shapes.items())
@@ -146,9 +147,9 @@ def _names(policy: PolicyFacts) -> list[Check]:
 def _normalisation(policy: PolicyFacts, key: str) -> Check:
     """Compare the data limits of the checkpoint with the joint limits [rad] and openings [m]: other units lie far beyond them."""
     low, high = policy.ranges[key]
-    there = f"{ACTION_LOW.min():.3g} … {ACTION_HIGH.max():.3g} rad, grippers to {ACTION_HIGH[6]:.3g} m"
+    there = f"{ROBOT.action_low.min():.3g} … {ROBOT.action_high.max():.3g} rad, grippers to {ROBOT.opening_max_m:.3g} m"
     here = f"{low.min():.3g} … {high.max():.3g}"
-    fits = low.shape == high.shape == ACTION_LOW.shape
+    fits = low.shape == high.shape == ROBOT.action_low.shape
     if fits:
         try:
             check_actions(np.stack([low, high]).astype(float))

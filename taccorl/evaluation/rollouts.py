@@ -10,9 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from taccorl.evaluation.episodes import SUCCESS, EpisodeRow
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.outcome import BAD_ACTION
-from taccorl.sim.robot import ARMS
 from taccorl.sim.spaces import STATE_KEY, Observation
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
@@ -104,7 +103,7 @@ class _Running:
         self.states.append(state)
         self.clipped_steps += bool(facts["clipped"])
         now_s = facts["steps"] / CONTROL_HZ
-        for arm, done in zip(ARMS, facts["subtask"], strict=True):
+        for arm, done in zip(ROBOT.arms, facts["subtask"], strict=True):
             for name in list(self.subtask_end_s[arm])[: int(done)]:
                 if self.subtask_end_s[arm][name] is None:
                     self.subtask_end_s[arm][name] = now_s
@@ -179,7 +178,7 @@ def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, one: _Running) -> 
         measures={k: float(v) for k, v in one.facts["measures"].items() if np.isfinite(v)},
         reason=reason,
     )
-    actions = np.array(one.actions, dtype=np.float32).reshape(-1, len(ACTION_NAMES))
+    actions = np.array(one.actions, dtype=np.float32).reshape(-1, len(ROBOT.action_names))
     return Rollout(row, actions, np.array(one.states, dtype=np.float32))
 
 

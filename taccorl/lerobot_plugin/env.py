@@ -13,14 +13,14 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 
-# Nothing of the twin is imported before an environment is made: lerobot-train loads this plug-in even where it needs none.
-_CAMERAS = ("front", "left_wrist", "right_wrist")
-_IMAGES = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (224, 224, 3)) for name in _CAMERAS}
+# The simulation is imported when an environment is made: lerobot-train loads this plug-in even where it needs none.
+_IMAGES = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (224, 224, 3)) for name in ROBOT.cameras}
 _FEATURES = {
-    "action": PolicyFeature(FeatureType.ACTION, (14,)),
-    "agent_pos": PolicyFeature(FeatureType.STATE, (14,)),
-    "tactile": PolicyFeature(FeatureType.STATE, (1536,)),
+    "action": PolicyFeature(FeatureType.ACTION, (ROBOT.num_actions,)),
+    "agent_pos": PolicyFeature(FeatureType.STATE, (ROBOT.num_actions,)),
+    "tactile": PolicyFeature(FeatureType.STATE, (ROBOT.num_taxels,)),
     **_IMAGES,
 }
 _FEATURES_MAP = {

@@ -1,6 +1,6 @@
 """LeRobot's teleoperators as leader arms of the twin: ``taccorl collect --source.type=leader --source.teleop=NAME``.
 
-LeRobot gives a dict of named numbers without units. Which of them are the twin's 14 and what they are measured in has to fit
+LeRobot gives a dict of named numbers without units. Which of them are the twin's and what they are measured in has to fit
 exactly, or be said: nothing is guessed, because an arm that takes degrees for radians hits the table.
 """
 
@@ -22,16 +22,16 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.teleop import LeaderSource
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW, OPEN_M
+from taccorl.robots import ROBOT
 
 JOINT_UNITS = ("rad", "deg", "range_m100_100")
 GRIPPER_UNITS = ("m", "range_0_100")
 _FAR_RAD, _FAR_M = 0.35, 0.02  # a first reading this far beyond a limit is another unit, not another arm's range
-_GRIPPERS = np.array([6, 13])
+_GRIPPERS = np.array(ROBOT.gripper_indices)
 
 
 class LeRobotLeader:
-    """A teleoperator that gives the twin's 14 values.
+    """A teleoperator that gives a value for every joint and gripper of the twin.
 
     Raises:
         TaccorlError: it gives other values than ``source`` says, or units are not said.
@@ -59,7 +59,7 @@ class LeRobotLeader:
             ) from error
 
     def read(self) -> np.ndarray:
-        """(14,) joint angles [rad] and gripper openings [m] now.
+        """(A,) joint angles [rad] and gripper openings [m] now.
 
         Raises:
             TaccorlError: a value is missing, is no number, or shows at the first reading that the unit is wrong.
@@ -87,14 +87,14 @@ class LeRobotLeader:
 
     def _check_first(self, given: np.ndarray, values: np.ndarray) -> None:
         far = np.where(np.isin(np.arange(len(values)), _GRIPPERS), _FAR_M, _FAR_RAD)
-        off = (values < ACTION_LOW - far) | (values > ACTION_HIGH + far)
+        off = (values < ROBOT.action_low - far) | (values > ROBOT.action_high + far)
         if off.any():
             k = int(np.flatnonzero(off)[0])
             what, unit, known = ("gripper", "m", GRIPPER_UNITS) if k in _GRIPPERS else ("joint", "rad", JOINT_UNITS)
             said = getattr(self._source, f"{what}_unit")
             raise TaccorlError(
-                f"{self._source.teleop}: {self.names[k]} reads {given[k]:g} {said}, far beyond {ACTION_LOW[k]:.3g} … "
-                f"{ACTION_HIGH[k]:.3g} {unit}: in another unit? --source.{what}_unit={'|'.join(known)}"
+                f"{self._source.teleop}: {self.names[k]} reads {given[k]:g} {said}, far beyond {ROBOT.action_low[k]:.3g} … "
+                f"{ROBOT.action_high[k]:.3g} {unit}: in another unit? --source.{what}_unit={'|'.join(known)}"
             )
 
 
@@ -102,7 +102,7 @@ def open_leader(source: LeaderSource) -> LeRobotLeader:
     """The teleoperator that ``source`` names, connected.
 
     Raises:
-        TaccorlError: unknown name, wrong options, other values than 14, no answer.
+        TaccorlError: unknown name, wrong options, other values than the twin's, no answer.
     """
     config = teleoperator_config(source.teleop, source.options)
     try:
@@ -196,17 +196,17 @@ def _check_units(source: LeaderSource) -> None:
 
 
 def to_twin(values: np.ndarray, joint_unit: str, gripper_unit: str) -> np.ndarray:
-    """(14,) in a leader's units → rad and m.
+    """(A,) in a leader's units → rad and m.
 
     rad, m: as they are. deg: π / 180. range_m100_100: −100 is our joint's lower limit, 100 its upper. range_0_100: 0 is closed,
     100 is 70 mm open.
     """
-    low, high = np.delete(ACTION_LOW, _GRIPPERS), np.delete(ACTION_HIGH, _GRIPPERS)
+    low, high = np.delete(ROBOT.action_low, _GRIPPERS), np.delete(ROBOT.action_high, _GRIPPERS)
     joints, grippers = np.delete(values, _GRIPPERS), values[_GRIPPERS]
     if joint_unit == "deg":
         joints = joints * math.pi / 180
     elif joint_unit == "range_m100_100":
         joints = low + (joints + 100) / 200 * (high - low)
     if gripper_unit == "range_0_100":
-        grippers = grippers / 100 * OPEN_M
-    return np.insert(joints, _GRIPPERS - np.arange(2), grippers)
+        grippers = grippers / 100 * ROBOT.opening_max_m
+    return np.insert(joints, _GRIPPERS - np.arange(len(_GRIPPERS)), grippers)

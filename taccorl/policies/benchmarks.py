@@ -11,8 +11,8 @@ from statistics import mean, median
 from typing import Any
 
 from taccorl.benchmark import Row, benchmark, spread
+from taccorl.robots import ROBOT
 
-CAMERAS = ("front", "left_wrist", "right_wrist")
 REPEATS = 5
 
 
@@ -104,14 +104,13 @@ def _policy(backbone: str, device: str, *, tactile: bool) -> Any:
     from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 
     known = _features()
-    pads = ("left_a", "left_b", "right_a", "right_b")
     config = TactilePI05Config(
         backbone=backbone,
         device=device,
         dtype="bfloat16" if device == "cuda" else "float32",
         tactile=tactile,
-        tactile_format=TactileFormat("flexitac_v2", pads, 32, 12, "fixed_scale", 1 / 75),
-        input_features={**known["input_features"], TACTILE: PolicyFeature(FeatureType.STATE, (1536,))},
+        tactile_format=TactileFormat("flexitac_v2", ROBOT.pads, *ROBOT.pad.shape, "fixed_scale", 1 / 75),
+        input_features={**known["input_features"], TACTILE: PolicyFeature(FeatureType.STATE, (ROBOT.num_taxels,))},
         output_features=known["output_features"],
     )
     torch.manual_seed(0)
@@ -135,10 +134,10 @@ def _features() -> dict[str, Any]:
     """State, three cameras and actions."""
     from lerobot.configs import FeatureType, PolicyFeature
 
-    images = {f"observation.images.{c}": PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for c in CAMERAS}
+    images = {f"observation.images.{c}": PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for c in ROBOT.cameras}
     return {
-        "input_features": {"observation.state": PolicyFeature(FeatureType.STATE, (14,)), **images},
-        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (14,))},
+        "input_features": {"observation.state": PolicyFeature(FeatureType.STATE, (ROBOT.num_actions,)), **images},
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ROBOT.num_actions,))},
     }
 
 
@@ -149,12 +148,12 @@ def _batch(rows: int, device: str, *, prompt_tokens: int) -> dict[str, Any]:
     torch.manual_seed(0)
     with torch.device(device):
         return {
-            **{f"observation.images.{c}": torch.rand(rows, 3, 224, 224) for c in CAMERAS},
-            "observation.state": torch.rand(rows, 14),
+            **{f"observation.images.{c}": torch.rand(rows, 3, 224, 224) for c in ROBOT.cameras},
+            "observation.state": torch.rand(rows, ROBOT.num_actions),
             "observation.language.tokens": torch.randint(2, 258, (rows, prompt_tokens)),
             "observation.language.attention_mask": (torch.arange(prompt_tokens) < prompt_tokens // 2).expand(rows, -1),
-            "observation.tactile": 2 * torch.rand(rows, 10, 1536),
-            "action": torch.randn(rows, 10, 14),
+            "observation.tactile": 2 * torch.rand(rows, 10, ROBOT.num_taxels),
+            "action": torch.randn(rows, 10, ROBOT.num_actions),
         }
 
 

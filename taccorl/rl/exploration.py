@@ -15,7 +15,8 @@ from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.evaluation.policy_actor import Processor
 from taccorl.rl.flow_policy import Batch, FlowPolicy
 from taccorl.rl.flow_sde import Draws, FlowSDE
-from taccorl.sim.robot import ARMS, RobotConfig
+from taccorl.robots import ROBOT
+from taccorl.sim.robot import RobotConfig
 
 _STEP_RAD = 1e-4  # of the finite difference of the forward kinematics
 
@@ -47,35 +48,34 @@ def measure_noise(
     draws = sde.draw(rows, shape, generator, actor.scored_HD.device)
     never = draws._replace(step_BS=torch.full_like(draws.step_BS, -1))
     plain = _targets(actor, sde, batch, never, postprocess)
-    arms = [ArmKinematics(arm, robot) for arm in ARMS]
+    arms = [ArmKinematics(arm, robot) for arm in ROBOT.arms]
     found = []
     for k in sde.choices if sde.num_stochastic == 1 else [-1]:
         chosen = draws if k < 0 else draws._replace(step_BS=torch.full_like(draws.step_BS, k))
         noise = _targets(actor, sde, batch, chosen, postprocess) - plain
-        joints = noise.reshape(*noise.shape[:2], len(ARMS), 7)
-        hand_m = np.stack([hand_shift_m(arm, plain, noise, a) for a, arm in enumerate(arms)])
+        joints, grippers = (noise.take(k, axis=-1) for k in (ROBOT.joint_indices, ROBOT.gripper_indices))
+        hand_m = np.stack([hand_shift_m(arm, plain, noise) for arm in arms])
         mean = noise.mean(axis=1, keepdims=True)
-        offset_m = np.stack([hand_shift_m(arm, plain, mean, a) for a, arm in enumerate(arms)])
+        offset_m = np.stack([hand_shift_m(arm, plain, mean) for arm in arms])
         found.append(
             Noise(
                 step=k,
-                joints_rad=float(np.sqrt((joints[..., :6] ** 2).mean())),
+                joints_rad=float(np.sqrt((joints**2).mean())),
                 hand_mm=1e3 * float(np.sqrt((hand_m**2).mean())),
                 offset_mm=1e3 * float(np.sqrt((offset_m**2).mean())),
-                gripper_mm=1e3 * float(np.sqrt((joints[..., 6] ** 2).mean())),
+                gripper_mm=1e3 * float(np.sqrt((grippers**2).mean())),
             )
         )
     return found
 
 
-def hand_shift_m(arm: ArmKinematics, targets_BHA: np.ndarray, noise_BHA: np.ndarray, index: int) -> np.ndarray:
+def hand_shift_m(arm: ArmKinematics, targets_BHA: np.ndarray, noise_BHA: np.ndarray) -> np.ndarray:
     """(B,) root mean square over the chunk of |J δq|, with the Jacobian J at the last target of each chunk."""
-    own = slice(7 * index, 7 * index + 6)
+    own = ROBOT.joint_slice(arm.arm)
     shift_B = np.empty(len(targets_BHA))
     for b, (target, noise_HJ) in enumerate(zip(targets_BHA[:, -1, own], noise_BHA[:, :, own], strict=True)):
         columns = []
-        for j in range(6):
-            step = _STEP_RAD * np.eye(6)[j]
+        for step in _STEP_RAD * np.eye(ROBOT.num_joints):
             columns.append((arm.pose(target + step)[:3, 3] - arm.pose(target - step)[:3, 3]) / (2 * _STEP_RAD))
         shift_B[b] = np.sqrt(((noise_HJ @ np.stack(columns)) ** 2).sum(-1).mean())
     return shift_B

@@ -25,8 +25,9 @@ from taccorl.rl.remote_shards import RemoteShard
 from taccorl.rl.rollout import Acted, Clock, Seen
 from taccorl.rl.twin_shard import Shard, ShardActed, ShardSeen
 from taccorl.rl.watched_episode import EpisodeWatch
+from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY
-from taccorl.sim.spaces import CAMERAS, IMAGE_KEYS, STATE_KEY, TACTILE_KEY
+from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY
 
 
 def needs_images(config: Any) -> bool:
@@ -65,7 +66,7 @@ class TwinWorld:
             require_same_parts(config, self.shards[0].task, self.shards[0].part_names)
         self._device = torch.device(config.device)
         inputs = config.input_features
-        self._cameras = [IMAGE_KEYS[name] for name in CAMERAS if IMAGE_KEYS[name] in inputs]
+        self._cameras = [IMAGE_KEYS[name] for name in ROBOT.cameras if IMAGE_KEYS[name] in inputs]
         self.needs_images = needs_images(config)
         self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK}
         self._kept |= {HAND_POSES} if config.knows_hands else set()

@@ -18,7 +18,7 @@ from taccorl.evaluation.episodes import EpisodeRow
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.failed_episodes import execute_again
 from taccorl.evaluation.rollouts import Rollout
-from taccorl.sim.actions import ACTION_NAMES
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import CONTROL_HZ
 
 VALUE = "rl.value"
@@ -92,7 +92,9 @@ def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, imag
         subtask_end_s={},
         clipped_steps=0,
     )
-    again = execute_again(scenes, Rollout(row, watched.actions_TA, np.zeros((0, len(ACTION_NAMES)))), images=images)
+    again = execute_again(
+        scenes, Rollout(row, watched.actions_TA, np.zeros((0, len(ROBOT.action_names)))), images=images
+    )
     value = FeatureSpec(dtype="float32", shape=(1,), unit="1", frame="critic", rate_hz=CONTROL_HZ, range=(-1e12, 1e12))
     spec = dataclasses.replace(again.episode.spec, features=again.episode.spec.features | {VALUE: value})
     arrays = again.episode.arrays | {VALUE: watched.values_T[:, None]}

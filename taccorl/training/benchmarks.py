@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.benchmark import Row, benchmark, spread
+from taccorl.robots import ROBOT
 
 EPISODES, EPISODE_ROWS = 2, 128
 BATCH, WORKERS, EPOCHS = 8, 2, 3
@@ -96,9 +97,10 @@ def _write(root: Path, cameras: int) -> Path:
     def episode(seed: int) -> Episode:
         numbers = np.random.default_rng(seed)
         arrays: dict[str, np.ndarray] = {
-            key: numbers.normal(size=(EPISODE_ROWS, 14)).astype(np.float32) for key in ("observation.state", "action")
+            key: numbers.normal(size=(EPISODE_ROWS, ROBOT.num_actions)).astype(np.float32)
+            for key in ("observation.state", "action")
         }
-        arrays[touch] = numbers.integers(-15, 15, (EPISODE_ROWS, 1536)).astype(np.int16)
+        arrays[touch] = numbers.integers(-15, 15, (EPISODE_ROWS, ROBOT.num_taxels)).astype(np.int16)
         return Episode(
             name=f"benchmark {seed}", spec=spec, start_ns=0, arrays=arrays, picture_keys=tuple(spec.keys("video")),
             pictures=pictures if cameras else lambda: iter([{}] * EPISODE_ROWS), instruction="insert the plug",

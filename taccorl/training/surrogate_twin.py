@@ -9,6 +9,7 @@ import dataclasses
 import numpy as np
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
@@ -35,7 +36,7 @@ def draw_surrogate_twin(secret: int) -> TwinConfig:
         raise TaccorlError(f"secret {secret}: seeds are 0, 1, 2, …")
     rng, nominal = np.random.default_rng([secret, 0x5A11]), TwinConfig()
     hidden: list[Effect] = []
-    for arm in ("left", "right"):
+    for arm in ROBOT.arms:
         hidden += [
             make_effect("coulomb_friction", arm=arm, torque_nm=rng.uniform(*FRICTION_NM)),
             make_effect("gravity_mismatch", arm=arm, share=rng.uniform(*GRAVITY_SHARE)),

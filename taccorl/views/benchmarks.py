@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from taccorl.benchmark import Row, against_reference, benchmark, cpu_s
+from taccorl.robots import ROBOT
 
 EPISODE_S = 24.0
 REPEATS = 5
@@ -24,7 +25,7 @@ def one_episode() -> Iterator[Row]:
         recording, rrd = Path(name) / "recording.mcap", Path(name) / "episode.rrd"
         write_mcap(recording, StandInConfig(duration_s=EPISODE_S, seed=0))
         with open_episodes(recording, "piper_flexitac_mcap") as (episode,):
-            what = f"{episode.num_rows} rows with 1536 taxels"
+            what = f"{episode.num_rows} rows with {ROBOT.num_taxels} taxels"
             yield _row(
                 f"checks of {what}, without pictures", lambda: check_episode(episode, pictures=False), "≤ 50,000"
             )

@@ -21,6 +21,7 @@ from taccorl.evaluation.episodes import EpisodeRow, summaries
 from taccorl.evaluation.failed_episodes import FailedEpisode
 from taccorl.evaluation.preflight import Check
 from taccorl.evaluation.statistics import PairedComparison
+from taccorl.robots import ROBOT
 from taccorl.sim.spaces import IMAGE_SHAPE
 from taccorl.views.episode import save_episode
 
@@ -158,7 +159,7 @@ def _failure(failed: FailedEpisode, rrd: Path) -> str:
         parts.append(note(row.reason))
     if failed.pictures is not None:
         times = ", ".join(f"{t:.1f}" for t in failed.instants_s)
-        parts.append(figure(_jpeg_uri(failed.pictures), f"front, left wrist, right wrist at {times} s"))
+        parts.append(figure(_jpeg_uri(failed.pictures), f"{', '.join(ROBOT.cameras).replace('_', ' ')} at {times} s"))
     parts.append(f'<p class="note"><a href="{html.escape(link)}">{html.escape(link)}</a>: '
                  f"<code>{html.escape(command)}</code></p>")  # fmt: skip
     return "".join(parts)

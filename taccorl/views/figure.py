@@ -11,22 +11,9 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from taccorl.data.episode import Episode
+from taccorl.robots import ROBOT
 from taccorl.views.colors import ARM_COLORS, LINE_COLORS, heat
 from taccorl.views.touch import Pad
-
-# Parent-to-link origin: position (m), then fixed-axis roll, pitch, yaw (rad). agilexrobotics/Piper_ros,
-# piper_description.urdf at 116596c.
-LINK_ORIGINS = (
-    ((0.0, 0.0, 0.123), (0.0, 0.0, 0.0)),
-    ((0.0, 0.0, 0.0), (1.5708, -0.1359, -3.1416)),
-    ((0.28503, 0.0, 0.0), (0.0, 0.0, -1.7939)),
-    ((-0.021984, -0.25075, 0.0), (1.5708, 0.0, 0.0)),
-    ((0.0, 0.0, 0.0), (-1.5708, 0.0, 0.0)),
-    ((8.8259e-5, -0.091, 0.0), (1.5708, 0.0, 0.0)),
-)
-FINGER_Z_M = 0.1358  # where the fingers begin on link 6's z axis; same file
-FINGER_LENGTH_M = 0.064  # 32 taxels, 2 mm apart
-PAD_WIDTH_M = 0.024  # 12 taxels, 2 mm apart
 
 # Schematic from here on.
 BASE_POS_WORLD = {"left": (0.0, 0.3, 0.0), "right": (0.0, -0.3, 0.0)}
@@ -54,7 +41,7 @@ def arms_of(episode: Episode) -> dict[str, np.ndarray]:
     index = {re.sub(r"\.pos$", "", name): i for i, name in enumerate(feature.names)}
     found = {}
     for side in BASE_POS_WORLD:
-        names = [f"{side}_joint_{i}" for i in range(1, 7)] + [f"{side}_gripper"]
+        names = [f"{side}_joint_{i}" for i in range(1, ROBOT.num_joints + 1)] + [f"{side}_gripper"]
         if all(name in index for name in names):
             found[side] = episode.arrays["observation.state"][:, [index[name] for name in names]].astype(float)
     return found
@@ -62,10 +49,11 @@ def arms_of(episode: Episode) -> dict[str, np.ndarray]:
 
 def link_poses(joints_rad: np.ndarray) -> np.ndarray:
     """(T, 7, 4, 4) base_from_link of the base and links 1 to 6, for (T, 6) joint angles."""
-    poses = np.tile(np.eye(4), (len(joints_rad), 7, 1, 1))
-    for i, (xyz, rpy) in enumerate(LINK_ORIGINS):
+    poses = np.tile(np.eye(4), (len(joints_rad), len(ROBOT.links) + 1, 1, 1))
+    for i, link in enumerate(ROBOT.links):
         origin = np.eye(4)
-        origin[:3, :3], origin[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz
+        origin[:3, :3] = Rotation.from_euler("xyz", link.rpy_parent_rad).as_matrix()
+        origin[:3, 3] = link.pos_parent_m
         turn = np.tile(np.eye(4), (len(joints_rad), 1, 1))
         turn[:, :3, :3] = Rotation.from_euler("z", joints_rad[:, i : i + 1]).as_matrix()
         poses[:, i + 1] = poses[:, i] @ origin @ turn
@@ -77,7 +65,7 @@ def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
     poses = np.repeat(link6_poses[:, None], 2, axis=1)
     for finger, sign in enumerate((1.0, -1.0)):
         offset = np.zeros((len(opening_m), 3))
-        offset[:, 1], offset[:, 2] = sign * opening_m / 2, FINGER_Z_M + FINGER_LENGTH_M / 2
+        offset[:, 1], offset[:, 2] = sign * opening_m / 2, ROBOT.finger_from_hand_m + ROBOT.pad.length_m / 2
         poses[:, finger, :3, 3] += np.einsum("tij,tj->ti", link6_poses[:, :3, :3], offset)
     return poses
 
@@ -86,7 +74,7 @@ def tool_paths(episode: Episode) -> dict[str, np.ndarray]:
     """Side → (T, 3) world positions of the middle between the pads."""
     paths = {}
     for side, joints in arms_of(episode).items():
-        faces = pad_poses(link_poses(joints[:, :6])[:, 6], joints[:, 6])
+        faces = pad_poses(link_poses(joints[:, :-1])[:, -1], joints[:, -1])
         paths[side] = faces[:, :, :3, 3].mean(axis=1) + BASE_POS_WORLD[side]
     return paths
 
@@ -94,7 +82,7 @@ def tool_paths(episode: Episode) -> dict[str, np.ndarray]:
 def floor_z_m(episode: Episode) -> float:
     """World height of the drawn floor: just below the lowest finger, for nobody records how high the arms stand."""
     lowest = min(path[:, 2].min() for path in tool_paths(episode).values())
-    return min(0.0, float(lowest) - FINGER_LENGTH_M / 2 - 0.01)
+    return min(0.0, float(lowest) - ROBOT.pad.length_m / 2 - 0.01)
 
 
 def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], indexes: list[rr.TimeColumn]) -> None:
@@ -103,12 +91,12 @@ def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], index
     by_name = {pad.name: pad for pad in pads}
     for side, joints in arms_of(episode).items():
         root = f"figure/{side}"
-        poses = link_poses(joints[:, :6])
+        poses = link_poses(joints[:, :-1])
         _log_still_parts(rec, root, side, floor_z_m(episode))
-        for i in range(1, 7):
+        for i in range(1, len(ROBOT.links) + 1):
             _send_poses(rec, f"{root}/link_{i}", poses[:, i], indexes)
-        faces = pad_poses(poses[:, 6], joints[:, 6])
-        for finger, name in enumerate("ab"):
+        faces = pad_poses(poses[:, -1], joints[:, -1])
+        for finger, name in enumerate(ROBOT.fingers):
             _send_poses(rec, f"{root}/finger_{name}", faces[:, finger], indexes)
             pad = by_name.get(f"{side}_{name}")
             if pad is None:
@@ -150,7 +138,7 @@ def _log_still_parts(rec: rr.RecordingStream, root: str, side: str, floor_z: flo
         show_labels=True,
     )
     rec.log(f"{root}/label", label, static=True)
-    ends = [xyz for xyz, _ in LINK_ORIGINS] + [(0.0, 0.0, 0.1)]
+    ends = [link.pos_parent_m for link in ROBOT.links] + [(0.0, 0.0, 0.1)]
     for i, (radius, end) in enumerate(zip(BONE_RADIUS_M, ends, strict=True)):
         link = f"{root}/link_{i}" if i else root
         if radius:
@@ -165,13 +153,13 @@ def _log_still_parts(rec: rr.RecordingStream, root: str, side: str, floor_z: flo
         half_sizes=[(0.018, 0.055, 0.016)], centers=[(0, 0, 0.116)], colors=[FINGER_COLOR], fill_mode="solid"
     )
     rec.log(f"{root}/link_6/rail", rail, static=True)
-    for name, sign in (("a", 1.0), ("b", -1.0)):
+    for name, sign in zip(ROBOT.fingers, (1.0, -1.0), strict=True):
         behind = sign * (PAD_THICKNESS_M + FINGER_THICKNESS_M / 2)
         for part, thickness, y, color in (
             ("body", FINGER_THICKNESS_M, behind, FINGER_COLOR),
             ("pad", PAD_THICKNESS_M, sign * PAD_THICKNESS_M / 2, None),
         ):
-            half = (PAD_WIDTH_M / 2, thickness / 2, FINGER_LENGTH_M / 2)
+            half = (ROBOT.pad.width_m / 2, thickness / 2, ROBOT.pad.length_m / 2)
             box = rr.Boxes3D(half_sizes=[half], centers=[(0, y, 0)], colors=color, fill_mode="solid")
             rec.log(f"{root}/finger_{name}/{part}", box, static=True)
 

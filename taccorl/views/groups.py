@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from taccorl.data.episode import Episode
 from taccorl.data.spec import FeatureSpec
+from taccorl.robots import ROBOT
 
 MOST_NUMBERS = 64
 """A feature of more numbers than this is no set of curves."""
@@ -56,7 +57,7 @@ def groups_of(feature: FeatureSpec) -> list[Group]:
             for side in sides:
                 of_side = tuple(i for i in columns if names[i].split("_")[0] == side)
                 labels = tuple(names[i].removeprefix(f"{side}_") for i in of_side)
-                name = f"{side} arm" if side in ("left", "right") else side
+                name = f"{side} arm" if side in ROBOT.arms else side
                 groups.append(Group(name, unit, of_side, labels))
         else:
             kind = "grippers" if all("gripper" in names[i] for i in columns) else "joints"

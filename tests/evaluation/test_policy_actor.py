@@ -13,7 +13,7 @@ from tiny_checkpoint import write_checkpoint
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes, score
 from taccorl.evaluation.preflight import PolicyFacts, preflight, refuse_differences
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
@@ -36,7 +36,7 @@ def facts(**changes: Any) -> PolicyFacts:
         robot_type="bi_piper_flexitac",
         touch_gain_per_count=1 / 75,
         touch_layout=(4, 32, 12),
-        ranges={"action": (ACTION_LOW, ACTION_HIGH)},
+        ranges={"action": (ROBOT.action_low, ROBOT.action_high)},
     )
     return dataclasses.replace(fitting, **changes)
 
@@ -71,7 +71,10 @@ def test_what_a_checkpoint_does_not_state_is_no_difference() -> None:
         ({"action_names": tuple("abcdefghijklmn")}, "action names: a, b, c"),
         ({"touch_gain_per_count": 1 / 255}, "touch gain: counts × 0.00392157 in the checkpoint, counts × 0.0133333"),
         ({"touch_layout": (2, 16, 16)}, "touch layout: 2 × 16 × 16 in the checkpoint, 4 × 32 × 12"),
-        ({"ranges": {"action": (np.degrees(ACTION_LOW), np.degrees(ACTION_HIGH))}}, "range of action: -170 … 180 in"),
+        (
+            {"ranges": {"action": (np.degrees(ROBOT.action_low), np.degrees(ROBOT.action_high))}},
+            "range of action: -170 … 180 in",
+        ),
         ({"unnormalised": ("action",)}, "normalisation: no statistics of action"),
     ],
 )

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.robots import ROBOT
 from taccorl.sim.spaces import IMAGE_KEYS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "policies"))
@@ -32,7 +32,7 @@ def write_checkpoint(folder: Path, **changes: Any) -> Path:
     policy = tiny_policy(
         fps=30, discrete_state_input=None, action_feature_names=list(arm_names()), input_features=inputs, **changes
     )
-    middle = torch.tensor((ACTION_LOW + ACTION_HIGH) / 2, dtype=torch.float32)
+    middle = torch.tensor((ROBOT.action_low + ROBOT.action_high) / 2, dtype=torch.float32)
     statistics = {
         name: {"q01": middle - 0.05, "q99": middle + 0.05, "min": middle - 0.05, "max": middle + 0.05}
         for name in ("action", "observation.state")

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.env import TaccorlEnv
-from taccorl.sim.spaces import CAMERAS, IMAGE_SHAPE, NUM_TAXELS
+from taccorl.sim.spaces import IMAGE_SHAPE
 
-KEYS = {"observation.state", "observation.tactile", *(f"observation.images.{name}" for name in CAMERAS)}
+KEYS = {"observation.state", "observation.tactile", *(f"observation.images.{name}" for name in ROBOT.cameras)}
 
 
 def env_config(**settings):
@@ -51,7 +52,7 @@ def test_features_are_those_of_the_dataset_spec() -> None:
     for name, shape in wanted.items():
         assert found.pop(name) == (shape if len(shape) == 1 else (shape[2], *shape[:2]))  # LeRobot: channels first
     assert not found
-    assert wanted["observation.tactile"] == (NUM_TAXELS,) and wanted["observation.images.front"] == IMAGE_SHAPE
+    assert wanted["observation.tactile"] == (ROBOT.num_taxels,) and wanted["observation.images.front"] == IMAGE_SHAPE
 
 
 def test_synchronous_environments_reach_the_policy_under_the_names_of_the_dataset() -> None:

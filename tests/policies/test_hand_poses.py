@@ -20,13 +20,13 @@ from taccorl.policies.tactile_pi05.hand_poses import (
     tcp_poses,
 )
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import make_tactile_pi05_pre_post_processors
-from taccorl.sim.actions import ACTION_HIGH, ACTION_LOW
+from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 
 
 @pytest.fixture(scope="module")
 def states() -> np.ndarray:
-    return np.random.default_rng(0).uniform(ACTION_LOW, ACTION_HIGH, (20, 14)).astype(np.float32)
+    return np.random.default_rng(0).uniform(ROBOT.action_low, ROBOT.action_high, (20, 14)).astype(np.float32)
 
 
 @pytest.mark.parametrize("robot", [RobotConfig(), RobotConfig(mount_height_m=0.1, mount_spacing_m=0.8)])
@@ -109,13 +109,14 @@ def test_poses_are_of_the_state_before_it_is_normalised(states):
 
 def test_joints_turn_about_their_own_z_axis():
     """What the chain assumes of the robot's model."""
-    from taccorl.sim.robot import ARMS, JOINTS, add_arm
+    from taccorl.robots import ROBOT
+    from taccorl.sim.robot import add_arm
 
     spec = mujoco.MjSpec()
-    for arm in ARMS:
+    for arm in ROBOT.arms:
         add_arm(spec, arm, RobotConfig())
     model = spec.compile()
-    for arm in ARMS:
-        for name in JOINTS:
+    for arm in ROBOT.arms:
+        for name in ROBOT.joints:
             assert model.joint(f"{arm}_{name}").axis.tolist() == [0, 0, 1]
             assert model.joint(f"{arm}_{name}").pos.tolist() == [0, 0, 0]

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from taccorl.demos import stand_in_robot
+from taccorl.robots import ROBOT
 from taccorl.views.colors import heat
 from taccorl.views.figure import (
     BASE_POS_WORLD,
-    FINGER_Z_M,
-    LINK_ORIGINS,
     arms_of,
     floor_z_m,
     link_poses,
@@ -40,7 +39,7 @@ def test_at_zero_the_shoulder_and_elbow_are_where_the_urdf_puts_them():
 def test_links_are_rigid_whatever_the_joints_do():
     poses = link_poses(JOINTS_RAD)
     length_m = np.linalg.norm(np.diff(poses[:, :, :3, 3], axis=1), axis=2)
-    assert np.allclose(length_m, [np.linalg.norm(xyz) for xyz, _ in LINK_ORIGINS])
+    assert np.allclose(length_m, [np.linalg.norm(link.pos_parent_m) for link in ROBOT.links])
     rotations = poses[:, :, :3, :3]
     assert np.allclose(rotations @ rotations.swapaxes(-1, -2), np.eye(3), atol=1e-9)
 
@@ -72,7 +71,7 @@ def test_gripper_opening_is_the_distance_between_the_pads(opening_m: float):
     assert np.allclose(gap, opening_m * link6[:, :3, 1]), "along y of link 6, finger a on the positive side"
     middle_in_link6 = np.einsum("tji,tj->ti", link6[:, :3, :3], pads[:, :, :3, 3].mean(axis=1) - link6[:, :3, 3])
     assert np.allclose(middle_in_link6[:, :2], 0, atol=1e-12)
-    assert (middle_in_link6[:, 2] > FINGER_Z_M).all()
+    assert (middle_in_link6[:, 2] > ROBOT.finger_from_hand_m).all()
 
 
 def test_arms_are_found_by_name_whatever_their_order():

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 
 if TYPE_CHECKING:
     from taccorl.sim.robot import RobotConfig
@@ -32,8 +33,6 @@ WORLD_M = 0.25
 """Unit of positions in the world."""
 HAND_TO_HAND_M = 0.1
 """Unit of the position of one hand in the other's frame."""
-_NUM_JOINTS = 6  # of an arm; sim.robot, which names them, would load MuJoCo wherever LeRobot loads its plug-ins
-_PER_ARM = _NUM_JOINTS + 1  # and a gripper
 
 # B batch, J joints
 
@@ -55,10 +54,10 @@ def arm_chains(robot: "RobotConfig | None" = None) -> list[list[list[list[float]
     """
     import mujoco
 
-    from taccorl.sim.robot import ARMS, JOINTS, RobotConfig, add_arm
+    from taccorl.sim.robot import RobotConfig, add_arm
 
     chains = []
-    for arm in ARMS:
+    for arm in ROBOT.arms:
         spec = mujoco.MjSpec()
         spec.compiler.degree = False
         add_arm(spec, arm, robot or RobotConfig())
@@ -66,7 +65,7 @@ def arm_chains(robot: "RobotConfig | None" = None) -> list[list[list[list[float]
         data = mujoco.MjData(model)
         data.qpos[:] = 0
         mujoco.mj_kinematics(model, data)
-        joints = [model.joint(f"{arm}_{name}") for name in JOINTS]
+        joints = [model.joint(f"{arm}_{name}") for name in ROBOT.joints]
         frames = [_frame(data.xpos[j.bodyid[0]], data.xmat[j.bodyid[0]]) for j in joints]
         site = model.site(f"{arm}_tcp").id
         frames.append(_frame(data.site_xpos[site], data.site_xmat[site]))
@@ -92,15 +91,15 @@ def tcp_poses(state_BS: Tensor, chains: Tensor) -> list[Tensor]:
         chains: (arms, 7, 4, 4), see ``arm_chains``.
     """
     poses = []
-    for arm, chain in enumerate(chains):
-        joints_BJ = state_BS[:, _PER_ARM * arm : _PER_ARM * arm + _NUM_JOINTS]
+    for arm, chain in zip(ROBOT.arms, chains, strict=True):
+        joints_BJ = state_BS[:, ROBOT.joint_slice(arm)]
         cos_BJ, sin_BJ = joints_BJ.cos(), joints_BJ.sin()
         turns_BJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(*joints_BJ.shape, 1, 1)
         turns_BJ44[..., 0, 0], turns_BJ44[..., 0, 1] = cos_BJ, -sin_BJ
         turns_BJ44[..., 1, 0], turns_BJ44[..., 1, 1] = sin_BJ, cos_BJ
         steps_BJ44 = _product(chain[:-1], turns_BJ44)
         pose_B44 = steps_BJ44[:, 0]
-        for j in range(1, _NUM_JOINTS):
+        for j in range(1, ROBOT.num_joints):
             pose_B44 = _product(pose_B44, steps_BJ44[:, j])
         poses.append(_product(pose_B44, chain[-1]))
     return poses
