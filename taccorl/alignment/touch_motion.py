@@ -105,7 +105,7 @@ class TouchMotion:
     measurement: Measurement = field(repr=False)
     """That it was made from."""
     pads: tuple[str, ...]
-    """Those that came near, in the order of ``PADS``."""
+    """Those that came near, in the order of ``ROBOT.pads``."""
     time_s: np.ndarray
     """(T, P) stamps on the measurement's clock: ends of scans."""
     measured: np.ndarray

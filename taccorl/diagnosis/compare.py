@@ -176,7 +176,7 @@ def _touches(
     floor = touch_floor([m for _, m in felt])
     if floor is None:
         return [], [f"touch of {', '.join(m.name for _, m in felt)}: too few frames for a noise floor"]
-    floor = floor.reshape(len(ROBOT.pads), *ROBOT.pad.shape)
+    floor = floor.reshape(len(ROBOT.pads), model.spec.rows, model.spec.columns)
     for use, m in felt:
         solid = m.pressed or pressed
         if solid is None:

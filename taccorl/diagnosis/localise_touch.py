@@ -14,7 +14,6 @@ from taccorl.data.timing import runs
 from taccorl.diagnosis.comparison import TouchTrace
 from taccorl.diagnosis.localise import LEAST_SHARE, Cell
 from taccorl.diagnosis.replays import CONTACT_COUNTS
-from taccorl.robots import ROBOT
 
 PHASES = {
     "loading": "the pad's sum rises",
@@ -54,15 +53,16 @@ def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
 
 def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Regime → its frames (N,) and its taxels (R, C), bool."""
-    everywhere = np.ones(ROBOT.pad.shape, dtype=bool)
+    rows, columns = trace.measured.shape[2:]
+    everywhere = np.ones((rows, columns), dtype=bool)
     always = np.ones(len(trace.measured), dtype=bool)
     found = phases(trace, pad)
     quiet = found["just released"] | found["untouched"]
-    third = np.arange(ROBOT.pad.shape[0])[:, None] * len(THIRDS) // ROBOT.pad.shape[0]
+    third = np.arange(rows)[:, None] * len(THIRDS) // rows
     return {
         "in contact": (~quiet, everywhere),
         "no contact": (quiet, everywhere),
-        **{name: (rows, everywhere) for name, rows in found.items()},
+        **{name: (frames, everywhere) for name, frames in found.items()},
         **{name: (always, everywhere & (third == k)) for k, name in enumerate(THIRDS)},
     }
 

@@ -27,7 +27,6 @@ from taccorl.alignment.touch_model import TouchModel
 from taccorl.alignment.touch_motion import TouchMotion
 from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.errors import TaccorlError
-from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import BoardEffect, Effect, TouchEffect
 from taccorl.sim.effects.pad_frame import PadFrameEffect
@@ -52,7 +51,6 @@ FEWEST_SHARED = 8
 """Pressed taxels that a validation recording must share with the fit recordings for a map of gains to be judged on it."""
 _WINDOW_M = 1e-3  # taxels that the object comes so near to are simulated,
 _RIM = 1  # and so many rows and columns around them
-_TAXELS = math.prod(ROBOT.pad.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +229,8 @@ class TouchProblem:
     def _chosen(self, motion: TouchMotion, rows: np.ndarray, taxels: np.ndarray) -> _Chosen:
         matters = motion.near(_WINDOW_M).any(axis=0)
         matters.reshape(-1)[taxels] = True
-        rows_there, columns_there = np.divmod(np.flatnonzero(matters) % _TAXELS, ROBOT.pad.shape[1])
-        rectangle = (_span(rows_there, ROBOT.pad.shape[0]), _span(columns_there, ROBOT.pad.shape[1]))
+        _, rows_there, columns_there = np.nonzero(matters)
+        rectangle = (_span(rows_there, motion.layout.rows), _span(columns_there, motion.layout.columns))
         number = np.arange(matters.size).reshape(matters.shape)
         window = number[:, *rectangle].ravel()
         every = np.ones(len(motion.time_s), dtype=bool)
@@ -270,7 +268,7 @@ class TouchProblem:
         else:
             places, all_frames = taxels, True
             reading = model.simulate(chosen.motion, *numbers)
-        zero = np.array([base[f"zero_{pad}"] for pad in self.pads])[taxels // _TAXELS]
+        zero = np.array([base[f"zero_{pad}"] for pad in self.pads])[taxels // chosen.motion.layout.num_taxels]
         low = -chosen.motion.baseline.reshape(-1)[taxels].astype(float)
         seen = reading.reshape(len(reading), -1)
         numbers = float(model.sensor.gain_count), zero, low, low + model.spec.max_count
@@ -302,7 +300,9 @@ class TouchProblem:
             there = np.isfinite(recording.measured).any(axis=1)  # the others are for validation
             everywhere = np.arange(len(chosen.window))
             alone = self._counts(base | zeros, material, chosen, everywhere)
-            rest = np.array([base[f"zero_{pad}"] for pad in self.pads])[chosen.window // _TAXELS]
+            rest = np.array([base[f"zero_{pad}"] for pad in self.pads])[
+                chosen.window // chosen.motion.layout.num_taxels
+            ]
             if len(material) < len(effects):
                 rest = self._counts(base, effects, chosen, everywhere) - alone
             pressed = np.where(chosen.at_end(self._model.spec.max_count), 0.0, alone)[there]

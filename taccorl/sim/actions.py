@@ -9,13 +9,6 @@ import numpy as np
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 
-# Other packages still take these from here.
-ACTION_NAMES, ACTION_LOW, ACTION_HIGH, OPEN_M = (
-    ROBOT.action_names,
-    ROBOT.action_low,
-    ROBOT.action_high,
-    ROBOT.opening_max_m,
-)
 _ABSURD = ROBOT.per_action(2 * np.pi, 0.5)  # rad, m beyond a limit: another unit
 
 

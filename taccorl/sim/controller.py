@@ -14,9 +14,6 @@ from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.settings import check_numbers
 
-# Other packages still take these from here.
-KP_NM_PER_RAD, KD_NMS_PER_RAD, TORQUE_FF_NM = ROBOT.kp_nm_per_rad, ROBOT.kd_nms_per_rad, ROBOT.torque_ff_nm
-
 
 @dataclass(kw_only=True)
 class ControllerConfig:

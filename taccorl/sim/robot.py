@@ -16,16 +16,6 @@ from taccorl.robots import ROBOT
 from taccorl.robots.bimanual_piper import CAPSULES, DARK, FINGER_MASS_KG, HAND_BOXES, INERTIAS, PAD_COLOR, STEEL
 from taccorl.sim.settings import check_numbers
 
-# Other packages still take these from here.
-ARMS, JOINTS, FINGERS, PADS, LINKS = ROBOT.arms, ROBOT.joints, ROBOT.fingers, ROBOT.pads, ROBOT.links
-PAD_TAXELS, TAXEL_PITCH_M, PAD_THICKNESS_M = ROBOT.pad.shape, ROBOT.pad.pitch_m, ROBOT.pad_thickness_m
-PAD_LENGTH_M, PAD_WIDTH_M = ROBOT.pad.length_m, ROBOT.pad.width_m
-FINGER_STROKE_M, FINGER_FROM_LINK6_M, TCP_FROM_LINK6_M = (
-    ROBOT.finger_stroke_m,
-    ROBOT.finger_from_hand_m,
-    ROBOT.tcp_from_hand_m,
-)
-
 
 @dataclass(kw_only=True)
 class RobotConfig:

@@ -6,7 +6,6 @@ from gymnasium.spaces import Box, Dict
 from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY
 
-CAMERAS, NUM_TAXELS = ROBOT.cameras, ROBOT.num_taxels  # other packages still take these from here
 IMAGE_SHAPE = (224, 224, 3)  # rows, columns, rgb: what π0.5 looks at
 STATE_KEY, TACTILE_KEY = "observation.state", "observation.tactile"
 IMAGE_KEYS = {name: f"observation.images.{name}" for name in ROBOT.cameras}

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
+from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.simulation import SUB_COMMANDS, Simulation, Watch
 from taccorl.sim.tasks import tasks
 from taccorl.sim.tasks.assembly_1 import Assembly1
@@ -304,3 +306,24 @@ def test_contact_of_an_undeclared_pair_is_an_error():
     sim.reset([0])
     with pytest.raises(TaccorlError, match="mating"):
         sim.contact("socket", "plug")
+
+
+def test_pads_have_the_taxels_that_the_sensor_s_spec_states(tmp_path):
+    """A spec of 16 × 8: reading, counts, and what an effect remembers have its size."""
+    text = find_spec("flexitac_v2").read_text(encoding="utf-8")
+    for old, new in (
+        ("\nrows: 32", "\nrows: 16"),
+        ("\ncolumns: 12", "\ncolumns: 8"),
+        ("{rows: 12, columns: 32", "{rows: 8, columns: 16"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "small.yaml").write_text(text, encoding="utf-8")
+    sensor = FlexiTacConfig(spec=str(tmp_path / "small.yaml"))
+    creep, dead = make_effect("taxel_creep", share=0.3), make_effect("dead_taxels", share=0.5)
+    sim = Simulation(Assembly1(), TwinConfig(sensor=sensor, effects=[creep, dead]))
+    sim.reset([0])
+    sim.step(sim.targets.copy())
+    assert sim.reading().shape == (1, 4, 16, 8)
+    assert sim.touch().shape == (1, 4 * 16 * 8)
+    assert sim.snapshot(np.arange(1)).memory["0/taxel_creep/crept"].shape == (1, 4, 16, 8)

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
 else:  # the names that a twin.yaml may give: others are an error with its line
     ArmChoice = Literal[*ROBOT.arms, "both"]
 
-CHANNELS = ROBOT.action_names  # other packages still take these from here
 Memory = dict[str, np.ndarray]
 """Name → array (N, …), changed in place."""
 LAYERS = ("robot", "material", "spread", "taxel", "baseline", "camera")

@@ -45,7 +45,7 @@ class GravityMismatch(ArmEffect):
         high=2.0,
         typical=0.9,
         over="kp",
-        source="the two published mass sets of this arm: 3.6 and 2.2 kg moving (taccorl/sim/robot.py)",
+        source="the two published mass sets of this arm: 3.6 and 2.2 kg moving (taccorl/robots/bimanual_piper.py)",
     )
 
     def drive(self) -> dict[str, float]:
