@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections import Counter
 from typing import Any
 
 from rich.console import Console
@@ -104,6 +105,12 @@ def ingest_table(report: dict[str, Any]) -> None:
                     label = Text(f"  {f['severity']}: ", SEVERITY[f["severity"]])
                     where = " ".join(w for w in (_name(r), e["name"]) if w)
                     out.print(label + Text(f"{where}: {f['feature']}: {f['text']}"), soft_wrap=True)
+    unprotected = Counter(r["unprotected"] for r in report["recordings"] if r.get("unprotected"))
+    for text, number in unprotected.items():
+        out.print(
+            Text("  note: ", SEVERITY["note"]) + Text(f"{number} of {len(report['recordings'])} recordings: {text}"),
+            soft_wrap=True,
+        )
     counts = ", ".join(f"{n} {o}" for o, n in report["outcomes"].items())
     out.print(f"recordings: {counts}", highlight=False)
 

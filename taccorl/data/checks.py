@@ -6,9 +6,9 @@ worth knowing; what could not be judged is a note too, never a pass in silence.
     error    not_finite, joint_limit, out_of_range, swapped_arms, swapped_pads, noise_only,
              action_lag (command after state), frozen_picture (half of the episode or more),
              touch_lag (too early on one arm and too late on the other)
-    warning  low_rate, gaps, old_samples, jump, idle, frozen_state, frozen_picture, action_lag (too long, or unlike the
-             other arm or the other episodes), dead_taxel, stuck_taxel, saturated, noisy_pad, frozen_touch, silent_pad,
-             touch_lag, pad_lag, baseline_drift, baseline_offset
+    warning  low_rate, gaps, old_samples, jump, sample_jump (between a channel's own samples), idle, frozen_state, frozen_picture,
+             action_lag (too long, or unlike the other arm or the other episodes), dead_taxel, stuck_taxel, saturated, noisy_pad,
+             frozen_touch, silent_pad, touch_lag, pad_lag, baseline_drift, baseline_offset
     note     duplicates, out_of_order, saturated (a few rows), contact_coverage, not_judged
 
 The parts are in ``joint_checks``, ``lag_checks`` (state against command), ``picture_checks``, ``touch_checks`` (a pad by
@@ -64,7 +64,7 @@ def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
     """
     if not episode.arrays or episode.num_rows < 2:
         return [not_judged("", "episode", "it has less than two rows of numbers")]
-    findings = [f for timing in episode.timing for f in check_timing(timing, episode)]
+    findings = [*episode.findings, *(f for timing in episode.timing for f in check_timing(timing, episode))]
     values = joint_checks.check_values(episode)
     wrong = {f.feature for f in values}
     findings += values + _check_motion(episode, wrong)

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from taccorl.data import decode, timing
-from taccorl.data.arms import ACTION
+from taccorl.data.arms import ACTION, STATE
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
+from taccorl.data.finding import Finding
+from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.recording import Recording, find_sources, opened, release
 from taccorl.data.spec import FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
 from taccorl.data.timing import NS_PER_S
@@ -23,6 +25,8 @@ START_UP_S = 1.0
 """Channels need not start and stop together: this much at either end is no loss worth a word."""
 END_SLACK_S = 0.25
 """So much may be missing at an end that was marked."""
+LONGEST_S = 24 * 3600.0
+"""Of one recording; at 200 Hz a channel holds 17 million messages by then."""
 MAX_WAITING_PICTURES = 1000
 """Cameras of one recording come interleaved; more waiting than this means that they do not."""
 
@@ -109,10 +113,23 @@ class Cutter:
                     f"{channel.spec.topic}: all {len(channel.log_ns)} messages are stamped 0 or broken"
                 )
             readings[name] = timing.ClockReading(**{**vars(reading), "order": keep[reading.order]})
+            self._check_span(name, readings[name])
         timing.check_clocks(
             {self.spec.channels[name].topic: r.skew_s for name, r in readings.items()}, self.spec.max_clock_spread_s
         )
         return readings
+
+    def _check_span(self, name: str, clock: timing.ClockReading) -> None:
+        """One wrong stamp, changed by a single bit, would make a recording of years."""
+        if clock.time_ns[-1] - clock.time_ns[0] <= LONGEST_S * NS_PER_S:
+            return
+        k, span_h = int(np.argmax(np.diff(clock.time_ns))), (clock.time_ns[-1] - clock.time_ns[0]) / NS_PER_S / 3600
+        (early, late), (before, after) = clock.order[k : k + 2], clock.time_ns[k : k + 2]
+        raise Unfit(
+            f"{self.spec.channels[name].topic}: its stamps span {span_h:.0f} h, at most {LONGEST_S / 3600:g} h are read: message "
+            f"{early} is at {before} ns, the next in time, message {late}, at {after} ns. Was a byte changed, a clock set? "
+            f"`clock: {'log' if self.spec.clock_of(name) == 'header' else 'header'}` on channel {name!r} uses other times"
+        )
 
     def _check_zero_stamps(self, name: str) -> None:
         """Stamps of 0 among wall-clock stamps are no times; a spec has to say so, or the recording begins in 1970."""
@@ -375,7 +392,27 @@ class Cutter:
             timing=tuple(timings),
             picture_rows={key: index for key, (_, index) in sources.items()},
             baselines=dict(self.baselines),
+            findings=tuple(self._sample_jumps(grid_ns)),
         )
+
+    def _sample_jumps(self, grid_ns: np.ndarray) -> Iterator[Finding]:
+        """In the channels of state and action, between the first and the last row. Slow ones are in the rows whole."""
+        fps = self.spec.target.fps
+        for key in (STATE, ACTION):
+            feature, start = self.spec.target.features.get(key), 0
+            for name in self.spec.features[key].channels if feature and key in self.spec.features else ():
+                values, clock = self.recording.channels[name].values, self.clocks[name]
+                assert values is not None and feature is not None
+                part = slice(start, start := start + values.shape[1])
+                if self.spec.channels[name].rate_hz <= fps:
+                    continue
+                inside = (clock.time_ns >= grid_ns[0]) & (clock.time_ns <= grid_ns[-1])
+                units = (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
+                names = feature.names or tuple(f"{key}[{i}]" for i in range(feature.size))
+                time_s = (clock.time_ns[inside] - grid_ns[0]) / NS_PER_S
+                samples = np.asarray(values[clock.order[inside]], dtype=float)
+                release(values)
+                yield from check_sample_jumps(name, samples, time_s, names[part], units[part], 1 / fps)
 
     def _timing(
         self, channel: str, key: str, mapping: MappingSpec, m: timing.Matched, rows: slice, grid_ns: np.ndarray

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from taccorl.data.finding import Finding
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
@@ -81,6 +82,8 @@ class Episode:
     stages: tuple[tuple[int, str], ...] = ()
     """(first row, name) of the task's stages, where known."""
     provenance: dict[str, object] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+    """On the recording's samples, of which the rows hold a part; empty in a dataset."""
 
     @property
     def num_rows(self) -> int:

@@ -44,7 +44,7 @@ MACHINE_FAULTS = {
     errno.EROFS: "the disk is read-only",
 }
 """Faults that no other recording would escape: the whole run stops."""
-RECORDING_STAGE_VERSION = 3
+RECORDING_STAGE_VERSION = 4
 DATASET_STAGE_VERSION = 3
 
 
@@ -348,6 +348,7 @@ def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tu
     entry["findings"] = [dataclasses.asdict(f) for f in across]
     entry["losses"] = [dataclasses.asdict(loss) for loss in cut.losses]
     entry["damage"] = [{**dataclasses.asdict(d), "file": Path(d.file).name} for d in recording.damage]
+    entry["unprotected"] = recording.reader.unprotected
     entry["messages"] = dict(sorted(recording.counts.items()))
     return good, entry
 

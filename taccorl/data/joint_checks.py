@@ -4,6 +4,7 @@ Letters in shapes: T rows, J elements of the vector.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -19,6 +20,8 @@ JOINT_SPEED_RAD_PER_S = 3.93
 """225 °/s, PiPER's fastest joints (J4 to J6; J1 to J3: 180 to 195 °/s)."""
 GRIPPER_SPEED_M_PER_S = 1.5
 """The whole 70 mm stroke in 47 ms: faster than a hand can press the leader's trigger."""
+SPEEDS = {"rad": JOINT_SPEED_RAD_PER_S, "m": GRIPPER_SPEED_M_PER_S}
+"""By the unit of a position, per second."""
 JUMP_MARGIN = 2.0
 """A row may show a sample one row older than its neighbour's, so that a step can hold the way of two rows."""
 STILL_RAD = 0.02
@@ -125,9 +128,8 @@ def _limit_finding(
 def check_jumps(episode: Episode, key: str) -> list[Finding]:
     """One-row steps longer than the robot can go in that time."""
     fps = episode.spec.fps
-    speed = {"rad": JOINT_SPEED_RAD_PER_S, "m": GRIPPER_SPEED_M_PER_S}
     units, names = element_units(episode, key), element_names(episode, key)
-    longest = np.array([speed.get(u, np.inf) for u in units]) * JUMP_MARGIN / fps
+    longest = np.array([SPEEDS.get(u, np.inf) for u in units]) * JUMP_MARGIN / fps
     steps = np.abs(np.diff(episode.arrays[key].astype(float), axis=0))
     findings = []
     for i in np.flatnonzero((steps > longest).any(axis=0)):
@@ -139,9 +141,54 @@ def check_jumps(episode: Episode, key: str) -> list[Finding]:
                 "warning",
                 key,
                 f"{names[i]} steps by {steps[row, i]:.3g} {units[i]} from row {row} to {row + 1} "
-                f"({(row + 1) / fps:.2f} s), {len(rows)} such steps; at {speed[units[i]]:g} {units[i]}/s it can go "
+                f"({(row + 1) / fps:.2f} s), {len(rows)} such steps; at {SPEEDS[units[i]]:g} {units[i]}/s it can go "
                 f"{longest[i]:.3g} {units[i]} in {JUMP_MARGIN:g} rows: a glitch of the encoder, or time is missing here",
                 (row, row + 2),
+            )
+        )
+    return findings
+
+
+def check_sample_jumps(
+    channel: str, values: np.ndarray, time_s: np.ndarray, names: Sequence[str], units: Sequence[str], row_s: float
+) -> list[Finding]:
+    """Steps from one sample of a channel to the next that are longer than the joint can go in the time between them.
+
+    Rows hold a part of a fast channel's samples, and less can happen between two samples than between two rows. A driver may
+    repeat a reading: the time counts from the last change, but not from further back than a row.
+
+    Args:
+        channel: for the message.
+        values: (N, J) samples of an episode, in rad and m where ``units`` say so; others are not judged.
+        time_s: (N,) since row 0, increasing.
+        names: of the J elements.
+        row_s: time between rows.
+    """
+    speed_per_s = np.array([SPEEDS.get(u, np.inf) for u in units])
+    if len(values) < 3 or np.isinf(speed_per_s).all():
+        return []
+    with np.errstate(invalid="ignore", over="ignore"):  # values that are not finite are an error of their own
+        steps, between_s = np.abs(np.diff(values, axis=0)), np.diff(time_s)
+    changed = np.concatenate([[True], (steps[:-1] > 0).any(axis=1)])
+    last_change = np.maximum.accumulate(np.where(changed, np.arange(len(steps)), 0))
+    since_s = np.maximum(
+        np.minimum(time_s[1:] - time_s[last_change], row_s), np.maximum(between_s, np.median(between_s))
+    )
+    longest = JUMP_MARGIN * since_s[:, None] * np.where(np.isinf(speed_per_s), 0.0, speed_per_s)
+    too_far = (steps > longest) & np.isfinite(speed_per_s)
+    findings = []
+    for i in np.flatnonzero(too_far.any(axis=0)):
+        samples = np.flatnonzero(too_far[:, i])
+        k = int(samples[np.argmax(steps[samples, i])])
+        findings.append(
+            Finding(
+                "sample_jump",
+                "warning",
+                channel,
+                f"{channel}: {names[i]} goes from {values[k, i]:.4g} to {values[k + 1, i]:.4g} {units[i]} in "
+                f"{1000 * between_s[k]:.1f} ms, at {time_s[k + 1]:.3f} s, {len(samples)} such steps; at "
+                f"{speed_per_s[i]:g} {units[i]}/s it can go {longest[k, i]:.3g} {units[i]}: changed bytes, a glitch of the "
+                "encoder, or a wrong stamp",
             )
         )
     return findings

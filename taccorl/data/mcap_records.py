@@ -159,6 +159,10 @@ class McapFile:
         self.file.seek(record.body)
         return self.file.read(record.length)
 
+    def has_data_crc(self, data_end: Record | None) -> bool:
+        """Did the writer leave a CRC of the data section?"""
+        return data_end is not None and any(self.body(data_end))
+
     def data_crc_matches(self, data_end: Record) -> bool:
         """Does the data section agree with the CRC in its last record? True where the writer left none."""
         crc = int.from_bytes(self.body(data_end), "little")

@@ -103,6 +103,9 @@ class Reader(ABC):
         """Known once ``messages`` has run to its end without bounds; a partial or abandoned read leaves it as it was."""
         self.metadata: dict[str, dict[str, str]] = {}
         """Named records beside the messages; filled while reading."""
+        self.unprotected = ""
+        """What no checksum protects, for the report: a changed byte there may be read as data. Empty: everything has one.
+        Known when ``damage`` is."""
 
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:

@@ -256,6 +256,24 @@ def test_jumps_beyond_twice_the_joints_speed_are_found(
         assert "left_joint_6.pos" in findings[0].text
 
 
+def test_between_samples_a_joint_may_go_what_its_speed_allows_since_the_reading_last_changed() -> None:
+    def jumps(values: list[float], unit: str = "rad") -> list[Finding]:
+        time_s = np.arange(len(values)) / 200
+        return joint_checks.check_sample_jumps("j", np.array(values)[:, None], time_s, ["a"], [unit], 1 / 30)
+
+    # 2 × 3.93 rad/s × 5 ms = 39.3 mrad
+    assert jumps([0, 0.039, 0.078, 0.117]) == []
+    [one] = jumps([0, 0.001, 0.041, 0.042])
+    assert "from 0.001 to 0.041 rad in 5.0 ms, at 0.010 s, 1 such steps" in one.text
+    assert jumps([0, 0.001, 0.041, 0.042], "adc_count") == []  # whose speed nobody knows
+    # Every reading sent three times: 15 ms to the next one, 118 mrad.
+    assert jumps([*[0] * 3, *[0.117] * 3, *[0.234] * 3]) == []
+    assert len(jumps([*[0] * 3, *[0.119] * 3, *[0.238] * 3])) == 1
+    # At rest it counts from a row before: 2 × 3.93 / 30 = 262 mrad.
+    assert jumps([0] * 100 + [0.261]) == []
+    assert len(jumps([0] * 100 + [0.263])) == 1
+
+
 def test_single_glitch_of_an_encoder_is_two_jumps(good: Episode) -> None:
     state, _, _ = copies(good)
     state[200, 8] += 0.6

@@ -2,7 +2,7 @@
 
 Bags since ROS 2 Iron hold their message definitions. For older ones the definitions of ROS 2's distributions are used: the
 newest whose layout fits a topic's first message to the byte. SQLite keeps no checksums: a lost page is noticed, reported and
-skipped; changed bytes inside a message are not.
+skipped, and so is what ``PRAGMA integrity_check`` finds; changed bytes inside a message are not.
 """
 
 import contextlib
@@ -26,6 +26,8 @@ from taccorl.errors import RecordingError
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 FARTHEST_ID = 1 << 62
+MOST_FAULTS = 5
+"""Results of SQLite's integrity check to report; a damaged page gives one for each of its cells."""
 EVERY_TIME = (-(1 << 63), (1 << 63) - 1)
 
 Decoder = Callable[[bytes], Any]
@@ -84,11 +86,16 @@ class Db3Reader(Reader):
                     orphans += topic_id not in names
                     if data is not None:
                         yield self._message(asked[topic_id], log_ns, data, topic_id in values)
+                if topics is not None and start_ns is None and end_ns is None:
+                    file.check_structure()
                 if orphans:
                     file.lost(f"{orphans} messages of topics that the bag does not name")
                 found += [d for d in file.damage if d not in found]
         if start_ns is None and end_ns is None:
             self.damage += [d for d in found if d not in self.damage]
+            self.unprotected = (
+                "SQLite bags hold no checksums: changed bytes in a message that still decodes are read as values"
+            )
 
     def _message(self, topic: str, log_ns: int, data: bytes, with_value: bool) -> Message:
         if not with_value:
@@ -243,6 +250,19 @@ class _File:
                 if following is None:
                     return
                 after, after_ns = following[0] - 1, following[1]
+
+    def check_structure(self) -> None:
+        """Note what SQLite finds wrong with the file's pages, unless a damage has been found already.
+
+        It reads every page. Nothing else finds pages that are used twice, and a message's log time that differs from the one in
+        the index of log times ("row 15 missing from index timestamp_idx": message 15).
+        """
+        if self.damage:
+            return
+        with contextlib.suppress(sqlite3.DatabaseError):
+            found = [row[0] for row in self._connection.execute(f"PRAGMA integrity_check({MOST_FAULTS})")]
+            for text in (" ".join(str(t).split()) for t in found if t != "ok"):
+                self.lost(f"SQLite's integrity check: {text}")
 
     def _next_readable(self, after: int) -> tuple[int, int] | None:
         """(id, log time) of the next message that can be read, where the one after ``after`` cannot; None if there is none."""

@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from taccorl.data.finding import listed
 from taccorl.data.recording import Damage, Message, Reader, TopicType, readers
 from taccorl.data.spec import ACTION, RecordingSpec
 from taccorl.data.timing import NS_PER_S
@@ -92,6 +93,7 @@ class Hdf5Reader(Reader):
             self._check_lengths(datasets)
             clock = RowClock.of(self._rate_hz(file), self.spec)
             asked = [topic for topic in datasets if topics is None or topic in topics]
+            unprotected = _unprotected({topic: datasets[topic] for topic in asked})
             read = {t: _Blocks(datasets[t]) for t in asked if topics is not None and t not in stamps_only}
             for topic in read:
                 problem = _topic_type(datasets[topic]).undecodable
@@ -117,6 +119,7 @@ class Hdf5Reader(Reader):
                         yield Message(topic, log_ns, None, value)
         if start_ns is None and end_ns is None:
             self.damage += [d for d in found if d not in self.damage]
+            self.unprotected = unprotected
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[h5py.File]:
@@ -233,6 +236,17 @@ def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
     file.visititems(visit)
     return found
+
+
+def _unprotected(datasets: dict[str, h5py.Dataset]) -> str:
+    """Which of them have no checksum. Fletcher32 and gzip's Adler-32 are verified by HDF5 when it reads a chunk."""
+    names = [topic for topic, d in datasets.items() if not d.fletcher32 and d.compression != "gzip"]
+    if not names:
+        return ""
+    return (
+        f"no checksum in {listed(names)}: changed bytes are read as values or pictures; the recorder can write one with "
+        "create_dataset(…, fletcher32=True)"
+    )
 
 
 def _length(dataset: h5py.Dataset) -> int:

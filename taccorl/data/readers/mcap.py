@@ -147,7 +147,7 @@ class _File:
         self.damage, self.already = damage, len(damage)
         self.known = reader._definitions.setdefault(path, _Definitions())
         self.misfits: dict[int, int] = {}
-        self.orphans = self.timeless = self.unchunked = 0
+        self.orphans = self.timeless = self.unchunked = self.unprotected = 0
         self.data_end: Record | None = None
         self.after_lost: int | None = None
 
@@ -168,6 +168,10 @@ class _File:
                 yield from self._convert(found, proven, record)
             if start_ns is None and end_ns is None:
                 self._check_ends(mcap)
+                if self.unprotected or (self.unchunked and not mcap.has_data_crc(self.data_end)):
+                    self.reader.unprotected = (
+                        "its recorder wrote messages without a CRC: changed bytes are read as values"
+                    )
         if self.orphans:
             self._damaged(0, mcap.size, f"{self.orphans} messages of channels whose definition was lost")
         if self.timeless:
@@ -257,6 +261,7 @@ class _File:
             reason = f"chunk lost ({type(error).__name__}: {str(error)[:120]})"
             self._damaged(record.offset, self.after_lost, reason, chunk)
             return [], True
+        self.unprotected += chunk.uncompressed_crc == 0
         logged = [r.log_time for r in found if isinstance(r, McapMessage)]
         self.reader._chunk_times[self.path, record.offset] = (min(logged), max(logged)) if logged else (0, 0)
         return found, chunk.uncompressed_crc != 0
