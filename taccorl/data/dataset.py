@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Collection, Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -232,11 +233,18 @@ class Dataset:
         entry = self._entry(index)
         try:
             chunk, file = int(entry[f"{prefix}chunk_index"]), int(entry[f"{prefix}file_index"])
-            return self.root / str(self.info[template]).format(chunk_index=chunk, file_index=file, **names)
-        except (KeyError, TypeError) as error:
+            name = str(self.info[template]).format(chunk_index=chunk, file_index=file, **names)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise DatasetError(
                 f"{self.root}/meta: nothing says which file holds {prefix} of episode {index}"
             ) from error
+        # By its text: in the cache of Hugging Face's Hub files are links to a folder beside.
+        if Path(os.path.normpath(name)).parts[:1] == ("..",) or Path(name).is_absolute():
+            raise DatasetError(
+                f"{self.root}/meta/info.json: {template} {self.info[template]!r} leads out of the dataset, to "
+                f"{self.root / name}, which is not opened: a dataset's files lie in its folder"
+            )
+        return self.root / name
 
 
 def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
@@ -340,9 +348,9 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
             rows += pq.read_table(path, columns=names).to_pylist()
     rows.sort(key=lambda r: r["episode_index"])
     listed, told = [r["episode_index"] for r in rows], info["total_episodes"]
-    if listed != list(range(told)):
-        missing = sorted(set(range(told)) - set(listed))
-        described = f"episode {missing[0]} is missing" if missing else "one stands twice or is too many"
+    if len(listed) != told or listed != list(range(told)):
+        missing = next((i for i in range(told) if i not in listed), None)  # `told` may be any number
+        described = "one stands twice or is too many" if missing is None else f"episode {missing} is missing"
         raise DatasetError(
             f"{root}: info.json counts {told} episodes, meta/episodes lists {len(listed)}, {described}: "
             f"a writer that died before finalize(), or an incomplete copy"

@@ -201,8 +201,8 @@ def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
         entry = _entry("quarantined", str(error))
     except TaccorlError as error:
         entry = _entry("refused", str(error))
-    except MemoryError:
-        raise
+    except MemoryError as error:  # one recording may ask for more than there is; the others need not
+        entry = _entry("refused", f"reading it takes more memory than there is ({error})")
     except Exception as error:
         if (fault := _machine_fault(error)) is not None:
             raise _stopped(fault, job.store) from error

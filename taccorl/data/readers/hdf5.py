@@ -4,6 +4,7 @@ Times follow from the rate that the spec's channels state. Pictures may be raw o
 """
 
 import contextlib
+import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,10 @@ from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
 BLOCK_BYTES = 4 << 20
+MOST_ROWS = 10_000_000
+"""Of one dataset: 92 hours at 30 Hz. A file of some kilobytes can claim any number of rows that were never written."""
+MOST_BLOCK_BYTES = 1 << 30
+"""Rows that are read at once: those of a chunk, or one. 1000 pictures of 480×640 are 0.9 GB."""
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
 RATE_ATTRIBUTES = ("fps", "frequency")
 BOOKKEEPING = ("/compress_len",)  # ALOHA: bytes of each padded picture; decoders find the end themselves
@@ -92,13 +97,16 @@ class Hdf5Reader(Reader):
             self.metadata["attributes"] = {name: _text(value) for name, value in file.attrs.items()}
             self._check_lengths(datasets)
             clock = RowClock.of(self._rate_hz(file), self.spec)
-            asked = [topic for topic in datasets if topics is None or topic in topics]
+            asked = [t for t in datasets if (t in topics if topics is not None else _unreadable(datasets[t]) is None)]
             unprotected = _unprotected({topic: datasets[topic] for topic in asked})
-            read = {t: _Blocks(datasets[t]) for t in asked if topics is not None and t not in stamps_only}
-            for topic in read:
-                problem = _topic_type(datasets[topic]).undecodable
+            wanted = [t for t in asked if topics is not None and t not in stamps_only]
+            for topic in asked:
+                problem = _unreadable(datasets[topic])
+                if problem is None and topic in wanted:
+                    problem = _topic_type(datasets[topic]).undecodable
                 if problem:
                     raise RecordingError(f"{self.source.path}: {topic}: {problem}")
+            read = {topic: _Blocks(datasets[topic]) for topic in wanted}
             for k in range(max((_length(datasets[t]) for t in asked), default=0)):
                 for topic in asked:
                     log_ns = clock.time_ns(topic, k)
@@ -189,11 +197,7 @@ class _Blocks:
 
     def __init__(self, dataset: h5py.Dataset) -> None:
         self._dataset, self._text = dataset, _is_text(dataset)
-        row_bytes = max(1, dataset.dtype.itemsize * int(np.prod(dataset.shape[1:])))
-        if h5py.check_vlen_dtype(dataset.dtype) is not None:
-            self._step = 1
-        else:
-            self._step = dataset.chunks[0] if dataset.chunks else max(1, BLOCK_BYTES // row_bytes)
+        self._step = _rows_at_once(dataset)
         self.start, self.stop = 0, 0
         self._rows: Any = None
 
@@ -209,6 +213,8 @@ class _Blocks:
             self.start = k - k % self._step
             self.stop = min(self.start + self._step, len(self._dataset))
             self._rows = None
+            if self._dataset.chunks and self.bytes_in_file() is None:
+                raise OSError("never written")
             self._rows = self._dataset[self.start : self.stop]
         if self._rows is None:
             return None
@@ -223,6 +229,36 @@ class _Blocks:
             return None
         info = self._dataset.id.get_chunk_info_by_coord((self.start,) + (0,) * (self._dataset.ndim - 1))
         return (info.byte_offset, info.byte_offset + info.size) if info.byte_offset is not None else None
+
+
+def _rows_at_once(dataset: h5py.Dataset) -> int:
+    if h5py.check_vlen_dtype(dataset.dtype) is not None:
+        return 1
+    return dataset.chunks[0] if dataset.chunks else max(1, BLOCK_BYTES // max(1, _row_bytes(dataset)))
+
+
+def _row_bytes(dataset: h5py.Dataset) -> int:
+    return dataset.dtype.itemsize * math.prod(dataset.shape[1:])
+
+
+def _unreadable(dataset: h5py.Dataset) -> str | None:
+    """Why no row of it may be read; None where rows may. Nothing outside of the file is opened, nothing large allocated."""
+    if dataset.is_virtual or dataset.external:
+        others = [s.file_name for s in dataset.virtual_sources()] if dataset.is_virtual else []
+        others += [name for name, _, _ in dataset.external or ()]
+        kind = "a virtual dataset" if dataset.is_virtual else "external storage"
+        return f"its values are in {listed(sorted(set(others)))} ({kind}), which is not opened: write the values into this file"
+    rows, block_bytes = _length(dataset), _rows_at_once(dataset) * _row_bytes(dataset)
+    if rows > MOST_ROWS:
+        return f"it claims {rows:,} rows; at most {MOST_ROWS:,} are read: write shorter recordings"
+    if block_bytes > MOST_BLOCK_BYTES:
+        return (
+            f"{_rows_at_once(dataset):,} rows of shape {list(dataset.shape[1:])}, which are read at once, are "
+            f"{block_bytes / 2**30:.1f} GiB; at most {MOST_BLOCK_BYTES / 2**30:.0f} GiB are read: write smaller chunks"
+        )
+    if rows and not dataset.id.get_storage_size():
+        return f"none of its {rows:,} rows was ever written: did the recorder die?"
+    return None
 
 
 def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
@@ -254,6 +290,9 @@ def _length(dataset: h5py.Dataset) -> int:
 
 
 def _topic_type(dataset: h5py.Dataset) -> TopicType:
+    problem = _unreadable(dataset)
+    if problem:
+        return TopicType(str(dataset.dtype), "hdf5", problem)
     if _is_compressed(dataset):
         return TopicType("CompressedImage", "hdf5")
     if _is_text(dataset):

@@ -321,3 +321,34 @@ def test_drafts_keep_the_names_that_a_dataset_gives_its_joints(theirs: Path, our
         assert (
             len(draft["features"]["observation.state"]["names"]) == draft["features"]["observation.state"]["shape"][0]
         )
+
+
+@pytest.mark.parametrize(
+    "place", ["../outside/{file_index}.parquet", "/outside.parquet", "data/../../x.parquet", "data/{"]
+)
+def test_a_data_path_that_leads_out_of_the_dataset_is_not_opened(ours: Path, tmp_path: Path, place: str) -> None:
+    copy = shutil.copytree(ours, tmp_path / "copy")
+    info = json.loads((copy / "meta/info.json").read_text())
+    info["data_path"] = place
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(RecordingError, match=r"copy/meta") as caught:
+        find_sources(copy)
+    if place != "data/{":  # which is no template at all
+        assert place in str(caught.value) and "leads out of the dataset" in str(caught.value)
+
+
+def test_a_dataset_that_claims_any_number_of_episodes_is_refused_at_once(ours: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(ours, tmp_path / "copy")
+    info = json.loads((copy / "meta/info.json").read_text())
+    (copy / "meta/info.json").write_text(json.dumps(info | {"total_episodes": 10**12}))
+    with pytest.raises(
+        RecordingError, match=r"counts 1000000000000 episodes, meta/episodes lists 2, episode 2 is missing"
+    ):
+        find_sources(copy)
+
+
+def test_files_of_a_dataset_may_be_links_as_in_the_hubs_cache(ours: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(ours, tmp_path / "snapshots" / "copy")
+    path = next((copy / "data").rglob("*.parquet"))
+    path.symlink_to(path.rename(tmp_path / "blob"))
+    assert len(find_sources(copy)) == 2
