@@ -36,7 +36,7 @@ class IngestConfig:
     store: Path = Path("outputs/store")
     """Finished recordings are kept here, so that a second run goes on where the first ended."""
     dry_run: bool = False
-    """Read, align and check, but write nothing."""
+    """Read, align and check, and write two rows into a scratch folder, but nothing that stays."""
     replace: bool = False
     """If `out` holds another dataset, move that aside (out.old-1, …) and publish this one."""
     engine: Engine = field(default_factory=LocalEngine)
@@ -121,13 +121,13 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
     inside = [file for job in jobs for file in job.source.files if file.resolve().is_relative_to(whole)]
     if inside:
         raise DatasetError(f"{inside[0]} is read, and lies in --out={out}: give another --out")
-    if config.dry_run:
-        return
     store = config.store.resolve()
     if whole.is_relative_to(store) or store.is_relative_to(whole):
         raise DatasetError(f"--out={out} and --store={config.store} lie in one another: choose another")
     for place in (whole, store):
         check_path(place)
+    if config.dry_run:
+        return
     for place in (whole.parent, store):
         folder = next(p for p in (place, *place.parents) if p.exists())
         if not folder.is_dir():

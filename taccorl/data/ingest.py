@@ -8,12 +8,14 @@ is in the dataset); ``refused`` (cannot be read or does not fit the spec). Origi
 import contextlib
 import dataclasses
 import errno
+import itertools
 import json
 import os
 import shlex
 import shutil
 import tempfile
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +29,7 @@ from taccorl.data.picture_checks import PictureWatch
 from taccorl.data.recording import Damage, Recording, Source, find_sources, opened
 from taccorl.data.spec import RecordingSpec
 from taccorl.errors import InTheWayError, RecordingError, TaccorlError
+from taccorl.lineage.digest import digest_file
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
@@ -118,7 +121,7 @@ def ingest(
             name=lambda job: job.source.name,
             on_done=lambda job, _: progress(job.source.name, next(done), len(jobs)) if progress else None,
         )
-    _leave_out_twins(entries)
+    _leave_out_twins(jobs, entries)
     report = _report(jobs, entries)
     shards = [(entry, Path(entry["artefact"])) for entry in entries if entry.get("artefact")]
     sources = [
@@ -158,19 +161,23 @@ def ingest(
     return report
 
 
-def _leave_out_twins(entries: list[dict[str, Any]]) -> None:
+def _leave_out_twins(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> None:
     """The same content twice would put the same episodes into training and test: the second is refused."""
+    sizes = [(tuple(p.stat().st_size for p in job.source.files if p.is_file()), job.source.part) for job in jobs]
+    alike = Counter(sizes)
     first: dict[tuple[Any, ...], str] = {}
-    for entry in entries:
-        if not entry.get("artefact"):
+    for job, entry, size in zip(jobs, entries, sizes, strict=True):
+        if entry["outcome"] not in ("written", "split") or alike[size] == 1:
             continue
+        if job.dry_run:
+            entry["source_digests"] = [digest_file(path) for path in job.source.files]
         content = (tuple(entry["source_digests"]), entry["part"])
         if content in first:
             digest = entry["source_digests"][0][:12]
             entry |= _entry(
                 "refused", f"the same content as {first[content]} (sha256 {digest}…): its episodes are in already"
             )
-            del entry["artefact"]
+            entry.pop("artefact", None)
         else:
             first[content] = entry["recording"]
 
@@ -254,9 +261,12 @@ def _build(job: Job, folder: Path, progress: Progress | None) -> None:
 
 
 def _dry(job: Job, progress: Progress | None) -> dict[str, Any]:
-    """What ``_build`` would say: everything is read, pictures too, and nothing written."""
+    """What ``_build`` would say: everything is read, pictures too; two rows are written by LeRobot into a scratch folder."""
+    from taccorl.data.lerobot_format import write_episodes
 
     def look(episodes: list[Episode]) -> None:
+        with tempfile.TemporaryDirectory(prefix="taccorl_") as scratch:
+            write_episodes([_first_rows(min(episodes, key=lambda e: e.num_rows))], Path(scratch) / "dataset")
         rows, done = sum(e.num_rows for e in episodes), 0
         for episode in episodes:
             for _ in episode.pictures():
@@ -266,6 +276,14 @@ def _dry(job: Job, progress: Progress | None) -> dict[str, Any]:
 
     with opened(job.source, job.spec) as recording:
         return _settle(Cutter(recording), look)[1]
+
+
+def _first_rows(episode: Episode, rows: int = 2) -> Episode:
+    return dataclasses.replace(
+        episode,
+        arrays={key: values[:rows] for key, values in episode.arrays.items()},
+        pictures=lambda: itertools.islice(episode.pictures(), rows),
+    )
 
 
 def _settle(cutter: Cutter, consume: Callable[[list[Episode]], None]) -> tuple[list[Episode], dict[str, Any]]:

@@ -10,6 +10,7 @@ import hashlib
 import itertools
 import json
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -365,6 +366,10 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
         where = f"features/{key}"
         if not (key == ACTION or key.startswith("observation.")):
             raise document.error(where, "LeRobot's policies read `action` and `observation.*` only")
+        if not re.fullmatch(r"[\w.-]+", key):
+            raise document.error(
+                where, f"{key!r}: a feature's name has letters, digits, `_`, `.` and `-`: it becomes a folder"
+            )
         if feature.sensor is not None:
             sensors[key] = load_sensor_spec(_beside(document, f"{where}/sensor", feature.sensor))
         _check_feature(document, where, feature, sensors.get(key))

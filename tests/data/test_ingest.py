@@ -1,6 +1,7 @@
 """Recordings into one dataset: every input has one outcome, a second run does only what is new, and nothing is damaged."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import resource
@@ -24,6 +25,7 @@ from taccorl.data.cutting import Cutter, open_episodes
 from taccorl.data.dataset import Dataset
 from taccorl.demos.stand_in import CAMERA_TOPICS, StandInConfig, read_frame_id, write_mcap
 from taccorl.errors import DatasetError
+from taccorl.lineage.store import Store
 
 pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")  # its other threads only wait
 FRONT = CAMERA_TOPICS["front"]
@@ -471,6 +473,34 @@ def test_a_dry_run_writes_nothing_at_all(
     shown = capsys.readouterr().out
     assert "1 written, 1 split, 1 quarantined, 1 refused" in shown
     assert "nothing was written" in shown
+
+
+def outcomes(report: dict[str, Any]) -> list[tuple[str, str, str]]:
+    return [(Path(r["recording"]).name, r["outcome"], r["reason"]) for r in report["recordings"]]
+
+
+@pytest.mark.parametrize("feature", ["observation.images/front", "observation.images.front"])
+def test_a_dry_run_promises_what_the_run_then_does(
+    ingests: Ingests, good: Path, feature: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(good, ingests.folder / "in"))
+    shutil.copy(folder / "b.mcap", folder / "c.mcap")
+    spec = _loaded(ingests.spec)
+    front = "observation.images.front"
+    features = {feature if key == front else key: f for key, f in spec.target.features.items()}
+    contract = dataclasses.replace(spec.target, features=features)  # past the spec's own check of names
+    mapped = {feature if key == front else key: m for key, m in spec.features.items()}
+    spec = dataclasses.replace(spec, contract=contract, features=mapped)
+    reports = []
+    for dry_run in (True, False):
+        store = Store(ingests.store)
+        jobs = ingest_module.find_jobs([folder], spec, "s", ingests.store, dry_run)
+        reports.append(ingest_module.ingest(jobs, ingests.out, store))
+    assert outcomes(reports[0]) == outcomes(reports[1])
+    # LeRobot refuses a `/` in a feature's name; without it the third recording is the second once more.
+    expected = ["refused"] * 3 if "/" in feature else ["written", "written", "refused"]
+    assert [outcome for _, outcome, _ in outcomes(reports[0])] == expected
+    assert ("/" in feature) == ("should not contain '/'" in reports[0]["recordings"][0]["reason"])
 
 
 # ---- the machine fails ----

@@ -332,6 +332,7 @@ def test_counts_must_fit_the_dataset(tmp_path):
         (("features",), {}, "features", "holds nothing"),
         (("sensors",), {"a": SENSOR}, "sensors", "is not a key of this file; give `sensor:`"),
         (("features", "states"), DATASET["features"]["action"], "features → states", "`action` and `observation.*` only"),
+        (("features", "observation.images/up"), DATASET["features"]["observation.images.front"], "images/up", "letters, digits"),
         ((*STATE, "shape"), [], "observation.state → shape", "[] holds nothing"),
         ((*STATE, "shape"), [0], "observation.state → shape", "[0] holds nothing"),
         ((*STATE, "shape"), [1, 2], "observation.state → shape", "LeRobot merges and edits flat features only; write [2]"),
