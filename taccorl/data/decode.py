@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from taccorl.data.ros_vectors import STRUCTURES, WRAPPERS
 from taccorl.data.spec import ChannelSpec, SensorSpec
 from taccorl.errors import RecordingError, nearest
 
@@ -42,7 +43,7 @@ def _part(value: Any, part: str) -> Any:
     return value.get(part, MISSING) if isinstance(value, dict) else getattr(value, part, MISSING)
 
 
-def _maybe(value: Any, field: str) -> Any:
+def maybe(value: Any, field: str) -> Any:
     """``get``, or None; quick, because most messages lack most fields that are asked for."""
     for part in field.split("."):
         value = _part(value, part)
@@ -62,10 +63,10 @@ def _fields(value: Any) -> list[str]:
 def stamp_ns(value: Any) -> int | None:
     """Header stamp of a decoded message (ns): ``header.stamp``, or a Foxglove ``timestamp``; None if it has neither."""
     for field in ("header.stamp", "timestamp"):
-        stamp = _maybe(value, field)
+        stamp = maybe(value, field)
         for sec, nsec in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs")):
             try:
-                found = int(_maybe(stamp, sec)) * 1_000_000_000 + int(_maybe(stamp, nsec))
+                found = int(maybe(stamp, sec)) * 1_000_000_000 + int(maybe(stamp, nsec))
             except (TypeError, ValueError, OverflowError):
                 continue
             return found if abs(found) < 2**63 else None
@@ -76,19 +77,36 @@ def text(value: Any, topic: str) -> str:
     """A std_msgs/String, a JSON string or ``{"data": …}``."""
     if isinstance(value, str):
         return value
-    found = _maybe(value, "data")
+    found = maybe(value, "data")
     if not isinstance(found, str):
         raise RecordingError(f"{topic}: expected a text (std_msgs/String), found {type(found or value).__name__}")
     return found
 
 
+def vector_paths(value: Any) -> dict[str, str]:
+    """Name → dotted path of the numbers in a ROS vector, pose, twist, wrench, IMU or odometry message; empty for others."""
+    fields = next((s for s in STRUCTURES if all(_part(value, f) is not MISSING for f in s)), ())
+    found: dict[str, str] = {}
+    for field in fields:
+        inner = {"": ""} if len(field) == 1 else vector_paths(_part(value, field))
+        if not inner:
+            return {}
+        prefix = "" if field in WRAPPERS else field
+        found |= {".".join(filter(None, (prefix, n))): ".".join(filter(None, (field, p))) for n, p in inner.items()}
+    return found
+
+
 def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
-    """(size,) float64 of one message: ``field``, picked by the message's own names, times ``scale``."""
+    """(size,) float64 of one message: ``field``, picked by the message's own names, times ``scale``.
+
+    A field, or a whole message, that is a vector, a pose … (``ros_vectors``) gives its numbers with the names of their paths.
+    """
     scale = np.array(channel.scale) if channel.scale else None
     indices: dict[tuple[str, ...], list[int]] = {}
+    paths: dict[str, str] = {}
 
     def pick(value: Any, numbers: np.ndarray) -> np.ndarray:
-        found = get(value, "name")
+        found = list(paths) or get(value, "name")
         try:
             names = () if isinstance(found, str | bytes) else tuple(str(n) for n in found)
         except TypeError:
@@ -107,6 +125,10 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
 
     def extract(value: Any) -> np.ndarray:
         found = get(value, channel.field) if channel.field else value
+        if not paths and not isinstance(found, list | tuple | np.ndarray):
+            paths.update(vector_paths(found))
+        if paths:
+            found = [get(found, path) for path in paths.values()]
         try:
             plain = np.asarray(found)
             if plain.dtype.kind not in "biuf":  # NumPy would read the text "1.5" as 1.5, and None as not-a-number
@@ -195,7 +217,7 @@ def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
         data = bytes(data)
     else:
         raise RecordingError(f"a picture as {type(data).__name__}; bytes, or base64 text in JSON, are read")
-    encoding = _maybe(value, "encoding")
+    encoding = maybe(value, "encoding")
     if encoding is not None:
         return _raw_picture(value, data, str(encoding))
     # A picture is never turned by its EXIF note: the camera's frame is the pixel grid.
@@ -206,7 +228,7 @@ def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
         decoded = None
     if decoded is None:
         raise RecordingError(
-            f"a picture of format {_maybe(value, 'format')!r} that OpenCV cannot decode (jpeg and png are read)"
+            f"a picture of format {maybe(value, 'format')!r} that OpenCV cannot decode (jpeg and png are read)"
         )
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
 
@@ -218,7 +240,7 @@ def _raw_picture(value: Any, data: bytes, encoding: str) -> np.ndarray:
     depth = channels[encoding]
     try:
         rows, columns = int(get(value, "height")), int(get(value, "width"))
-        step = int(_maybe(value, "step") or columns * depth)
+        step = int(maybe(value, "step") or columns * depth)
     except (TypeError, ValueError) as error:
         raise RecordingError(f"a raw picture without whole numbers for its size: {error}") from error
     if min(rows, columns) <= 0 or step < columns * depth:

@@ -57,6 +57,8 @@ class _Roles:
     pictures: list[TopicSummary]
     pads: list[TopicSummary]
     """Of one sensor."""
+    vectors: list[TopicSummary]
+    """Poses, wrenches, IMU readings …: a feature each."""
     spare: list[TopicSummary]
     """Other topics with numbers: any of them may be what the user wants."""
     names: dict[str, str]
@@ -64,7 +66,14 @@ class _Roles:
 
     @property
     def used(self) -> list[TopicSummary]:
-        return [*self.states, *self.commands, *self.pictures, *self.pads]
+        return [*self.states, *self.commands, *self.pictures, *self.pads, *self.vectors]
+
+    def vector_key(self, t: TopicSummary) -> str:
+        """Feature of one of ``vectors``; names that mean something to LeRobot or to us are not for them."""
+        name = self.names[t.topic]
+        return (
+            f"observation.{name}_vector" if name in ("state", "environment_state", "tactile") else f"observation.{name}"
+        )
 
 
 def _roles(inventory: Inventory) -> _Roles:
@@ -74,7 +83,8 @@ def _roles(inventory: Inventory) -> _Roles:
     pictures = [t for t in pictures if "depth" not in t.topic.lower() and f"{t.topic}/compressed" not in topics]
     pads = [t for t in useful if t.sensor]
     pads = [t for t in pads if t.sensor == pads[0].sensor]
-    numbers = [t for t in useful if t.num_values and not t.sensor]
+    vectors = [t for t in useful if t.units]
+    numbers = [t for t in useful if t.num_values and not t.sensor and not t.units]
     commands = [t for t in numbers if _says(t, COMMAND_WORDS)]
     commands = [t for t in commands if t.names] or commands
     measured = [t for t in numbers if not _says(t, COMMAND_WORDS)]
@@ -82,8 +92,10 @@ def _roles(inventory: Inventory) -> _Roles:
     states = _one_of_each(states) or (measured if len(measured) == 1 else [])
     # a mobile base has commands of its own: one topic that alone commands all of the state is enough
     commands = next(([t] for t in commands if t.num_values == sum(s.num_values or 0 for s in states)), commands)
-    spare = [t for t in numbers if t not in commands and t not in states]
-    return _Roles(states, commands, pictures, pads, spare, _channel_names(useful))
+    commands = commands or [t for t in vectors if _says(t, COMMAND_WORDS)]  # a mobile base's velocity, a target pose
+    measured = [t for t in vectors if not _says(t, COMMAND_WORDS)]
+    spare = [t for t in (*numbers, *vectors) if t not in (*commands, *states, *measured)]
+    return _Roles(states, commands, pictures, pads, measured, spare, _channel_names(useful))
 
 
 def _one_of_each(topics: list[TopicSummary]) -> list[TopicSummary]:
@@ -177,6 +189,7 @@ def _mappings(roles: _Roles) -> list[str]:
             f"  action: {{channels: [TODO], align: asof}}   # no topic is named as a command: {other}{states}, as measured"
         )
     found += [line(f"observation.images.{roles.names[t.topic]}", [t]) for t in roles.pictures]
+    found += [line(roles.vector_key(t), [t]) for t in roles.vectors]
     return found + ([line("observation.tactile", roles.pads)] if roles.pads else [])
 
 
@@ -186,6 +199,8 @@ def _channel(t: TopicSummary, clock: str, rate_known: bool, is_row_command: bool
         parts.append(f"type: {_yaml(t.type.name)}")
     if t.holds(JOINTS):
         parts += ["field: position", f"pick: [{', '.join(_yaml(n) for n in t.names)}]"]
+    elif t.units:
+        parts.append(f"pick: [{', '.join(t.names)}]")
     elif t.num_values and t.type.shape is None:
         parts.append("field: data")
     if clock == "header" and not t.stamped:
@@ -232,6 +247,8 @@ def _dataset(inventory: Inventory, roles: _Roles, path: Path) -> str:
     elif roles.states:
         lines += ["  # as observation.state; another number of values if the channels of `action` have another"]
         lines += _numbers("action", roles.states, elements, known)
+    for t in roles.vectors:
+        lines += _numbers(roles.vector_key(t), [t], list(t.names), known)
     for t in roles.pictures:
         name, rate = roles.names[t.topic], f"{_rate_hz([t]):g}" if known else "TODO"
         lines += [
@@ -260,16 +277,29 @@ def _elements(topics: list[TopicSummary], roles: _Roles) -> list[str]:
 def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: bool) -> list[str]:
     size = sum(t.num_values or 0 for t in topics)
     each = elements[0] if elements else ""
-    units = ", ".join(u for u in UNITS if u not in ("adc_count", "rgb8", "unknown"))
+    known_units = ", ".join(u for u in UNITS if u not in ("adc_count", "rgb8", "unknown"))
+    units = [u for t in topics for u in t.units]
+    unit = f"TODO   # one for all, rad, or a list of {size}, [rad, …, m]; known: {known_units}"
+    if units and all(units):
+        unit = units[0] if len(set(units)) == 1 else f"[{', '.join(units)}]"
+    frames = {t.frame for t in topics if t.units} - {""}
+    frame = (
+        "joint"
+        if not units
+        else _yaml(frames.pop())
+        if len(frames) == 1
+        else "TODO   # in which the values are: base_link"
+    )
+    widest = "[-3.14, 3.14]" if not units else "[-1, 1]" if set(units) == {"wxyz"} else "[-10, 10]"
     return [
         f"  {key}:",
         "    dtype: float32",
         f"    shape: [{size}]",
         *([f"    names: [{', '.join(_yaml(n) for n in elements)}]"] if elements else []),
-        f"    unit: TODO   # one for all, rad, or a list of {size}, [rad, …, m]; known: {units}",
-        "    frame: joint",
+        f"    unit: {unit}",
+        f"    frame: {frame}",
         f"    rate_hz: {f'{_rate_hz(topics):g}' if known else 'TODO'}",
-        "    range: TODO   # lowest and highest valid value for all, [-3.14, 3.14]"
+        f"    range: TODO   # lowest and highest valid value for all, {widest}"
         + (f", or for each: {{{each}: [-2.6, 2.6], …}}" if each else ""),
     ]
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from taccorl.data import decode
 from taccorl.data.recording import Damage, Reader, Source, TopicType, readers
+from taccorl.data.ros_vectors import unit_of, vector_type
 from taccorl.data.spec import ChannelSpec, SensorSpec, data_specs_folder, load_sensor_spec, shipped_recording_specs
 from taccorl.data.timing import NS_PER_S, SIM_TIME_S
 from taccorl.errors import RecordingError
@@ -17,6 +18,7 @@ PICTURES = ("CompressedImage", "Image")
 JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
+IMU_PARTS = ("orientation", "angular_velocity", "linear_acceleration")
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,11 @@ class TopicSummary:
     zero_stamps: int
     """Messages stamped 0, where others have a time."""
     names: tuple[str, ...] = ()
-    """Of its values, from the ``name`` list of its first message, or as its type says."""
+    """Of its values, from the ``name`` list of its first message, as its type says, or their paths in a vector, a pose …"""
+    units: tuple[str, ...] = ()
+    """Of the values of a vector, a pose …, empty where its type does not say; () for other messages."""
+    frame: str = ""
+    """``header.frame_id`` of such a message."""
     num_values: int | None = None
     """Numbers in a message of joints or of an array; None where it holds no list of numbers."""
     sensor: str | None = None
@@ -162,7 +168,7 @@ def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpe
         sizes = [name for name, s in sensors.items() if t.type.name == s.wire.dtype and shape in _frames(s)]
         size = math.prod(shape) if len(shape) <= 1 else None
         return {"names": t.type.names, "num_values": size, "sensor": next(iter(sizes), None)}
-    if not t.holds((*JOINTS, *ARRAYS, *PICTURES)):
+    if not t.holds((*JOINTS, *ARRAYS, *PICTURES)) and vector_type(t.type.name) is None:
         return {}
     try:
         # by its time, for readers that can go there; the file is let go at the first message
@@ -182,6 +188,8 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
     Raises:
         RecordingError: a spec could not use it either.
     """
+    if vector_type(t.type.name) is not None:
+        return _vector_content(t, value)
     channel = ChannelSpec(topic=t.topic, rate_hz=1.0, field="position" if t.holds(JOINTS) else "data")
     if t.holds(PICTURES):
         decode.picture(value, replace(channel, field=None))
@@ -195,6 +203,25 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
             with contextlib.suppress(RecordingError):
                 return {"sensor": name, "num_values": decode.pad_extractor(channel, sensor)(value).size}
     return {"num_values": decode.vector_extractor(channel)(value).size}
+
+
+def _vector_content(t: TopicSummary, value: Any) -> dict[str, Any]:
+    """Names and units of a vector, a pose …; of an IMU only what it measures (else its covariance begins with −1).
+
+    Raises:
+        RecordingError: a field that holds no number.
+    """
+    decode.vector_extractor(ChannelSpec(topic=t.topic, rate_hz=1.0))(value)
+    covariances = {part: np.ravel(decode.maybe(value, f"{part}_covariance")) for part in IMU_PARTS}
+    absent = [part for part, covariance in covariances.items() if covariance[:1].tolist() == [-1.0]]
+    names = tuple(name for name in decode.vector_paths(value) if name.partition(".")[0] not in absent)
+    units = tuple(unit_of(name, t.type.name) for name in names)
+    return {
+        "names": names,
+        "num_values": len(names),
+        "units": units,
+        "frame": str(decode.maybe(value, "header.frame_id") or ""),
+    }
 
 
 def _fitting(reader_name: str, topics: dict[str, str]) -> tuple[str, ...]:

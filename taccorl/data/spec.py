@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from taccorl.data.ros_vectors import vector_type
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, SpecError, nearest
 
@@ -190,7 +191,7 @@ class ChannelSpec:
     field: str | None = None
     """Field of the message (dotted)."""
     pick: tuple[str, ...] = ()
-    """Elements by the message's own ``name`` list, never by position."""
+    """Elements by the message's own ``name`` list, or by their paths in a pose, a wrench … (``ros_vectors``), never by place."""
     scale: tuple[float, ...] = ()
     """Multiplied in after picking, per element: unit conversion or a driver's known factor."""
     clock: Literal["header", "log"] | None = None
@@ -479,8 +480,11 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
             raise document.error(
                 f"{where}/scale", f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
             )
-        if channel.pick and channel.field is None:
-            raise document.error(f"{where}/pick", "names elements of a `field` (position, velocity …); none is given")
+        if channel.pick and channel.field is None and vector_type(channel.type or "") is None:
+            raise document.error(
+                f"{where}/pick",
+                "names elements of a `field` (position, velocity …); none is given (needed unless `type` is a pose, a wrench …)",
+            )
     if spec.max_clock_spread_s <= 0:
         raise document.error("max_clock_spread_s", f"{spec.max_clock_spread_s:g} s: no two clocks agree to that")
     _check_sources(document, spec)

@@ -1,0 +1,50 @@
+"""ROS messages of vectors, poses, velocities, forces and IMU readings: which of their fields are numbers, and in which unit.
+
+A value's name is its path in the message without the fields that only wrap: ``position.x`` is at ``pose.pose.position.x`` of an
+Odometry. Quaternions are read in the order w, x, y, z of the unit ``wxyz``; ROS writes w last. Headers, covariances and names
+of frames are left out.
+"""
+
+WRAPPERS = ("vector", "point", "quaternion", "pose", "twist", "wrench", "accel", "transform")
+"""Fields of the Stamped and WithCovariance forms that hold the message itself."""
+STRUCTURES = (
+    ("w", "x", "y", "z"),
+    ("x", "y", "z"),
+    ("position", "orientation"),
+    ("translation", "rotation"),
+    ("linear", "angular"),
+    ("force", "torque"),
+    ("orientation", "angular_velocity", "linear_acceleration"),
+    ("pose", "twist"),
+    *((wrapper,) for wrapper in WRAPPERS),
+)
+"""Fields of a message that hold numbers, in the order in which they are read: the first line whose fields are all there."""
+TYPES = ("Vector3", "Point", "Quaternion", "Pose", "Transform", "Twist", "Accel", "Wrench", "Imu", "Odometry")
+UNITS = {
+    "position": "m",
+    "translation": "m",
+    "orientation": "wxyz",
+    "rotation": "wxyz",
+    "linear": "m/s",
+    "angular": "rad/s",
+    "force": "N",
+    "torque": "Nm",
+    "angular_velocity": "rad/s",
+    "linear_acceleration": "m/s2",
+}
+"""By the field that holds x, y, z (REP 103: SI)."""
+UNITS_OF_ACCEL = {"linear": "m/s2", "angular": "rad/s2"}
+UNITS_OF_TYPE = {"Point": "m", "Quaternion": "wxyz"}
+"""Where x, y, z are the message's own. Nobody knows the unit of a Vector3."""
+
+
+def vector_type(kind: str) -> str | None:
+    """One of ``TYPES``, whatever its package and form: ``geometry_msgs/msg/PoseStamped`` is a Pose; None for other types."""
+    name = kind.replace(".", "/").rpartition("/")[2].removesuffix("Stamped").removesuffix("WithCovariance")
+    return name if name in TYPES else None
+
+
+def unit_of(name: str, kind: str) -> str:
+    """Unit of the value ``name`` of a message of type ``kind``; empty where the type does not say."""
+    field, own = name.rpartition(".")[0], vector_type(kind) or ""
+    return (UNITS_OF_ACCEL if own == "Accel" else UNITS).get(field, "") if field else UNITS_OF_TYPE.get(own, "")

@@ -1,0 +1,269 @@
+"""Vectors, poses, twists, wrenches, IMU readings and odometry: read as numbers by name, drafted as features with their units."""
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from taccorl.cli.main import main
+from taccorl.data import decode
+from taccorl.data.dataset import Dataset
+from taccorl.data.inspection import inspect_source
+from taccorl.data.recording import find_sources, readers
+from taccorl.data.ros_vectors import unit_of, vector_type
+from taccorl.data.spec import ChannelSpec, load_recording_spec
+from taccorl.errors import RecordingError
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+START_NS = 1_780_000_000 * 10**9
+NUM = 300
+"""3 s at 100 Hz."""
+XYZ = ("x", "y", "z")
+
+
+def make(kind: str, **fields: Any) -> Any:
+    return STORE.types[kind](**fields)
+
+
+def vector(*xyz: float, kind: str = "Vector3") -> Any:
+    return make(f"geometry_msgs/msg/{kind}", **dict(zip(XYZ, xyz, strict=True)))
+
+
+def quaternion(w: float, x: float, y: float, z: float) -> Any:
+    return make("geometry_msgs/msg/Quaternion", w=w, x=x, y=y, z=z)
+
+
+def header(k: int, frame: str) -> Any:
+    sec, nanosec = divmod(START_NS + k * 10**7, 10**9)
+    return make(
+        "std_msgs/msg/Header",
+        stamp=make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec),
+        frame_id=frame,
+    )
+
+
+def pose() -> Any:
+    return make(
+        "geometry_msgs/msg/Pose", position=vector(1, 2, 3, kind="Point"), orientation=quaternion(0.5, 0.1, 0.2, 0.3)
+    )
+
+
+def twist() -> Any:
+    return make("geometry_msgs/msg/Twist", linear=vector(4, 5, 6), angular=vector(7, 8, 9))
+
+
+def wrench(k: int = 0) -> Any:
+    return make("geometry_msgs/msg/Wrench", force=vector(1, 2, k / 100), torque=vector(0.1, 0.2, 0.3))
+
+
+def imu(k: int = 0, orientation_covariance: float = -1.0) -> Any:
+    covariance = np.zeros(9)
+    return make(
+        "sensor_msgs/msg/Imu",
+        header=header(k, "imu_link"),
+        orientation=quaternion(1, 0, 0, 0),
+        orientation_covariance=np.array([orientation_covariance] + [0.0] * 8),
+        angular_velocity=vector(0.1, 0.2, 0.3),
+        angular_velocity_covariance=covariance,
+        linear_acceleration=vector(0, 0, 9.81),
+        linear_acceleration_covariance=covariance,
+    )
+
+
+def odometry(k: int = 0) -> Any:
+    return make(
+        "nav_msgs/msg/Odometry",
+        header=header(k, "odom"),
+        child_frame_id="base_link",
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose(), covariance=np.arange(36.0)),
+        twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist(), covariance=np.arange(36.0)),
+    )
+
+
+def stamped(kind: str, field: str, value: Any, k: int = 0) -> Any:
+    return make(f"geometry_msgs/msg/{kind}Stamped", header=header(k, "tool0"), **{field: value})
+
+
+POSE = (
+    (["position.x", "position.y", "position.z"], ["m"] * 3, [1, 2, 3]),
+    (
+        ["orientation.w", "orientation.x", "orientation.y", "orientation.z"],
+        ["wxyz"] * 4,
+        [0.5, 0.1, 0.2, 0.3],
+    ),
+)
+TWIST = (
+    (["linear.x", "linear.y", "linear.z"], ["m/s"] * 3, [4, 5, 6]),
+    (
+        ["angular.x", "angular.y", "angular.z"],
+        ["rad/s"] * 3,
+        [7, 8, 9],
+    ),
+)
+FORCE = (
+    (["force.x", "force.y", "force.z"], ["N"] * 3, [1, 2, 0]),
+    (
+        ["torque.x", "torque.y", "torque.z"],
+        ["Nm"] * 3,
+        [0.1, 0.2, 0.3],
+    ),
+)
+IMU = (
+    (["orientation.w", "orientation.x", "orientation.y", "orientation.z"], ["wxyz"] * 4, [1, 0, 0, 0]),
+    (["angular_velocity.x", "angular_velocity.y", "angular_velocity.z"], ["rad/s"] * 3, [0.1, 0.2, 0.3]),
+    (["linear_acceleration.x", "linear_acceleration.y", "linear_acceleration.z"], ["m/s2"] * 3, [0, 0, 9.81]),
+)
+ACCEL = make("geometry_msgs/msg/Accel", linear=vector(4, 5, 6), angular=vector(7, 8, 9))
+MESSAGES = [
+    (vector(1, 2, 3), [(list(XYZ), [""] * 3, [1, 2, 3])]),
+    (stamped("Vector3", "vector", vector(1, 2, 3)), [(list(XYZ), [""] * 3, [1, 2, 3])]),
+    (vector(1, 2, 3, kind="Point"), [(list(XYZ), ["m"] * 3, [1, 2, 3])]),
+    (stamped("Point", "point", vector(1, 2, 3, kind="Point")), [(list(XYZ), ["m"] * 3, [1, 2, 3])]),
+    (quaternion(0.5, 0.1, 0.2, 0.3), [(list("wxyz"), ["wxyz"] * 4, [0.5, 0.1, 0.2, 0.3])]),
+    (
+        stamped("Quaternion", "quaternion", quaternion(0.5, 0.1, 0.2, 0.3)),
+        [(list("wxyz"), ["wxyz"] * 4, [0.5, 0.1, 0.2, 0.3])],
+    ),
+    (pose(), POSE),
+    (stamped("Pose", "pose", pose()), POSE),
+    (twist(), TWIST),
+    (stamped("Twist", "twist", twist()), TWIST),
+    (wrench(), FORCE),
+    (stamped("Wrench", "wrench", wrench()), FORCE),
+    (
+        stamped("Accel", "accel", ACCEL),
+        [(TWIST[0][0], ["m/s2"] * 3, [4, 5, 6]), (TWIST[1][0], ["rad/s2"] * 3, [7, 8, 9])],
+    ),
+    (imu(), IMU),
+    (odometry(), (*POSE, *TWIST)),
+]
+
+
+def kind_of(message: Any) -> str:
+    return message.__msgtype__
+
+
+@pytest.mark.parametrize(("message", "groups"), MESSAGES, ids=lambda m: kind_of(m) if hasattr(m, "__msgtype__") else "")
+def test_every_message_is_numbers_with_names_and_units(message: Any, groups: Any) -> None:
+    names = [name for group in groups for name in group[0]]
+    assert list(decode.vector_paths(message)) == names
+    assert vector_type(kind_of(message)) is not None
+    assert [unit_of(name, kind_of(message)) for name in names] == [u for group in groups for u in group[1]]
+    whole = decode.vector_extractor(ChannelSpec(topic="/t", rate_hz=1))
+    assert whole(message).tolist() == [value for group in groups for value in group[2]]
+    picked = ChannelSpec(topic="/t", rate_hz=1, pick=(names[-1], names[0]), scale=(1, 10))
+    assert decode.vector_extractor(picked)(message).tolist() == [groups[-1][2][-1], 10 * groups[0][2][0]]
+
+
+def test_a_part_of_a_message_is_named_within_that_part() -> None:
+    part = ChannelSpec(topic="/t", rate_hz=1, field="pose.pose", pick=("orientation.w", "position.z"))
+    assert decode.vector_extractor(part)(odometry()).tolist() == [0.5, 3]
+    assert decode.vector_extractor(ChannelSpec(topic="/t", rate_hz=1, field="angular_velocity"))(imu()).tolist() == [
+        0.1,
+        0.2,
+        0.3,
+    ]
+    json = {
+        "header": {},
+        "wrench": {"force": dict(zip(XYZ, (1, 2, 3), strict=True)), "torque": {"x": 4, "y": 5, "z": 6}},
+    }
+    extract = decode.vector_extractor(ChannelSpec(topic="/t", rate_hz=1))
+    assert extract(json).tolist() == [1, 2, 3, 4, 5, 6]
+    with pytest.raises(RecordingError, match=r"no field 'torque'; known: force"):
+        extract({"wrench": {"force": {"x": 1, "y": 2, "z": 3}}})
+    with pytest.raises(RecordingError, match=r"'force\.w' is not among its names; did you mean 'force\.\w'"):
+        decode.vector_extractor(ChannelSpec(topic="/t", rate_hz=1, pick=("force.w",)))(json)
+
+
+@pytest.mark.parametrize(
+    "value", [SimpleNamespace(x=1, y=2), {"pose": {"name": "home"}}, {"x": {"y": 1}}, {"position": [1.0]}]
+)
+def test_other_messages_have_no_such_numbers(value: Any) -> None:
+    assert decode.vector_paths(value) == {}
+
+
+@pytest.mark.parametrize(
+    "kind", ["sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray", "sensor_msgs/msg/JointState", ""]
+)
+def test_other_types_are_no_vectors(kind: str) -> None:
+    assert vector_type(kind) is None
+
+
+def write_bag(folder: Path) -> Path:
+    """A mobile robot: odometry, IMU without orientation, force sensor, a bare Vector3; commanded by velocity."""
+    topics: dict[str, tuple[str, Any]] = {
+        "/odom": ("nav_msgs/msg/Odometry", odometry),
+        "/imu/data": ("sensor_msgs/msg/Imu", imu),
+        "/ft/wrench": ("geometry_msgs/msg/WrenchStamped", lambda k: stamped("Wrench", "wrench", wrench(k), k)),
+        "/wind": ("geometry_msgs/msg/Vector3", lambda k: vector(1, 2, 3)),
+        "/cmd_vel": ("geometry_msgs/msg/Twist", lambda k: twist()),
+    }
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections = {t: writer.add_connection(t, kind, typestore=STORE) for t, (kind, _) in topics.items()}
+        for k in range(NUM):
+            for topic, (kind, message) in topics.items():
+                writer.write(connections[topic], START_NS + k * 10**7, STORE.serialize_cdr(message(k), kind))
+    return folder
+
+
+def test_a_robot_without_joint_states_is_drafted_and_ingested_with_units_and_frames(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag")
+    assert all(not t.problem and t.num_values for t in inspect_source(*find_sources(bag)[0]).topics)
+    assert main(["ingest", "inspect", str(bag), f"--draft={tmp_path / 'mine.yaml'}"]) == 0
+    written = {"text": "drive", "unit": "m/s", "range": "[-20, 20]", "frame": "base_link"}
+    for path in tmp_path.glob("mine*.yaml"):
+        assert "not used" not in path.read_text()
+        path.write_text(re.sub(r"(\w+): TODO\b", lambda m: f"{m[1]}: {written[m[1]]}", path.read_text()))
+    spec = load_recording_spec(tmp_path / "mine.yaml")
+    features = spec.target.features
+    assert features["observation.ft_wrench"].unit == ("N", "N", "N", "Nm", "Nm", "Nm")
+    assert features["observation.ft_wrench"].frame == "tool0"
+    assert features["observation.odom"].unit == (*["m"] * 3, *["wxyz"] * 4, *["m/s"] * 3, *["rad/s"] * 3)
+    assert features["observation.odom"].names[3:5] == ("orientation.w", "orientation.x")
+    # The IMU says that it has no orientation: its covariance begins with -1.
+    assert features["observation.imu_data"].unit == (*["rad/s"] * 3, *["m/s2"] * 3)
+    assert features["observation.wind"].unit == "m/s" and features["observation.wind"].frame == "base_link"
+    assert spec.features["action"].channels == ("cmd_vel",)
+    words = [f"--spec={tmp_path / 'mine.yaml'}", f"--out={tmp_path / 'out'}", f"--store={tmp_path / 'store'}"]
+    assert main(["ingest", str(bag), *words]) == 0
+    arrays = Dataset(tmp_path / "out").episode(0).arrays
+    assert arrays["observation.odom"][5].tolist() == pytest.approx([1, 2, 3, 0.5, 0.1, 0.2, 0.3, 4, 5, 6, 7, 8, 9])
+    assert arrays["action"][5].tolist() == [4, 5, 6, 7, 8, 9]
+    # Row t is at t / 30 s; the newest of the samples at k / 100 s is k = floor(100 t / 30), its force k / 100 N.
+    expected = [int(100 * t / 30 + 1e-9) / 100 for t in range(len(arrays["action"]))]
+    assert arrays["observation.ft_wrench"][:, 2].tolist() == pytest.approx(expected)
+
+
+def test_a_pose_in_mcap_is_read_as_it_is_in_a_bag(tmp_path: Path) -> None:
+    from mcap_ros2.writer import Writer as Ros2Writer
+
+    path = tmp_path / "a.mcap"
+    definition = (
+        "std_msgs/Header header\ngeometry_msgs/Pose pose\n"
+        "===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+        "===\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+        "===\nMSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+        "===\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
+        "===\nMSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w"
+    )
+    message = {
+        "header": {"stamp": {"sec": 1_780_000_000, "nanosec": 0}, "frame_id": "base"},
+        "pose": {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.1, "y": 0.2, "z": 0.3, "w": 0.5}},
+    }
+    with path.open("wb") as file:
+        writer = Ros2Writer(file)
+        schema = writer.register_msgdef("geometry_msgs/msg/PoseStamped", definition)
+        writer.write_message("/tool", schema, message, START_NS, START_NS)
+        writer.finish()
+    reader_name, source = find_sources(path)[0]
+    (topic,) = inspect_source(reader_name, source).topics
+    assert topic.names[2:4] == ("position.z", "orientation.w")
+    assert (topic.units[3], topic.frame, topic.num_values) == ("wxyz", "base", 7)
+    (read,) = readers.get(reader_name)(source).messages({"/tool"})
+    values = decode.vector_extractor(ChannelSpec(topic="/tool", rate_hz=1))(read.value)
+    assert values.tolist() == [1, 2, 3, 0.5, 0.1, 0.2, 0.3]
