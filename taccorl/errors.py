@@ -32,6 +32,11 @@ class LostError(TaccorlError):
     """A state from which an expert cannot complete its task. Messages have no numbers: they are counted."""
 
 
+def printable(text: object) -> str:
+    """Its text with every character that a terminal would obey or hide (escape sequences, line breaks) written out: ``\\x1b``."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+
+
 _MOST_NAMES = 60  # all effects fit, the files of a large folder do not
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import parse
 from taccorl.data.file_kinds import no_recording
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError, nearest, printable
 
 if TYPE_CHECKING:
     from taccorl.data.cutting import Cutter
@@ -126,7 +126,7 @@ def _check_recordings(config: CheckConfig) -> int:
     skipped: list[str] = []
     sources = find_sources(config.path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped)
     for line in skipped:
-        print(f"not read: {line}")
+        print(f"not read: {printable(line)}")
     for _, source in sources:
         try:
             with opened(source, spec) as recording:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import parse
-from taccorl.errors import DatasetError, InTheWayError, TaccorlError
+from taccorl.errors import DatasetError, InTheWayError, TaccorlError, printable
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 
@@ -89,7 +89,7 @@ def _ingest(config: IngestConfig) -> int:
     skipped: list[str] = []
     jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped)
     for line in skipped:
-        print(f"not read: {line}")
+        print(f"not read: {printable(line)}")
     _check_out(config, jobs)
     store = None if config.dry_run else Store(config.store)
     if store is not None:
@@ -193,7 +193,7 @@ def _inspect(config: InspectConfig) -> int:
         try:
             inventory = inspect_source(name, source)
         except TaccorlError as error:
-            print(f"{source.name}: {without_place(str(error), source.name)}")
+            print(printable(f"{source.name}: {without_place(str(error), source.name)}"))
             failed += 1
             continue
         inventory_table(inventory)
@@ -218,11 +218,11 @@ def _find_all(config: InspectConfig) -> tuple[list[tuple[Path, str, "Source"]], 
         except TaccorlError as error:
             if len(config.paths) == 1:
                 raise
-            print(error)
+            print(printable(error))
             failed += 1
             continue
         for entry in skipped:
-            print(f"{path}: not read: {entry}")
+            print(printable(f"{path}: not read: {entry}"))
         failed += len(skipped)
         found += [(path, name, source) for name, source in sources]
     return found, failed

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Callable
 
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError, nearest, printable
 
 VERBS = {
     "twin": {
@@ -55,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()  # a closed pipe shows here at the latest
         return code
     except TaccorlError as error:
-        print(f"taccorl {words[0]}: {error}", file=sys.stderr)
+        print(f"taccorl {words[0]}: {printable(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"\ntaccorl {words[0]}: stopped; what was finished is kept, run again to go on", file=sys.stderr)
@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
         return 141
     except OSError as error:
         place = f" ({error.filename})" if error.filename else ""
-        print(f"taccorl {words[0]}: {error.strerror or error}{place}", file=sys.stderr)
+        print(f"taccorl {words[0]}: {printable(f'{error.strerror or error}{place}')}", file=sys.stderr)
         return 2
 
 

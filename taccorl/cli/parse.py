@@ -17,6 +17,10 @@ from typing import Any
 
 from taccorl.errors import TaccorlError, nearest
 
+LONGEST_VALUE = 4000
+"""Characters of an option's value: Python refuses whole numbers of 4300 digits."""
+DEEPEST_VALUE = 100
+"""Brackets in a value: PyYAML gives up between 200 and 1000 levels."""
 HELP = ("-h", "--help")
 _BOOLEANS = ("true", "false", "yes", "no", "on", "off", "y", "n", "1", "0")  # what YAML or Python may take for one
 _NEGATIVE = re.compile(r"-\.?\d.*")
@@ -218,6 +222,7 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
         if name == "--config_path":
             _check_config_file(_path(value))
             option = f"{name}={json.dumps(str(_path(value)), ensure_ascii=False)}"
+        _check_size(name, value)
         given.append(option)
     try:
         return draccus.parse(config_class, args=given, exit_on_error=False)
@@ -230,12 +235,19 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
         raise TaccorlError(" ".join(str(error).split())) from error
 
 
-def _check_config_file(path: Path) -> None:
-    import yaml
+def _check_size(name: str, value: str) -> None:
+    """draccus reads values as YAML and would end in an error of Python's own."""
+    if len(value) > LONGEST_VALUE:
+        raise TaccorlError(
+            f"{name}: {len(value):,} characters, at most {LONGEST_VALUE:,} are read: give it by --config_path"
+        )
+    if sum(map(value.count, "[{")) > DEEPEST_VALUE:
+        raise TaccorlError(f"{name}: more than {DEEPEST_VALUE} brackets in a value: give it by --config_path")
 
-    try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise TaccorlError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
+
+def _check_config_file(path: Path) -> None:
+    from taccorl.data.strict_yaml import load_yaml
+
+    found = load_yaml(path)
     if not isinstance(found, dict):
         raise TaccorlError(f"{path}: expected options and their values, found {type(found).__name__}")

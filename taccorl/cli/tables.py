@@ -8,10 +8,11 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
-from rich.text import Text
+from rich.text import Text as RichText
 
 from taccorl.data.inspection import Inventory
 from taccorl.data.recording import without_place
+from taccorl.errors import printable
 
 WIDE = 150
 """Columns of a log file or pipe, which has no width of its own."""
@@ -21,6 +22,11 @@ LONG_TEXT = 400
 """Characters of a metadata record to show: rosbag2 writes pages of settings into one."""
 COLORS = {"written": "green", "split": "yellow", "quarantined": "red", "refused": "red"}
 SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
+
+
+def Text(text: str, style: str = "") -> RichText:
+    """Text of which the terminal obeys nothing: names of topics and files are other people's."""
+    return RichText(printable(text), style)
 
 
 class _Console(Console):
@@ -68,7 +74,7 @@ class Bars:
 
     def update(self, name: str, done: int, total: int) -> None:
         """``done`` of ``total`` of the recording ``name``."""
-        self._progress.update(self._task, description=_shorten(name), completed=done, total=total)
+        self._progress.update(self._task, description=printable(_shorten(name)), completed=done, total=total)
         if self._progress.console.is_terminal:
             return
         now_s = time.monotonic()
@@ -79,7 +85,7 @@ class Bars:
             _, first, first_s = self._begin
             rate_hz = (done - first) / (now_s - first_s) if now_s > first_s else 0.0
             left = f", {rate_hz:.3g}/s, {(total - done) / rate_hz:.0f} s left" if rate_hz else ""
-            print(f"{name}: {done} of {total}{left}", file=sys.stderr, flush=True)
+            print(f"{printable(name)}: {done} of {total}{left}", file=sys.stderr, flush=True)
 
 
 def ingest_table(report: dict[str, Any]) -> None:

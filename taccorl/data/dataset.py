@@ -334,7 +334,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     vague = [key for key, f in info["features"].items() if not {"dtype", "shape"} <= set(f)]
     if vague:
         raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
-    if int(info["fps"]) != info["fps"] or info["fps"] <= 0:
+    if not math.isfinite(info["fps"]) or int(info["fps"]) != info["fps"] or info["fps"] <= 0:
         raise DatasetError(f"{path}: fps {info['fps']}; whole numbers of rows a second are read")
     return info
 
@@ -537,6 +537,6 @@ def _plainly(path: Path, what: str) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise DatasetError(f"{path}: is missing: copy the whole dataset") from error
-    except (pa.ArrowException, av.error.FFmpegError, OSError, ValueError, IndexError) as error:
+    except (pa.ArrowException, av.error.FFmpegError, OSError, ValueError, IndexError, RecursionError) as error:
         known = no_recording(path) or f"is not {what} ({type(error).__name__}: {' '.join(str(error).split())})"
         raise DatasetError(f"{path}: {known}") from error

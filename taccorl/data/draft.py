@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from taccorl.data.inspection import JOINTS, PICTURES, TEXTS, Inventory, TopicSummary
 from taccorl.data.spec import UNITS, data_specs_folder, load_sensor_spec
+from taccorl.errors import printable
 
 COMMAND_WORDS = ("command", "cmd", "ctrl", "target", "action", "master", "leader", "desired", "goal")
 STATE_WORDS = ("qpos", "state", "position", "joint")
@@ -159,7 +160,7 @@ def _recording(inventory: Inventory, roles: _Roles, path: Path) -> str:
             for t in roles.used
         ),
         *(f"  # {roles.names[t.topic]}: {_channel(t, clock, known)}" for t in roles.spare),
-        *(f"  # not used: {' '.join((t.problem or f'{t.topic} ({t.type.name})').split())}" for t in unused),
+        *(f"  # not used: {printable(t.problem or f'{t.topic} ({t.type.name})')}" for t in unused),
         "features:   # several channels are joined in the order of the list",
         *_mappings(roles),
     ]
@@ -168,7 +169,7 @@ def _recording(inventory: Inventory, roles: _Roles, path: Path) -> str:
 
 def _head(inventory: Inventory) -> list[str]:
     return [
-        f"# Draft from {' '.join(inventory.source.name.split())}: replace every TODO as the comment behind it says,",
+        f"# Draft from {printable(inventory.source.name)}: replace every TODO as the comment behind it says,",
         "# check every line; `taccorl ingest … --dry_run=true` tells what is still wrong.",
         "spec_version: 1",
     ]
@@ -326,4 +327,4 @@ def _rate_hz(topics: list[TopicSummary]) -> float:
 def _yaml(text: str) -> str:
     """A text as YAML reads it back; quoted unless it is plainly a name or path."""
     plain = re.fullmatch(r"/?[A-Za-z_][A-Za-z0-9_/.-]*", text)
-    return text if plain and text.lower() not in YAML_WORDS else json.dumps(text, ensure_ascii=False)
+    return text if plain and text.lower() not in YAML_WORDS else printable(json.dumps(text, ensure_ascii=False))

@@ -2,6 +2,8 @@
 
 Keys that start with ``x-`` are shared anchors and ignored. Nothing is guessed: ``no`` is not the text "no", ``"3"`` is not
 the number 3, and 010, 0x1F, 1:30 and .inf, which YAML 1.1 reads in ways of its own, are not numbers at all.
+
+PyYAML takes half a minute for a megabyte of short list items and ends deep nesting in a RecursionError, so files have a limit.
 """
 
 import dataclasses
@@ -16,8 +18,42 @@ import yaml
 
 from taccorl.errors import SpecError, nearest
 
+MOST_BYTES = 1 << 18
+"""Of a file that people write; the largest shipped one has 9 kB."""
+MOST_DIGITS = 100
+"""Of a whole number; Python itself refuses 4300 digits, with an error of its own."""
+MOST_SHOWN = 60
+"""Characters of a value in a message."""
 PLAIN_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
+
+
+def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
+    """The plain values of somebody else's YAML file.
+
+    Raises:
+        SpecError: it cannot be read, is larger than ``most_bytes``, or is not YAML.
+    """
+    text = _read(path, most_bytes, "YAML")
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError) as error:
+        raise SpecError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise SpecError(f"{path}: is nested too deeply") from error
+
+
+def _read(path: Path, most_bytes: int, what: str) -> str:
+    try:
+        with path.open("rb") as file:
+            content = file.read(most_bytes + 1)
+        if len(content) > most_bytes:
+            raise SpecError(
+                f"{path}: is larger than {most_bytes:,} bytes, the most that is read of such a file: is it another?"
+            )
+        return content.decode("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpecError(f"{path}: cannot be read as {what}: {error}") from error
 
 
 class Document[T]:
@@ -30,10 +66,7 @@ class Document[T]:
     def __init__(self, cls: type[T], path: Path) -> None:
         self.path = Path(path)
         self._lines: dict[str, int] = {}
-        try:
-            text = self.path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise SpecError(f"{self.path}: cannot be read as a spec: {error}") from error
+        text = _read(self.path, MOST_BYTES, "a spec")
         try:
             root = yaml.compose(text, Loader=yaml.SafeLoader)
         except yaml.MarkedYAMLError as error:
@@ -54,7 +87,7 @@ class Document[T]:
         while parts and "/".join(parts) not in self._lines:
             parts.pop()
         line = self._lines.get("/".join(parts), 1)
-        place = f"{key.replace('/', ' → ')}: " if key else ""
+        place = f"{_short(key.replace('/', ' → '))}: " if key else ""
         return SpecError(f"{self.path}:{line}: {place}{text}")
 
     def _build(self, kind: Any, node: yaml.Node, key: str) -> Any:
@@ -67,7 +100,7 @@ class Document[T]:
         if origin is Literal:
             text = self._scalar(str, node, key)
             if text not in args:
-                raise self.error(key, f"{text!r} is none of {', '.join(map(repr, args))}; {nearest(text, args)}")
+                raise self.error(key, f"{_quoted(text)} is none of {', '.join(map(repr, args))}; {nearest(text, args)}")
             return text
         if origin is dict:
             items = self._items(node, key)
@@ -104,7 +137,7 @@ class Document[T]:
         for name, child in self._items(node, key):
             path = f"{key}/{name}" if key else name
             if name not in known:
-                raise self.error(path, f"unknown key {name!r}; {nearest(name, known)}")
+                raise self.error(path, f"unknown key {_quoted(name)}; {nearest(name, known)}")
             values[known[name]] = self._build(hints[known[name]], child, path)
         for name, field in fields.items():
             required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
@@ -152,20 +185,30 @@ class Document[T]:
         if kind is bool and tag == "bool":
             return str(node.value).lower() in ("true", "yes", "on")
         plain = node.style is None  # quoted digits are a text
-        if kind is int and plain and PLAIN_INT.fullmatch(node.value):
+        if kind is int and plain and len(node.value) <= MOST_DIGITS and PLAIN_INT.fullmatch(node.value):
             return int(node.value)
         # By its own rule, not by YAML 1.1's, which reads 1e-3 as a text
         if kind is float and plain and PLAIN_FLOAT.fullmatch(node.value) and math.isfinite(float(node.value)):
             return float(node.value)
         if kind is str and tag == "str":
             return str(node.value)
-        hint = {str: "; put it in quotes", int: "; plain digits only", float: "; plain decimal digits only"}.get(
-            kind, ""
-        )
+        hint = {
+            str: "; put it in quotes",
+            int: f"; at most {MOST_DIGITS} digits" if len(node.value) > MOST_DIGITS else "; plain digits only",
+            float: "; plain decimal digits only",
+        }.get(kind, "")
         raise self.error(key, f"expected {kind.__name__}, found {_describe(node)}{hint}")
 
 
 def _describe(node: yaml.Node) -> str:
     if isinstance(node, yaml.ScalarNode):
-        return f"{node.value!r}"
+        return _quoted(str(node.value))
     return "a list" if isinstance(node, yaml.SequenceNode) else "keys and values"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 4 * MOST_SHOWN else f"{text[: 4 * MOST_SHOWN]}…"
+
+
+def _quoted(value: str) -> str:
+    return repr(value) if len(value) <= MOST_SHOWN else f"{value[:MOST_SHOWN]!r}… ({len(value):,} characters)"

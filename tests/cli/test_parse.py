@@ -175,6 +175,14 @@ def test_a_slip_is_named_with_the_way_out(
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("value", ["1" * 5000, "[" * 1000])
+def test_an_absurd_value_is_refused_by_its_options_name(value: str) -> None:
+    from taccorl.cli.collect import CollectConfig
+
+    with pytest.raises(TaccorlError, match=r"--episodes: .*--config_path"):
+        parse(CollectConfig, [f"--episodes={value}"])
+
+
 def test_help_names_the_verb_then_says_what_the_module_says(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         parse(Robot, ["x", "--help"], positional="paths", prog="taccorl move")

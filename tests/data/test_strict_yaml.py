@@ -1,12 +1,13 @@
 """Strict YAML: every way to write a wrong spec gives one line that names file, line, key, value and the way out."""
 
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
-from taccorl.data.strict_yaml import Document
+from taccorl.data.strict_yaml import Document, load_yaml
 from taccorl.errors import SpecError
 
 
@@ -200,6 +201,35 @@ def test_an_empty_value_is_nothing_only_where_nothing_is_allowed(tmp_path):
 )  # fmt: skip
 def test_what_is_no_spec_at_all_gets_a_plain_message(tmp_path, text, expected):
     assert refusal(tmp_path, text).startswith(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            f"{GOOD}inner: {{count: {'1' * 5000}}}",
+            ("a.yaml:3: inner → count", "(5,000 characters)", "at most 100 digits"),
+        ),
+        (f"name: pad\nrate_hz: {'1' * 5000}", ("a.yaml:2: rate_hz", "expected float", "(5,000 characters)")),
+        (f"{GOOD}{'x' * 900}: 1", ("a.yaml:3: xxx", "unknown key", "(900 characters)")),
+        ("name: " + "[" * 20_000, ("a.yaml: is nested too deeply",)),
+        (f"name: {'x' * 20_000_000}", ("a.yaml: is larger than 262,144 bytes",)),
+        ("name: [" + "1," * 10_000_000 + "]", ("a.yaml: is larger than 262,144 bytes",)),
+    ],
+)
+def test_absurd_values_are_refused_soon_and_in_short(tmp_path, text, expected):
+    begin_s = time.process_time()
+    message = refusal(tmp_path, text)
+    assert time.process_time() - begin_s < 10
+    assert all(fact in message for fact in expected)
+    assert len(message) < 700
+
+
+@pytest.mark.parametrize("text", ["a: " + "1" * 5000, "[" * 20_000, "x" * 300_000, "a: [", "\x1b: 1"])
+def test_other_peoples_yaml_has_the_same_bounds(tmp_path, text):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(SpecError, match=r"a\.yaml: is"):
+        load_yaml(tmp_path / "a.yaml")
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path):

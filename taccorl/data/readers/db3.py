@@ -16,13 +16,12 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from taccorl.data import decode
-from taccorl.data.readers.mcap import bag_sources
+from taccorl.data.readers.mcap import MOST_METADATA_BYTES, bag_sources
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
 from taccorl.data.spec import RecordingSpec
-from taccorl.errors import RecordingError
+from taccorl.data.strict_yaml import load_yaml
+from taccorl.errors import RecordingError, SpecError
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 FARTHEST_ID = 1 << 62
@@ -328,9 +327,9 @@ def _bag_metadata(source: Source) -> dict[str, Any]:
     """rosbag2's metadata.yaml of these files; empty where there is none."""
     folder = source.path if source.path.is_dir() else source.path.parent
     try:
-        found = yaml.safe_load((folder / "metadata.yaml").read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        found = load_yaml(folder / "metadata.yaml", MOST_METADATA_BYTES)["rosbag2_bagfile_information"]
         named = {Path(n).name for n in found["relative_file_paths"]}
-    except (OSError, yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError):
+    except (SpecError, KeyError, TypeError):
         return {}
     return found if {p.name for p in source.files} <= named else {}
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
 
@@ -31,8 +30,11 @@ from taccorl.data.mcap_records import (
 )
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
 from taccorl.data.spec import RecordingSpec
-from taccorl.errors import RecordingError
+from taccorl.data.strict_yaml import load_yaml
+from taccorl.errors import RecordingError, SpecError
 
+MOST_METADATA_BYTES = 1 << 20
+"""Of a bag's metadata.yaml; rosbag2 writes one to two kB a topic."""
 MAX_TIME_NS = 2**63 - 1
 MAX_MISFITS = 10
 """Messages of one channel, unprotected by a CRC, that may fail to decode as damage; more mean that its schema is wrong."""
@@ -117,9 +119,9 @@ def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | N
     index = path / "metadata.yaml"
     if index.is_file():
         try:
-            names = yaml.safe_load(index.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
+            names = load_yaml(index, MOST_METADATA_BYTES)["rosbag2_bagfile_information"]["relative_file_paths"]
             named = [path / Path(n).name for n in names]
-        except (yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError) as error:
+        except (SpecError, KeyError, TypeError) as error:
             raise RecordingError(f"{index}: not rosbag2's metadata ({type(error).__name__}: {error})") from error
         absent = [p.name for p in named if not p.is_file()]
         if absent:
