@@ -96,8 +96,8 @@ class LerobotReader(Reader):
                 raise RecordingError(f"{self.source.name}: {topic}: {known[topic].undecodable}")
         with _as_recording_errors(), contextlib.ExitStack() as stack:
             self._check_action_time()
-            self.unprotected = "ingest does not compare a dataset's files with digests" + (
-                f": taccorl check {self.source.path} does" if self.dataset.provenance else ", and this one holds none"
+            self.unprotected = "ingest does not compare a dataset's files with digests: " + (
+                "taccorl check of the dataset does" if self.dataset.provenance else "it holds none"
             )
             log_ns = self._times_ns(asked)
             tasks = dict(self.dataset.tasks(self.index))

@@ -337,6 +337,19 @@ def test_a_data_path_that_leads_out_of_the_dataset_is_not_opened(ours: Path, tmp
         assert place in str(caught.value) and "leads out of the dataset" in str(caught.value)
 
 
+def test_whether_a_dataset_has_digests_is_said_without_its_place(ours: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(ours, tmp_path / "copy")
+    reader = reader_of(copy)
+    assert list(reader.messages({"task"}))
+    assert (
+        "holds none" in reader.unprotected and str(copy) not in reader.unprotected
+    )  # entries of a store know no places
+    (copy / "meta/taccorl/manifest.json").write_text('{"files": {}}')
+    reader = reader_of(copy)
+    assert list(reader.messages({"task"}))
+    assert "taccorl check" in reader.unprotected and str(copy) not in reader.unprotected
+
+
 def test_a_dataset_that_claims_any_number_of_episodes_is_refused_at_once(ours: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(ours, tmp_path / "copy")
     info = json.loads((copy / "meta/info.json").read_text())
