@@ -143,4 +143,4 @@ def test_what_cannot_be_decoded_is_named_once(stand_in: tuple[Path, Any]) -> Non
     assert nameless.problem == "/x: not read"
     inventory = Inventory(Source(Path("a\nb.h5"), ()), "hdf5", (nameless,), {}, ())
     assert "  # not used: /x: not read" in draft_specs(inventory).recording
-    assert draft_specs(inventory).recording.startswith("# Draft from a b.h5: ")
+    assert draft_specs(inventory).recording.startswith(r"# Draft from a\nb.h5: ")
