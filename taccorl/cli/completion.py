@@ -66,6 +66,8 @@ def _own_names(module: str, node: ast.ClassDef) -> list[str]:
     names = []
     for field in node.body:
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            if ast.unparse(field.annotation).startswith("ClassVar"):
+                continue
             inner = _field_names(module, field.annotation.id) if isinstance(field.annotation, ast.Name) else []
             names += [f"{field.target.id}.{name}" for name in inner] or [field.target.id]
     return names

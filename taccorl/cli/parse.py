@@ -22,7 +22,7 @@ LONGEST_VALUE = 4000
 DEEPEST_VALUE = 100
 """Brackets in a value: PyYAML gives up between 200 and 1000 levels."""
 HELP = ("-h", "--help")
-_BOOLEANS = ("true", "false", "yes", "no", "on", "off", "y", "n", "1", "0")  # what YAML or Python may take for one
+_BOOLEANS = ("true", "false", "yes", "no", "on", "off")  # YAML's
 _NEGATIVE = re.compile(r"-\.?\d.*")
 
 

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 from collections.abc import Collection, Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,11 @@ BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index
 """LeRobot's own columns: no features."""
 NUMBERS = ("float32", "float64", "int16", "int64")
 """Kinds of numbers that are read from flat features."""
+MOST_FPS = 100_000
+MOST_NUMBERS = 10_000_000
+"""Of a feature in a row: ten times a frame of 640 × 480 in three colours."""
+_TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
+"""Paths of files in info.json: other people's, so no width that fills the memory, and no attribute of anything."""
 TOLERANCE_S = 1e-4
 """A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``."""
 
@@ -233,10 +239,13 @@ class Dataset:
         entry = self._entry(index)
         try:
             chunk, file = int(entry[f"{prefix}chunk_index"]), int(entry[f"{prefix}file_index"])
-            name = str(self.info[template]).format(chunk_index=chunk, file_index=file, **names)
+            text = str(self.info[template])
+            if not _TEMPLATE.fullmatch(text):
+                raise ValueError(f"{template} {text[:200]!r} is no path with fields such as {{chunk_index:03d}}")
+            name = text.format(chunk_index=chunk, file_index=file, **names)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise DatasetError(
-                f"{self.root}/meta: nothing says which file holds {prefix} of episode {index}"
+                f"{self.root}/meta: nothing says which file holds {prefix} of episode {index} ({error})"
             ) from error
         # By its text: in the cache of Hugging Face's Hub files are links to a folder beside.
         if Path(os.path.normpath(name)).parts[:1] == ("..",) or Path(name).is_absolute():
@@ -334,8 +343,8 @@ def _read_info(root: Path) -> dict[str, Any]:
     vague = [key for key, f in info["features"].items() if not {"dtype", "shape"} <= set(f)]
     if vague:
         raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
-    if not math.isfinite(info["fps"]) or int(info["fps"]) != info["fps"] or info["fps"] <= 0:
-        raise DatasetError(f"{path}: fps {info['fps']}; whole numbers of rows a second are read")
+    if not math.isfinite(info["fps"]) or int(info["fps"]) != info["fps"] or not 0 < info["fps"] <= MOST_FPS:
+        raise DatasetError(f"{path}: fps {info['fps']}; whole numbers of rows a second up to {MOST_FPS} are read")
     return info
 
 
@@ -417,6 +426,8 @@ def _derive_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[st
         elif f["dtype"] == "image":
             skipped[key] = "pictures inside the parquet files; lerobot-edit-dataset's convert_image_to_video helps"
             continue
+        elif math.prod(shape) > MOST_NUMBERS:
+            skipped[key] = f"{f['dtype']} {list(shape)}: at most {MOST_NUMBERS:,} numbers a row are read"
         elif f["dtype"] not in NUMBERS or len(shape) != 1:
             skipped[key] = f"{f['dtype']} {list(shape)}: flat {', '.join(NUMBERS)} are read"
             continue

@@ -216,12 +216,18 @@ def _vector_content(t: TopicSummary, value: Any) -> dict[str, Any]:
     absent = [part for part, covariance in covariances.items() if covariance[:1].tolist() == [-1.0]]
     names = tuple(name for name in decode.vector_paths(value) if name.partition(".")[0] not in absent)
     units = tuple(unit_of(name, t.type.name) for name in names)
+    # An odometry's pose is in header.frame_id, its twist in child_frame_id (nav_msgs/Odometry): no frame is that of all.
+    frame = "" if _is_odometry(value) else decode.maybe(value, "header.frame_id")
     return {
         "names": names,
         "num_values": len(names),
         "units": units,
-        "frame": str(decode.maybe(value, "header.frame_id") or ""),
+        "frame": str(frame or ""),
     }
+
+
+def _is_odometry(value: Any) -> bool:
+    return all(decode.maybe(value, field) is not None for field in ("child_frame_id", "pose.pose", "twist.twist"))
 
 
 def _fitting(reader_name: str, topics: dict[str, str]) -> tuple[str, ...]:

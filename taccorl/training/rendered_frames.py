@@ -25,7 +25,7 @@ from taccorl.demos.recorder import PICTURE
 from taccorl.errors import DatasetError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine
-from taccorl.lineage.manifest import read_manifest
+from taccorl.lineage.manifest import read_manifest, software
 from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
@@ -110,10 +110,13 @@ def _executions(root: Path) -> list[str]:
 def _rendered_before(store: Store, config: FramesConfig) -> dict[str, _Place]:
     """Digest of an execution → its frames at this resolution. Only of datasets that are still there, as they were."""
     found: dict[str, _Place] = {}
+    now = {name: version for name, version in software().items() if name in ("mujoco", "taccorl")}
     for folder in store.artefacts():
         manifest = read_manifest(folder) if folder.parent.name == FRAMES.name else {}
         if not manifest or (manifest["config"], manifest["stage_version"]) != (canonical(config), FRAMES.version):
             continue
+        if any(manifest["software"].get(name) != version for name, version in now.items()):
+            continue  # it may have drawn other pictures
         root = Path(manifest["inputs"][0]["path"])
         executions = _executions(root) if root.is_dir() else []
         if executions and store.source(root).digest == manifest["inputs"][0]["digest"]:

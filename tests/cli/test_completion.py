@@ -82,3 +82,7 @@ def test_every_verb_has_options_or_words() -> None:
     for group in VERBS.values():
         for verb in group:
             assert (verb == "completion") != bool(options_of(verb)), verb
+
+
+def test_what_a_class_alone_knows_is_no_option():
+    assert "source.repeatable" not in options_of("collect")  # a ClassVar

@@ -153,6 +153,7 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("x", "--name=a", "--joints=six"), ("joints", "'six'", "int")),
         (("x", "--name=a", "--joints=1.5"), ("joints", "1.5")),
         (("x", "--name=a", "--quick=maybe"), ("quick", "'maybe'", "bool")),
+        (("x", "--name=a", "--quick=1"), ("quick", "'1'", "bool", "--quick=true")),
         (("x", "--name=a", "--reach_m=[1"), ("[1",)),
         (("x", "--name=a", "--paths=b"), ("'x' and --paths=…", "one way")),
         (("", "--name=a"), ("paths is empty",)),

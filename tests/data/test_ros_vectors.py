@@ -224,6 +224,7 @@ def test_a_robot_without_joint_states_is_drafted_and_ingested_with_units_and_fra
     assert features["observation.ft_wrench"].unit == ("N", "N", "N", "Nm", "Nm", "Nm")
     assert features["observation.ft_wrench"].frame == "tool0"
     assert features["observation.odom"].unit == (*["m"] * 3, *["wxyz"] * 4, *["m/s"] * 3, *["rad/s"] * 3)
+    assert features["observation.odom"].frame == "base_link"  # a TODO: its pose is in "odom", its twist in "base_link"
     assert features["observation.odom"].names[3:5] == ("orientation.w", "orientation.x")
     # The IMU says that it has no orientation: its covariance begins with -1.
     assert features["observation.imu_data"].unit == (*["rad/s"] * 3, *["m/s2"] * 3)

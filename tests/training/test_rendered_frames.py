@@ -23,7 +23,7 @@ from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.errors import DatasetError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
-from taccorl.training import reading
+from taccorl.training import reading, rendered_frames
 from taccorl.training.frame_cache import FRAMES, CacheRequest, FramesConfig, empty_frames, resized
 from taccorl.training.reading import FastReader
 from taccorl.training.rendered_frames import render_frames
@@ -136,6 +136,10 @@ def test_frames_of_an_episode_are_rendered_once_and_copied_into_the_next_dataset
 
     _, frames_of_one = made("one", sources[1:])
     assert said == ["episode 0 of 1: rendered"]
+    assert len(rendered_frames._rendered_before(store, FramesConfig((28, 28)))) == 1
+    with monkeypatch.context() as patch:  # another MuJoCo may draw other pictures
+        patch.setattr(rendered_frames, "software", lambda: {"mujoco": "3.0.0"})
+        assert rendered_frames._rendered_before(store, FramesConfig((28, 28))) == {}
     both, frames_of_both = made("both", sources)
     assert said == ["episode 0 of 2: rendered", "episode 1 of 2: copied"]
     first = both.first_row(1)

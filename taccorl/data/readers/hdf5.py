@@ -248,7 +248,9 @@ def _unreadable(dataset: h5py.Dataset) -> str | None:
         others += [name for name, _, _ in dataset.external or ()]
         kind = "a virtual dataset" if dataset.is_virtual else "external storage"
         return f"its values are in {listed(sorted(set(others)))} ({kind}), which is not opened: write the values into this file"
-    rows, block_bytes = _length(dataset), _rows_at_once(dataset) * _row_bytes(dataset)
+    rows = _length(dataset)
+    chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize  # wider than the rows, if they may grow
+    block_bytes = max(_rows_at_once(dataset) * _row_bytes(dataset), chunk_bytes)
     if rows > MOST_ROWS:
         return f"it claims {rows:,} rows; at most {MOST_ROWS:,} are read: write shorter recordings"
     if block_bytes > MOST_BLOCK_BYTES:

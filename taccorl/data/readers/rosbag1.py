@@ -72,6 +72,10 @@ class Rosbag1Reader(Reader):
                             ) from error
                     stamp_ns = None if value is None else decode.stamp_ns(value)
                     yield Message(topic, log_ns, stamp_ns, value if topic in read else None)
+        if start_ns is None and end_ns is None:
+            self.unprotected = (
+                "ROS 1 bags hold no checksums: changed bytes in a message that still decodes are read as values"
+            )
 
 
 @contextlib.contextmanager

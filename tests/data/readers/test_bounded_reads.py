@@ -45,6 +45,12 @@ def virtual(file: h5py.File, name: str) -> None:
             lambda f, n: f.create_dataset(n, (ROWS, 14 * 10**6), "f4", chunks=(ROWS, 10**6), compression="gzip"),
             ("62 rows", "[14000000]", "3.2 GiB", "smaller chunks"),
         ),
+        (
+            lambda f, n: f.create_dataset(
+                n, SHAPE, "f8", maxshape=(None, None), chunks=(1, 250 * 10**6), compression="gzip"
+            ),
+            ("1.9 GiB", "1 GiB"),  # HDF5 unpacks whole chunks, and these are wider than the rows
+        ),
         (lambda f, n: f.create_dataset(n, SHAPE, "f4"), ("none of its 62 rows was ever written",)),
         (external, (SECRET, "external storage", "not opened")),
         (virtual, (OTHER, "virtual dataset", "not opened")),

@@ -13,13 +13,13 @@ import pytest
 import yaml
 
 from taccorl.data.cutting import Cutter
-from taccorl.data.dataset import dataset_spec_to_json, episode_record
+from taccorl.data.dataset import Dataset, dataset_spec_to_json, episode_record
 from taccorl.data.draft import draft_specs
 from taccorl.data.episode import Episode
 from taccorl.data.inspection import inspect_source
 from taccorl.data.recording import find_sources, opened, readers
 from taccorl.data.spec import RecordingSpec, data_specs_folder, load_dataset_spec, load_recording_spec
-from taccorl.errors import RecordingError
+from taccorl.errors import DatasetError, RecordingError
 
 ROWS = (40, 41)
 CAMERAS = ("front", "left_wrist", "right_wrist")
@@ -324,7 +324,15 @@ def test_drafts_keep_the_names_that_a_dataset_gives_its_joints(theirs: Path, our
 
 
 @pytest.mark.parametrize(
-    "place", ["../outside/{file_index}.parquet", "/outside.parquet", "data/../../x.parquet", "data/{"]
+    "place",
+    [
+        "../outside/{file_index}.parquet",
+        "/outside.parquet",
+        "data/../../x.parquet",
+        "data/{",
+        "data/{chunk_index:>3000000000}.parquet",
+        "data/{chunk_index.__class__}.parquet",
+    ],
 )
 def test_a_data_path_that_leads_out_of_the_dataset_is_not_opened(ours: Path, tmp_path: Path, place: str) -> None:
     copy = shutil.copytree(ours, tmp_path / "copy")
@@ -333,7 +341,9 @@ def test_a_data_path_that_leads_out_of_the_dataset_is_not_opened(ours: Path, tmp
     (copy / "meta/info.json").write_text(json.dumps(info))
     with pytest.raises(RecordingError, match=r"copy/meta") as caught:
         find_sources(copy)
-    if place != "data/{":  # which is no template at all
+    if "data/{" in place:  # which is no template of numbers
+        assert repr(place) in str(caught.value)
+    else:
         assert place in str(caught.value) and "leads out of the dataset" in str(caught.value)
 
 
@@ -358,6 +368,18 @@ def test_a_dataset_that_claims_any_number_of_episodes_is_refused_at_once(ours: P
         RecordingError, match=r"counts 1000000000000 episodes, meta/episodes lists 2, episode 2 is missing"
     ):
         find_sources(copy)
+
+
+def test_absurd_rates_and_shapes_are_refused_or_left_out(ours: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(ours, tmp_path / "copy")
+    shutil.rmtree(copy / "meta/taccorl")
+    info = json.loads((copy / "meta/info.json").read_text())
+    info["features"]["observation.state"]["shape"] = [10**10]
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    assert "10,000,000" in Dataset(copy).skipped["observation.state"]
+    (copy / "meta/info.json").write_text(json.dumps(info | {"fps": 10**30}))
+    with pytest.raises(DatasetError, match="fps 1000000000000000000000000000000"):
+        Dataset(copy)
 
 
 def test_files_of_a_dataset_may_be_links_as_in_the_hubs_cache(ours: Path, tmp_path: Path) -> None:

@@ -83,6 +83,7 @@ def test_values_stamps_and_log_times_come_back(tmp_path: Path, compression: Any)
     assert cv2.imdecode(pictures[7].value.data, cv2.IMREAD_COLOR)[0, 0].tolist() == [7, 7, 7]
     assert {topic: kind.name for topic, kind in reader.topics().items()} == KINDS
     assert reader.damage == []
+    assert "no checksums" in reader.unprotected
 
 
 def test_only_times_may_be_asked_for_and_only_a_part(bag: Path) -> None:
