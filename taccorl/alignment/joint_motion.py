@@ -41,7 +41,7 @@ class JointMotion:
     start: float
     """rad: reported at rest before the first command."""
     pose: np.ndarray
-    """Rad, m: where the arm's joints and its gripper are; the joint's own is not used."""
+    """Pose at which the arm's other joints [rad] and its gripper [m] are held; the number of the free joint is not used."""
     kp_scale: float = 1.0
     """Gains of this recording over those that are asked for: commanded ones, where known, over the twin's; else over those of
     the other recordings (``Measurement.gain_scale``)."""

@@ -116,7 +116,7 @@ def _within(effect: Effect, window: tuple[slice, slice]) -> Effect:
 
 
 def _memory(effect: Effect, motion: TouchMotion) -> Memory:
-    """As before the first scan, of the taxels in the motion's window."""
+    """State of the effects' memory before the first scan, for the taxels in the motion's window."""
     shape = motion.layout.shape
     return {
         name: np.ascontiguousarray(array[..., *motion.window]) if array.shape[-2:] == shape else array

@@ -105,7 +105,7 @@ class TouchMotion:
     measurement: Measurement = field(repr=False)
     """That it was made from."""
     pads: tuple[str, ...]
-    """Those that came near, in the order of ``ROBOT.pads``."""
+    """Pads that the object came near, in the order of ``ROBOT.pads``."""
     time_s: np.ndarray
     """(T, P) stamps on the measurement's clock: ends of scans."""
     measured: np.ndarray
@@ -122,7 +122,7 @@ class TouchMotion:
     clearance_m: np.ndarray
     """(T, P, I) the object is at least so far out of the plane of the taxels; below 0 it may reach through."""
     layout: PadLayout
-    """Of the whole pads."""
+    """Taxels of a whole pad; ``window`` says which of them are simulated."""
     window: tuple[slice, slice] = (slice(None), slice(None))
     """Rows and columns of the pads that R × C are: all but for a ``cut``."""
 

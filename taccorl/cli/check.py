@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import parse
-from taccorl.data.file_kinds import no_recording
+from taccorl.data.file_kinds import no_dataset
 from taccorl.errors import TaccorlError, nearest, printable
 
 if TYPE_CHECKING:
@@ -41,13 +41,7 @@ def main(argv: list[str]) -> int:
             f"{config.path}: no such file or folder; {nearest(config.path.name, [p.name for p in siblings])}"
         )
     if config.spec is None:
-        what = no_recording(config.path)
-        known = (
-            f": {what}"
-            if what
-            else " is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"
-        )
-        raise TaccorlError(f"{config.path}{known}")
+        raise TaccorlError(no_dataset(config.path))
     return _check_recordings(config)
 
 

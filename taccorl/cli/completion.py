@@ -18,12 +18,12 @@ SECOND_WORDS = {
     "lineage": ("explain", "prune"),
     "completion": ("bash", "zsh", "fish"),
 }
-"""Verb → words that may follow it, other than files."""
+"""Verb → second words that it takes, such as ``explain`` of ``taccorl lineage explain``."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def main(argv: list[str]) -> int:
-    """0: printed."""
+    """Print the script; returns the exit status 0."""
     shells = {"bash": _bash, "zsh": _zsh, "fish": _fish}
     if argv in (["-h"], ["--help"]):
         print((__doc__ or "").replace("``", ""))
@@ -74,7 +74,7 @@ def _own_names(module: str, node: ast.ClassDef) -> list[str]:
 
 
 def _class(module: str, name: str) -> tuple[str, ast.ClassDef | None]:
-    """The class and the module of taccorl that defines it."""
+    """Module that defines class ``name``, which ``module`` defines or imports, and the class in its source; None if not found."""
     for node in _nodes(module):
         if isinstance(node, ast.ClassDef) and node.name == name:
             return module, node

@@ -18,9 +18,9 @@ from typing import Any
 from taccorl.errors import TaccorlError, nearest
 
 LONGEST_VALUE = 4000
-"""Characters of an option's value: Python refuses whole numbers of 4300 digits."""
+"""Longest value of an option [characters]. Python refuses to read whole numbers of more than 4300 digits."""
 DEEPEST_VALUE = 100
-"""Brackets in a value: PyYAML gives up between 200 and 1000 levels."""
+"""Most opening brackets in a value. PyYAML fails somewhere between 200 and 1000 levels of nesting."""
 HELP = ("-h", "--help")
 _BOOLEANS = ("true", "false", "yes", "no", "on", "off")  # YAML's
 _NEGATIVE = re.compile(r"-\.?\d.*")
@@ -236,7 +236,7 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
 
 
 def _check_size(name: str, value: str) -> None:
-    """draccus reads values as YAML and would end in an error of Python's own."""
+    """Refuse values that are too long or too deeply nested: draccus reads values as YAML, which would end in a traceback."""
     if len(value) > LONGEST_VALUE:
         raise TaccorlError(
             f"{name}: {len(value):,} characters, at most {LONGEST_VALUE:,} are read: give it by --config_path"

@@ -25,7 +25,7 @@ SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
 def Text(text: str, style: str = "") -> RichText:
-    """Text of which the terminal obeys nothing: names of topics and files are other people's."""
+    """Text whose control characters are escaped: names of topics and files come from other people."""
     return RichText(printable(text), style)
 
 

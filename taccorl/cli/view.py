@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import parse
-from taccorl.data.file_kinds import no_recording
+from taccorl.data.file_kinds import no_dataset
 from taccorl.errors import TaccorlError
 
 if TYPE_CHECKING:
@@ -103,13 +103,7 @@ def _opened(config: ViewConfig) -> Iterator["Episode"]:
             yield attempt_episode(config.path)
             return
     if config.spec is None:
-        what = no_recording(config.path)
-        known = (
-            f": {what}"
-            if what
-            else " is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"
-        )
-        raise TaccorlError(f"{config.path}{known}")
+        raise TaccorlError(no_dataset(config.path))
     from taccorl.data.cutting import open_episodes
 
     with open_episodes(config.path, config.spec) as episodes:

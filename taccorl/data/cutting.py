@@ -26,7 +26,7 @@ START_UP_S = 1.0
 END_SLACK_S = 0.25
 """So much may be missing at an end that was marked."""
 LONGEST_S = 24 * 3600.0
-"""Of one recording; at 200 Hz a channel holds 17 million messages by then."""
+"""Longest recording that is read. At 200 Hz a channel has 17 million messages by then."""
 MAX_WAITING_PICTURES = 1000
 """Cameras of one recording come interleaved; more waiting than this means that they do not."""
 

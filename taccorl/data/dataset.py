@@ -34,9 +34,10 @@ NUMBERS = ("float32", "float64", "int16", "int64")
 """Kinds of numbers that are read from flat features."""
 MOST_FPS = 100_000
 MOST_NUMBERS = 10_000_000
-"""Of a feature in a row: ten times a frame of 640 × 480 in three colours."""
+"""Most numbers that a feature may have in a row: ten times a picture of 640 × 480 in three colours."""
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
-"""Paths of files in info.json: other people's, so no width that fills the memory, and no attribute of anything."""
+"""Accepted paths of files in info.json: fields are plain names, with a width of two digits at most. Python's own format language
+would also accept widths that exhaust the memory, and attributes of objects."""
 TOLERANCE_S = 1e-4
 """A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``."""
 

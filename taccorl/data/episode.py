@@ -83,7 +83,7 @@ class Episode:
     """(first row, name) of the task's stages, where known."""
     provenance: dict[str, object] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
-    """On the recording's samples, of which the rows hold a part; empty in a dataset."""
+    """Findings in the recording's samples, of which the rows hold only a part; empty for a dataset."""
 
     @property
     def num_rows(self) -> int:

@@ -9,14 +9,14 @@ class FileKind(NamedTuple):
     """A kind of file."""
 
     name: str
-    """With its article."""
+    """Name with its article, such as ``an MCAP file``."""
     magic: bytes
     """Bytes that such a file holds at ``offset``."""
     offset: int = 0
     reader: str | None = None
     """Name of the reader that opens it; None: it is no recording."""
     command: str = ""
-    """What gives the file that is wanted, with {path} and {folder}."""
+    """Shell command that produces the wanted file; {path} and {folder} stand for this file and its folder."""
 
 
 FILE_KINDS = (
@@ -54,3 +54,10 @@ def no_recording(path: Path) -> str | None:
         return None
     command = kind.command.format(path=shlex.quote(str(path)), folder=shlex.quote(str(path.parent)))
     return f"{kind.name}, no recording" + (f"; this gives the file: {command}" if command else "")
+
+
+def no_dataset(path: Path) -> str:
+    """Why ``path``, which is no dataset, is refused where a recording would need its spec, and what helps."""
+    if what := no_recording(path):
+        return f"{path}: {what}"
+    return f"{path} is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"

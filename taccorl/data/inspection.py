@@ -44,11 +44,11 @@ class TopicSummary:
     zero_stamps: int
     """Messages stamped 0, where others have a time."""
     names: tuple[str, ...] = ()
-    """Of its values, from the ``name`` list of its first message, as its type says, or their paths in a vector, a pose …"""
+    """Names of the values: the ``name`` list of the first message, the type's, or paths such as ``force.x`` in a wrench."""
     units: tuple[str, ...] = ()
-    """Of the values of a vector, a pose …, empty where its type does not say; () for other messages."""
+    """Unit of each value of a vector, pose and the like, empty where the type does not state one; () for other messages."""
     frame: str = ""
-    """``header.frame_id`` of such a message."""
+    """``header.frame_id`` of a vector, pose and the like; empty for odometry, whose twist is in another frame than its pose."""
     num_values: int | None = None
     """Numbers in a message of joints or of an array; None where it holds no list of numbers."""
     sensor: str | None = None

@@ -131,7 +131,7 @@ class _Files:
 def _write_episodes(
     destination: Path, parts: Sequence[_Part], features: dict[str, Any], tasks: "_Tasks", pool: ThreadPoolExecutor
 ) -> None:
-    """The tables of episodes, changed all together: one by one they took most of the time of a merge."""
+    """Write ``meta/episodes``. Tables are joined first and changed together: one by one they took most of the time of a merge."""
     sources = [(place, path, part) for part in parts for path, place in part.episodes.items()]
     read = list(pool.map(lambda source: _without_lost_features(_read(source[1]), features), sources))
     for place in dict.fromkeys(source[0] for source in sources):
@@ -154,13 +154,13 @@ def _write_episodes(
 
 
 def _read(path: Path) -> pa.Table:
-    """``pq.read_table`` takes twice as long for a small file of many columns."""
+    """Table of a Parquet file. For small files of many columns this takes half the time of ``pq.read_table``."""
     with pq.ParquetFile(path) as file:
         return file.read()
 
 
 def _path(root: Path, kind: str, place: _Place) -> Path:
-    """Of a Parquet file; its folder is made."""
+    """Path of a Parquet file of ``kind`` in the dataset at ``root``; makes its folder."""
     path = root / kind / f"chunk-{place[0]:03d}" / f"file-{place[1]:03d}.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

@@ -21,7 +21,7 @@ JOINT_SPEED_RAD_PER_S = 3.93
 GRIPPER_SPEED_M_PER_S = 1.5
 """The whole 70 mm stroke in 47 ms: faster than a hand can press the leader's trigger."""
 SPEEDS = {"rad": JOINT_SPEED_RAD_PER_S, "m": GRIPPER_SPEED_M_PER_S}
-"""By the unit of a position, per second."""
+"""Unit of a position → highest speed that is plausible for it [that unit per second]."""
 JUMP_MARGIN = 2.0
 """A row may show a sample one row older than its neighbour's, so that a step can hold the way of two rows."""
 STILL_RAD = 0.02

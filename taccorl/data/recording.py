@@ -49,7 +49,7 @@ class TopicType:
     shape: tuple[int, ...] | None = None
     """Shape of one value, where the format says so (HDF5, LeRobot)."""
     names: tuple[str, ...] = ()
-    """Of the elements of one value, where the format says so (LeRobot)."""
+    """Names of the elements of one value, where the format states them (LeRobot)."""
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,10 @@ UNITS = {
     "angular_velocity": "rad/s",
     "linear_acceleration": "m/s2",
 }
-"""By the field that holds x, y, z (REP 103: SI)."""
+"""Name of the field that holds x, y and z → their unit. ROS messages are in SI units (REP 103)."""
 UNITS_OF_ACCEL = {"linear": "m/s2", "angular": "rad/s2"}
 UNITS_OF_TYPE = {"Point": "m", "Quaternion": "wxyz"}
-"""Where x, y, z are the message's own. Nobody knows the unit of a Vector3."""
+"""Type of a message that is x, y, z (and w) itself → their unit. A bare Vector3 has none: its type does not say what it is."""
 
 
 def vector_type(kind: str) -> str | None:

@@ -55,7 +55,7 @@ _DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of an episode: ``default_rng([scen
 _CARE = Care(limit_s=600.0, tries=2)
 _STALL_STEPS = CONTROL_HZ  # 1 s
 _STILL = ROBOT.per_action(0.02, 0.001)
-"""(A,) [rad, m] range of a hand's joints and opening that is hardly a motion."""
+"""(A,) [rad, m]: joints and grippers whose range over a second is smaller than this count as still."""
 
 Progress = Callable[[str], None]
 

@@ -35,7 +35,7 @@ class Response:
     """What the twin did."""
 
     measurement: Measurement
-    """As it was replayed: all signals of the robot, at an even rate that is a whole number of physics steps."""
+    """The recording as it was replayed: all signals, resampled at a rate whose period is a whole number of physics steps."""
     way: Literal["joint", "twin"]
     reported: np.ndarray
     """(T, 14) rad, m; NaN for signals that were not replayed."""

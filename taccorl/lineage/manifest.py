@@ -143,7 +143,7 @@ def _read_again(path: Path) -> tuple[str, list[int], str]:
 
 
 def is_verified(folder: Path) -> bool:
-    """Whether ``verify`` has found all files of ``folder`` unchanged, and their sizes, times and inodes are still the same."""
+    """True if an earlier ``verify`` of ``folder`` found every file unchanged, and no size, time stamp or inode changed since."""
     try:
         place = manifest_place(folder)
         if place is None:

@@ -93,8 +93,9 @@ class FlowSDE:
         return Draws(initial.to(device), noise.to(device), step.to(device))
 
     def mean(self, x_BHD: Tensor, v_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean (B, H, D) and standard deviation (B, 1, 1) of x after denoising step ``k_B``, in normalised actions.
+        """Mean (B, H, D) and standard deviation (B, 1, 1) of a chunk after one denoising step, in normalised actions.
 
+        ``k_B`` (B,) says which step each chunk of the batch takes, counted from 0.
         Where ``noisy_BHD`` is False, the mean is that of Euler's step and the deviation does not apply.
         """
         t = torch.tensor(self.times, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]

@@ -49,9 +49,9 @@ class PadLayout:
     """Taxels of one tactile pad. Taxel = row · columns + column."""
 
     rows: int
-    """From palm to tip."""
+    """Number of rows, from palm to tip."""
     columns: int
-    """Across the finger."""
+    """Number of columns, across the finger."""
     pitch_m: float
     """Distance of neighbouring taxels, along rows and columns alike."""
 
@@ -106,7 +106,7 @@ class RobotSpec:
     joints: tuple[str, ...]
     """Names of one arm's joints without the arm's prefix, base to hand."""
     links: tuple[Link, ...]
-    """Of one arm: the link that each joint moves."""
+    """Links of one arm, base to hand: link k is moved by joint k."""
     kp_nm_per_rad: tuple[float, ...]
     """K_p of the joints' controllers, τ = K_p (q* − q) − K_d q̇ + T_ref."""
     kd_nms_per_rad: tuple[float, ...]
@@ -114,13 +114,13 @@ class RobotSpec:
     torque_ff_nm: tuple[float, ...]
     """T_ref of the joints."""
     fingers: tuple[str, ...]
-    """Of one gripper; each has a pad."""
+    """Names of the fingers of one gripper; each finger has a pad."""
     finger_stroke_m: float
     """Travel of each finger."""
     finger_from_hand_m: float
-    """Origin of the fingers on the hand's z axis."""
+    """Distance of the fingers' origin from the hand's origin, along the hand's z axis."""
     tcp_from_hand_m: float
-    """TCP on the hand's z axis."""
+    """Distance of the TCP from the hand's origin, along the hand's z axis."""
     grip_force_max_n: float
     """Greatest closing force of each finger."""
     pad: PadLayout
@@ -145,7 +145,7 @@ class RobotSpec:
 
     @property
     def num_taxels(self) -> int:
-        """Of all pads together."""
+        """K: number of taxels of all pads together."""
         return len(self.pads) * self.pad.num_taxels
 
     @property
@@ -157,7 +157,7 @@ class RobotSpec:
 
     @property
     def num_joints(self) -> int:
-        """Of one arm, without its gripper."""
+        """Number of joints of one arm, without its gripper."""
         return len(self.joints)
 
     @property
@@ -176,7 +176,7 @@ class RobotSpec:
         return tuple(f"{arm}_{name}" for arm in self.arms for name in (*self.joints, "gripper"))
 
     def arm_slice(self, arm: str) -> slice:
-        """An arm's joints and gripper among the A numbers.
+        """Where the joints and the gripper of ``arm`` are in an action of A numbers.
 
         Raises:
             ValueError: no such arm.
@@ -185,7 +185,7 @@ class RobotSpec:
         return slice(first, first + self.num_per_arm)
 
     def joint_slice(self, arm: str) -> slice:
-        """An arm's joints among the A numbers.
+        """Where the joints of ``arm`` are in an action of A numbers.
 
         Raises:
             ValueError: no such arm.
@@ -194,7 +194,7 @@ class RobotSpec:
         return slice(first, first + self.num_joints)
 
     def gripper_index(self, arm: str) -> int:
-        """An arm's gripper among the A numbers.
+        """Index of the gripper of ``arm`` in an action of A numbers.
 
         Raises:
             ValueError: no such arm.
@@ -203,12 +203,12 @@ class RobotSpec:
 
     @property
     def gripper_indices(self) -> list[int]:
-        """All grippers among the A numbers."""
+        """Index of each arm's gripper in an action of A numbers, in the order of the arms."""
         return [self.gripper_index(arm) for arm in self.arms]
 
     @property
     def joint_indices(self) -> list[int]:
-        """All joints among the A numbers."""
+        """Index of each joint, grippers left out, in an action of A numbers."""
         grippers = self.gripper_indices
         return [k for k in range(self.num_actions) if k not in grippers]
 

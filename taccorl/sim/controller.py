@@ -17,7 +17,10 @@ from taccorl.sim.settings import check_numbers
 
 @dataclass(kw_only=True)
 class ControllerConfig:
-    """Per joint, base to hand, the same for all arms."""
+    """Gains K_p, K_d and feed-forward torques of the joints' controllers, τ = K_p (q* − q) − K_d q̇ + T_ref.
+
+    Each list has one number for each joint of an arm, from base to hand, and holds for all arms.
+    """
 
     kp_nm_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kp_nm_per_rad))
     kd_nms_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kd_nms_per_rad))

@@ -75,10 +75,10 @@ def render_frames(
 
 @dataclass(frozen=True)
 class _Place:
-    """Of an episode's frames in the store."""
+    """Where the frames of an episode are in the store."""
 
     folder: Path
-    """Artefact of frames."""
+    """Folder of an artefact of the stage ``frames``."""
     first_row: int
 
 

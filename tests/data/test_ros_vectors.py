@@ -226,7 +226,7 @@ def test_a_robot_without_joint_states_is_drafted_and_ingested_with_units_and_fra
     assert features["observation.odom"].unit == (*["m"] * 3, *["wxyz"] * 4, *["m/s"] * 3, *["rad/s"] * 3)
     assert features["observation.odom"].frame == "base_link"  # a TODO: its pose is in "odom", its twist in "base_link"
     assert features["observation.odom"].names[3:5] == ("orientation.w", "orientation.x")
-    # The IMU says that it has no orientation: its covariance begins with -1.
+    # sensor_msgs/Imu: orientation_covariance[0] = -1 means that the IMU does not measure orientation.
     assert features["observation.imu_data"].unit == (*["rad/s"] * 3, *["m/s2"] * 3)
     assert features["observation.wind"].unit == "m/s" and features["observation.wind"].frame == "base_link"
     assert spec.features["action"].channels == ("cmd_vel",)
@@ -235,7 +235,8 @@ def test_a_robot_without_joint_states_is_drafted_and_ingested_with_units_and_fra
     arrays = Dataset(tmp_path / "out").episode(0).arrays
     assert arrays["observation.odom"][5].tolist() == pytest.approx([1, 2, 3, 0.5, 0.1, 0.2, 0.3, 4, 5, 6, 7, 8, 9])
     assert arrays["action"][5].tolist() == [4, 5, 6, 7, 8, 9]
-    # Row t is at t / 30 s; the newest of the samples at k / 100 s is k = floor(100 t / 30), its force k / 100 N.
+    # Rows come at 30 Hz, samples at 100 Hz; sample k, at k / 100 s, has the force k / 100 N. Row t holds the newest sample at its
+    # time, t / 30 s, which is k = floor(100 t / 30).
     expected = [int(100 * t / 30 + 1e-9) / 100 for t in range(len(arrays["action"]))]
     assert arrays["observation.ft_wrench"][:, 2].tolist() == pytest.approx(expected)
 

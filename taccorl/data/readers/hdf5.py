@@ -21,9 +21,9 @@ from taccorl.errors import RecordingError
 
 BLOCK_BYTES = 4 << 20
 MOST_ROWS = 10_000_000
-"""Of one dataset: 92 hours at 30 Hz. A file of some kilobytes can claim any number of rows that were never written."""
+"""Most rows that an HDF5 dataset may have: 92 hours at 30 Hz. A file of some kilobytes can claim any number of unwritten rows."""
 MOST_BLOCK_BYTES = 1 << 30
-"""Rows that are read at once: those of a chunk, or one. 1000 pictures of 480×640 are 0.9 GB."""
+"""Largest block that is read at once, a chunk or a row [bytes]. 1000 pictures of 480×640 are 0.9 GB."""
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
 RATE_ATTRIBUTES = ("fps", "frequency")
 BOOKKEEPING = ("/compress_len",)  # ALOHA: bytes of each padded picture; decoders find the end themselves
@@ -242,7 +242,7 @@ def _row_bytes(dataset: h5py.Dataset) -> int:
 
 
 def _unreadable(dataset: h5py.Dataset) -> str | None:
-    """Why no row of it may be read; None where rows may. Nothing outside of the file is opened, nothing large allocated."""
+    """Reason why the dataset must not be read; None if it may. Opens no other file and allocates nothing large."""
     if dataset.is_virtual or dataset.external:
         others = [s.file_name for s in dataset.virtual_sources()] if dataset.is_virtual else []
         others += [name for name, _, _ in dataset.external or ()]
@@ -277,7 +277,7 @@ def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def _unprotected(datasets: dict[str, h5py.Dataset]) -> str:
-    """Which of them have no checksum. Fletcher32 and gzip's Adler-32 are verified by HDF5 when it reads a chunk."""
+    """Sentence that names the datasets without a checksum (Fletcher32, or gzip with its Adler-32); empty if all have one."""
     names = [topic for topic, d in datasets.items() if not d.fletcher32 and d.compression != "gzip"]
     if not names:
         return ""

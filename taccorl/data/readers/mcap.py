@@ -34,7 +34,7 @@ from taccorl.data.strict_yaml import load_yaml
 from taccorl.errors import RecordingError, SpecError
 
 MOST_METADATA_BYTES = 1 << 20
-"""Of a bag's metadata.yaml; rosbag2 writes one to two kB a topic."""
+"""Largest metadata.yaml of a bag [bytes]; rosbag2 writes 1 to 2 kB for each topic."""
 MAX_TIME_NS = 2**63 - 1
 MAX_MISFITS = 10
 """Messages of one channel, unprotected by a CRC, that may fail to decode as damage; more mean that its schema is wrong."""

@@ -38,7 +38,7 @@ from taccorl.sim.simulation import Simulation
 
 PicturesAs = Literal["video", "cache", "none"]
 DATASET_STAGE = "executed"
-"""Stage of the dataset; its inputs are the executions, one an episode."""
+"""Name of the stage that writes the dataset. Its inputs are one execution for each episode, in the order of the episodes."""
 _SECONDS = ("physics", "touch", "writing")
 _SAME = ("task", "difficulty", "twin", "randomization")  # of all sources
 
