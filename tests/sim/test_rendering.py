@@ -451,6 +451,7 @@ def test_workers_draw_before_and_after_a_fork_or_say_why_they_cannot():
         print(child())
         kept = Renderer(model, ["front"])
         kept.render([data])
+        sys.stdout.flush()  # else the child has these lines in its buffer, too, and prints them again
         if os.fork() == 0:
             try:
                 kept.render([data])
