@@ -1,4 +1,4 @@
-# Each target sets up what it needs, from a bare clone.
+# Each target sets up what it needs, from a bare clone. make help lists them: the text after ## of each.
 PYTHON ?= python3.12
 BIN := .venv/bin
 # Processes that run tests side by side; each needs about 3 GB and, on its own, one core: make test JOBS=8.
@@ -8,40 +8,42 @@ export HF_HUB_OFFLINE := 1
 # Compiled modules are kept, whatever the shell says: importing LeRobot takes 25 s without, and tests start many processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-slow lint bench pictures lock clean
+.PHONY: help demo test test-slow lint bench pictures lock clean
 
-demo: .venv/.ready
+demo: .venv/.ready  ## twin → recordings → dataset → checks → Rerun file, and a hidden effect found; into outputs/demo (the default)
 	@echo "demo: the twin demonstrates → recordings → dataset → checks → Rerun; a hidden effect is found. Nothing here comes from a robot."
 	$(BIN)/python -m pipelines.demo
 
-test: .venv/.ready
+# Only the targets that have a description.
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
+
+test: .venv/.ready  ## all fast tests, two processes side by side (JOBS=8: eight)
 	@echo "test: everything but the tests marked slow (make test-slow)"
 	$(PYTEST) -m "not slow"
 
-test-slow: .venv/.ready
+test-slow: .venv/.ready  ## what takes long: notebooks, browsers, training, kills, whole searches
 	$(PYTEST) -m slow
 
-lint: .venv/.ready
+lint: .venv/.ready  ## ruff, pyright and the order of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	PYTHONPATH=. $(BIN)/lint-imports
 
-# make bench ONLY=ingest: one of the registered benchmarks. Rows go to bench.json and docs/benchmarks.md.
-bench: .venv/.ready
+bench: .venv/.ready  ## measure; writes bench.json and docs/benchmarks.md (ONLY=ingest: one benchmark)
 	$(BIN)/python -m taccorl.benchmark $(if $(ONLY),--only=$(ONLY))
 
-# The pictures of the README, docs/task_*.png, and the page of effects, docs/effects.md.
-pictures: .venv/.ready
+pictures: .venv/.ready  ## draw the pictures of the README and docs/effects.md again
 	$(BIN)/python -m pipelines.task_pictures
 	$(BIN)/python -m pipelines.effects_page
 	$(BIN)/python -m pipelines.mend_picture
 
 # Names and versions only: no addresses, no hashes.
-lock: .venv/.ready
+lock: .venv/.ready  ## newest versions that fit pyproject.toml, into requirements.lock
 	$(BIN)/uv pip compile pyproject.toml --group dev --python $(BIN)/python --no-annotate --no-header --upgrade -q -o requirements.lock
 
-clean:
+clean:  ## remove .venv, outputs and caches
 	rm -rf .venv outputs .pytest_cache .ruff_cache .import_linter_cache
 
 .venv/.ready: requirements.lock pyproject.toml
