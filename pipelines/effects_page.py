@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from taccorl.sim.effects import effects
+from taccorl.sim.effects.catalogue import section
 
 PAGE = Path("docs/effects.md")
-_LINKS = {"kp": "K_p", "kd": "K_d", "torque_ff": "T_ref", "k_n": "k_n", "k_d": "k_d"}
-"""Numbers that are always fitted; all else is an effect."""
 
 
 def text() -> str:
@@ -14,7 +13,8 @@ def text() -> str:
     lines = [
         "# Physical effects",
         "",
-        "Written by `make pictures` from `taccorl/sim/effects/`; do not edit. A `twin.yaml` lists those that a twin has:",
+        "Written by `make pictures` from `taccorl/sim/effects/`; do not edit. `taccorl effects` prints the same. A `twin.yaml`",
+        "lists the effects that a twin has:",
         "",
         "```yaml",
         "effects:",
@@ -22,30 +22,25 @@ def text() -> str:
         "```",
         "",
         "At its absent value an effect is not built at all, and the twin is the same to the last bit. A parameter without one",
-        "only shapes the effect. An effect of your own is one file there, or one module under the entry point `taccorl.plugins`.",
+        "only shapes the effect. A number in the unit `reading` is a share of the normalised reading: of FlexiTac pads 1 is 75",
+        "counts, of a sensor of cells a tenth of what it is rated for.",
         "",
-        "| effect | parameter | unit | absent | from | to | typical | source |",
-        "|---|---|---|---|---|---|---|---|",
+        "For an effect of your own, `taccorl effects new my_effect --out=my_effect.py` writes an example with its test. It joins",
+        "the others by the entry point `taccorl.plugins`, or as a file in `taccorl/sim/effects/`.",
+        "",
+        "| effect | acts on | parameter | unit | absent | from | to | typical | source |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for name in effects:
-        for p in effects.get(name).parameters():
+        cls = effects.get(name)
+        for p in cls.parameters():
             absent = "" if p.absent is None else f"{p.absent:g}"
-            cells = [name, p.name, p.unit, absent, f"{p.low:g}", f"{p.high:g}", f"{p.typical:g}", p.source]
+            cells = [name, ", ".join(cls.kinds()), p.name, p.unit, absent]
+            cells += [f"{p.low:g}", f"{p.high:g}", f"{p.typical:g}", p.source]
             lines.append("| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |")
     for name in effects:
-        lines += about(name)
+        lines += section(effects.get(name))
     return "\n".join(lines) + "\n"
-
-
-def about(name: str) -> list[str]:
-    """The section of one effect: what it is, in words for somebody who has never met it."""
-    cls = effects.get(name)
-    lines = ["", f"## {name}", "", f"`{cls.equation}`", "", cls.in_words, ""]
-    lines += [f"- **What it does to a policy:** {cls.at_a_policy}", f"- **What to record:** {cls.to_record}"]
-    lines += [
-        f"- **Looks like {_LINKS.get(other, f'[{other}](#{other})')}:** {why}" for other, why in cls.near_twins.items()
-    ]
-    return lines
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from taccorl.cli.main import VERBS
 from taccorl.errors import TaccorlError, nearest
 
 SECOND_WORDS = {
+    "effects": ("new",),
     "ingest": ("inspect",),
     "lineage": ("explain", "prune"),
     "completion": ("bash", "zsh", "fish"),
@@ -45,7 +46,7 @@ def options_of(verb: str) -> list[str]:
     calls = [node for node in _nodes(module) if isinstance(node, ast.Call)]
     parsed = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id == "parse"]
     names = [name for arg in parsed if isinstance(arg, ast.Name) for name in _field_names(module, arg.id)]
-    return [*dict.fromkeys(names), *(["config_path"] if names else [])]
+    return [*(name.rstrip("_") for name in dict.fromkeys(names)), *(["config_path"] if names else [])]
 
 
 @cache

@@ -18,6 +18,7 @@ VERBS = {
         "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
         "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",
         "add-effect": "the twin with one effect more, with the fitted values",
+        "effects": "the physical effects that can be found; `effects new NAME` writes an example of your own",
         "excite": "which motion to record next, so that two effects can be told apart",
         "surrogate": "recordings of a robot that is not there, with effects hidden in it",
     },

@@ -40,8 +40,8 @@ def parse[ConfigT](
     """
     argv = joined(argv)
     words = [a for a in argv if not a.startswith("-")]
-    options = [a for a in argv if a.startswith("-")]
     hints = typing.get_type_hints(config_class)
+    options = [_as_field(a, hints) for a in argv if a.startswith("-")]
     if any(option in HELP for option in options):
         _print_help(config_class, hints, positional, prog)
         sys.exit(0)
@@ -82,6 +82,12 @@ def joined(argv: Sequence[str]) -> list[str]:
         else:
             found.append(word)
     return found
+
+
+def _as_field(option: str, hints: dict[str, Any]) -> str:
+    """``--for=x`` as ``--for_=x``: a trailing underscore keeps a field free of Python's own words."""
+    name, equals, value = option.partition("=")
+    return f"{name}_{equals}{value}" if f"{name.removeprefix('--')}_" in hints else option
 
 
 def given_names(argv: Sequence[str]) -> set[str]:
@@ -131,6 +137,7 @@ def _print_help(config_class: type, hints: dict[str, Any], positional: str | Non
     said = (module.__doc__ or "").strip().replace("``", "")
     options = ArgumentParser(config_class, usage=" ".join([prog, *words, "[options]"]), description=said).parser
     for action in options._actions:
+        action.option_strings = [name.rstrip("_") for name in action.option_strings]
         if action.dest in required:
             action.help = f"{action.help} (required)"
         if action.dest in required or action.default is None:
@@ -144,7 +151,7 @@ def _check_option(option: str, hints: dict[str, Any]) -> None:
     name, equals, value = option.lstrip("-").partition("=")
     known = ["config_path", *hints, *(f"{n}.{inner}" for n, hint in hints.items() for inner in _inner_names(hint))]
     if name not in known or not option.startswith("--"):
-        raise TaccorlError(f"unknown option {option!r}; {nearest(name, known)}")
+        raise TaccorlError(f"unknown option {option!r}; {nearest(name, [n.rstrip('_') for n in known])}")
     if not equals or not value:
         raise TaccorlError(f"option {option!r} needs a value: --{name}=…")
     if hints.get(name) is bool and value.lower() not in _BOOLEANS:

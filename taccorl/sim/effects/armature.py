@@ -18,6 +18,7 @@ class Armature(JointEffect):
     """(M + ΔJ) q̈: what a rotor adds behind its gear, J_rotor · ratio². Grows with the square of the frequency."""
 
     name: ClassVar = "armature"
+    needs: ClassVar = ("acceleration",)
     equation: ClassVar = "(M + ΔJ) q̈"
     in_words: ClassVar = (
         "The motor's rotor turns with the joint, as fast as the gear makes it. The controller has to accelerate it "

@@ -24,6 +24,7 @@ class AsymmetricFriction(JointEffect):
     """
 
     name: ClassVar = "asymmetric_friction"
+    needs: ClassVar = ("velocity",)
     equation: ClassVar = "τ = −F (1 + a sign q̇) sign q̇"
     in_words: ClassVar = (
         "Dry friction that is greater one way than the other, as of worm gears, seals, or a gear worn on one flank."

@@ -23,6 +23,7 @@ class Backlash(JointEffect):
     """
 
     name: ClassVar = "backlash"
+    needs: ClassVar = ("position",)
     equation: ClassVar = "|q_link − q_motor| ≤ w; no torque passes in between"
     in_words: ClassVar = (
         "The gear has play: the link can be turned a little by hand while the motor stands. Weight lays it against "

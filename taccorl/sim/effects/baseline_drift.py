@@ -33,7 +33,7 @@ class BaselineDrift(TouchEffect):
         ),
     }
     rate_per_min: float = parameter(
-        unit="1/min",
+        unit="reading/min",
         symbol="b",
         absent=0.0,
         low=-2.0,

@@ -19,6 +19,7 @@ class CableSpring(JointEffect):
     """τ = −k (q − q₀): the joint rests k (q₀ − q) / K_p off, more the further it is from q₀. MuJoCo's joint spring."""
 
     name: ClassVar = "cable_spring"
+    needs: ClassVar = ("position",)
     equation: ClassVar = "τ = −k (q − q₀)"
     in_words: ClassVar = (
         "Cables and hoses along the arm bend with the joint and pull it back to where they are relaxed."

@@ -7,7 +7,7 @@ import mujoco
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
-from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.effect import Effect, Kind
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
@@ -18,6 +18,7 @@ class CameraEffect(Effect):
     """An effect of pictures: the same numbers for all cameras that are chosen. Cameras that differ get an entry each."""
 
     layer: ClassVar = "camera"
+    needs: ClassVar = ("picture",)
     cameras: list[str] = field(default_factory=lambda: list(ROBOT.cameras))
     """Names as in the twin's ``cameras``."""
 
@@ -25,6 +26,10 @@ class CameraEffect(Effect):
         super().__post_init__()
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise TaccorlError(f"effect {self.name}: cameras are {self.cameras}; name at least one, each once")
+
+    @classmethod
+    def kinds(cls) -> tuple[Kind, ...]:
+        return ("camera",)
 
     def acts_on(self) -> list[str]:
         return list(self.cameras)

@@ -27,6 +27,7 @@ class Cogging(JointEffect):
     """
 
     name: ClassVar = "cogging"
+    needs: ClassVar = ("position",)
     equation: ClassVar = "τ = A sin(N q + φ)"
     in_words: ClassVar = (
         "Magnets against slots, tooth after tooth: turned slowly by hand the joint clicks through the same places."

@@ -23,6 +23,7 @@ class CommandDelay(JointEffect):
     """
 
     name: ClassVar = "command_delay"
+    needs: ClassVar = ("target",)
     equation: ClassVar = "τ = K_p (q*(t − d) − q) − K_d q̇ + T_ref"
     in_words: ClassVar = (
         "Commands reach the drive late: bus, driver, interpolation. The drive's own loop is not delayed."

@@ -19,6 +19,7 @@ class CommandLag(JointEffect):
     """
 
     name: ClassVar = "command_lag"
+    needs: ClassVar = ("target",)
     equation: ClassVar = "ṙ = (q* − r) / T; τ = K_p (r − q) − K_d q̇ + T_ref"
     in_words: ClassVar = "The drive smooths its targets with a low-pass before it follows them."
     at_a_policy: ClassVar = "Corners of a path are cut, and a contact is felt long after the command that made it."

@@ -23,6 +23,7 @@ class ContactCompliance(Effect):
     """
 
     name: ClassVar = "contact_compliance"
+    needs: ClassVar = ("contact",)
     layer: ClassVar = "robot"
     equation: ClassVar = "a = −k K r − √k B ṙ"
     in_words: ClassVar = (

@@ -13,6 +13,7 @@ class ContactFriction(Effect):
     """μ = c μ_scene: sliding friction of every part and fixture with whatever touches it, randomised or not."""
 
     name: ClassVar = "contact_friction"
+    needs: ClassVar = ("contact",)
     layer: ClassVar = "robot"
     equation: ClassVar = "|F_t| ≤ c μ N"
     in_words: ClassVar = (

@@ -19,6 +19,7 @@ class CoulombFriction(JointEffect):
     """τ = −F sign(q̇); at rest any τ with |τ| ≤ F. The joint stops up to F / K_p before its target, on the side it comes from."""
 
     name: ClassVar = "coulomb_friction"
+    needs: ClassVar = ("velocity",)
     equation: ClassVar = "τ = −F sign(q̇); at rest |τ| ≤ F"
     in_words: ClassVar = (
         "Dry friction of gear and bearings: the same torque against the motion at any speed, and the joint sticks at"

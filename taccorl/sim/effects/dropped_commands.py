@@ -30,6 +30,7 @@ class DroppedCommands(JointEffect):
     """
 
     name: ClassVar = "dropped_commands"
+    needs: ClassVar = ("target",)
     equation: ClassVar = "r_k = q*_k with probability 1 − p, else r_{k−1}; τ = K_p (r − q) − K_d q̇ + T_ref"
     in_words: ClassVar = (
         "A busy bus or computer loses a command now and then; the drive keeps the one before until the next arrives."

@@ -28,7 +28,7 @@ Letters in shapes: N simulations, A numbers of an action, P pads, R rows and C c
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -46,6 +46,26 @@ if TYPE_CHECKING:
 else:  # the names that a twin.yaml may give: others are an error with its line
     ArmChoice = Literal[*ROBOT.arms, "both"]
 
+Kind = Literal["joint", "pads", "camera", "cells", "scene"]
+"""What effects act on: a driven joint of any robot or axis, the pads of a hand, a camera, a sensor of cells, or loose parts."""
+KINDS: tuple[Kind, ...] = ("joint", "pads", "camera", "cells", "scene")
+NEEDS = {
+    "target": "commands that are sent to the joint's controller",
+    "position": "the joint's position",
+    "velocity": "the joint's velocity",
+    "acceleration": "the joint's acceleration",
+    "effort": "the torque or force that the motor gives",
+    "load": "the torque or force that the gear passes on to the load",
+    "weight": "a controller that compensates the weight",
+    "bodies": "a model of all moving bodies",
+    "contact": "a model of the touched parts",
+    "depth": "how deep each taxel is in a known object",
+    "reading": "readings of taxels or cells",
+    "neighbours": "more than one cell",
+    "temperature": "the temperature beside the readings",
+    "picture": "pictures of a camera",
+}
+"""Word in ``Effect.needs`` → what a model must know so that the effect can be computed."""
 Memory = dict[str, np.ndarray]
 """Name → array (N, …), changed in place."""
 LAYERS = ("robot", "material", "spread", "taxel", "baseline", "camera")
@@ -99,6 +119,8 @@ class Effect:
     name: ClassVar[str]
     """As registered."""
     layer: ClassVar[Literal["robot", "material", "spread", "taxel", "baseline", "camera"]]
+    needs: ClassVar[tuple[str, ...]]
+    """What a model of the part must know to compute it, in words of ``NEEDS``."""
     equation: ClassVar[str] = ""
     in_words: ClassVar[str] = ""
     """What it is, on a robot, for somebody who has never met it."""
@@ -157,6 +179,16 @@ class Effect:
     def settings(cls) -> list[str]:
         """Names of all that can be set: parameters, selectors, what is known about them."""
         return [f.name for f in dataclasses.fields(cls)]
+
+    @classmethod
+    def kinds(cls) -> tuple[Kind, ...]:
+        """What it can act on."""
+        return ("scene",)
+
+    @classmethod
+    def works_with(cls, gives: Collection[str]) -> bool:
+        """Whether a part whose model knows ``gives`` (words of ``NEEDS``) has all that the effect needs."""
+        return set(cls.needs) <= set(gives)
 
     @property
     def is_absent(self) -> bool:
@@ -285,6 +317,10 @@ class ArmEffect(Effect):
     arm: ArmChoice = "both"
     """One arm of the robot, or ``both`` for all of them."""
 
+    @classmethod
+    def kinds(cls) -> tuple[Kind, ...]:
+        return ("joint",)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.arm not in (*ROBOT.arms, "both"):
@@ -328,10 +364,16 @@ class JointEffect(ArmEffect):
 class TouchEffect(Effect):
     """An effect of pads or of their taxels."""
 
+    needs: ClassVar = ("reading",)
     windows: ClassVar[bool] = False
     """Whether ``reading`` and ``memory`` also hold for a rectangle of each pad's taxels, where nothing touches beyond its rim."""
     pads: list[str] = field(default_factory=lambda: list(ROBOT.pads))
     """``left_a`` … ``right_b``."""
+
+    @classmethod
+    def kinds(cls) -> tuple[Kind, ...]:
+        """A sensor of cells has readings, and no fingers, boards of a kind or parts in contact."""
+        return ("pads", "cells") if cls.reading is not Effect.reading else ("pads",)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -353,6 +395,10 @@ class TouchEffect(Effect):
 @dataclass(kw_only=True)
 class BoardEffect(TouchEffect):
     """An effect that is drawn once for each board."""
+
+    @classmethod
+    def kinds(cls) -> tuple[Kind, ...]:
+        return ("pads",)
 
     seed: int = 0
     """Of these boards: another one is another set of taxels."""

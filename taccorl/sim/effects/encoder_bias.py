@@ -22,6 +22,7 @@ class EncoderBias(JointEffect):
     """
 
     name: ClassVar = "encoder_bias"
+    needs: ClassVar = ("position",)
     equation: ClassVar = "y = q + b; τ = K_p (q* − y) − K_d q̇ + T_ref"
     in_words: ClassVar = (
         "The joint's zero is off: the arm reports an angle that is wrong by a constant, and goes to wrong places on "

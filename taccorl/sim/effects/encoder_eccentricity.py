@@ -22,6 +22,7 @@ class EncoderEccentricity(JointEffect):
     """
 
     name: ClassVar = "encoder_eccentricity"
+    needs: ClassVar = ("position",)
     equation: ClassVar = "y = q + A sin(q + φ); τ = K_p (q* − y) − K_d ẏ + T_ref"
     in_words: ClassVar = (
         "The encoder's disc or magnet sits beside the joint's axis: angles are wrong by one wave a turn."

@@ -22,6 +22,7 @@ class EncoderScale(JointEffect):
     """
 
     name: ClassVar = "encoder_scale"
+    needs: ClassVar = ("position",)
     equation: ClassVar = "y = s q; τ = K_p (q* − y) − K_d ẏ + T_ref"
     in_words: ClassVar = (
         "The gear ratio or the counts a turn are a little off in the driver: every angle is wrong by a percentage."

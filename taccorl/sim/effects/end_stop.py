@@ -25,6 +25,7 @@ class EndStop(JointEffect):
     """
 
     name: ClassVar = "end_stop"
+    needs: ClassVar = ("position", "velocity")
     equation: ClassVar = "τ = −s [k δ + b δ̇]₊, δ = s (q − q_e) > 0, s = sign(q_e − q at the start), b = k · 5 ms"
     in_words: ClassVar = (
         "A mechanical stop, a short cable or a cover that is in the way: at one angle the joint runs against it."

@@ -22,6 +22,7 @@ class ErrorDeadband(JointEffect):
     """
 
     name: ClassVar = "error_deadband"
+    needs: ClassVar = ("target", "position")
     equation: ClassVar = "τ = K_p d(e) − K_d q̇ + T_ref; d(e) = 0 where |e| ≤ w, else e − w sign e"
     in_words: ClassVar = (
         "The drive's firmware ignores small errors, so that it does not hum at rest: nothing holds the joint within ±"

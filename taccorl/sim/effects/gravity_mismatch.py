@@ -21,6 +21,7 @@ class GravityMismatch(ArmEffect):
     """
 
     name: ClassVar = "gravity_mismatch"
+    needs: ClassVar = ("weight",)
     equation: ClassVar = "τ_comp = s c g(q)"
     in_words: ClassVar = (
         "The controller carries the arm's weight with masses that are not the arm's: it hangs, or rises, where it "

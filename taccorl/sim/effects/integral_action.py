@@ -26,6 +26,7 @@ class IntegralAction(JointEffect):
     """
 
     name: ClassVar = "integral_action"
+    needs: ClassVar = ("target", "position")
     equation: ClassVar = "τ = K_p (e + r ∫ e dt) − K_d q̇ + T_ref, e = q* − q"
     in_words: ClassVar = (
         "The drive's I-gain is on: what friction and weight leave of an error is worked off in a second or so."

@@ -23,6 +23,7 @@ class JointCompliance(JointEffect):
     """
 
     name: ClassVar = "joint_compliance"
+    needs: ClassVar = ("position", "effort")
     equation: ClassVar = "q_link − q_motor = c τ; damping κ / c"
     in_words: ClassVar = (
         "The gear between motor and link gives way like a spring. The encoder on the motor does not see it."

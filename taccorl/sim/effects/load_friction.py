@@ -26,6 +26,7 @@ class LoadFriction(JointEffect):
     """
 
     name: ClassVar = "load_friction"
+    needs: ClassVar = ("velocity", "load")
     equation: ClassVar = "|τ| ≤ μ |τ_motor − τ_load|, against the motion"
     in_words: ClassVar = (
         "Teeth that are pressed together rub more: friction grows with the torque that goes through the gear."

@@ -22,6 +22,7 @@ class PadCompliance(TouchEffect):
     """
 
     name: ClassVar = "pad_compliance"
+    needs: ClassVar = ("contact",)
     layer: ClassVar = "robot"
     equation: ClassVar = "N = k K δ"
     in_words: ClassVar = "The pads' rubber gives way more, or less, than the model says under the same force."

@@ -22,6 +22,7 @@ class PadFrameEffect(TouchEffect):
     """
 
     layer: ClassVar = "robot"
+    needs: ClassVar = ("depth",)
 
     def offset_pad_m(self, pad: str) -> np.ndarray:
         """(3,) by how much the taxels of ``pad`` move, in its frame: across, from palm to tip, out of the pad. Across runs along

@@ -24,6 +24,7 @@ class Payload(ArmEffect):
     """
 
     name: ClassVar = "payload"
+    needs: ClassVar = ("bodies",)
     equation: ClassVar = "τ_j = −m g ∂z_c/∂q_j on every joint, and m's inertia"
     in_words: ClassVar = (
         "Something heavy is fixed to the hand that nobody told the controller of: a tool, a sensor, a camera."

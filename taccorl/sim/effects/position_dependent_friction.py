@@ -29,6 +29,7 @@ class PositionDependentFriction(JointEffect):
     """
 
     name: ClassVar = "position_dependent_friction"
+    needs: ClassVar = ("position", "velocity")
     equation: ClassVar = "τ = −F₀ exp(−((q − q₀) / w)²) sign q̇; at rest |τ| ≤ F₀ exp(−((q − q₀) / w)²)"
     in_words: ClassVar = (
         "A tight spot: turned slowly by hand the joint runs freely but for one place of its range, where it rubs, in both "

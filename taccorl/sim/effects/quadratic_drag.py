@@ -21,6 +21,7 @@ class QuadraticDrag(JointEffect):
     """
 
     name: ClassVar = "quadratic_drag"
+    needs: ClassVar = ("velocity",)
     equation: ClassVar = "τ = −c q̇ |q̇|"
     in_words: ClassVar = (
         "Oil that the gear churns, or a cable that is whirled around: it brakes fast motion and no other."

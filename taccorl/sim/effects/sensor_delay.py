@@ -20,6 +20,7 @@ class SensorDelay(JointEffect):
     """y(t) = q(t − d): the arm moves as before, the report lags. Its controller sits in the drive and sees q at once."""
 
     name: ClassVar = "sensor_delay"
+    needs: ClassVar = ("position",)
     equation: ClassVar = "y(t) = q(t − d)"
     in_words: ClassVar = (
         "Angles are reported late: a slow bus or a driver that buffers. The motion itself is as before."

@@ -22,6 +22,7 @@ class SlewLimit(JointEffect):
     """
 
     name: ClassVar = "slew_limit"
+    needs: ClassVar = ("target",)
     equation: ClassVar = "|ṙ| ≤ v_max; τ = K_p (r − q) − K_d q̇ + T_ref"
     in_words: ClassVar = (
         "A speed limit in the drive's firmware: faster commands are followed at that speed and no faster."

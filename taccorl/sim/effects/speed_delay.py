@@ -31,6 +31,7 @@ class SpeedDelay(JointEffect):
     """
 
     name: ClassVar = "speed_delay"
+    needs: ClassVar = ("velocity",)
     equation: ClassVar = "−K_d (q̇ − τ q̈)"
     in_words: ClassVar = (
         "The motor's controller computes a few hundred to a few thousand times a second, from a speed that it filters. It "

@@ -25,6 +25,7 @@ class StribeckFriction(JointEffect):
     """
 
     name: ClassVar = "stribeck_friction"
+    needs: ClassVar = ("velocity",)
     equation: ClassVar = "|τ| = F (1 + s exp(−(q̇ / v_s)²))"
     in_words: ClassVar = (
         "Friction that is greatest at rest and falls once the joint moves, as in greased gears: the joint sticks and"

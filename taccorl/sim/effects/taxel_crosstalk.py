@@ -18,6 +18,7 @@ class TaxelCrosstalk(TouchEffect):
     """
 
     name: ClassVar = "taxel_crosstalk"
+    needs: ClassVar = ("reading", "neighbours")
     layer: ClassVar = "spread"
     windows: ClassVar = True
     equation: ClassVar = "r = f + c/4 Σ (f_neighbour − f)"

@@ -11,7 +11,7 @@ import numpy as np
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
+from taccorl.sim.effects.effect import Kind, Memory, TouchEffect, parameter
 
 
 @effects.register("taxel_gain_map")
@@ -49,6 +49,11 @@ class TaxelGainMap(TouchEffect):
     gains: list[float] = field(default_factory=lambda: [0.0])
     """g_i: one per taxel, row after row from palm to tip, pad after pad; or one for all of them. 0, as it is by default, is a
     pad that is not connected."""
+
+    @classmethod
+    def kinds(cls) -> tuple[Kind, ...]:
+        """Of a sensor of cells each cell's gain is always fitted."""
+        return ("pads",)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,6 +15,7 @@ class TaxelGhosting(TouchEffect):
     """r_ij = f_ij + g (Σ_k f_ik + Σ_k f_kj − 2 f_ij): each of the others on its two wires adds the share g of its reading."""
 
     name: ClassVar = "taxel_ghosting"
+    needs: ClassVar = ("reading", "neighbours")
     layer: ClassVar = "spread"
     windows: ClassVar = True
     equation: ClassVar = "r_ij = f_ij + g (Σ_{k≠j} f_ik + Σ_{k≠i} f_kj)"

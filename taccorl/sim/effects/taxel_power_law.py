@@ -46,7 +46,7 @@ class TaxelPowerLaw(TouchEffect):
         source="Hertz: 3/2 for a ball on a half-space",
     )
     reference: float = parameter(
-        unit="1",
+        unit="reading",
         symbol="f₀",
         absent=None,
         low=0.1,

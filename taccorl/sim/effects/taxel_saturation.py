@@ -32,7 +32,7 @@ class TaxelSaturation(TouchEffect):
         "k_n": "At one depth it is a smaller k_n; press to three depths.",
     }
     limit: float = parameter(
-        unit="1",
+        unit="reading",
         symbol="f_s",
         absent=math.inf,
         low=0.05,

@@ -29,7 +29,7 @@ class TaxelThreshold(TouchEffect):
         "taxel_power_law": "p > 1 also hides light touches; press to three depths.",
     }
     threshold: float = parameter(
-        unit="1",
+        unit="reading",
         symbol="t",
         absent=0.0,
         low=0.0,

@@ -19,6 +19,7 @@ class TorqueFade(JointEffect):
     """
 
     name: ClassVar = "torque_fade"
+    needs: ClassVar = ("effort",)
     equation: ClassVar = "τ_motor = [1 − R t]₊ (K_p (q* − q) − K_d q̇ + T_ref + τ_comp)"
     in_words: ClassVar = (
         "Warm magnets are weaker and warm windings take less current: the same command gives less torque with time."

@@ -21,6 +21,7 @@ class TorqueLag(JointEffect):
     """
 
     name: ClassVar = "torque_lag"
+    needs: ClassVar = ("effort",)
     equation: ClassVar = "T τ̇ = u − τ, u = K_p (q* − q) − K_d q̇ + T_ref"
     in_words: ClassVar = (
         "Current builds up slowly in the motor's winding, or the drive filters it: torque is a few milliseconds late."

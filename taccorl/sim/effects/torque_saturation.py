@@ -23,6 +23,7 @@ class TorqueSaturation(JointEffect):
     """
 
     name: ClassVar = "torque_saturation"
+    needs: ClassVar = ("effort",)
     equation: ClassVar = "|τ_motor| ≤ τ_max"
     in_words: ClassVar = (
         "The drive's current is limited: beyond a torque nothing more comes, whatever the controller asks for."

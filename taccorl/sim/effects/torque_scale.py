@@ -23,6 +23,7 @@ class TorqueScale(JointEffect):
     """
 
     name: ClassVar = "torque_scale"
+    needs: ClassVar = ("effort",)
     equation: ClassVar = "τ_motor = g (K_p (q* − q) − K_d q̇ + T_ref + τ_comp)"
     in_words: ClassVar = (
         "The drive's torque constant or its firmware's unit is wrong: it gives g times what it is asked for."

@@ -29,6 +29,7 @@ class TorqueSpeedLimit(JointEffect):
     """
 
     name: ClassVar = "torque_speed_limit"
+    needs: ClassVar = ("effort", "velocity")
     equation: ClassVar = "|τ_motor| ≤ τ_s (1 − |q̇| / v₀) where it drives, ≤ τ_s where it brakes"
     in_words: ClassVar = (
         "The supply voltage is limited: a motor that turns fast induces a voltage of its own, and what remains drives less "

@@ -22,6 +22,7 @@ class VelocityFeedforward(JointEffect):
     """
 
     name: ClassVar = "velocity_feedforward"
+    needs: ClassVar = ("target",)
     equation: ClassVar = "τ = K_p (q* − q) + K_d (α q̇* − q̇) + T_ref"
     in_words: ClassVar = (
         "The driver sends speeds along with positions, so the damping does not brake the motion that is wanted."

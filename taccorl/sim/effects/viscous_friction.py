@@ -21,6 +21,7 @@ class ViscousFriction(JointEffect):
     """
 
     name: ClassVar = "viscous_friction"
+    needs: ClassVar = ("velocity",)
     equation: ClassVar = "τ = −b q̇"
     in_words: ClassVar = "Grease: a torque against the motion in proportion to its speed."
     at_a_policy: ClassVar = "The arm lags a little more behind fast commands."

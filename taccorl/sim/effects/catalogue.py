@@ -1,0 +1,61 @@
+"""The registry in words: one entry for each effect, for ``taccorl effects`` and for docs/effects.md."""
+
+from collections.abc import Sequence
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import KINDS, NEEDS, Effect, Parameter
+
+ALWAYS_FITTED = {"kp": "K_p", "kd": "K_d", "torque_ff": "T_ref", "k_n": "k_n", "k_d": "k_d"}
+"""Near-twins that are no effects but numbers that every fit has → how they are written."""
+
+
+def names_for(kind: str = "") -> list[str]:
+    """Names of the effects that act on ``kind`` (a word of ``KINDS``); of all effects for an empty one.
+
+    Raises:
+        TaccorlError: no such kind; names the nearest.
+    """
+    if kind and kind not in KINDS:
+        raise TaccorlError(f"--for={kind}: no effect acts on that; {nearest(kind, KINDS)}")
+    return [name for name in effects if not kind or kind in effects.get(name).kinds()]
+
+
+def brief(cls: type[Effect]) -> list[str]:
+    """Lines of plain text: what it acts on, equation, parameters with units, what it needs, what shows it, its near-twins."""
+    lines = [f"{cls.name}  ({', '.join(cls.kinds())})  {cls.equation}"]
+    lines += [f"    {parameter_words(p)}" for p in cls.parameters()]
+    lines += [f"    needs: {', '.join(cls.needs)}", f"    record: {cls.to_record}"]
+    twins = [ALWAYS_FITTED.get(name, name) for name in cls.near_twins]
+    return [*lines, *([f"    near-twins: {', '.join(twins)}"] if twins else [])]
+
+
+def full(cls: type[Effect]) -> list[str]:
+    """``brief``, with what it is in words, and what tells it from each near-twin."""
+    head, *rest = brief(cls)
+    rest = [line for line in rest if not line.startswith("    near-twins: ")]
+    rest = [line if not line.startswith("    needs: ") else f"    needs: {needs_words(cls.needs)}" for line in rest]
+    lines = [head, f"    {cls.in_words}", *rest, f"    what it does to a policy: {cls.at_a_policy}"]
+    return [*lines, *(f"    near-twin {ALWAYS_FITTED.get(name, name)}: {why}" for name, why in cls.near_twins.items())]
+
+
+def needs_words(needs: Sequence[str]) -> str:
+    """``velocity (the joint's velocity)``"""
+    return ", ".join(f"{word} ({NEEDS[word]})" for word in needs)
+
+
+def parameter_words(p: Parameter) -> str:
+    """``F: torque_nm [N·m], absent at 0, 0 … 20, typically 0.4``"""
+    absent = "shapes the effect" if p.absent is None else f"absent at {p.absent:g}"
+    return f"{p.symbol}: {p.name} [{p.unit}], {absent}, {p.low:g} … {p.high:g}, typically {p.typical:g}"
+
+
+def section(cls: type[Effect]) -> list[str]:
+    """Lines of Markdown: the effect's section in docs/effects.md."""
+    lines = ["", f"## {cls.name}", "", f"`{cls.equation}`", "", cls.in_words, ""]
+    lines += [f"- **Acts on:** {', '.join(cls.kinds())}; needs {needs_words(cls.needs)}"]
+    lines += [f"- **What it does to a policy:** {cls.at_a_policy}", f"- **What to record:** {cls.to_record}"]
+    return lines + [
+        f"- **Looks like {ALWAYS_FITTED.get(other, f'[{other}](#{other})')}:** {why}"
+        for other, why in cls.near_twins.items()
+    ]
