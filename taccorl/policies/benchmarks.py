@@ -23,8 +23,8 @@ def touch_cost() -> Iterator[Row]:
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     rows, repeats = (32, 4 * REPEATS) if device == "cuda" else (2, REPEATS)  # there they take 50 ms, as Python likes
-    feeling, blind = (_policy("small", device, tactile=tactile) for tactile in (True, False))
-    batch = _batch(rows, device, prompt_tokens=200)
+    feeling, blind = (random_policy("small", device, tactile=tactile) for tactile in (True, False))
+    batch = random_batch(rows, device, prompt_tokens=200)
     for label, of in (("training step", _training_step), ("chunk", _chunk)):
         with_touch, without = (of(policy, batch) for policy in (feeling, blind))
         pairs = [(_time_s(with_touch, device), _time_s(without, device)) for _ in range(repeats + 2)][2:]
@@ -50,7 +50,7 @@ def full_size() -> Iterator[Row]:
 
 
 def _chunk_rows(gpu: str) -> Iterator[Row]:
-    policy, batch = _policy("full", "cuda", tactile=True), _batch(1, "cuda", prompt_tokens=200)
+    policy, batch = random_policy("full", "cuda", tactile=True), random_batch(1, "cuda", prompt_tokens=200)
     graphed, eager = _chunk(policy, batch), _chunk(policy, batch, cuda_graph=False)
     ours, theirs = graphed(), eager()
     difference = float((ours - theirs).abs().max() / theirs.abs().max())
@@ -69,13 +69,13 @@ def _chunk_rows(gpu: str) -> Iterator[Row]:
 def _training_rows(gpu: str) -> Iterator[Row]:
     import torch
 
-    policy, batch = _policy("full", "cuda", tactile=True), _batch(8, "cuda", prompt_tokens=200)
+    policy, batch = random_policy("full", "cuda", tactile=True), random_batch(8, "cuda", prompt_tokens=200)
     torch.cuda.reset_peak_memory_stats()
     times_s = _step_times_s(policy, batch)
     peak_gb = torch.cuda.max_memory_allocated() / 1e9
     ours, theirs = _gradient_errors(policy, _contact_in_every_other({k: v[:2] for k, v in batch.items()}))
     del policy
-    blind_s = median(_step_times_s(_policy("full", "cuda", tactile=False), batch))
+    blind_s = median(_step_times_s(random_policy("full", "cuda", tactile=False), batch))
     lerobots_s = median(_step_times_s(_lerobots_pi05(), batch))
     yield Row(
         name=f"training step, batch 8, bf16, AdamW, {gpu}",
@@ -96,7 +96,8 @@ def _training_rows(gpu: str) -> Iterator[Row]:
     )  # fmt: skip
 
 
-def _policy(backbone: str, device: str, *, tactile: bool) -> Any:
+def random_policy(backbone: str, device: str, *, tactile: bool) -> Any:
+    """A ``TactilePI05Policy`` with random weights for the robot's state, actions, pads and three cameras at 224 × 224."""
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
 
@@ -141,8 +142,8 @@ def _features() -> dict[str, Any]:
     }
 
 
-def _batch(rows: int, device: str, *, prompt_tokens: int) -> dict[str, Any]:
-    """All rows in contact; half of the prompt's tokens are there."""
+def random_batch(rows: int, device: str, *, prompt_tokens: int) -> dict[str, Any]:
+    """Made-up inputs of ``random_policy``, and actions. All rows in contact; half of the prompt's tokens are there."""
     import torch
 
     torch.manual_seed(0)

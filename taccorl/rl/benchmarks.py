@@ -1,6 +1,7 @@
-"""Benchmark of the environments that collect rollouts for post-training. ``make bench ONLY=rollout_shards``."""
+"""Figures of post-training: ``make bench ONLY=rollout_shards`` anywhere, ``make bench ONLY=full_post_training`` on a GPU."""
 
 import dataclasses
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -98,4 +99,119 @@ def rollout_shards() -> Iterator[Row]:
             rival_value=rate,
             n=len(shares),
             spread=spread(shares),
+        )
+
+
+@benchmark("full_post_training")
+def full_post_training() -> Iterator[Row]:
+    """π0.5's own size on one GPU: a decision of 128 environments and the paper's optimiser step of 512 decisions, without the
+    physics. Weights are random and observations made up: what is measured is time and memory."""
+    import torch
+
+    if not torch.cuda.is_available():
+        print("  full_post_training needs a GPU: nothing measured")
+        return
+    gpu = torch.cuda.get_device_name()
+    torch.backends.cuda.matmul.allow_tf32 = True  # --policy.tf32=true
+    yield from post_training_rows("full", "cuda", f"TF32, {gpu}", num_envs=128, num_decisions=512)
+    torch.backends.cuda.matmul.allow_tf32 = False
+    yield from post_training_rows("full", "cuda", f"float32, {gpu}", num_envs=32, num_decisions=32)
+
+
+def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int, num_decisions: int) -> Iterator[Row]:
+    """Rows of ``full_post_training``, of any backbone and device.
+
+    Args:
+        where: arithmetic and device, as the rows name them.
+        num_envs: environments, 128 in the paper.
+        num_decisions: of an optimiser step, 512 in the paper; a multiple of ``num_envs``.
+    """
+    import torch
+
+    from taccorl.policies.benchmarks import random_batch, random_policy
+    from taccorl.rl.critic import Critic
+    from taccorl.rl.flow_policy import TactileFlowPolicy
+    from taccorl.rl.flow_sde import FlowSDE
+    from taccorl.rl.ppo import PPO, Decisions
+    from taccorl.rl.settings import FlowSDESettings, PolicySettings, PPOSettings
+
+    cuda = device.startswith("cuda")
+    micro_batch = min(16, num_envs)
+    policy = random_policy(backbone, device, tactile=True)
+    sde = FlowSDE(FlowSDESettings())
+    actor = TactileFlowPolicy(policy, PolicySettings(), sde.num_steps)
+    batch = random_batch(num_envs, device, prompt_tokens=200)
+    batch = {k: (x * 255).to(torch.uint8) if "images" in k else x for k, x in batch.items() if k != "action"}
+    generator = torch.Generator().manual_seed(0)
+    groups = [{k: x[rows] for k, x in batch.items()} for rows in torch.arange(num_envs).split(32)]  # in memory at once
+    draws = sde.draw(num_envs, (policy.config.chunk_size, policy.config.max_action_dim), generator, device)
+
+    def decide() -> tuple[Any, ...]:
+        parts = torch.arange(num_envs, device=device).split(32)
+        return tuple(actor.sample(group, sde, draws.rows(part)) for group, part in zip(groups, parts, strict=True))
+
+    def timed(work: Callable[[], Any]) -> float:
+        before = time.perf_counter()
+        work()
+        if cuda:
+            torch.cuda.synchronize()
+        return time.perf_counter() - before
+
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    times_s = [timed(decide) for _ in range(4)][1:]
+    label = f"{backbone}, {where}"
+    yield Row(
+        name=f"one decision of {num_envs} environments, policy alone, {label}",
+        value=median(times_s), unit="s", n=len(times_s), spread=spread(times_s),
+    )  # fmt: skip
+    if cuda:
+        peak_gb = torch.cuda.max_memory_allocated() / 1e9
+        yield Row(name=f"GPU memory of it, {label}", value=peak_gb, unit="GB", n=1, spread=0.0)
+
+    sampled, features = zip(*decide(), strict=True)
+    repeats = num_decisions // num_envs
+    many = torch.arange(num_envs, device=device).repeat(repeats)
+    before, after, log_prob = (
+        torch.cat([getattr(s, k) for s in sampled])[many] for k in ("before_BSHD", "after_BSHD", "log_prob_B")
+    )
+    decisions = Decisions(
+        batch={k: x[many] for k, x in batch.items()},
+        before_MSHD=before,
+        after_MSHD=after,
+        step_MS=draws.step_BS[many],
+        log_prob_M=log_prob,
+        features_MF=torch.cat(features)[many],
+        privileged_MP=torch.zeros(num_decisions, 0, device=device),
+        advantage_M=torch.randn(num_decisions, device=device),
+        return_M=torch.rand(num_decisions, device=device),
+    )
+    critic = Critic(actor.num_features).to(device)
+    ppo = PPO(
+        actor,
+        critic,
+        sde,
+        PPOSettings(batch_size=num_decisions, micro_batch=micro_batch, kl_stop=math.inf),
+        ratio_guard=math.inf,
+    )
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    found: list[dict[str, float]] = []
+    times_s = [timed(lambda: found.append(ppo.update(decisions, generator))) for _ in range(3)][1:]
+    yield Row(
+        name=f"one optimiser step of {num_decisions} decisions and the KL after it, micro-batches of {micro_batch}, {label}",
+        value=median(times_s), unit="s", n=len(times_s), spread=spread(times_s),
+    )  # fmt: skip
+    yield Row(
+        name=f"largest |ratio − 1| before the first step, {label}",
+        value=found[0]["first_ratio_error"], unit="1", n=1, spread=0.0,
+    )  # fmt: skip
+    if cuda:
+        peak_gb = torch.cuda.max_memory_allocated() / 1e9
+        yield Row(
+            name=f"GPU memory of it: weights, gradients, AdamW, activations, {label}",
+            value=peak_gb,
+            unit="GB",
+            n=1,
+            spread=0.0,
         )
