@@ -6,12 +6,12 @@
 import copy
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from taccorl.alignment.rigid_joint import AT_TCP, Position, Rigid, rigid_terms
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.added import AddedEffects, present
@@ -20,21 +20,7 @@ from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.effects.payload import Payload
 from taccorl.sim.twin import TwinConfig, empty_bench
 
-Position = tuple[float, float, float]
-AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
-"""m, in link 6's frame: the middle between the pads, where a gripper holds what it carries."""
 _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
-
-
-class Rigid(NamedTuple):
-    """What MuJoCo says of one joint with the others held; names and signs as in ``joint_kernel.Drive``."""
-
-    inertia: float
-    rotor_inertia: float = 0.0
-    gravity_sin: float = 0.0
-    gravity_cos: float = 0.0
-    compensation_sin: float = 0.0
-    compensation_cos: float = 0.0
 
 
 def split_signal(signal: str) -> tuple[str, str]:
@@ -141,15 +127,7 @@ def rigid(
     spec = arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m)
     for effect in effects:
         effect.edit(spec, config)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    weight, carried = [], []
-    for angle in (0.5 * np.pi, 0.0):
-        data.qpos[0] = angle
-        mujoco.mj_forward(model, data)
-        weight.append(float(data.qfrc_bias[0]))
-        carried.append(float(data.qfrc_gravcomp[0]))
-    return Rigid(float(data.M[0]), float(model.dof_armature[0]), *weight, *carried)
+    return rigid_terms(spec.compile(), signal)
 
 
 def run(

@@ -1,7 +1,8 @@
-"""One joint of the twin against one recording, in about a millisecond: what identification runs thousands of times.
+"""One joint of a machine against one recording, in about a millisecond: what identification runs thousands of times.
 
-The other joints move as they were measured. Inertia and weight are those of the compiled arm, so what is identified here holds
-in the twin; ``tests/alignment/test_joint_model.py`` compares with MuJoCo, effect by effect, and with the whole twin.
+The other joints move as they were measured. Inertia and weight are those of the compiled model (``rigid_joint``), so what is
+identified on the PiPER holds in its twin; ``tests/alignment/test_joint_model.py`` compares with MuJoCo, effect by effect, and
+with the whole twin.
 
 Letters in shapes: T rows.
 """
@@ -13,18 +14,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from taccorl.alignment import arm_bench
-from taccorl.alignment.arm_bench import Rigid, of_joint, split_signal
+from taccorl.alignment.arm_joint import HasJoints, joint_of
 from taccorl.alignment.joint_kernel import Drive, simulate
 from taccorl.alignment.joint_motion import JointMotion as JointMotion
 from taccorl.alignment.joint_motion import joint_motion as joint_motion
+from taccorl.alignment.rigid_joint import AxisJoint, Rigid, RigidJoint, weighs
+from taccorl.alignment.rigid_joint import Gains as Gains
 from taccorl.errors import TaccorlError
-from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
 
 GRAVITY_M_PER_S2 = 9.81
-_COMMAND_HZ = 150.0  # taccorl.sim.replay sends slower rows in straight lines of such steps
 _ADDITIVE = {
     "added_inertia",
     "viscous",
@@ -36,17 +36,6 @@ _ADDITIVE = {
     "speed_delay",
 }
 _FACTORS = {"gravity_carried", "torque_scale", "encoder_scale"}
-
-
-class Gains(NamedTuple):
-    """τ = K_p (q* − q) − K_d q̇ + T_ref. Of a sliding axis N/m, N·s/m, N."""
-
-    kp: float
-    """N·m/rad."""
-    kd: float
-    """N·m·s/rad."""
-    torque_ff: float
-    """N·m."""
 
 
 class PayloadLever(NamedTuple):
@@ -72,24 +61,21 @@ class JointResponse:
 
 
 class JointModel:
-    """A joint of the twin ``config``, effects of the config that act on it included.
+    """A joint of a machine, the machine's own effects that act on it included.
 
     Raises:
-        TaccorlError: no such joint, or a gripper.
+        TaccorlError: no such joint, or a gripper of the PiPER.
     """
 
-    def __init__(self, config: TwinConfig, signal: str) -> None:
-        arm, joint = split_signal(signal)
-        k = ROBOT.joints.index(joint)
-        control = config.controller_of(arm)
-        self.signal = signal
-        self.unit: Literal["rad", "m"] = "rad"
-        self.gains = Gains(control.kp_nm_per_rad[k], control.kd_nms_per_rad[k], control.torque_ff_nm[k])
-        """As the twin's config has them."""
-        self.timestep_s = config.physics.timestep_s
-        self._config: TwinConfig | None = config
-        self._own = of_joint(config.effects, signal)
-        self._rigid: dict[tuple, Rigid] = {}
+    def __init__(self, machine: TwinConfig | HasJoints, signal: str) -> None:
+        self._set(joint_of(machine, signal))
+
+    @classmethod
+    def of(cls, joint: RigidJoint) -> "JointModel":
+        """The model of a joint that is known already."""
+        model = cls.__new__(cls)
+        model._set(joint)
+        return model
 
     @classmethod
     def axis(
@@ -101,14 +87,15 @@ class JointModel:
         unit: Literal["rad", "m"] = "rad",
         timestep_s: float = 1.0 / 1200.0,
     ) -> "JointModel":
-        """An axis that is not the arm's: an inertia [kg m²], or a mass [kg] on a slide with ``unit`` m, without weight.
+        """An axis by itself: an inertia [kg m²], or a mass [kg] on a slide with ``unit`` m, without weight.
 
-        Effects reach it by ``Effect.drive`` whatever joints they name; those without one are refused.
+        Effects act on it by ``Effect.drive`` whatever joints they name; those without one are refused.
         """
-        model = cls.__new__(cls)
-        model.signal, model.unit, model.gains, model.timestep_s = name, unit, gains, timestep_s
-        model._config, model._own, model._rigid = None, [], {(): Rigid(inertia)}
-        return model
+        return cls.of(AxisJoint(name, inertia, gains, unit, timestep_s))
+
+    def _set(self, joint: RigidJoint) -> None:
+        self.joint, self.signal, self.unit, self.gains = joint, joint.signal, joint.unit, joint.gains
+        self._rigid: dict[tuple, Rigid] = {}
 
     def simulate(
         self, motion: JointMotion, gains: Gains, effects: Sequence[Effect] = (), lever: PayloadLever = AT_ITS_PLACE
@@ -117,20 +104,20 @@ class JointModel:
 
         Args:
             gains: those of a recording with ``kp_scale`` = 1.
-            effects: besides the config's; one of the same name takes the place of the config's.
+            effects: besides the machine's; one of the same name takes the place of the machine's.
             lever: left out where effects have no ``drive`` and MuJoCo runs.
 
         Raises:
             TaccorlError: rows that are no whole number of physics steps, or an effect that an axis cannot have.
         """
-        sent, parts, hold = self._sent(motion)
-        present = self._effects(effects)
+        sent, parts, hold, step_s = self._sent(motion)
+        present = self.joint.effects(effects)
         kp, kd = gains.kp * motion.kp_scale, gains.kd * motion.kd_scale
         scaled = Gains(kp, kd, gains.torque_ff)
         drives = [(effect.name, effect.drive()) for effect in present]
         numbers = _combined([(name, drive) for name, drive in drives if drive is not None])
         if numbers is None or any(drive is None for _, drive in drives):
-            return self._in_mujoco(motion, scaled, present, sent, parts, hold)
+            return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
         drive = Drive(*scaled, **self._body(motion, bodies)._asdict())._replace(**numbers)
         weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
@@ -139,7 +126,9 @@ class JointModel:
             gravity_cos=drive.gravity_cos + weight * lever.cos_m,
         )
         drive = Drive(*(float(x) for x in drive))
-        reported, effort = simulate(drive, sent, motion.coupling_nm, motion.start, hold, parts, self.timestep_s)
+        reported, effort = simulate(drive, sent, motion.coupling_nm, motion.start, hold, parts, step_s)
+        if self.joint.effort_holds_weight:
+            effort = effort + drive.gravity_carried * self.carried_nm(motion, reported)
         return JointResponse(reported, effort)
 
     def carried_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
@@ -159,70 +148,34 @@ class JointModel:
 
     def is_weighed(self, motion: JointMotion) -> bool:
         """Whether weight acts about the joint: not about one whose axis is vertical."""
-        body = self._body(motion, [])
-        return math.hypot(body.gravity_sin, body.gravity_cos) > 1e-6
-
-    def _effects(self, effects: Sequence[Effect]) -> list[Effect]:
-        if self._config is None:
-            return [effect for effect in effects if not effect.is_absent]
-        names = {effect.name for effect in effects}
-        return of_joint([*(e for e in self._own if e.name not in names), *effects], self.signal)
+        return weighs(self._body(motion, []))
 
     def _body(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
-        if self._config is None:
-            return self._rigid[()]
         key = (motion.pose.tobytes(), motion.payload_kg, motion.payload_at_m, *map(repr, bodies))
         if key not in self._rigid:
             if len(self._rigid) > 1000:  # a search that changes bodies would fill the memory
                 self._rigid.clear()
-            self._rigid[key] = arm_bench.rigid(
-                self._config, self.signal, motion.pose, motion.payload_kg, bodies, motion.payload_at_m
-            )
+            self._rigid[key] = self.joint.rigid(motion, bodies)
         return self._rigid[key]
 
-    def _sent(self, motion: JointMotion) -> tuple[np.ndarray, int, int]:
-        """Targets as ``taccorl.sim.replay`` sends them: (T · parts,), parts, and physics steps for each."""
-        steps = 1.0 / (motion.rate_hz * self.timestep_s)
+    def _sent(self, motion: JointMotion) -> tuple[np.ndarray, int, int, float]:
+        """Targets as the machine sends them: (T · parts,), parts, physics steps for each, and the step [s]."""
+        step_s = self.joint.timestep_s(motion.rate_hz)
+        steps = 1.0 / (motion.rate_hz * step_s)
         if abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
             raise TaccorlError(
-                f"{motion.name}: {motion.rate_hz:g} Hz is {steps:.3f} physics steps of {self.timestep_s * 1e3:.3f} ms a "
-                f"row; bring it to {1 / (max(1, round(steps)) * self.timestep_s):g} Hz first (Measurement.resampled)"
+                f"{motion.name}: {motion.rate_hz:g} Hz is {steps:.3f} physics steps of {step_s * 1e3:.3f} ms a "
+                f"row; bring it to {1 / (max(1, round(steps)) * step_s):g} Hz first (Measurement.resampled)"
             )
-        parts = math.ceil(_COMMAND_HZ / motion.rate_hz)
+        parts = max(1, math.ceil(self.joint.command_hz / motion.rate_hz))
         while round(steps) % parts:
             parts -= 1
         if parts == 1:
-            return motion.target, 1, round(steps)
+            return motion.target, 1, round(steps), step_s
         following = np.append(motion.target[1:], motion.target[-1])
         share = np.arange(1, parts + 1) / parts
         sent = motion.target[:, None] + share * (following - motion.target)[:, None]
-        return sent.ravel(), parts, round(steps) // parts
-
-    def _in_mujoco(
-        self, motion: JointMotion, gains: Gains, effects: Sequence[Effect], sent: np.ndarray, parts: int, hold: int
-    ) -> JointResponse:
-        if self._config is None:
-            unknown = [effect.name for effect in effects if effect.drive() is None]
-            raise TaccorlError(
-                f"{self.signal}: an axis without an arm knows effects by their numbers in the one-joint model, and "
-                f"{' and '.join(unknown or sorted(e.name for e in effects))} cannot be had there; leave it out"
-            )
-        steps = np.arange(len(sent) * hold) / (parts * hold)
-        coupling = np.interp(steps, np.arange(len(motion.coupling_nm)), motion.coupling_nm)
-        reported, effort = arm_bench.run(
-            self._config,
-            self.signal,
-            sent,
-            hold,
-            coupling,
-            gains=gains,
-            start=motion.start,
-            pose=motion.pose,
-            payload_kg=motion.payload_kg,
-            payload_at_m=motion.payload_at_m,
-            effects=effects,
-        )
-        return JointResponse(reported[::parts], effort[::parts])
+        return sent.ravel(), parts, round(steps) // parts, step_s
 
 
 def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, float] | None:

@@ -7,22 +7,23 @@ iit-DLSLab/sim2real-robot-identification).
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
+from taccorl.alignment.arm_joint import HasJoints, joint_of
+from taccorl.alignment.arm_joint import selectors as selectors
 from taccorl.alignment.joint_kernel import MOST_LOST
-from taccorl.alignment.joint_model import Gains, JointModel, JointMotion, PayloadLever, joint_motion
-from taccorl.alignment.measurement import Measurement, unit_of
+from taccorl.alignment.joint_model import Gains, JointModel, JointMotion, PayloadLever
+from taccorl.alignment.joint_motion import motion_of
+from taccorl.alignment.measurement import UNITS, Measurement
 from taccorl.alignment.measurements import Measurements, motions
 from taccorl.alignment.noise_floor import SignalFloor, noise_floor
 from taccorl.diagnosis.identifiable import TIMING_S
 from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
-from taccorl.diagnosis.replays import BENCH_REST
 from taccorl.errors import TaccorlError
-from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects as registry
-from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
+from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.speed_delay import SpeedDelay
 from taccorl.sim.twin import TwinConfig
 
@@ -55,10 +56,10 @@ OF_RECORDINGS = (EFFORT_SCALE.name, *(f.name for f in PAYLOAD_PLACE))
 
 
 class JointProblem:
-    """A joint of the twin ``config`` and recordings of it.
+    """A joint of the PiPER's twin, or of another machine, and recordings of it.
 
     Args:
-        signal: ``left_joint5``.
+        signal: name of the joint; of the PiPER ``left_joint5``.
         gains: whether commanded gains are believed.
         effort: whether the motor's effort is a second channel where every recording has it.
 
@@ -68,15 +69,16 @@ class JointProblem:
 
     def __init__(
         self,
-        config: TwinConfig,
+        machine: TwinConfig | HasJoints,
         signal: str,
         measurements: Measurements,
         *,
         gains: GainsAre = "auto",
         effort: bool = True,
     ) -> None:
-        on_robot = {use: tuple(map(_on_robot, getattr(measurements, use))) for use in ("fit", "validation", "test")}
-        measurements = dataclasses.replace(measurements, **on_robot)
+        joint = joint_of(machine, signal)
+        whole = {use: tuple(map(joint.whole, getattr(measurements, use))) for use in ("fit", "validation", "test")}
+        measurements = dataclasses.replace(measurements, **whole)
         everything = measurements.all
         stated = all(signal in m.kp and signal in m.kd for m in everything)
         if gains == "commanded" and not stated:
@@ -85,13 +87,10 @@ class JointProblem:
                 f"{silent}: the commanded gains of {signal} are not stated; write kp and kd into its measurements.yaml, "
                 "or fit them (gains=fitted)"
             )
-        arm, joint = signal.split("_", 1)
-        self._self: dict[str, Any] = {"arm": arm, "joints": [joint]}
         self.signal, self.commanded = signal, gains != "fitted" and stated
-        own = [e for e in config.effects if isinstance(e, ArmEffect) and e.fitted and _acts_on(e, signal)]
+        own, bare = joint.freed()
         self.present = tuple(effect.name for effect in own)
-        others = [e for e in config.effects if not any(e is mine for mine in own)]
-        self.model = JointModel(dataclasses.replace(config, effects=others), signal)
+        self.model = JointModel.of(bare)
         self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
         self.floors = floors_of(everything, signal, effort=self.effort)
         """Pooled over all recordings; one whose motion was repeated is judged by its own."""
@@ -101,7 +100,7 @@ class JointProblem:
         self._own_floors = {r: floors_of(group, signal, effort=self.effort) for r, group in groups.items()}
         self._motion = root
         self.fit, self.validation, self.test = (
-            [self._recording(m, config) for m in side]
+            [self._recording(m) for m in side]
             for side in (measurements.fit, measurements.validation, measurements.test)
         )
         self.base = self._base()
@@ -111,7 +110,7 @@ class JointProblem:
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
         }
         if any(f.name == SPEED_DELAY.name for f in self.base):
-            delays = (e for e in config.effects if isinstance(e, SpeedDelay) and _acts_on(e, signal))
+            delays = (e for e in bare.effects([]) if isinstance(e, SpeedDelay))
             self.start[SPEED_DELAY.name] = sum(e.delay_s for e in delays)
 
     @property
@@ -148,7 +147,10 @@ class JointProblem:
         """(T, C) angle [rad], and effort [N·m] as the driver would report it."""
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
         if SPEED_DELAY.name in base:
-            effects = [*effects, SpeedDelay(**self._self, delay_s=float(base[SPEED_DELAY.name]))]
+            effects = [
+                *effects,
+                SpeedDelay(**self.model.joint.selectors(SpeedDelay) or {}, delay_s=float(base[SPEED_DELAY.name])),
+            ]
         answer = self.model.simulate(recording.data, self._gains(base), effects, lever)
         if not self.effort:
             return answer.reported[:, None]
@@ -159,7 +161,7 @@ class JointProblem:
         seen = self._seen(values)
         for name in registry:
             cls = registry.get(name)
-            where = selectors(cls, self.signal) if cls.fitted else None
+            where = self.model.joint.selectors(cls) if cls.fitted else None
             if where is not None and (self.commanded or name not in _GAIN_LIKE):
                 self.candidates[name] = candidate(cls, seen, **where)
 
@@ -189,10 +191,10 @@ class JointProblem:
         ]
         return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
 
-    def _recording(self, m: Measurement, config: TwinConfig) -> Recording:
-        motion = joint_motion(m, config, self.signal)
+    def _recording(self, m: Measurement) -> Recording:
+        motion = motion_of(m, self.signal, self.model.joint)
         columns = [motion.measured, motion.effort] if self.effort else [motion.measured]
-        names = [f"{self.signal} [{unit_of(self.signal)}]", f"{self.signal} effort [N·m]"]
+        names = [f"{self.signal} [{self.model.unit}]", f"{self.signal} effort [{UNITS[self.model.unit][1]}]"]
         return Recording(
             name=m.name,
             time_s=motion.time_s,
@@ -226,23 +228,6 @@ class JointProblem:
             "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
             "duration_s": max(float(m.time_s[-1]) for m in motions),
         }
-
-
-def _on_robot(m: Measurement) -> Measurement:
-    """With all 14 signals: joints that a table lacks rest where the bench has them."""
-    return m if m.signals == ROBOT.action_names else m.on_robot(BENCH_REST)
-
-
-def _acts_on(effect: ArmEffect, signal: str) -> bool:
-    return signal in effect.acts_on() or signal.split("_", 1)[0] in effect.acts_on()
-
-
-def selectors(cls: type[Effect], signal: str) -> dict[str, Any] | None:
-    """What a class must be told so that it acts on this joint only; None for effects of something else."""
-    arm, joint = signal.split("_", 1)
-    if issubclass(cls, JointEffect):
-        return {"arm": arm, "joints": [joint]} if joint in cls.possible else None
-    return {"arm": arm} if issubclass(cls, ArmEffect) else None
 
 
 def floors_of(measurements: Sequence[Measurement], signal: str, *, effort: bool) -> list[SignalFloor]:

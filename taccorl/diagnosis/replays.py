@@ -11,9 +11,11 @@ from typing import Literal
 
 import numpy as np
 
-from taccorl.alignment.arm_bench import AT_TCP, held_payload
+from taccorl.alignment.arm_bench import held_payload
+from taccorl.alignment.arm_joint import BENCH_REST as BENCH_REST
 from taccorl.alignment.joint_model import JointModel, joint_motion
 from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.rigid_joint import AT_TCP
 from taccorl.alignment.touch_motion import PressedObject, TouchMotion, touch_motion
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -41,10 +43,6 @@ class Response:
     """(T, 14) rad, m; NaN for signals that were not replayed."""
     effort: np.ndarray
     """(T, 14) N·m, N that the motors give at the time of each row; NaN where not known."""
-
-
-BENCH_REST = np.concatenate([[*Bench.home_rad[arm], 0.0] for arm in ROBOT.arms])
-"""(14,) where joints are that a table does not tell."""
 
 
 def replay_joints(config: TwinConfig, m: Measurement, signals: Sequence[str]) -> Response:
