@@ -4,7 +4,8 @@ from pathlib import Path
 
 from taccorl.diagnosis.compare import compare
 from taccorl.diagnosis.figures import joint_response
-from taccorl.diagnosis.joints import diagnose_joint, mended
+from taccorl.diagnosis.joints import diagnose_joint
+from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.surrogate.cases import draw_case
 from taccorl.diagnosis.surrogate.recordings import recordings
 
@@ -18,7 +19,7 @@ def main() -> None:
     measurements = recordings(case, "chirp")
     finding = diagnose_joint(case.twin, case.signal, measurements)
     traces = []
-    for twin in (case.twin, mended(case.twin, [finding])):
+    for twin in (case.twin, PiperTwin(case.twin).mended([finding])[0].config):
         compared = compare(twin, measurements, name="twin")
         traces.append(next(t for t in compared.traces if t.recording == SHOWN and t.kind == "position"))
     joint_response(*traces).savefig(PICTURE, dpi=80)

@@ -21,7 +21,7 @@ flange, z along the hand towards the fingers, y the direction in which they clos
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -137,6 +137,7 @@ def read_measurements(
     validation: Sequence[str] = (),
     test: Sequence[str] = (),
     validation_every: int | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Measurements:
     """A recording, a table, a dataset, or a folder of those, divided.
 
@@ -145,6 +146,7 @@ def read_measurements(
         columns: columns file of the tables; else the index's, else our own names.
         validation, test: names of measurements; with those the index's ``use`` is not looked at.
         validation_every: every k-th motion that is not named is for validation; else the index's.
+        units: signal of the machine → unit of its position, for tables without a columns file; the PiPER's if not given.
 
     Raises:
         TaccorlError: nothing to read, unknown names, or a motion and its repeat on both sides.
@@ -156,7 +158,7 @@ def read_measurements(
     columns = columns if columns is not None or index.columns is None else folder / index.columns
     table_spec = columns if isinstance(columns, TableSpec) or columns is None else load_table_spec(columns)
     skipped: list[str] = []
-    found = sorted(_read(path, spec, table_spec, skipped), key=lambda m: natural_key(m.name))
+    found = sorted(_read(path, spec, table_spec, units, skipped), key=lambda m: natural_key(m.name))
     found = _noted(found, index, folder, whole=path.is_dir())
     whole = path.is_dir()
     if validation or test or not whole:  # who asks for one file wants to fit it
@@ -348,7 +350,11 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
 
 
 def _read(
-    path: Path, spec: str | Path | RecordingSpec | None, columns: TableSpec | None, skipped: list[str]
+    path: Path,
+    spec: str | Path | RecordingSpec | None,
+    columns: TableSpec | None,
+    units: Mapping[str, str] | None,
+    skipped: list[str],
 ) -> list[Measurement]:
     if not path.exists():
         siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
@@ -357,12 +363,12 @@ def _read(
         return read_dataset(path)
     if path.is_file():
         if path.suffix in SUFFIXES:
-            return [read_table(path, columns)]
+            return [read_table(path, columns, units)]
         return _read_recordings(path, spec, skipped)
     children = sorted(path.iterdir(), key=lambda p: natural_key(p.name))
     datasets = [p for p in children if (p / "meta" / "info.json").is_file()]
     tables = [p for p in children if p.is_file() and p.suffix in SUFFIXES]
-    found = [m for p in datasets for m in read_dataset(p)] + [read_table(p, columns) for p in tables]
+    found = [m for p in datasets for m in read_dataset(p)] + [read_table(p, columns, units) for p in tables]
     left: list[str] = []
     try:
         found += _read_recordings(path, spec, left)

@@ -15,7 +15,7 @@ units are written down in a columns file; no unit is ever guessed::
 
 import csv
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -142,8 +142,16 @@ def _columns_of(signal: SignalColumns) -> Iterable[tuple[str, Column]]:
             yield field.name, column
 
 
-def own_spec(path: Path, header: list[str]) -> TableSpec:
+def robot_units() -> dict[str, str]:
+    """Signal of the PiPER → unit of its position."""
+    return {name: unit_of(name) for name in ROBOT.action_names}
+
+
+def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | None = None) -> TableSpec:
     """The columns of a table that speaks our language.
+
+    Args:
+        signal_units: signal of the machine → unit of its position, rad or m; the PiPER's if not given.
 
     Raises:
         RecordingError: ``t`` or a position or a target is missing, or a column is unknown; names file and column.
@@ -153,20 +161,21 @@ def own_spec(path: Path, header: list[str]) -> TableSpec:
             f"{path}: no column 't' [s]; it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}. Other "
             "names and units are written down in a columns file (taccorl/alignment/tables.py shows one)"
         )
+    known = robot_units() if signal_units is None else signal_units
     parts: dict[str, set[str]] = {}
     for k, column in enumerate(header):
         name, _, key = column.rpartition(".")
         if column == "t":
             continue
         if key not in _CONVERSIONS or not name:
-            own = [f"{n}.{key}" for n in ROBOT.action_names for key in _CONVERSIONS]
+            own = [f"{n}.{key}" for n in known for key in _CONVERSIONS]
             raise RecordingError(
                 f"{path}: column {k + 1} {column!r} is not NAME.q, .q_target, .qd or .tau; {nearest(column, own)}"
             )
-        if name not in ROBOT.action_names:
+        if name not in known:
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r}: the robot has no {name!r}; {nearest(name, ROBOT.action_names)}. "
-                "Signals of other machines need a columns file, which states their units"
+                f"{path}: column {k + 1} {column!r}: the robot has no {name!r}; {nearest(name, known)}. "
+                "Signals of other machines need their machine's file (--twin) or a columns file, which state their units"
             )
         parts.setdefault(name, set()).add(key)
     for name, keys in parts.items():
@@ -181,25 +190,29 @@ def own_spec(path: Path, header: list[str]) -> TableSpec:
     }
     signals = {
         name: SignalColumns(
-            **{key: Column(column=f"{name}.{key}", unit=units[unit_of(name)][key]) for key in parts[name]}
+            **{key: Column(column=f"{name}.{key}", unit=units[known[name]][key]) for key in parts[name]}
         )
-        for name in sorted(parts, key=ROBOT.action_names.index)
+        for name in sorted(parts, key=list(known).index)
     }
     if not signals:
         raise RecordingError(f"{path}: it holds times and no signal")
     return TableSpec(time=Column(column="t", unit="s"), signals=signals)
 
 
-def read_table(path: Path, spec: TableSpec | None = None) -> Measurement:
+def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[str, str] | None = None) -> Measurement:
     """A CSV or parquet file as a measurement. Even rows stay as they are; others come to an even grid (``even_rows``).
+
+    Args:
+        spec: names and units of its columns; our own names if not given.
+        signal_units: as ``own_spec``, for a table without a spec.
 
     Raises:
         RecordingError: a column is missing, a cell is empty or no number; names file, line and column.
     """
     path = Path(path)
     read = _read_parquet if path.suffix == ".parquet" else _read_csv
-    header, columns = read(path, spec)
-    spec = spec or own_spec(path, header)
+    header, columns = read(path, spec, signal_units)
+    spec = spec or own_spec(path, header, signal_units)
     time_s = columns[spec.time.column] * TIME_S[spec.time.unit]
     if len(time_s) < 2:
         raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
@@ -237,12 +250,14 @@ def _wanted(spec: TableSpec) -> list[str]:
     return [spec.time.column, *(c.column for s in spec.signals.values() for _, c in _columns_of(s))]
 
 
-def _check_header(path: Path, header: list[str], spec: TableSpec | None) -> list[str]:
+def _check_header(
+    path: Path, header: list[str], spec: TableSpec | None, signal_units: Mapping[str, str] | None
+) -> list[str]:
     """Columns to read: all of the spec's, or all."""
     twice = sorted({h for h in header if header.count(h) > 1})
     wanted = header if spec is None else _wanted(spec)
     if spec is None:
-        own_spec(path, header)
+        own_spec(path, header, signal_units)
     for name in wanted:
         if name not in header:
             raise RecordingError(f"{path}: no column {name!r}; {nearest(name, header)}")
@@ -251,7 +266,9 @@ def _check_header(path: Path, header: list[str], spec: TableSpec | None) -> list
     return wanted
 
 
-def _read_csv(path: Path, spec: TableSpec | None) -> tuple[list[str], dict[str, np.ndarray]]:
+def _read_csv(
+    path: Path, spec: TableSpec | None, signal_units: Mapping[str, str] | None
+) -> tuple[list[str], dict[str, np.ndarray]]:
     separator = SEPARATORS[spec.separator if spec else "comma"]
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -264,7 +281,7 @@ def _read_csv(path: Path, spec: TableSpec | None) -> tuple[list[str], dict[str, 
                 raise RecordingError(
                     f"{path}: its columns are parted by {other}; write `separator: {other}` in a columns file"
                 )
-            wanted = _check_header(path, header, spec)
+            wanted = _check_header(path, header, spec, signal_units)
             at = [header.index(name) for name in wanted]
             found: list[list[float]] = []
             for row in rows:
@@ -294,10 +311,12 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
     return value
 
 
-def _read_parquet(path: Path, spec: TableSpec | None) -> tuple[list[str], dict[str, np.ndarray]]:
+def _read_parquet(
+    path: Path, spec: TableSpec | None, signal_units: Mapping[str, str] | None
+) -> tuple[list[str], dict[str, np.ndarray]]:
     try:
         header = list(pq.read_schema(path).names)
-        wanted = _check_header(path, header, spec)
+        wanted = _check_header(path, header, spec, signal_units)
         table = pq.read_table(path, columns=wanted)
     except (pa.ArrowException, OSError) as error:
         raise RecordingError(f"{path}: cannot be read as parquet: {' '.join(str(error).split())}") from error

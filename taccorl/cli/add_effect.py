@@ -8,17 +8,16 @@ Writes a copy, ``twin+coulomb_friction.yaml``, which collection, generation and 
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
+    from taccorl.diagnosis.machine import Addition, Machine
     from taccorl.sim.effects.effect import Effect
-    from taccorl.sim.twin import TwinConfig
 
 
 @dataclass(kw_only=True)
@@ -28,7 +27,7 @@ class AddEffectConfig:
     effect: str
     """Name of the effect; docs/effects.md lists them."""
     twin: Path | None = None
-    """twin.yaml; the nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file with kind: axis. The PiPER's nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """left_joint5; joint5 or J4 (the paper's name of it) for both arms. All that were diagnosed with it if not given."""
     pads: list[str] = field(default_factory=list)
@@ -43,41 +42,22 @@ class AddEffectConfig:
     """Change the twin's own file."""
 
 
-class Entry(NamedTuple):
-    """What is added to one part."""
-
-    part: str
-    """left_joint5, left pads"""
-    effects: "list[Effect]"
-    """The one that is added, and those of the twin that were refitted with it."""
-    base: dict[str, float]
-    """Numbers that were refitted with it."""
-    intervals: dict[str, list[float]]
-
-
 def main(argv: list[str]) -> int:
     """0: written."""
     config = parse(AddEffectConfig, argv, positional="effect", prog="taccorl add-effect")
     out = _place(config)
-    from taccorl.cli.measured import twin_of
-    from taccorl.diagnosis import pads
-    from taccorl.diagnosis.joints import add_effect, set_numbers
-    from taccorl.sim.twin_file import save_twin
+    from taccorl.diagnosis.machine import load_machine
 
-    twin = twin_of(config.twin)
-    entries = _by_hand(config) if config.values else _diagnosed(config, twin)
-    of_pads = {e.part: (e.base, e.intervals) for e in entries if e.base and pads.pads_of(e.base)}
-    shared = pads.agreed(of_pads) if of_pads else {}
-    for e in entries:
-        base = shared if e.part in of_pads else e.base
-        if e.part in of_pads:
-            pads.set_numbers(twin, base)
-        elif base:
-            set_numbers(twin, e.part, base, e.intervals)
-        for effect in e.effects:
-            add_effect(twin, effect)
-            _say(e.part, effect, base)
-    save_twin(twin, out)
+    machine = load_machine(config.twin)
+    by_hand = config.values
+    added = (
+        machine.by_hand(config.effect, config.joints, config.pads, by_hand) if by_hand else _diagnosed(config, machine)
+    )
+    mended = machine.with_additions(added)
+    for addition in added:
+        for effect in addition.effects:
+            _say(addition, effect)
+    mended.save(out)
     print(f"wrote {out}; next: taccorl compare --twin={out} --measurements=YOUR_SWEEPS")
     return 0
 
@@ -98,46 +78,9 @@ def _place(config: AddEffectConfig) -> Path:
     return out
 
 
-def _by_hand(config: AddEffectConfig) -> list[Entry]:
-    from taccorl.cli.diagnose import joints_named
-    from taccorl.diagnosis.joint_problem import selectors
-    from taccorl.diagnosis.joints import SIGNALS
-    from taccorl.robots import ROBOT
-    from taccorl.sim.effects import effects, make_effect
-
-    found = []
-    kind = effects.get(config.effect)
-    if all(selectors(kind, signal) is None for signal in SIGNALS):
-        if config.joints:
-            raise TaccorlError(f"{config.effect} is no effect of joints; leave --joints out")
-        where = {"pads": [f"{arm}_{finger}" for arm in _arms(config.pads, ROBOT.arms) for finger in ROBOT.fingers]}
-        part = " and ".join(config.pads or ["all"]) + " pads"
-        return [Entry(part, [make_effect(config.effect, **where, **config.values, evidence="by hand")], {}, {})]
-    if config.pads:
-        raise TaccorlError(f"{config.effect} is an effect of joints; leave --pads out")
-    if not config.joints:
-        raise TaccorlError(f"{config.effect}: which joints? --joints=left_joint5, or joint5 for both arms")
-    for signal in joints_named(config.joints, SIGNALS):
-        chosen = selectors(kind, signal)
-        if chosen is None:
-            raise TaccorlError(f"{config.effect} cannot act on {signal}")
-        made = make_effect(config.effect, **chosen, **config.values, evidence="by hand")
-        found.append(Entry(signal, [made], {}, {}))
-    return found
-
-
-def _arms(names: Sequence[str], known: Sequence[str]) -> list[str]:
-    for name in names:
-        if name not in known:
-            raise TaccorlError(f"--pads={name}: no pads of that arm here; {nearest(name, known)}")
-    return [arm for arm in known if not names or arm in names]
-
-
-def _diagnosed(config: AddEffectConfig, twin: "TwinConfig") -> list[Entry]:
-    """What the diagnosis of this twin says, part by part."""
-    from taccorl.cli.diagnose import joints_named
+def _diagnosed(config: AddEffectConfig, machine: "Machine") -> list["Addition"]:
+    """What the diagnosis of this machine says, part by part."""
     from taccorl.diagnosis.report import NUMBERS
-    from taccorl.sim.twin_file import twin_digest
 
     path = config.diagnosis / NUMBERS
     if not path.is_file():
@@ -145,18 +88,15 @@ def _diagnosed(config: AddEffectConfig, twin: "TwinConfig") -> list[Entry]:
             f"{path}: no diagnosis there; run `taccorl diagnose` first, or give the numbers: --values={{torque_nm: 0.4}}"
         )
     report = json.loads(path.read_text(encoding="utf-8"))
-    if report.get("provenance", {}).get("twin, SHA-256") != twin_digest(twin):
+    if report.get("provenance", {}).get("twin, SHA-256") != machine.digest():
         made_with = report.get("provenance", {}).get("twin", "another twin")
         raise TaccorlError(f"{path}: was made with another twin ({made_with}); run `taccorl diagnose` with this one")
     diagnoses = report["diagnoses"]
-    joints = [part for part in diagnoses if "_joint" in part]
-    arms = [part.removesuffix(" pads") for part in diagnoses if part not in joints]
-    wanted = list(joints_named(config.joints, joints)) if config.joints else []
-    wanted += [f"{arm} pads" for arm in _arms(config.pads, arms)] if config.pads else []
+    wanted = config.joints or config.pads
     offers, refused = [], []
-    for part in wanted or diagnoses:
+    for part in machine.select(list(diagnoses), config.joints, config.pads):
         try:
-            offers += _offer(config.effect, part, diagnoses[part])
+            offers += _offer(machine, config.effect, part, diagnoses[part])
         except TaccorlError as error:
             refused.append(error)
     if refused and (wanted or not offers):
@@ -167,21 +107,19 @@ def _diagnosed(config: AddEffectConfig, twin: "TwinConfig") -> list[Entry]:
     return offers
 
 
-def _offer(name: str, part: str, diagnosis: dict[str, Any]) -> list[Entry]:
+def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) -> list["Addition"]:
     """The effect as the diagnosis would add it; of those that it did not choose, as its first round fitted it; [] if it did not.
 
     Raises:
         TaccorlError: the diagnosis refused it, or did not keep its numbers.
     """
-    from taccorl.diagnosis.joint_problem import selectors
-    from taccorl.diagnosis.pads import pads_of
-    from taccorl.sim.effects import effects, make_effect
+    from taccorl.diagnosis.machine import Addition
 
     kept = [e for e in diagnosis["effects"] if e["effect"] == name or e["effect"] in diagnosis["present"]]
     if name in [e["effect"] for e in kept] and len(diagnosis["effects"]) - len(diagnosis["present"]) == 1:
         # Effects that the twin had were refitted with it.
-        made = [make_effect(e["effect"], **{k: v for k, v in e.items() if k != "effect"}) for e in kept]
-        return [Entry(part, made, diagnosis["base"], diagnosis["intervals"])]
+        made = [machine.effect(e["effect"], part, {k: v for k, v in e.items() if k != "effect"}) for e in kept]
+        return [Addition(part, [e for e in made if e is not None], diagnosis["base"], diagnosis["intervals"])]
     first = diagnosis["rounds"][:1]
     rows = [e for r in first for e in r["evidence"] if e["name"] == name]
     if rows and name not in (first[0]["added"], *first[0]["ties"]):
@@ -193,21 +131,20 @@ def _offer(name: str, part: str, diagnosis: dict[str, Any]) -> list[Entry]:
         raise TaccorlError(
             f"{part}: the map of {name} is kept only where it is what was added; diagnose --without=[{others}]"
         )
-    chosen = selectors(effects.get(name), part) if "_joint" in part else {"pads": pads_of(diagnosis["base"])}
-    if not rows or chosen is None:
+    if not rows:
         return []
     values = {k.split(".", 1)[1]: v for k, v in rows[0]["values"].items()}
     words = f"{rows[0]['verdict']}: validation error {rows[0]['validation_error']:.2f} noise floors with it alone"
-    effect = make_effect(name, **chosen, **values, evidence=words)
-    return [Entry(part, [effect], rows[0]["base"], diagnosis["intervals"])]
+    effect = machine.effect(name, part, {**values, "evidence": words}, diagnosis["base"])
+    return [] if effect is None else [Addition(part, [effect], rows[0]["base"], diagnosis["intervals"])]
 
 
-def _say(part: str, effect: "Effect", base: dict[str, float]) -> None:
+def _say(addition: "Addition", effect: "Effect") -> None:
     from taccorl.diagnosis.evidence_words import unit_words
 
     numbers = [f"{p.name} {getattr(effect, p.name):.4g}{unit_words(p.unit)}" for p in effect.parameters()]
-    print(f"{part}: {effect.name} {', '.join(numbers)}")
-    if base:
-        print(f"  with {', '.join(f'{k} {v:.4g}' for k, v in base.items())}")
+    print(f"{addition.part}: {effect.name} {', '.join(numbers)}")
+    if addition.base:
+        print(f"  with {', '.join(f'{k} {v:.4g}' for k, v in addition.base.items())}")
     if effect.evidence:
         print(f"  {effect.evidence}")

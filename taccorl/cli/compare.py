@@ -1,4 +1,5 @@
 """``taccorl compare --twin=twin.yaml --measurements=sweeps/``: how far the twin is from measurements, and where.
+``taccorl compare --twin=drive.yaml --measurements=bench/``: of another machine, whose file says ``kind: axis``.
 
 MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may say which
 are for validation, which repeat one another, and what the pads pressed: then touch is compared, pad by pad. Every recording's
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from taccorl.alignment.touch_motion import PressedObject
     from taccorl.data.finding import Finding
     from taccorl.diagnosis.comparison import Comparison, Score
-    from taccorl.sim.twin import TwinConfig
+    from taccorl.diagnosis.machine import Machine
 
 
 @dataclass(kw_only=True)
@@ -50,9 +51,9 @@ class CompareConfig:
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
-    """twin.yaml; the nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file with kind: axis. The PiPER's nominal twin if not given."""
     against: Path | None = None
-    """Another twin.yaml, shown beside the first."""
+    """Another such file, shown beside the first."""
     joints: list[str] = field(default_factory=list)
     """Only these, such as left_joint5; all that were commanded to move if not given."""
     spec: str | None = None
@@ -77,17 +78,20 @@ def main(argv: list[str]) -> int:
     _check_outputs(config)
     from taccorl.alignment.measurements import read_measurements
     from taccorl.alignment.telemetry_checks import accepted, check_names
-    from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of, unused_accepts
+    from taccorl.cli.measured import checked, clock_is_off, print_findings, unused_accepts
+    from taccorl.diagnosis.machine import load_machine
 
     check_names(config.accept)
 
-    twins = [
-        (name_of(path), twin_of(path)) for path in (config.twin, config.against)[: 1 + (config.against is not None)]
-    ]
+    twins = [load_machine(path) for path in (config.twin, config.against)[: 1 + (config.against is not None)]]
     measurements = read_measurements(
-        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
+        config.measurements,
+        spec=config.spec,
+        columns=config.columns,
+        validation_every=config.validation_every,
+        units=twins[0].units,
     )
-    findings = checked(measurements, "not compared", config.accept)
+    findings = checked(twins[0], measurements, "not compared", config.accept)
     if findings is None:
         return 1
     comparisons = _compared(config, twins, measurements)
@@ -118,24 +122,21 @@ def _check_outputs(config: CompareConfig) -> None:
         check_free(config.rerun)
 
 
-def _compared(
-    config: CompareConfig, twins: "Sequence[tuple[str, TwinConfig]]", measurements: "Measurements"
-) -> list["Comparison"]:
+def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "Measurements") -> list["Comparison"]:
     from taccorl.cli.tables import Bars
-    from taccorl.diagnosis.compare import compare
     from taccorl.diagnosis.comparison import only
 
     pressed = _pressed(config.pressed)
     found = []
-    for name, twin in twins:
+    for twin in twins:
         with Bars(len(measurements.all)) as bars:
             found.append(
-                compare(
-                    twin,
+                twin.compare(
                     measurements,
-                    name=name,
                     pressed=pressed,
-                    progress=lambda recording, done, total, name=name: bars.update(f"{name}: {recording}", done, total),
+                    progress=lambda recording, done, total, name=twin.name: bars.update(
+                        f"{name}: {recording}", done, total
+                    ),
                 )
             )
     return [only(c, config.joints) for c in found] if config.joints else found
@@ -216,17 +217,16 @@ def _write(
     comparisons: "Sequence[Comparison]",
     findings: dict[str, list["Finding"]],
     late: dict[str, list["Finding"]],
-    twins: "Sequence[tuple[str, TwinConfig]]",
+    twins: "Sequence[Machine]",
     argv: Sequence[str],
 ) -> None:
     first, after = comparisons[0], comparisons[1] if len(comparisons) > 1 else None
     if config.out is not None:
         from taccorl.diagnosis.report import Report, write_report
-        from taccorl.sim.twin_file import twin_digest
 
         provenance = {"command": shlex.join(["taccorl", "compare", *argv])}
-        for name, twin in twins:
-            provenance[f"{name}, SHA-256"] = twin_digest(twin)
+        for twin in twins:
+            provenance[f"{twin.name}, SHA-256"] = twin.digest()
         clock = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
         title = f"{first.twin} beside {config.measurements.name}" + (f", and {after.twin}" if after else "")
         report = Report(title=title, comparison=first, after=after, findings=clock, provenance=provenance)

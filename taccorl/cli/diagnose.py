@@ -12,6 +12,7 @@ effect explains is called "something else".
     --out=DIR              report.html, report.json, which `taccorl add-effect` reads, and the mended twin.yaml
 """
 
+import itertools
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,17 +20,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.parse import parse
-from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements import Measurements
     from taccorl.diagnosis.comparison import Comparison
-    from taccorl.diagnosis.joints import JointFinding
-    from taccorl.diagnosis.pads import PadFinding
+    from taccorl.diagnosis.machine import Finding, Machine
     from taccorl.diagnosis.regimes import RegimeErrors
     from taccorl.diagnosis.report import Report
     from taccorl.diagnosis.verdict import Verdict
-    from taccorl.sim.twin import TwinConfig
 
 
 COLORS = {"high": "green", "moderate": "yellow", "low": "red"}
@@ -45,7 +43,7 @@ class DiagnoseConfig:
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
-    """twin.yaml; the nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file with kind: axis. The PiPER's nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """Only these: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If neither joints
     nor pads are given, all that are swept and all that press something known."""
@@ -79,31 +77,26 @@ def main(argv: list[str]) -> int:
     check_folder(config.out)
     from taccorl.alignment.measurements import read_measurements
     from taccorl.alignment.telemetry_checks import accepted, check_names
-    from taccorl.cli.measured import checked, clock_is_off, name_of, print_findings, twin_of, unused_accepts
-    from taccorl.diagnosis.compare import compare
-    from taccorl.diagnosis.joints import swept_joints
-    from taccorl.diagnosis.pads import pressed_arms
+    from taccorl.cli.measured import checked, clock_is_off, print_findings, unused_accepts
+    from taccorl.diagnosis.machine import load_machine
     from taccorl.sim.effects import effects
 
     check_names(config.accept)
-    twin = twin_of(config.twin)
+    machine = load_machine(config.twin)
     for name in config.without:
         effects.get(name)
     measurements = read_measurements(
-        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
+        config.measurements,
+        spec=config.spec,
+        columns=config.columns,
+        validation_every=config.validation_every,
+        units=machine.units,
     )
-    findings = checked(measurements, "not diagnosed", config.accept)
+    findings = checked(machine, measurements, "not diagnosed", config.accept)
     if findings is None:
         return 1
-    swept, pressed = swept_joints(measurements), pressed_arms(measurements)
-    if not swept and not pressed:
-        raise TaccorlError(
-            "no fit recording sweeps a joint (2 mrad at least), or says what pads pressed; record sweeps or presses: taccorl "
-            "excite plans both; of presses, state `pressed` in measurements.yaml"
-        )
-    arms = arms_named(config.pads, pressed) if config.pads or not config.joints else ()
-    signals = joints_named(config.joints, swept) if config.joints or (swept and not config.pads) else ()
-    before = compare(twin, measurements, name=name_of(config.twin))
+    parts = machine.select(machine.parts(measurements), config.joints, config.pads)
+    before = machine.compare(measurements)
     late = {name: accepted(found, config.accept) for name, found in before.clock.items() if found}
     unused_accepts(config.accept, findings, late)
     print_findings({f"replay of {name}": found for name, found in late.items()})
@@ -112,120 +105,49 @@ def main(argv: list[str]) -> int:
             "not diagnosed: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"
         )
         return 1
-    joints, pads = _diagnosed(config, twin, signals, arms, measurements)
-    mended, disagree = _mended(twin, joints, pads)
+    found = _diagnosed(config, machine, parts, measurements)
+    mended, disagree = machine.mended(found)
     said = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
-    report = _report(config, argv, twin, [*joints, *pads], before, measurements, mended, said)
+    report = _report(config, argv, machine, found, before, measurements, mended, said)
     verdicts, regimes = report.verdicts(), report.regimes()
-    for finding in (*joints, *pads):
+    for finding in found:
         print_finding(finding, verdicts[finding.part], regimes.get(finding.part))
-    _write(config, report, [*joints, *pads], mended)
+    _write(config, report, found, machine, mended)
     if disagree:
-        print(f"the mended twin's pads are as they were: {disagree}")
-    done = all(f.diagnosis.status in ("nothing_missing", "at_floor") for f in (*joints, *pads))
+        print(disagree)
+    done = all(f.diagnosis.status in ("nothing_missing", "at_floor") for f in found)
     return int(not done or bool(disagree))
 
 
-def joints_named(names: Sequence[str], swept: Sequence[str]) -> tuple[str, ...]:
-    """Joints that are meant: ``left_joint5``; ``joint5`` and the paper's ``J4`` are that joint of every arm that is swept.
-
-    Raises:
-        TaccorlError: nothing is swept, an unknown name, or a joint that no recording sweeps.
-    """
-    if not swept:
-        raise TaccorlError(
-            "no fit recording sweeps a joint (2 mrad at least); record sweeps: taccorl excite plans them"
-        )
-    if not names:
-        return tuple(swept)
-    chosen: list[str] = []
-    for name in names:
-        joint = f"joint{int(name[1:]) + 1}" if name[:1] in "Jj" and name[1:].isdigit() else name
-        joint = f"joint{joint}" if joint.isdigit() else joint
-        meant = [s for s in swept if joint in (s, s.split("_", 1)[1])]
-        if not meant:
-            raise TaccorlError(f"{name}: no such joint is swept in these recordings; {nearest(joint, swept)}")
-        chosen += [s for s in meant if s not in chosen]
-    return tuple(chosen)
-
-
-def arms_named(names: Sequence[str], pressed: Sequence[str]) -> tuple[str, ...]:
-    """Arms whose pads are meant.
-
-    Raises:
-        TaccorlError: one whose pads press nothing known.
-    """
-    for name in names:
-        if name not in pressed:
-            raise TaccorlError(
-                f"--pads={name}: no fit recording says what pads of such an arm pressed; "
-                + (nearest(name, pressed) if pressed else "state `pressed` in measurements.yaml")
-            )
-    return tuple(arm for arm in pressed if not names or arm in names)
-
-
 def _diagnosed(
-    config: DiagnoseConfig,
-    twin: "TwinConfig",
-    signals: Sequence[str],
-    arms: Sequence[str],
-    measurements: "Measurements",
-) -> "tuple[list[JointFinding], list[PadFinding]]":
+    config: DiagnoseConfig, machine: "Machine", parts: Sequence[str], measurements: "Measurements"
+) -> "list[Finding]":
     from taccorl.cli.tables import Bars
-    from taccorl.diagnosis.joints import diagnose_joints
-    from taccorl.diagnosis.pads import diagnose_pads
+    from taccorl.diagnosis.machine import diagnose_parts
     from taccorl.diagnosis.search import SearchConfig
 
     search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
-    total = len(signals) + len(arms)
-    with Bars(total) as bars:
-        count = 0
-
-        def done(part: str) -> None:
-            nonlocal count
-            count += 1
-            bars.update(part, count, total)
-
-        joints = diagnose_joints(
-            twin,
-            signals,
+    with Bars(len(parts)) as bars:
+        count = itertools.count(1)
+        return diagnose_parts(
+            machine,
+            parts,
             measurements,
             gains=config.gains,
             search=search,
             without=config.without,
             workers=config.workers,
-            done=done,
+            done=lambda part: bars.update(part, next(count), len(parts)),
         )
-        pads = diagnose_pads(
-            twin, arms, measurements, search=search, without=config.without, workers=config.workers, done=done
-        )
-    return joints, pads
 
 
-def _mended(
-    twin: "TwinConfig", joints: "Sequence[JointFinding]", pads: "Sequence[PadFinding]"
-) -> "tuple[TwinConfig, str]":
-    """The twin with all that was found, and why its pads are not in it, if they are not."""
-    from taccorl.diagnosis import joints as of_joints
-    from taccorl.diagnosis import pads as of_pads
-
-    mended = of_joints.mended(twin, joints)
-    try:
-        return of_pads.mended(mended, pads), ""
-    except TaccorlError as error:
-        return mended, str(error)
-
-
-def print_finding(
-    finding: "JointFinding | PadFinding", first: "Verdict", regimes: "RegimeErrors | None" = None
-) -> None:
-    """What was found at one joint or pair of pads: the verdict first, then what can be told, the evidence and the numbers."""
+def print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors | None" = None) -> None:
+    """What was found at one part of a machine: the verdict first, then what can be told, the evidence and the numbers."""
     from rich.table import Table
     from rich.text import Text
 
     from taccorl.cli.tables import console
     from taccorl.diagnosis.evidence_words import evidence_words
-    from taccorl.diagnosis.pads import PadFinding
 
     out, d = console(), finding.diagnosis
     out.print(Text(f"\n{finding.part}", "bold"))
@@ -239,7 +161,7 @@ def print_finding(
     out.print(f"  noise floor {finding.noise}", highlight=False)
     judged = "the last rows of each" if finding.rows_split else ", ".join(finding.recordings["validation"])
     out.print(f"  {finding.numbers}; chosen by the error on {judged} (validation)", highlight=False, soft_wrap=True)
-    if isinstance(finding, PadFinding) and finding.remark:
+    if finding.remark:
         out.print(f"  {finding.remark}", highlight=False, soft_wrap=True)
     hardly = [_why_invisible(finding, name) for name in finding.can_tell.invisible if name not in d.names]
     if hardly:
@@ -286,17 +208,16 @@ def _some(words: Sequence[str]) -> str:
     return ", ".join(words[:MOST_NAMES]) + (f" and {more} more: see the report" if more > 0 else "")
 
 
-def _why_invisible(finding: "JointFinding | PadFinding", name: str) -> str:
+def _why_invisible(finding: "Finding", name: str) -> str:
     from taccorl.sim.effects import effects
 
     twins = [t for t in effects.get(name).near_twins if t in finding.diagnosis.start]
     return f"{name} (taken up by {' and '.join(twins)})" if twins else name
 
 
-def details(finding: "JointFinding | PadFinding") -> list[str]:
+def details(finding: "Finding") -> list[str]:
     """The numbers behind the verdict: errors, identified and absolute numbers, near-twins, what does as well."""
     from taccorl.diagnosis.evidence_words import to_record, unit_words
-    from taccorl.diagnosis.identifiable import Known
 
     d = finding.diagnosis
     errors = d.errors["fitted"]["validation"], d.errors["after"]["validation"]
@@ -308,7 +229,7 @@ def details(finding: "JointFinding | PadFinding") -> list[str]:
         if name in d.base:
             low, high = d.intervals.get(name, (float("nan"), float("nan")))
             lines.append(f"    {name} {d.base[name]:.4g} ({low:.4g} … {high:.4g}), the twin had {d.start[name]:.4g}")
-    known: Known | None = getattr(finding, "known", None)
+    known = finding.known
     if known is not None:
         own = [n.words() for n in known.identifiable if "." not in n.name]
         pinned = f"; scale of torques fixed by {' and '.join(known.pinned_by)}" if known.pinned_by else ""
@@ -354,69 +275,57 @@ def details(finding: "JointFinding | PadFinding") -> list[str]:
 def _report(
     config: DiagnoseConfig,
     argv: Sequence[str],
-    twin: "TwinConfig",
-    found: "Sequence[JointFinding | PadFinding]",
+    machine: "Machine",
+    found: "Sequence[Finding]",
     before: "Comparison",
     measurements: "Measurements",
-    mended: "TwinConfig",
+    mended: "Machine",
     findings: dict,
 ) -> "Report":
     """With the comparisons that show what refitted numbers removed, and what effects did."""
-    from taccorl.diagnosis import joints as of_joints
-    from taccorl.diagnosis import pads as of_pads
-    from taccorl.diagnosis.compare import compare
-    from taccorl.diagnosis.joints import JointFinding
-    from taccorl.diagnosis.pads import PadFinding
     from taccorl.diagnosis.report import Report
-    from taccorl.sim.twin_file import twin_digest
 
-    joints = [f for f in found if isinstance(f, JointFinding)]
-    pads = [f for f in found if isinstance(f, PadFinding)]
-    refitted = of_pads.refitted(of_joints.refitted(twin, joints), pads)
+    refitted = machine.refitted(found)
     options = [f"--measurements={config.measurements}"]
     options += [f"--twin={config.twin}"] * (config.twin is not None)
     options += [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))
     return Report(
         title=f"What {before.twin} lacks, from {config.measurements.name}",
         comparison=before,
-        refitted=compare(refitted, measurements, name="refitted twin"),
-        after=compare(mended, measurements, name="mended twin"),
+        refitted=refitted.compare(measurements, name="refitted twin"),
+        after=mended.compare(measurements, name="mended twin"),
         diagnoses={f.part: f.diagnosis for f in found},
         can_tell={f.part: f.can_tell for f in found},
-        known={f.part: f.known for f in joints},
+        known={f.part: f.known for f in found if f.known is not None},
         options=[shlex.quote(word) for word in options],
         findings=findings,
         provenance={
             "command": shlex.join(["taccorl", "diagnose", *argv]),
             "twin": str(config.twin) if config.twin else "nominal twin",
-            "twin, SHA-256": twin_digest(twin),
+            "twin, SHA-256": machine.digest(),
         },
     )
 
 
 def _write(
-    config: DiagnoseConfig, report: "Report", found: "Sequence[JointFinding | PadFinding]", mended: "TwinConfig"
+    config: DiagnoseConfig, report: "Report", found: "Sequence[Finding]", machine: "Machine", mended: "Machine"
 ) -> None:
-    from taccorl.diagnosis.pads import PadFinding
     from taccorl.diagnosis.report import write_report
-    from taccorl.sim.twin_file import save_twin
 
     written = write_report(report, config.out)
     again = f" (replaced the report of {written.replaced})" if written.replaced else ""
     print(f"\nwrote {written.page} and {written.numbers.name}{again}")
     names = list(dict.fromkeys(e.name for f in found for e in f.diagnosis.effects if e.name not in f.diagnosis.present))
     if config.until == "noise_floor":
-        path = config.out / "twin.yaml"
-        save_twin(mended, path)
-        names = [name for name in names if any(e.name == name for e in mended.effects)]
-        print(
-            f"wrote {path}: {', '.join(names) or 'the refitted gains, no effect'}; it is what collect and training load"
-        )
+        path = config.out / mended.file_name
+        mended.save(path)
+        names = [name for name in names if name in mended.effects]
+        print(f"wrote {path}: {', '.join(names) or 'the refitted gains, no effect'}; {mended.saved_words}")
     elif names:
         words = ["taccorl", "add-effect", names[0]]
-        words += [f"--pads={f.arm}" for f in found if isinstance(f, PadFinding) and names[0] in f.diagnosis.names]
+        words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]
         words += [f"--twin={config.twin}"] * (config.twin is not None)
         words += [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))
         print(f"next: {shlex.join(words)}")
-    elif any(isinstance(f, PadFinding) for f in found):
+    elif any(machine.option_of(f.part) for f in found):
         print("next: the same with --until=noise_floor writes a twin with the refitted numbers")

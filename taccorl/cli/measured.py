@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from taccorl.alignment.measurement import Measurement
     from taccorl.alignment.measurements import Measurements
     from taccorl.data.finding import Finding
+    from taccorl.diagnosis.machine import Machine
     from taccorl.sim.twin import TwinConfig
 
 
@@ -20,23 +21,21 @@ def twin_of(path: Path | None) -> "TwinConfig":
     return TwinConfig() if path is None else load_twin(path)
 
 
-def name_of(path: Path | None) -> str:
-    """How tables and pages call that twin."""
-    return "nominal twin" if path is None else path.stem
-
-
 def checked(
-    measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
+    machine: "Machine", measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
 ) -> dict[str, list["Finding"]] | None:
-    """What the checks of telemetry say, printed; None where they found errors, which ``verdict`` then says first.
+    """What the checks of telemetry and of the machine say, printed; None where they found errors, which ``verdict`` then says
+    first.
 
     Args:
         accept: checks whose errors become warnings.
     """
-    from taccorl.alignment.telemetry_checks import check_measurements
+    from taccorl.alignment.telemetry_checks import accepted, check_measurements
 
-    found = check_measurements(measurements.all, accept=accept)
-    found = {m.name: [*_judged(m, found.get(m.name, [])), *_pose_unknown(m)] for m in measurements.all}
+    found, own = check_measurements(measurements.all, accept=accept), machine.check(measurements)
+    found = {
+        m.name: [*_judged(m, found.get(m.name, [])), *accepted(own.get(m.name, []), accept)] for m in measurements.all
+    }
     print_findings(found)
     for line in measurements.skipped:
         print(f"not read: {line}")
@@ -67,24 +66,6 @@ def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
 def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
     """A press need not move a joint as far or as long as a sweep does."""
     return [f for f in findings if m.pressed is None or f.check not in ("no_motion", "short", "too_short")]
-
-
-def _pose_unknown(m: "Measurement") -> list["Finding"]:
-    """A table without an arm's other joints: inertia and weight are then those of the bench's pose."""
-    from taccorl.data.finding import Finding
-    from taccorl.robots import ROBOT
-
-    found = []
-    for arm in ROBOT.arms:
-        there = [j for j in ROBOT.joints if f"{arm}_{j}" in m.signals]
-        if there and len(there) < len(ROBOT.joints):
-            lacking = ", ".join(f"{arm}_{j}" for j in ROBOT.joints if j not in there)
-            text = (
-                f"it lacks {lacking}: they are taken to stand as on the bench, and inertia and weight of what moves follow from "
-                "that; add their columns, constant ones will do"
-            )
-            found.append(Finding("pose_unknown", "warning", f"{arm} arm", text))
-    return found
 
 
 def print_findings(found: dict[str, list["Finding"]]) -> None:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
@@ -67,6 +66,8 @@ class JointFinding:
     def measured(self) -> str:
         """What the errors are of."""
         return "angles and efforts together" if len(self.floors) > 1 else "angles"
+
+    remark = ""
 
 
 def swept_joints(measurements: Measurements) -> tuple[str, ...]:
@@ -176,26 +177,6 @@ def _payload_remarks(found: Diagnosis) -> list[str]:
     ]
 
 
-def diagnose_joints(
-    config: TwinConfig,
-    signals: Sequence[str],
-    measurements: Measurements,
-    *,
-    gains: GainsAre = "auto",
-    search: SearchConfig | None = None,
-    without: Sequence[str] = (),
-    workers: int = 1,
-    done: Callable[[str], None] = lambda _: None,
-) -> list[JointFinding]:
-    """Several joints, ``workers`` at a time; the same for any number of them.
-
-    Args:
-        done: called with each joint that is finished.
-    """
-    one = partial(diagnose_joint, config, measurements=measurements, gains=gains, search=search, without=without)
-    return each(one, signals, workers, done)
-
-
 def each[FindingT](
     diagnosed: Callable[[str], FindingT], parts: Sequence[str], workers: int, done: Callable[[str], None]
 ) -> list[FindingT]:
@@ -212,28 +193,6 @@ def each[FindingT](
             job.result()
             done(jobs[job])
         return [job.result() for job in jobs]
-
-
-def mended(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig:
-    """``config`` with the effects that were found, and with the numbers that were fitted beside them."""
-    new = copy.deepcopy(config)
-    for finding in findings:
-        d = finding.diagnosis
-        set_numbers(new, finding.signal, d.base, d.intervals)
-        for effect in finding.diagnosis.effects:
-            add_effect(new, effect)
-    return new
-
-
-def refitted(config: TwinConfig, findings: Sequence[JointFinding]) -> TwinConfig:
-    """``config`` with its always fitted numbers refitted and no further effect: what effects are credited against."""
-    new = copy.deepcopy(config)
-    for finding in findings:
-        first = finding.diagnosis.before
-        set_numbers(new, finding.signal, first.values, first.intervals())
-        for effect in first.effects:
-            add_effect(new, effect)
-    return new
 
 
 def set_numbers(

@@ -4,11 +4,9 @@ A pair is judged by matched contact replays (``TouchProblem``): its fingers stan
 place is known. A twin has one k_n and one k_d for all of its pads, effects act on the pads in which they were found.
 """
 
-import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -19,7 +17,6 @@ from taccorl.alignment.touch_motion import TouchMotion
 from taccorl.diagnosis.evidence import block_squares, standard_score
 from taccorl.diagnosis.fit import fit
 from taccorl.diagnosis.identifiability import Identifiability, identifiability
-from taccorl.diagnosis.joints import add_effect, each
 from taccorl.diagnosis.problem import Recording, split_rows
 from taccorl.diagnosis.replays import matched_contact
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose, gain_of
@@ -78,6 +75,7 @@ class PadFinding:
         return "k_n, k_d and each pad's zero fitted"
 
     measured = f"means of {FRAMES_A_ROW} frames"
+    known = None
 
 
 def part_of(arm: str) -> str:
@@ -154,21 +152,6 @@ def diagnose_arm(
     )
 
 
-def diagnose_pads(
-    config: TwinConfig,
-    arms: Sequence[str],
-    measurements: Measurements,
-    *,
-    search: SearchConfig | None = None,
-    without: Sequence[str] = (),
-    workers: int = 1,
-    done: Callable[[str], None] = lambda _: None,
-) -> list[PadFinding]:
-    """The pads of several arms, as ``diagnose_joints`` does joints."""
-    one = partial(diagnose_arm, config, measurements=measurements, search=search, without=without)
-    return each(one, arms, workers, lambda arm: done(part_of(arm)))
-
-
 def unjudged_gains(
     problem: TouchProblem,
     found: Diagnosis,
@@ -228,37 +211,6 @@ def _check_pads(motions: Sequence[TouchMotion]) -> None:
 
 
 # the twin --------------------------------------------------------------------------------------------------------------
-
-
-def mended(config: TwinConfig, findings: Sequence[PadFinding]) -> TwinConfig:
-    """``config`` with the effects that were found, and with the k_n and k_d that were fitted beside them.
-
-    Raises:
-        TaccorlError: the pads of two arms need different ones.
-    """
-    new = copy.deepcopy(config)
-    if findings:
-        fitted = {f.part: (f.diagnosis.base, f.diagnosis.intervals) for f in findings}
-        set_numbers(new, agreed(fitted))
-    for finding in findings:
-        for effect in finding.diagnosis.effects:
-            add_effect(new, effect)
-    return new
-
-
-def refitted(config: TwinConfig, findings: Sequence[PadFinding]) -> TwinConfig:
-    """As ``joints.refitted``: k_n and k_d fitted without any further effect; as they are where two arms need different ones."""
-    new = copy.deepcopy(config)
-    firsts = {f.part: f.diagnosis.before for f in findings}
-    try:
-        if firsts:
-            set_numbers(new, agreed({part: (first.values, first.intervals()) for part, first in firsts.items()}))
-    except TaccorlError:
-        return new
-    for first in firsts.values():
-        for effect in first.effects:
-            add_effect(new, effect)
-    return new
 
 
 def set_numbers(config: TwinConfig, base: Mapping[str, float]) -> None:

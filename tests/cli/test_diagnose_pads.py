@@ -168,7 +168,7 @@ def test_by_hand_an_effect_may_act_on_the_pads_of_one_arm(said: Any, tmp_path: P
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--pads=right"], "--pads=right: no fit recording says what pads of such an arm pressed; known: left"),
+        (["--pads=right"], "--pads=right: no pads of that arm here; known: left"),
         pytest.param(["--joints=J3"], "no fit recording sweeps a joint", marks=pytest.mark.slow),
     ],
 )

@@ -14,12 +14,12 @@ from taccorl.diagnosis.joints import (
     JointFinding,
     add_effect,
     diagnose_joint,
-    diagnose_joints,
-    mended,
     moves,
     set_numbers,
     swept_joints,
 )
+from taccorl.diagnosis.machine import diagnose_parts
+from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.diagnosis.search import SearchConfig
 from taccorl.errors import TaccorlError
@@ -129,7 +129,7 @@ def test_two_workers_find_the_same_as_one():
     assert joints == (SIGNAL, "right_joint6")
     told: list[str] = []
     found = [
-        diagnose_joints(TwinConfig(), joints, both, search=ONE, without=WITHOUT, workers=n, done=told.append)
+        diagnose_parts(PiperTwin.nominal(), joints, both, search=ONE, without=WITHOUT, workers=n, done=told.append)
         for n in (1, 2)
     ]
     assert sorted(told) == sorted(2 * joints)
@@ -146,7 +146,7 @@ def test_two_workers_find_the_same_as_one():
 
 def test_the_mended_twin_is_at_the_floor_and_comes_back_from_its_file(finding, tmp_path):
     nominal = TwinConfig()
-    twin = mended(nominal, [finding])
+    twin = PiperTwin(nominal).mended([finding])[0].config
     assert nominal == TwinConfig(), "the twin that went in is as it was"
     save_twin(twin, tmp_path / "twin.yaml")
     read = load_twin(tmp_path / "twin.yaml")

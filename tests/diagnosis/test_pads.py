@@ -13,7 +13,9 @@ from taccorl.alignment.touch_motion import indenter
 from taccorl.diagnosis.compare import compare
 from taccorl.diagnosis.evidence_words import evidence_words, to_record, unit_words
 from taccorl.diagnosis.joints import moves, swept_joints
-from taccorl.diagnosis.pads import PadFinding, agreed, diagnose_arm, diagnose_pads, mended, pads_of, pressed_arms
+from taccorl.diagnosis.machine import Addition, diagnose_parts
+from taccorl.diagnosis.machines.piper import PiperTwin
+from taccorl.diagnosis.pads import PadFinding, agreed, diagnose_arm, pads_of, pressed_arms
 from taccorl.diagnosis.search import Evidence, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
@@ -85,7 +87,7 @@ def test_the_mended_twin_has_the_effect_and_the_refitted_numbers_and_its_error_f
     finding: PadFinding, measured: Measurements
 ):
     twin = TwinConfig()
-    new = mended(twin, [finding])
+    new = PiperTwin(twin).mended([finding])[0].config
     assert twin == TwinConfig(), "the old one stays"
     assert isinstance(new.sensor, FlexiTacConfig)
     assert new.sensor.normal_stiffness_per_m == finding.diagnosis.base["k_n"]
@@ -97,7 +99,7 @@ def test_the_mended_twin_has_the_effect_and_the_refitted_numbers_and_its_error_f
         assert (one.signal, one.use) == (other.signal, other.use)
         assert one.ratio > 4.0 and other.ratio < 1.2
     assert {s.signal for s in before.pad_scores()} == {"left_a", "left_b"}
-    assert mended(twin, []) == twin
+    assert PiperTwin(twin).mended([])[0].config == twin
 
 
 def test_an_effect_that_the_twin_has_on_these_pads_is_refitted_and_replaced(measured: Measurements):
@@ -106,7 +108,7 @@ def test_an_effect_that_the_twin_has_on_these_pads_is_refitted_and_replaced(meas
     found = diagnose_arm(wrong, "left", measured, search=ONE, without=WITHOUT)
     assert found.diagnosis.present == ("taxel_saturation",)
     assert found.diagnosis.status == "nothing_missing"
-    (effect,) = mended(wrong, [found]).effects
+    (effect,) = PiperTwin(wrong).mended([found])[0].config.effects
     assert vars(effect)["limit"] == pytest.approx(LIMIT, rel=0.03)
 
 
@@ -115,11 +117,11 @@ def test_pads_of_both_arms_are_found_and_each_by_itself(measured: Measurements):
     alone = measured.fit[0]
     both = Measurements((alone, on_the_right(alone)))
     assert pressed_arms(both) == ("left", "right")
-    found = diagnose_pads(TwinConfig(), ("left", "right"), both, search=ONE, without=WITHOUT)
+    found = diagnose_parts(PiperTwin.nominal(), ("left pads", "right pads"), both, search=ONE, without=WITHOUT)
     assert [f.part for f in found] == ["left pads", "right pads"]
     assert all(f.rows_split for f in found)
     assert found[0].diagnosis.base["k_n"] == pytest.approx(found[1].diagnosis.base["k_n"], rel=1e-3)
-    twin = mended(TwinConfig(), found)
+    twin = PiperTwin(TwinConfig()).mended(found)[0].config
     assert [e.acts_on() for e in twin.effects] == [["left_a", "left_b"], ["right_a", "right_b"]]
 
 
@@ -146,7 +148,9 @@ def test_numbers_that_do_not_agree_are_no_guess(finding: PadFinding):
     with pytest.raises(
         TaccorlError, match=r"k_n of left pads .*right pads .*one for all its pads.*--pads=left or --pads=right"
     ):
-        mended(TwinConfig(), [finding, other])
+        PiperTwin(TwinConfig()).with_additions(
+            [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in (finding, other)]
+        )
 
 
 # which recordings ------------------------------------------------------------------------------------------------------

@@ -14,7 +14,8 @@ from simulated_sweeps import SIGNAL, friction, sweeps
 
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.compare import compare
-from taccorl.diagnosis.joints import JointFinding, diagnose_joint, mended, refitted
+from taccorl.diagnosis.joints import JointFinding, diagnose_joint
+from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.report import NUMBERS, PAGE, Report, Written, check_folder, write_report
 from taccorl.diagnosis.search import SearchConfig
 from taccorl.errors import TaccorlError
@@ -117,8 +118,8 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointFinding, P
     report = Report(
         title="what is missing",
         comparison=compare(TwinConfig(), measured, name="nominal twin"),
-        refitted=compare(refitted(TwinConfig(), [finding]), measured, name="refitted twin"),
-        after=compare(mended(TwinConfig(), [finding]), measured, name="mended twin"),
+        refitted=PiperTwin.nominal().refitted([finding]).compare(measured, name="refitted twin"),
+        after=PiperTwin.nominal().mended([finding])[0].compare(measured, name="mended twin"),
         diagnoses={SIGNAL: finding.diagnosis},
         can_tell={SIGNAL: finding.can_tell},
         known={SIGNAL: finding.known},

@@ -12,7 +12,8 @@ from taccorl.alignment.joint_motion import joint_motion
 from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.fit import FINE, fit, moved_by
 from taccorl.diagnosis.joint_problem import JointProblem
-from taccorl.diagnosis.joints import diagnose_joint, mended, set_numbers
+from taccorl.diagnosis.joints import diagnose_joint, set_numbers
+from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.motions import CHIRP, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
 from taccorl.diagnosis.search import diagnose
 from taccorl.diagnosis.surrogate.cases import Case, draw_case
@@ -176,7 +177,7 @@ def test_a_payload_off_its_place_is_said_with_the_way_out_and_is_nothing_of_the_
     (remark,) = [r for r in found.diagnosis.remarks if "payload" in r]
     assert "5.2 mm" in remark
     assert "payload_position_m" in remark
-    assert mended(case.twin, [found]).effects == case.twin.effects
+    assert PiperTwin(case.twin).mended([found])[0].config.effects == case.twin.effects
 
 
 def test_validation_rows_without_a_measurement_are_refused():

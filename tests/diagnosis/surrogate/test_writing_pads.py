@@ -13,6 +13,7 @@ from taccorl.alignment.measurements import INDEX, Measurements, read_measurement
 from taccorl.cli.main import main
 from taccorl.cli.measured import checked
 from taccorl.demos.stand_in_config import START_UNIX_NS
+from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.surrogate import touch, writing
 from taccorl.diagnosis.surrogate.touch import TouchCase, TouchRecordings, draw_touch_case
 from taccorl.diagnosis.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
@@ -76,7 +77,7 @@ def test_what_was_pressed_is_read_back(case: TouchCase, read: Measurements):
 
 
 def test_nothing_is_wrong_with_the_recordings(read: Measurements):
-    found = checked(read, "")
+    found = checked(PiperTwin.nominal(), read, "")
     assert found is not None and [f for own in found.values() for f in own if f.severity != "note"] == []
 
 

@@ -1,0 +1,369 @@
+"""What is compared with measurements and diagnosed: the PiPER's twin, or another machine that a file describes.
+
+The commands ``compare``, ``diagnose`` and ``add-effect`` use a ``Machine`` only by the methods here. ``load_machine`` reads which
+kind a file describes from its key ``kind:``; a file without that key is a ``twin.yaml`` of the PiPER.
+
+A new kind is one module in ``taccorl/diagnosis/machines/`` with one class under ``@machines.register("kind")``.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
+
+import numpy as np
+import yaml
+
+from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.touch_motion import PressedObject
+from taccorl.data.finding import Finding as DataFinding
+from taccorl.diagnosis.comparison import Comparison
+from taccorl.diagnosis.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.identifiable import Known
+from taccorl.diagnosis.joints import each
+from taccorl.diagnosis.problem import Problem, Recording, Values, split_rows
+from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.errors import SpecError, TaccorlError, nearest
+from taccorl.plugins import Registry
+from taccorl.sim.effects.effect import Effect
+
+GainsAre = Literal["auto", "commanded", "fitted"]
+"""``auto``: gains that every recording states stay fixed, others are fitted."""
+
+
+class Finding(Protocol):
+    """What was found out about one part of a machine."""
+
+    @property
+    def part(self) -> str:
+        """As tables and reports call it."""
+        ...
+
+    @property
+    def diagnosis(self) -> Diagnosis: ...
+
+    @property
+    def can_tell(self) -> Identifiability:
+        """What its recordings can show and tell apart, whatever they say."""
+        ...
+
+    @property
+    def known(self) -> Known | None:
+        """The numbers that the recordings identify; None where that is not worked out."""
+        ...
+
+    @property
+    def noise(self) -> str:
+        """Noise floors in words."""
+        ...
+
+    @property
+    def numbers(self) -> str:
+        """Where the always fitted numbers are from, in words."""
+        ...
+
+    @property
+    def measured(self) -> str:
+        """Channels whose errors are counted, in words."""
+        ...
+
+    @property
+    def recordings(self) -> dict[str, tuple[str, ...]]:
+        """fit, validation, test → names."""
+        ...
+
+    @property
+    def rows_split(self) -> bool:
+        """No recording was marked for validation: the last rows of each were used."""
+        ...
+
+    @property
+    def remark(self) -> str:
+        """What the search could not judge; empty if there is nothing."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartFinding:
+    """A ``Finding`` of a part that needs nothing special."""
+
+    part: str
+    diagnosis: Diagnosis
+    can_tell: Identifiability
+    noise: str
+    numbers: str
+    measured: str
+    recordings: dict[str, tuple[str, ...]]
+    rows_split: bool
+    known: Known | None = None
+    remark: str = ""
+
+
+class Addition(NamedTuple):
+    """What is written into a machine's file at one part."""
+
+    part: str
+    effects: Sequence[Effect]
+    """Those that are added, and those of the file that were refitted with them."""
+    base: Mapping[str, float]
+    """Always fitted numbers, refitted with them; empty: they stay."""
+    intervals: Mapping[str, Sequence[float]]
+    """Number → 95 % interval."""
+
+
+class PartProblem(Problem, Protocol):
+    """A problem with the recordings that it is solved on."""
+
+    fit: Sequence[Recording]
+    validation: Sequence[Recording]
+    test: Sequence[Recording]
+    start: Values
+    """Numbers from which the search starts."""
+    present: tuple[str, ...]
+    """Effects that the file has already."""
+    noise: str
+    numbers: str
+    measured: str
+
+
+class Machine(ABC):
+    """A machine as a file describes it. Machines are values: methods that change something return another one."""
+
+    name: str
+    """For titles and tables: the file's stem."""
+    part_word: ClassVar[str] = "part"
+    """What messages call one of its parts: joint, axis, pad."""
+    file_name: str
+    """Name of the file that ``diagnose --until=noise_floor`` writes."""
+    saved_words: ClassVar[str] = "compare and diagnose load it"
+    """Use of a file that ``save`` has written."""
+
+    @classmethod
+    @abstractmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file.
+
+        Raises:
+            SpecError: with file, line and key.
+        """
+
+    @abstractmethod
+    def save(self, path: Path) -> None:
+        """Write a file that ``load`` reads as the same machine; it is replaced as a whole or not at all."""
+
+    @abstractmethod
+    def digest(self) -> str:
+        """16 hexadecimal digits that two machines share only if they are the same."""
+
+    @property
+    @abstractmethod
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that it has."""
+
+    @property
+    @abstractmethod
+    def units(self) -> Mapping[str, str]:
+        """Signal → unit of its position (rad, m), for tables without a columns file."""
+
+    # measurements ----------------------------------------------------------------------------------------------------
+
+    def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
+        """Recording → findings that only this machine can make, such as positions beyond its limits."""
+        return {}
+
+    @abstractmethod
+    def parts(self, measurements: Measurements) -> tuple[str, ...]:
+        """Parts that the fit recordings excite, so that something can be found out about them.
+
+        Raises:
+            TaccorlError: none; names what to record.
+        """
+
+    def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
+        """Those of ``parts`` that ``--joints`` and ``--pads`` name; all if neither is given.
+
+        Raises:
+            TaccorlError: a name that is none of them.
+        """
+        if pads:
+            raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; leave --pads out")
+        for name in joints:
+            if name not in parts:
+                raise TaccorlError(f"{name}: no such {self.part_word} here; {nearest(name, parts)}")
+        return tuple(p for p in parts if not joints or p in joints)
+
+    @abstractmethod
+    def compare(
+        self,
+        measurements: Measurements,
+        *,
+        name: str = "",
+        pressed: PressedObject | None = None,
+        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
+    ) -> Comparison:
+        """Simulate every recording's commands, and keep what is left.
+
+        Args:
+            name: for titles; the machine's own if empty.
+            pressed: object between the PiPER's fingers in recordings that do not state one.
+            progress: called with (recording, recordings done, recordings in all).
+        """
+
+    def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> PartProblem:
+        """One part as a problem for the search; kinds with a ``diagnose`` of their own need none."""
+        raise NotImplementedError
+
+    def diagnose(
+        self,
+        part: str,
+        measurements: Measurements,
+        *,
+        gains: GainsAre = "auto",
+        search: SearchConfig | None = None,
+        without: Sequence[str] = (),
+    ) -> Finding:
+        """Search for the effect that is missing at one part.
+
+        Args:
+            without: effects that are not considered.
+        """
+        problem = self.problem(part, measurements, gains)
+        fit_to, validation = (problem.fit, problem.validation) if problem.validation else split_rows(problem.fit)
+        if not any(np.isfinite(r.measured).any() for r in validation):
+            raise TaccorlError(
+                f"{part}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so no effect "
+                "can be judged; record a motion that is measured to its end, or mark another one with use: validation"
+            )
+        can_tell = identifiability(problem, fit_to, problem.start, problem.present)
+        found = diagnose(
+            problem,
+            fit_to,
+            validation,
+            problem.test,
+            start=problem.start,
+            present=problem.present,
+            without=without,
+            config=search,
+        )
+        return PartFinding(
+            part=part,
+            diagnosis=found,
+            can_tell=can_tell,
+            noise=problem.noise,
+            numbers=problem.numbers,
+            measured=problem.measured,
+            recordings={use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")},
+            rows_split=not problem.validation,
+        )
+
+    # effects ---------------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def effect(
+        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
+    ) -> Effect | None:
+        """The effect of that name at one part; None if it cannot act there.
+
+        Args:
+            values: its parameters, interval and evidence, and whatever else its fields hold where a report gives them.
+            base: always fitted numbers of the diagnosis that fitted it.
+
+        Raises:
+            TaccorlError: unknown effect or parameter, or a value out of bounds.
+        """
+
+    def by_hand(
+        self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
+    ) -> list[Addition]:
+        """An effect with numbers by hand at the parts that are named; at the only part if the machine has one.
+
+        Raises:
+            TaccorlError: it cannot act there, or no part is named.
+        """
+        if not joints and len(self.units) > 1:
+            raise TaccorlError(f"{name}: which {self.part_word}? --joints={next(iter(self.units))}")
+        found = []
+        for part in self.select(tuple(self.units), joints, pads):
+            effect = self.effect(name, part, {**values, "evidence": "by hand"})
+            if effect is None:
+                raise TaccorlError(f"{name} cannot act on {part}")
+            found.append(Addition(part, [effect], {}, {}))
+        return found
+
+    @abstractmethod
+    def with_additions(self, additions: Sequence[Addition]) -> Self:
+        """With these effects and numbers; an effect of the same name at the same part is replaced.
+
+        Raises:
+            TaccorlError: parts that share a number need different ones.
+        """
+
+    def mended(self, findings: Sequence[Finding]) -> tuple[Self, str]:
+        """With all that was found, and why a part of it could not be written; empty if all was."""
+        found = [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in findings]
+        return self.with_additions(found), ""
+
+    def refitted(self, findings: Sequence[Finding]) -> Self:
+        """With the always fitted numbers refitted and no further effect: what effects are credited against."""
+        firsts = [(f.part, f.diagnosis.before) for f in findings]
+        return self.with_additions([Addition(part, b.effects, b.values, b.intervals()) for part, b in firsts])
+
+    def option_of(self, part: str) -> list[str]:
+        """Options with which ``taccorl add-effect`` must name this part although it was diagnosed."""
+        return []
+
+
+machines: Registry[type[Machine]] = Registry("kind of machine", "taccorl.diagnosis.machines")
+
+
+def load_machine(path: Path | None) -> Machine:
+    """The machine that a file describes; the nominal twin of the PiPER without a file.
+
+    Raises:
+        SpecError: the file cannot be read, its kind is unknown, or it does not fit that kind; with file and line.
+    """
+    from taccorl.diagnosis.machines.piper import PiperTwin
+
+    if path is None:
+        return PiperTwin.nominal()
+    path = Path(path)
+    kind, line = _kind(path)
+    if kind is None:
+        return PiperTwin.load(path)
+    if kind not in machines:
+        raise SpecError(f"{path}:{line}: kind: no kind of machine {kind!r}; {nearest(kind, machines)}")
+    return machines.get(kind).load(path)
+
+
+def _kind(path: Path) -> tuple[str | None, int]:
+    """Value and line of the key ``kind``. None where the file is not YAML or cannot be read, too: what reads it says so."""
+    try:
+        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
+        return None, 1
+    for key, value in root.value if isinstance(root, yaml.MappingNode) else ():
+        if key.value == "kind":
+            return str(value.value), key.start_mark.line + 1
+    return None, 1
+
+
+def diagnose_parts(
+    machine: Machine,
+    parts: Sequence[str],
+    measurements: Measurements,
+    *,
+    gains: GainsAre = "auto",
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+    workers: int = 1,
+    done: Callable[[str], None] = lambda _: None,
+) -> list[Finding]:
+    """Several parts, ``workers`` at a time; the same for any number of them.
+
+    Args:
+        done: called with each part that is finished.
+    """
+    one = partial(machine.diagnose, measurements=measurements, gains=gains, search=search, without=without)
+    return each(one, parts, workers, done)

@@ -1,0 +1,1 @@
+"""Kinds of machines, one module each; ``taccorl.diagnosis.machine`` says what a kind must be able to do."""

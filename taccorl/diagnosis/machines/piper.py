@@ -1,0 +1,216 @@
+"""The PiPER's twin as a machine: two arms and their pads, described by a ``twin.yaml`` (``taccorl.sim.twin_file``)."""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from taccorl.alignment.measurement import Measurement, unit_of
+from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.touch_motion import PressedObject
+from taccorl.data.finding import Finding as DataFinding
+from taccorl.diagnosis import joints, pads
+from taccorl.diagnosis.compare import compare
+from taccorl.diagnosis.comparison import Comparison
+from taccorl.diagnosis.joint_problem import selectors
+from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine
+from taccorl.diagnosis.search import SearchConfig
+from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import load_twin, save_twin, twin_digest
+
+
+@dataclass(frozen=True)
+class PiperTwin(Machine):
+    """A twin of the PiPER. Its parts are joints (``left_joint5``) and pairs of pads (``left pads``)."""
+
+    config: TwinConfig
+    name: str = "twin"
+    file_name: str = "twin.yaml"
+    part_word: ClassVar[str] = "joint"
+    saved_words: ClassVar[str] = "it is what collect and training load"
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        return cls(load_twin(path), path.stem)
+
+    @classmethod
+    def nominal(cls) -> "PiperTwin":
+        """The twin without any file."""
+        return cls(TwinConfig(), "nominal twin")
+
+    def save(self, path: Path) -> None:
+        save_twin(self.config, path)
+
+    def digest(self) -> str:
+        return twin_digest(self.config)
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.config.effects)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        return {name: unit_of(name) for name in ROBOT.action_names}
+
+    def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
+        """A table without an arm's other joints: inertia and weight are then those of the bench's pose."""
+        return {m.name: _pose_unknown(m) for m in measurements.all}
+
+    def parts(self, measurements: Measurements) -> tuple[str, ...]:
+        found = [*joints.swept_joints(measurements), *map(pads.part_of, pads.pressed_arms(measurements))]
+        if not found:
+            raise TaccorlError(
+                "no fit recording sweeps a joint (2 mrad at least), or says what pads pressed; record sweeps or presses: "
+                "taccorl excite plans both; of presses, state `pressed` in measurements.yaml"
+            )
+        return tuple(found)
+
+    def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
+        """``left_joint5``; ``joint5`` and the paper's ``J4`` are that joint of every arm. Pads are named by their arm."""
+        swept = [p for p in parts if p in _SIGNALS]
+        pressed = [p.removesuffix(" pads") for p in parts if p not in _SIGNALS]
+        arms = _arms_named(pads, pressed) if pads or not joints else []
+        signals = _joints_named(joints, swept) if joints or (swept and not pads) else []
+        return (*signals, *map(_part_of, arms))
+
+    def compare(
+        self,
+        measurements: Measurements,
+        *,
+        name: str = "",
+        pressed: PressedObject | None = None,
+        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
+    ) -> Comparison:
+        return compare(self.config, measurements, name=name or self.name, pressed=pressed, progress=progress)
+
+    def diagnose(
+        self,
+        part: str,
+        measurements: Measurements,
+        *,
+        gains: GainsAre = "auto",
+        search: SearchConfig | None = None,
+        without: Sequence[str] = (),
+    ) -> Finding:
+        if part in _SIGNALS:
+            return joints.diagnose_joint(self.config, part, measurements, gains=gains, search=search, without=without)
+        arm = part.removesuffix(" pads")
+        return pads.diagnose_arm(self.config, arm, measurements, search=search, without=without)
+
+    def effect(
+        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
+    ) -> Effect | None:
+        """Of pads: those whose zeros are in ``base``."""
+        if {"arm", "joints", "pads"} & {*values}:  # as a report has it: it says itself where it acts
+            return make_effect(name, **values)
+        where = selectors(effects.get(name), part) if part in _SIGNALS else {"pads": pads.pads_of(base or {})}
+        return None if where is None else make_effect(name, **where, **values)
+
+    def by_hand(
+        self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
+    ) -> list[Addition]:
+        kind = effects.get(name)
+        if all(selectors(kind, signal) is None for signal in _SIGNALS):
+            if joints:
+                raise TaccorlError(f"{name} is no effect of joints; leave --joints out")
+            where = [f"{arm}_{finger}" for arm in _arms_named(pads, ROBOT.arms) for finger in ROBOT.fingers]
+            made = make_effect(name, pads=where, **values, evidence="by hand")
+            return [Addition(" and ".join(pads or ["all"]) + " pads", [made], {}, {})]
+        if pads:
+            raise TaccorlError(f"{name} is an effect of joints; leave --pads out")
+        if not joints:
+            raise TaccorlError(f"{name}: which joints? --joints=left_joint5, or joint5 for both arms")
+        found = []
+        for signal in _joints_named(joints, _SIGNALS):
+            made = self.effect(name, signal, {**values, "evidence": "by hand"})
+            if made is None:
+                raise TaccorlError(f"{name} cannot act on {signal}")
+            found.append(Addition(signal, [made], {}, {}))
+        return found
+
+    def with_additions(self, additions: Sequence[Addition]) -> "PiperTwin":
+        """k_n and k_d are those of all pads: what several arms' pads were fitted to must agree."""
+        config = copy.deepcopy(self.config)
+        of_pads = {a.part: (a.base, a.intervals) for a in additions if a.base and a.part not in _SIGNALS}
+        if of_pads:
+            pads.set_numbers(config, pads.agreed(of_pads))
+        for a in additions:
+            if a.base and a.part in _SIGNALS:
+                joints.set_numbers(config, a.part, a.base, a.intervals)
+            for effect in a.effects:
+                joints.add_effect(config, effect)
+        return PiperTwin(config, self.name)
+
+    def mended(self, findings: Sequence[Finding]) -> "tuple[PiperTwin, str]":
+        """Without what was found in the pads where two arms need different k_n or k_d."""
+        try:
+            return super().mended(findings)
+        except TaccorlError as error:
+            found, _ = super().mended([f for f in findings if f.part in _SIGNALS])
+            return found, f"the mended twin's pads are as they were: {error}"
+
+    def refitted(self, findings: Sequence[Finding]) -> "PiperTwin":
+        try:
+            return super().refitted(findings)
+        except TaccorlError:
+            return super().refitted([f for f in findings if f.part in _SIGNALS])
+
+    def option_of(self, part: str) -> list[str]:
+        return [] if part in _SIGNALS else [f"--pads={part.removesuffix(' pads')}"]
+
+
+_SIGNALS = joints.SIGNALS
+_part_of = pads.part_of
+
+
+def _joints_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Joints that are meant, each once.
+
+    Raises:
+        TaccorlError: nothing is known, or a name that is none of them.
+    """
+    if not known:
+        raise TaccorlError(
+            "no fit recording sweeps a joint (2 mrad at least); record sweeps: taccorl excite plans them"
+        )
+    chosen: list[str] = [] if names else list(known)
+    for name in names:
+        joint = f"joint{int(name[1:]) + 1}" if name[:1] in "Jj" and name[1:].isdigit() else name
+        joint = f"joint{joint}" if joint.isdigit() else joint
+        meant = [s for s in known if joint in (s, s.split("_", 1)[1])]
+        if not meant:
+            raise TaccorlError(f"{name}: no such joint is swept in these recordings; {nearest(joint, known)}")
+        chosen += [s for s in meant if s not in chosen]
+    return chosen
+
+
+def _arms_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Arms whose pads are meant.
+
+    Raises:
+        TaccorlError: one whose pads are not known.
+    """
+    for name in names:
+        if name not in known:
+            way_out = nearest(name, known) if known else "state `pressed` in measurements.yaml"
+            raise TaccorlError(f"--pads={name}: no pads of that arm here; {way_out}")
+    return [arm for arm in known if not names or arm in names]
+
+
+def _pose_unknown(m: Measurement) -> list[DataFinding]:
+    found = []
+    for arm in ROBOT.arms:
+        there = [j for j in ROBOT.joints if f"{arm}_{j}" in m.signals]
+        if there and len(there) < len(ROBOT.joints):
+            lacking = ", ".join(f"{arm}_{j}" for j in ROBOT.joints if j not in there)
+            text = (
+                f"it lacks {lacking}: they are taken to stand as on the bench, and inertia and weight of what moves follow from "
+                "that; add their columns, constant ones will do"
+            )
+            found.append(DataFinding("pose_unknown", "warning", f"{arm} arm", text))
+    return found
