@@ -5,23 +5,23 @@ from collections.abc import Iterable
 
 
 class TaccorlError(Exception):
-    """Anything that is the input's fault, not the program's: shown as one line, never as a traceback."""
+    """An error in the user's input. Commands show it as one line, without a traceback."""
 
 
 class SpecError(TaccorlError):
-    """A data spec that cannot be obeyed: unknown key, missing field, wrong type."""
+    """An invalid data spec: unknown key, missing field, wrong type."""
 
 
 class RecordingError(TaccorlError):
-    """A recording that cannot be read or does not hold what its spec promises."""
+    """A recording that cannot be read or does not contain what its spec states."""
 
 
 class DatasetError(TaccorlError):
-    """A dataset that is incomplete, of another kind, or in the way."""
+    """A dataset that is incomplete or of another kind, or a destination that is occupied."""
 
 
 class InTheWayError(DatasetError):
-    """Something else lies where a dataset is to be; it was not touched."""
+    """The destination of a dataset is occupied by something else, which was not changed."""
 
 
 class UnreachableError(TaccorlError):
@@ -33,7 +33,7 @@ class LostError(TaccorlError):
 
 
 def printable(text: object) -> str:
-    """Its text with every character that a terminal would obey or hide (escape sequences, line breaks) written out: ``\\x1b``."""
+    """``value`` as text with control characters (escape sequences, line breaks) escaped, such as ``\\x1b``."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 

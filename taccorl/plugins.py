@@ -18,7 +18,7 @@ ENTRY_POINT_GROUP = "taccorl.plugins"
 
 
 class Registry[T]:
-    """Names to plug-in classes of one kind, filled by importing the plug-in folder and the published entry points."""
+    """Registry of plug-in classes of one kind, by name, filled by importing the plug-in folder and the published entry points."""
 
     def __init__(self, kind: str, folder: str) -> None:
         self.kind, self.folder = kind, folder

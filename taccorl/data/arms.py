@@ -1,4 +1,4 @@
-"""Which elements of ``observation.state`` and ``action`` are which arm's: by their names and units, never by position."""
+"""Assign the elements of ``observation.state`` and ``action`` to arms by name and unit, never by position."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ STATE = "observation.state"
 
 @dataclass(frozen=True)
 class Arm:
-    """Which elements of ``observation.state`` and ``action`` are one arm's."""
+    """Indices of the elements of ``observation.state`` and ``action`` that belong to one arm."""
 
     name: str
     """Prefix of its names without the underscore; empty for a robot with one arm."""

@@ -1,7 +1,7 @@
 """Is an episode fit to train on? Timing, joints, pictures and touch, each judged by pure functions on its arrays.
 
-An **error** says that the data is wrong: ingest quarantines the episode. A **warning** says: look at it. A **note** is
-worth knowing; what could not be judged is a note too, never a pass in silence.
+An **error** says that the data is wrong: ingest quarantines the episode. A **warning** should be looked at. A **note** is
+information; a check that could not be made is reported as a note.
 
     error    not_finite, joint_limit, out_of_range, swapped_arms, swapped_pads, noise_only,
              action_lag (command after state), frozen_picture (half of the episode or more),
@@ -109,7 +109,7 @@ def _check_touch(episode: Episode, key: str, joints_fit: bool) -> list[Finding]:
 
 
 def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
-    """How one channel's samples met the rows."""
+    """Check the timing of one channel: rate, gaps, and age of its samples at the rows."""
     duration_s = episode.num_rows / episode.spec.fps
     promised_hz = timing.nominal_hz or episode.spec.features[timing.feature].rate_hz
     samples = max(timing.rate_hz * duration_s, 1.0)
@@ -157,7 +157,7 @@ def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
 
 
 def check_recording_episodes(episodes: Sequence[Episode]) -> list[Finding]:
-    """What only shows when the episodes of one recording are laid side by side; names the odd one."""
+    """Checks that compare the episodes of one recording and name the one that differs."""
     if len(episodes) < 2:
         return []
     good = [e for e in episodes if e.arrays and e.num_rows >= 2 and not joint_checks.check_values(e)]

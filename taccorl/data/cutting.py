@@ -32,7 +32,7 @@ MAX_WAITING_PICTURES = 1000
 
 
 class Unfit(RecordingError):
-    """Readable, but not fit for a dataset: the recording is quarantined, not refused."""
+    """Error: the recording is readable, but its data is wrong. It is quarantined, not refused."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Loss:
 
 @dataclass
 class Cut:
-    """What a recording gave."""
+    """Result of cutting one recording: its episodes, and the losses between them."""
 
     origin_ns: int = 0
     """The recording's first sample, on its channels' clock: where the losses' seconds count from."""
@@ -506,7 +506,8 @@ class Cutter:
             raise BrokenPicture(channel, identity[0], str(error)) from error
 
     def drop_broken_pictures(self) -> int:
-        """Decode every picture once and forget those that do not: their rows take an older one or split the episode."""
+        """Decode every picture once and drop those that do not decode: their rows show an older picture, or the episode is
+        split."""
         channels = {
             c: key
             for key in self.spec.target.keys("video")

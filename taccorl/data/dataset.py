@@ -81,7 +81,7 @@ class Dataset:
         return int(self._entry(index)["length"])
 
     def first_row(self, index: int) -> int:
-        """Of one episode, in the whole dataset."""
+        """Index in the whole dataset of the episode's first row."""
         return int(self._entry(index)["dataset_from_index"])
 
     def data_file(self, index: int) -> Path:
@@ -89,7 +89,7 @@ class Dataset:
         return self._file("data_path", "data/", index)
 
     def video(self, index: int, key: str) -> Video:
-        """The episode's part of a video file.
+        """Path and time range of the episode within a video file.
 
         Raises:
             DatasetError: its frames are in the cache of training alone.
@@ -100,7 +100,8 @@ class Dataset:
         return Video(path, float(self._entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
 
     def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
-        """(T, *shape) of features that are no pictures, as stored; (T,) of texts. Reads only these rows and columns.
+        """Feature → (T, *shape) values of features other than pictures, as stored; (T,) of texts. Reads only these rows and
+        columns.
 
         Raises:
             DatasetError: rows are missing, or a value does not fit its feature's shape.
@@ -152,7 +153,7 @@ class Dataset:
         return {} if self._records is None else dict(self._records[index])
 
     def episode(self, index: int) -> Episode:
-        """One episode: its numbers now, its pictures when asked for."""
+        """Read one episode: its numbers at once, its pictures on demand."""
         features = self.info["features"]
         present = {key: f for key, f in self.spec.features.items() if key in features}
         cameras = tuple(key for key, f in present.items() if f.dtype == "video")
@@ -186,7 +187,8 @@ class Dataset:
                 yield dict(zip(cameras, shown, strict=True))
 
     def video_problems(self) -> list[str]:
-        """Proof, without decoding, that every row has its own frame: packets of each video file against the episodes' rows."""
+        """Compare, without decoding, the packets of each video file with the episodes' rows: every row must have its own
+        frame."""
         features = self.info["features"]
         cameras = [key for key, f in features.items() if f["dtype"] == "video" and key not in self.unstored]
         problems = []
@@ -284,7 +286,7 @@ def dataset_spec_from_json(path: Path) -> DatasetSpec:
 
 
 def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
-    """What ``meta/taccorl/episodes.json`` keeps of an episode: all that LeRobot's files cannot say."""
+    """Entry of ``meta/taccorl/episodes.json`` for an episode: what LeRobot's files cannot state."""
     return {
         "recording": str(episode.provenance.get("recording", episode.name)),
         "part": episode.provenance.get("part"),

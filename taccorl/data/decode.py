@@ -1,4 +1,5 @@
-"""What a decoded message means: numbers by name, pad frames, pictures, texts. The same for ROS 2, protobuf, JSON and arrays."""
+"""Values of decoded messages: numbers by name, pad frames, pictures, texts. The same code for ROS 2, protobuf, JSON and
+arrays."""
 
 import base64
 import re
@@ -21,7 +22,7 @@ def natural_key(name: str) -> tuple[Any, ...]:
 
 
 def type_key(name: str) -> str:
-    """``sensor_msgs/JointState`` and ``sensor_msgs/msg/JointState`` are one type."""
+    """Name of a message type without ``/msg``: ``sensor_msgs/JointState`` and ``sensor_msgs/msg/JointState`` are one type."""
     return name.replace("/msg/", "/")
 
 
@@ -97,7 +98,8 @@ def vector_paths(value: Any) -> dict[str, str]:
 
 
 def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
-    """(size,) float64 of one message: ``field``, picked by the message's own names, times ``scale``.
+    """Function that returns the values of one message, (size,) float64: ``field``, selected by the message's own names, times
+    ``scale``.
 
     A field, or a whole message, that is a vector, a pose … (``ros_vectors``) gives its numbers with the names of their paths.
     """
@@ -150,7 +152,7 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
 
 
 def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], np.ndarray]:
-    """(rows · columns,) counts of one pad frame in the pad's own order, as the wire's dtype."""
+    """Function that returns the counts of one pad frame, (rows · columns,), in the pad's own order and the wire's dtype."""
     wire = sensor.wire
     dtype = np.dtype(wire.dtype).newbyteorder("<")
 

@@ -1,6 +1,7 @@
-"""Two specs to start from, drafted after a look at a recording: how it is read, and what its dataset holds.
+"""Draft two specs from a recording: how recordings are read, and what their dataset holds.
 
-What the recording tells is filled in: topics, types, names of joints, rates, shapes. What it cannot tell (units, valid ranges,
+Filled in is what the recording states: topics, types, names of joints, rates, shapes. What it does not state (units, valid
+ranges,
 the instruction) is ``TODO`` with a comment that says what to write there.
 """
 
@@ -30,19 +31,19 @@ STALE_PERIODS = 2.4
 
 
 class Drafts(NamedTuple):
-    """Two YAML texts."""
+    """Texts of a drafted recording spec and a drafted dataset spec, in YAML."""
 
     recording: str
     dataset: str
 
 
 def dataset_path(path: Path) -> Path:
-    """Where the dataset spec lies that goes with a recording spec at ``path``."""
+    """Path of the dataset spec that is drafted beside the recording spec at ``path``."""
     return path.with_name(f"{path.stem}_dataset.yaml")
 
 
 def draft_specs(inventory: Inventory, path: Path = Path("draft.yaml")) -> Drafts:
-    """A recording spec to lie at ``path``, and the dataset spec beside it that it names."""
+    """Draft a recording spec for ``path`` and the dataset spec beside it, which it names."""
     roles = _roles(inventory)
     return Drafts(_recording(inventory, roles, path), _dataset(inventory, roles, path))
 

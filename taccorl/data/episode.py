@@ -1,4 +1,4 @@
-"""One attempt on one clock: numbers as arrays, pictures as a stream; what the writer writes, checks check and views show.
+"""Episode: one attempt on one clock, with numbers as arrays and pictures as a stream. The writer, checks and views use it.
 
 Letters in shapes: T rows (time), K taxels, L history.
 """
@@ -32,7 +32,7 @@ class Video:
 
 @dataclass(frozen=True)
 class ChannelTiming:
-    """How a channel's samples met the rows of this episode (all in seconds)."""
+    """Timing of one channel's samples at the rows of this episode; all in seconds."""
 
     channel: str
     feature: str
@@ -95,7 +95,7 @@ class Episode:
         return np.arange(self.num_rows) / self.spec.fps
 
     def executed(self) -> np.ndarray:
-        """(T, A) what was sent: the actions, or of a disturbed episode what they became.
+        """(T, A) targets that were sent: the actions, or in a disturbed episode the disturbed targets.
 
         Raises:
             DatasetError: it was disturbed, and what was sent is not there any more.
@@ -118,7 +118,7 @@ class Episode:
         return np.array([u == unit for u in names])
 
     def pads(self, key: str) -> dict[str, np.ndarray]:
-        """Pad name → (T, rows, columns) newest counts above baseline of tactile feature ``key``."""
+        """Pad name → (T, rows, columns): newest counts above baseline of tactile feature ``key``."""
         feature, sensor = self.spec.features[key], self.spec.sensors[key]
         counts = self.arrays[key].reshape(-1, feature.history, len(feature.pads), sensor.rows, sensor.columns)
         return {pad: counts[:, -1, p] for p, pad in enumerate(feature.pads)}

@@ -1,4 +1,4 @@
-"""What a file is by its first bytes, whatever its ending; of archives and Git LFS pointers, the command that gives the file."""
+"""Recognise kinds of files by their first bytes; for archives and Git LFS pointers, name the command that gives the file."""
 
 import shlex
 from pathlib import Path
@@ -36,7 +36,7 @@ _HEAD_BYTES = max(kind.offset + len(kind.magic) for kind in FILE_KINDS)
 
 
 def sniff(path: Path) -> FileKind | None:
-    """What a file is by its first bytes; None where they are not known, or ``path`` is no file."""
+    """Kind of a file by its first bytes; None if they are unknown or ``path`` is no file."""
     if not path.is_file():  # a pipe would wait for ever
         return None
     try:
@@ -48,7 +48,8 @@ def sniff(path: Path) -> FileKind | None:
 
 
 def no_recording(path: Path) -> str | None:
-    """What a file of a known kind is that no reader opens, with the command that helps; None for any other file."""
+    """Description of a file that no reader opens (archive, LFS pointer …), with the command that helps; None for any other
+    file."""
     kind = sniff(path)
     if kind is None or kind.reader is not None:
         return None

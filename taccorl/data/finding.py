@@ -1,4 +1,4 @@
-"""What a check found in an episode: a stable name, how bad, where, and in words what to do."""
+"""Finding of a check in an episode: stable name, severity, place, and text with the remedy."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +8,7 @@ Severity = Literal["error", "warning", "note"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check says about one episode, or about one episode among the others of its recording."""
+    """One finding about one episode, or about one episode compared with the others of its recording."""
 
     check: str
     """Short stable name, e.g. ``joint_limit``."""
@@ -23,7 +23,7 @@ class Finding:
 
 
 def not_judged(feature: str, what: str, why: str) -> Finding:
-    """A check that could not be made says so, rather than pass in silence."""
+    """Note that a check could not be made, and why."""
     return Finding("not_judged", "note", feature, f"{what} not judged: {why}")
 
 

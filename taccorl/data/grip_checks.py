@@ -1,4 +1,4 @@
-"""Touch against the grippers: does each pad feel what its own gripper holds, when it holds it, and nothing before?
+"""Touch against the grippers: does each pad read contact while its own gripper holds a part, and only then?
 
     hold     the gripper's command goes on closing, its state does not: a part is between the fingers
     lag      first contact of the pad − moment at which the gripper came to its held opening
@@ -54,7 +54,7 @@ OFFSET_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Hold:
-    """A gripper holds a part."""
+    """A period in which a gripper holds a part."""
 
     first: int
     """Row at which the gripper stands still."""
@@ -91,7 +91,7 @@ def find_holds(opening: np.ndarray, command: np.ndarray, fps: int) -> list[Hold]
 
 @dataclass(frozen=True)
 class Grippers:
-    """What the grippers did in an episode."""
+    """Openings, commands and holds of the grippers in an episode."""
 
     opening: dict[str, np.ndarray]
     """Arm → (T,) m."""
@@ -113,7 +113,7 @@ class Grippers:
 
 
 def read_grippers(episode: Episode) -> Grippers | None:
-    """None where state or command have no gripper in m."""
+    """Read the grippers of an episode; None if state or command have no gripper in m."""
     arms = [arm for arm in episode_arms(episode) if arm.gripper is not None]
     if not arms or not all(np.isfinite(episode.arrays[k]).all() for k in (STATE, ACTION)):
         return None
@@ -123,7 +123,7 @@ def read_grippers(episode: Episode) -> Grippers | None:
 
 
 def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad], grippers: Grippers) -> list[Finding]:
-    """Everything that pads and grippers say together."""
+    """All checks that compare pads with grippers."""
     fps = episode.spec.fps
     if episode.num_rows < JUDGE_S * fps:
         return [not_judged(key, "touch against grippers", f"{episode.num_rows / fps:.1f} s, it takes {JUDGE_S:g} s")]
@@ -149,10 +149,10 @@ def _share(contact: np.ndarray, rows: np.ndarray, fps: int) -> float:
 
 
 def swapped_pads(pads: list[Pad], grippers: Grippers, fps: int) -> list[str] | None:
-    """Pads that feel the other arm's holds and not their own; None where the arms never hold one without the other.
+    """Pads that read contact during holds of the other arm instead of their own; None if no arm ever holds alone.
 
-    While one arm holds alone, a pad of its own must be silent and one of the other arm's must feel it; and where the other
-    arm holds alone as well, it must be the other way round.
+    While one arm holds alone, one of its own pads must read nothing and one of the other arm's pads must read contact. If the
+    other arm also holds alone at some time, the opposite must be true then.
     """
     if len(grippers.opening) != 2:
         return []

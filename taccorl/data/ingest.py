@@ -63,7 +63,7 @@ class Job:
 
 
 class NothingToWrite(RecordingError):
-    """The recording gave no episode that a dataset may have; carries its report entry."""
+    """Error: no episode of the recording may go into a dataset. Has the recording's report entry."""
 
     def __init__(self, entry: dict[str, Any]) -> None:
         super().__init__(entry["reason"])

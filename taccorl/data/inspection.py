@@ -64,7 +64,7 @@ class TopicSummary:
 
     @property
     def sim_time(self) -> bool:
-        """The header counts from a simulation's start (or from boot), not from 1970."""
+        """True if header stamps count from the start of a simulation (or from boot), not from 1970."""
         return self.stamped and abs(self.skew_s) > SIM_TIME_S
 
     def holds(self, kinds: tuple[str, ...]) -> bool:
@@ -74,7 +74,7 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class Inventory:
-    """One recording, looked at."""
+    """Contents of one recording: topics, rates, damage, and the shipped specs that fit."""
 
     source: Source
     reader: str
@@ -91,7 +91,7 @@ class Inventory:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What keeps even a spec that fits from reading all of it."""
+        """Damage because of which even a fitting spec cannot read the whole recording."""
         simulated = [t.topic for t in self.topics if t.sim_time]
         found = [f"{len(simulated)} topics are stamped in simulation time, first {simulated[0]}"] if simulated else []
         lost = [d for d in self.damage if d.lost]

@@ -1,4 +1,4 @@
-"""Do joints and commands make sense by themselves? Limits and units, jumps, rests, repeated values.
+"""Checks of joints and commands: limits and units, jumps, idle stretches, repeated values.
 
 Letters in shapes: T rows, J elements of the vector.
 """
@@ -41,7 +41,7 @@ MOVING_RAD = 0.05
 
 
 def check_values(episode: Episode) -> list[Finding]:
-    """NaN, infinity, limits and units of every feature that is not a video."""
+    """Check every feature that is not a video for NaN, infinity, limits and units."""
     findings = []
     for key, values in episode.arrays.items():
         finite = np.isfinite(values)
@@ -126,7 +126,7 @@ def _limit_finding(
 
 
 def check_jumps(episode: Episode, key: str) -> list[Finding]:
-    """One-row steps longer than the robot can go in that time."""
+    """Find steps between rows that are larger than a joint can move in that time."""
     fps = episode.spec.fps
     units, names = element_units(episode, key), element_names(episode, key)
     longest = np.array([SPEEDS.get(u, np.inf) for u in units]) * JUMP_MARGIN / fps
@@ -152,7 +152,7 @@ def check_jumps(episode: Episode, key: str) -> list[Finding]:
 def check_sample_jumps(
     channel: str, values: np.ndarray, time_s: np.ndarray, names: Sequence[str], units: Sequence[str], row_s: float
 ) -> list[Finding]:
-    """Steps from one sample of a channel to the next that are longer than the joint can go in the time between them.
+    """Find steps between samples of a channel that are larger than a joint can move in that time.
 
     Rows hold a part of a fast channel's samples, and less can happen between two samples than between two rows. A driver may
     repeat a reading: the time counts from the last change, but not from further back than a row.
@@ -207,7 +207,7 @@ def still_rows(values: np.ndarray, threshold: np.ndarray, window: int) -> np.nda
 
 
 def check_idle(episode: Episode, touch: np.ndarray) -> list[Finding]:
-    """Nothing moves, nothing is commanded and touch does not change.
+    """Find stretches in which nothing moves, commands are constant and touch does not change.
 
     Args:
         touch: (T, P) mean counts of each pad, P may be 0: pressing with arms at rest is work, not idling.
@@ -249,7 +249,7 @@ def check_idle(episode: Episode, touch: np.ndarray) -> list[Finding]:
 
 
 def check_frozen_state(episode: Episode, arm: Arm) -> list[Finding]:
-    """An arm's state repeats bit by bit while its command moves: the driver republishes old values."""
+    """Find an arm whose state repeats bit by bit while its command moves: its driver republishes old values."""
     fps = episode.spec.fps
     state, action = episode.arrays[STATE][:, arm.joints], episode.arrays[ACTION][:, arm.joints]
     same = np.concatenate([[False], (np.diff(state, axis=0) == 0).all(axis=1)])

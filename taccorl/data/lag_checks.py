@@ -35,7 +35,7 @@ SWAP_RATIO = 3.0
 
 @dataclass(frozen=True)
 class Lag:
-    """How long after the command an arm's state moves."""
+    """Time by which an arm's state lags behind its command."""
 
     lag_s: float
     correlation: float
@@ -45,7 +45,7 @@ class Lag:
 def find_lag(action: np.ndarray, state: np.ndarray, fps: int, search_s: tuple[float, float] = LAG_SEARCH_S) -> Lag:
     """Lag of ``state`` (T, n) behind ``action`` (T, n) by cross-correlation of velocities; parabola through the peak.
 
-    Each column counts alike; those at rest (range below MOVING_RAD, which fits counts as well) not at all.
+    Moving columns have equal weight; columns at rest (range below MOVING_RAD) are not used.
     """
     moving = (np.ptp(action, axis=0) > MOVING_RAD) & (np.ptp(state, axis=0) > MOVING_RAD)
     if not moving.any():
@@ -157,7 +157,7 @@ def arms_swapped(state: np.ndarray, action: np.ndarray, left: Arm, right: Arm, f
 
 
 def check_swapped_arms(episode: Episode) -> list[Finding]:
-    """State of the left arm with the command of the right one, and the other way round."""
+    """Find exchanged arms: the state of the left arm with the command of the right one, and vice versa."""
     arms = {arm.name: arm for arm in episode_arms(episode)}
     if not {"left", "right"} <= set(arms):
         return []

@@ -1,8 +1,8 @@
-"""Episodes into a LeRobot v3 dataset, by LeRobot's own writer, with proof that every row has its own picture.
+"""Write episodes as a LeRobot v3 dataset with LeRobot's own writer, and verify that every row has its own picture.
 
 LeRobot 0.6.1's streaming encoder drops frames without an error when it lags behind (video_utils.py, feed_frame), and rows
-then show later pictures. So frames are fed under back-pressure, and afterwards every video file is proved to hold exactly
-one frame a row at its time; a dataset that fails is written again the slow way, through PNG files.
+then show later pictures. So frames are fed under back-pressure, and afterwards every video file is verified to hold exactly
+one frame per row at its time; a dataset that fails is written again the slow way, through PNG files.
 """
 
 import contextlib
@@ -56,7 +56,7 @@ ENCODERS: dict[str, dict[str, Any]] = {
 
 
 def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """LeRobot's features dict. Unit, frame, range and, for touch, the sensor's layout travel in the feature itself."""
+    """LeRobot's features dict. Unit, frame, range and, for touch, the sensor's layout are stored in the feature itself."""
     features: dict[str, dict[str, Any]] = {}
     for key in keys:
         f = spec.features[key]
@@ -110,7 +110,7 @@ def check_path(path: Path) -> None:
 def write_episodes(
     episodes: Sequence[Episode], root: Path, *, progress: Callable[[int], None] | None = None, streaming: bool = True
 ) -> None:
-    """A new dataset at ``root`` with these episodes; proved, else written again through PNG files.
+    """Write these episodes as a new dataset at ``root``, and verify it; if that fails, write it again through PNG files.
 
     Args:
         progress: called with the number of rows written so far.
@@ -240,7 +240,7 @@ def _pixels_counted() -> Iterator[None]:
     """While open, LeRobot counts how often each of a pixel's 256 values occurs, instead of sorting every picture into 5000 bins.
 
     Of bytes the counts hold every statistic exactly. LeRobot 0.6.1's way took 45 % of the CPU time of an augmented episode with
-    three cameras (11.4 against 6.2 s, CHANGELOG).
+    three cameras (11.4 against 6.2 s, docs/decisions.md).
     """
     from lerobot.datasets import compute_stats
 
@@ -341,8 +341,8 @@ def _wait_for_room(dataset: Any) -> None:
 
 
 def merge(roots: Sequence[Path], destination: Path) -> None:
-    """Datasets into one; a single one is copied. With videos by LeRobot's ``aggregate_datasets``, else by ``joining``. Proved
-    like a written one.
+    """Merge datasets into one; a single one is copied. With videos by LeRobot's ``aggregate_datasets``, else by ``joining``. The
+    result is verified like a written one.
 
     Statistics of joints and actions are those of all rows: LeRobot 0.6.1 takes the mean of the datasets' quantiles, which is no
     quantile of theirs together.

@@ -1,4 +1,4 @@
-"""What the bytes of an MCAP channel's messages mean: their decoder, and the short way to their stamp."""
+"""Decoders for the messages of an MCAP channel, and fast extraction of their stamps."""
 
 import contextlib
 import json
@@ -26,7 +26,7 @@ def type_name(schema: Schema | None) -> str:
 
 
 def message_decoder(channel: Channel, schema: Schema | None) -> Decoder:
-    """Bytes to a message: attributes (ROS 2, protobuf) or a JSON object.
+    """Function from bytes to a message: an object with attributes (ROS 2, protobuf) or a JSON object.
 
     Raises:
         RecordingError: an encoding that is not read, or a schema that does not parse.
@@ -59,7 +59,7 @@ def message_decoder(channel: Channel, schema: Schema | None) -> Decoder:
 
 
 def message_stamper(channel: Channel, schema: Schema | None) -> Stamper:
-    """Bytes to the stamp; without decoding the message where a ROS 2 header comes first, at a fixed place."""
+    """Function from bytes to the stamp. If a ROS 2 header comes first, the message is not decoded."""
     if channel.message_encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
         fields = _top_fields(schema.data.decode(errors="replace"))
         if fields and fields[0][0] in HEADERS and fields[0][1] == "header":

@@ -1,4 +1,4 @@
-"""The records of an MCAP file, none of them trusted: is this one whole, where is the next one, what does a chunk hold.
+"""Records of an MCAP file that may be damaged: whether a record is whole, where the next one is, what a chunk contains.
 
 A record is an opcode (1 byte), a length (8) and a body. CRCs protect what is inside a chunk and the summary at the file's
 end, nothing else; so a record counts as whole only if the lengths inside its body add up to its own.
@@ -52,7 +52,7 @@ _END_BYTES = HEADER_BYTES + 20 + len(MAGIC)
 
 
 class Record(NamedTuple):
-    """Where a record lies in its file."""
+    """Position of a record in its file."""
 
     opcode: int
     offset: int
@@ -90,7 +90,7 @@ _PARSERS = {
 
 @dataclass
 class Summary:
-    """What the end of a file says about the rest."""
+    """Summary section at the end of a file: index and statistics."""
 
     problem: str | None = None
     """Why nothing in it is believed."""
@@ -160,11 +160,11 @@ class McapFile:
         return self.file.read(record.length)
 
     def has_data_crc(self, data_end: Record | None) -> bool:
-        """Did the writer leave a CRC of the data section?"""
+        """True if the writer stored a CRC of the data section."""
         return data_end is not None and any(self.body(data_end))
 
     def data_crc_matches(self, data_end: Record) -> bool:
-        """Does the data section agree with the CRC in its last record? True where the writer left none."""
+        """True if the data section agrees with the CRC in its last record, or if there is none."""
         crc = int.from_bytes(self.body(data_end), "little")
         return crc == 0 or self._crc(0, data_end.offset) == crc
 

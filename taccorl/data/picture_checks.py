@@ -1,4 +1,4 @@
-"""Do the cameras live? A camera that repeats one picture while joints move shows something that is not so.
+"""Find frozen cameras: a camera that repeats one picture while joints move.
 
 Two ways to see it: the same source picture on many rows (``Episode.picture_rows``), and decoded pictures that do not
 change. Each picture is compared as block means in grey levels, so that neither noise nor a video codec decides.
@@ -44,18 +44,18 @@ def same_picture_runs(thumbs: np.ndarray) -> list[tuple[int, int]]:
 
 
 class PictureWatch:
-    """Watches an episode's pictures go by, row after row, for whoever decodes them anyway (ingest, while it writes)."""
+    """Finds frozen cameras from an episode's pictures, row by row, while they are decoded for another purpose (writing)."""
 
     def __init__(self, episode: Episode) -> None:
         self.episode = episode
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was seen: the episode is shown again from its first row."""
+        """Start again from the episode's first row."""
         self._thumbs: dict[str, list[np.ndarray]] = {key: [] for key in self.episode.picture_keys}
 
     def see(self, pictures: Pictures) -> None:
-        """The next row's pictures."""
+        """Take the pictures of the next row."""
         for key, thumbs in self._thumbs.items():
             thumbs.append(thumbnail(pictures[key]).astype(np.float16))  # exact to 1/16 of a level
 

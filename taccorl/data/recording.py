@@ -38,7 +38,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class TopicType:
-    """What a file says a topic is."""
+    """Type of a topic, as stated by the file."""
 
     name: str
     """Schema name, e.g. ``sensor_msgs/msg/JointState``."""
@@ -54,7 +54,7 @@ class TopicType:
 
 @dataclass(frozen=True)
 class Damage:
-    """A part of a file that is lost, and why."""
+    """A part of a file that cannot be read, and the reason."""
 
     file: str
     byte_start: int
@@ -83,7 +83,8 @@ class Source:
 
 
 class Reader(ABC):
-    """A recording format. Subclasses read; they never write, decode nothing that was not asked for, and lose nothing silently."""
+    """Base class of readers, one per recording format. A reader never writes, decodes only what is requested, and reports
+    every loss."""
 
     suffixes: ClassVar[tuple[str, ...]] = ()
     """File endings that this reader opens, for finding recordings in a folder."""
@@ -250,7 +251,7 @@ def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
 
 
 def without_place(text: str, path: Path | str) -> str:
-    """An error's text for where its file has been named already."""
+    """Text of an error without the path, for messages that name the file already."""
     return text.removeprefix(f"{path}: ")
 
 
@@ -356,7 +357,7 @@ class Spool:
         self._rows = 0
 
     def append(self, row: np.ndarray) -> None:
-        """``row``: 1-D; every row of a channel has the same size and dtype."""
+        """Append one row (1-D array); all rows of a channel have the same size and dtype."""
         if self._dtype is None:
             self._dtype, self._size = row.dtype, row.size
         elif row.size != self._size:
@@ -365,7 +366,7 @@ class Spool:
         self._rows += 1
 
     def finish(self) -> np.ndarray:
-        """(rows, size)"""
+        """All rows as a memory-mapped array (rows, size)."""
         self._file.close()
         if self._rows == 0 or self._dtype is None:
             return np.empty((0, 0))
@@ -373,7 +374,7 @@ class Spool:
 
 
 def release(values: np.ndarray) -> None:
-    """Give the memory of a memory-mapped array back; it is read from disk again when it is next used."""
+    """Release the memory of a memory-mapped array. It is read from disk again at its next use."""
     mapped = getattr(values, "_mmap", None)
     if mapped is not None and hasattr(mapped, "madvise"):
         mapped.madvise(mmap.MADV_DONTNEED)

@@ -1,4 +1,4 @@
-"""The data contract: what a dataset holds, how a sensor speaks, how recordings fill the dataset.
+"""Data contract: contents of a dataset, format of a sensor, and how recordings fill a dataset.
 
 Every feature states dtype, shape, unit, frame, rate and valid range. The files live in ``data_specs/``.
 """
@@ -50,7 +50,7 @@ OTHER_UNITS = {
 
 @dataclass(frozen=True, kw_only=True)
 class WireSpec:
-    """How one pad frame arrives: ``rows × columns`` values of ``dtype``, row after row."""
+    """Format of one pad frame as sent by the sensor: ``rows × columns`` values of ``dtype``, row after row."""
 
     rows: int
     columns: int
@@ -179,7 +179,7 @@ class DatasetSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSpec:
-    """One recorded stream: where it is, what part of it counts, on which clock, when it is late."""
+    """One recorded stream: its topic, the part that is used, its clock, and the age at which a sample is too old."""
 
     topic: str
     """Topic (MCAP, bag), path inside the file (HDF5) or feature key (LeRobot)."""

@@ -29,7 +29,7 @@ PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[
 
 
 def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
-    """The plain values of somebody else's YAML file.
+    """Read a YAML file written by another tool, as plain values, with limits on size and depth.
 
     Raises:
         SpecError: it cannot be read, is larger than ``most_bytes``, or is not YAML.

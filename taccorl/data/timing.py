@@ -1,4 +1,4 @@
-"""From many clocks to one: which clock a channel keeps, and which of its samples each row of the grid shows.
+"""Bring channels with different clocks to one grid: clock of each channel, and the sample of it that each row shows.
 
 Pure functions on int64 nanoseconds. No observation shows the future: ``hold``, ``asof`` and ``window`` use nothing after the
 row's time, and ``interpolate`` (for offline study) looks ahead to one next sample, within the channel's max_age_s, and says so.
@@ -74,7 +74,7 @@ def read_clock(
 
 
 def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
-    """Are all channels on one clock?
+    """Check that all channels are on one clock.
 
     Args:
         skew_s: topic → ``ClockReading.skew_s``.
@@ -123,7 +123,7 @@ def next_rows(grid_ns: np.ndarray, fps: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Matched:
-    """Which samples of one channel each row shows. T rows, L history."""
+    """Indices of the samples of one channel that each row shows. T rows, L history."""
 
     index: np.ndarray
     """(T, L) sample index, oldest first; −1 where the row has none."""
@@ -144,7 +144,7 @@ def match(
     history: int = 1,
     rate_hz: float = 0.0,
 ) -> Matched:
-    """Samples for every row.
+    """Find the samples of one channel for every row.
 
     Args:
         grid_ns: (T,) row times.

@@ -1,4 +1,4 @@
-"""Do the pads' taxels live? Dead, stuck, saturated, noisy or frozen ones, and how much of an episode is touch at all.
+"""Checks of single pads: dead, stuck, saturated, noisy or frozen taxels, and the share of an episode with contact.
 
 Judged from one pad alone; ``grip_checks`` holds touch against the grippers. What one episode cannot show: a taxel that
 nothing touched (it is not called dead), the pads a and b of one gripper exchanged (both touch the same part at the
@@ -93,12 +93,12 @@ class Pad:
 
     @functools.cached_property
     def structured(self) -> bool:
-        """Neighbouring taxels feel alike in the strongest frames: touch, not noise."""
+        """True if neighbouring taxels are correlated in the strongest frames, as in contact and unlike noise."""
         return spatial_structure(np.where(self.stuck, np.float32(0), self.counts)) >= STRUCTURE
 
     @functools.cached_property
     def contact(self) -> np.ndarray:
-        """(T,) bool: the pad feels something."""
+        """(T,) bool: the pad reads contact."""
         if not self.structured:
             return np.zeros(len(self.counts), dtype=bool)
         return (self.smooth >= self.noise_count).sum(axis=(1, 2)) >= CONTACT_MIN_TAXELS
@@ -236,7 +236,7 @@ def taxel_list(mask: np.ndarray) -> str:
 
 
 def check_pads(episode: Episode, key: str, pads: list[Pad]) -> list[Finding]:
-    """Everything that a pad says by itself."""
+    """All checks of one pad."""
     if episode.num_rows < JUDGE_S * episode.spec.fps:
         seconds = episode.num_rows / episode.spec.fps
         return [not_judged(key, "taxels", f"{seconds:.1f} s, it takes {JUDGE_S:g} s")]

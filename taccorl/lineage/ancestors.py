@@ -1,4 +1,5 @@
-"""What an artefact's inputs were made from, and theirs: a published manifest carries it, for the store may be emptied."""
+"""Ancestors of an artefact: its inputs, their inputs, and so on. A published manifest contains them, because the store may be
+pruned."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,8 @@ Entry = dict[str, Any]
 
 
 def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> dict[str, Manifest]:
-    """``{key: the manifest in short}`` of everything above ``inputs`` that a stage made, as far as it can be found."""
+    """``{key: shortened manifest}`` of all artefacts from which ``inputs`` were made, directly or indirectly, as far as they
+    are found."""
     found: dict[str, Manifest] = {}
     carried: dict[str, Manifest] = {}
     todo = list(inputs)
@@ -30,7 +32,7 @@ def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> di
 
 
 def manifest_of(entry: Entry, find_key: Callable[[str], Path | None], carried: dict[str, Manifest]) -> Manifest:
-    """What made this input: as it says itself, where it lies or in the store, else as is ``carried``; empty if raw."""
+    """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source."""
     key = entry["key"]
     if key is None:
         return {}

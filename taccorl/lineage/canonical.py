@@ -2,7 +2,7 @@
 
 Decided here:
 
-* A dataclass carries its ``type``: its draccus choice name, else its class name. Two plug-ins with the same fields
+* A dataclass has a key ``type``: its draccus choice name, else its class name. Two plug-ins with the same fields
   must not share a key.
 * Fields declared ``field(compare=False)`` say how, not what (workers, progress): they are left out.
 * ``Path`` and ``str`` are the same thing; an enum is its name; a tuple is a list; the order of a dict does not matter.

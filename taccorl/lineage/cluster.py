@@ -1,6 +1,6 @@
 """The same function on a Slurm or Ray cluster: datatrove's executors start the tasks, files carry items and results.
 
-A job is a folder that all nodes see: ``job.pkl`` (function, items, care), ``results/<index>.pkl`` (renamed into place),
+A job is a folder that all nodes see: ``job.pkl`` (function, items, retry policy), ``results/<index>.pkl`` (renamed into place),
 ``logs/``. Task r of n works on the items r, r+n, r+2n, … in a process of its own, so that an item that kills it, or hangs,
 costs no other. A result that is not there when the job has ended means that its task was killed: the item is named.
 """
@@ -27,7 +27,7 @@ Take = Callable[[int, Done | Failed], None]
 
 @dataclass(frozen=True)
 class Job:
-    """A function, its items and how to care for them, written down for tasks on other machines."""
+    """A function, its items and the retry policy, stored in a folder for tasks on other machines."""
 
     folder: Path
     num_items: int
@@ -65,7 +65,7 @@ class Job:
         return cls(folder, len(items))
 
     def collect(self, taken: set[int], take: Take) -> None:
-        """Hand every result that has come since to ``take``."""
+        """Pass every result that arrived since the last call to ``take``."""
         for path in sorted((self.folder / "results").glob("*.pkl")):
             index = int(path.stem)
             if index not in taken:
@@ -73,14 +73,14 @@ class Job:
                 take(index, pickle.loads(path.read_bytes()))
 
     def name_the_lost(self, taken: set[int], take: Take) -> None:
-        """After the job has ended: the items without a result."""
+        """After the end of the job: report the items without a result as failed."""
         for index in range(self.num_items):
             if index not in taken:
                 take(index, Failed(f"its task ended without a result; logs: {self.folder / 'logs'}"))
 
 
 class RankTask:
-    """What one task does; a pipeline step as datatrove calls it. Holds only a path, so that it is light to send."""
+    """Work of one task, as a datatrove pipeline step. Contains only a path, so that it is cheap to send."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -1,4 +1,4 @@
-"""Where a store published what: one small file per destination, so that `prune` knows what the datasets need."""
+"""Record of the paths to which a store published artefacts, one small file each, so that `prune` knows which datasets exist."""
 
 import json
 import os
@@ -14,13 +14,13 @@ def is_free(path: Path) -> bool:
 
 
 class Destinations:
-    """The paths outside a store that it published to, each with the key of what it put there last."""
+    """Paths outside a store to which it published, each with the key of the artefact published there last."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def remember(self, path: Path, key: str) -> None:
-        """Note that the artefact of ``key`` is, or is about to be, at ``path``; one rename, so never half a note."""
+        """Record, in one atomic rename, that the artefact of ``key`` is or will be published at ``path``."""
         note = self.folder / f"{digest_bytes(os.fsencode(path))[:32]}.json"
         content = json.dumps({"path": str(path), "key": key}) + "\n"
         if note.is_file() and note.read_text(encoding="ascii") == content:
@@ -34,11 +34,11 @@ class Destinations:
         temp.replace(note)
 
     def present(self) -> list[Path]:
-        """Those that still hold what was published there."""
+        """Destinations that still contain what was published there."""
         return [path for path, key in self._notes() if read_manifest(path).get("key") == key]
 
     def gone(self) -> list[Path]:
-        """Those that were removed, moved or replaced."""
+        """Destinations whose content was removed, moved or replaced."""
         return [path for path, key in self._notes() if read_manifest(path).get("key") != key]
 
     def _notes(self) -> list[tuple[Path, str]]:

@@ -37,7 +37,7 @@ def digest_files(files: Mapping[str, str]) -> str:
 
 
 class DigestCache:
-    """Digests of files by path, valid while size, times and inode stand still.
+    """Digests of files by path, valid while size, times and inode are unchanged.
 
     One small file per entry, renamed into place: processes need no lock and lose no entry of one another. As long as the
     parent of ``folder`` is not there, entries are kept in memory: a command that is refused makes no store.
@@ -63,7 +63,7 @@ class DigestCache:
             self.write_kept()
 
     def write_kept(self) -> None:
-        """Write the entries that are in memory alone."""
+        """Write the entries that exist only in memory."""
         while self._kept:
             with contextlib.suppress(KeyError):  # another thread writes them, too
                 entry, text = self._kept.popitem()

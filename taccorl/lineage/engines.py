@@ -1,9 +1,9 @@
-"""Engines: run one function over many items, in this process, in several, or on a cluster.
+"""Engines run one function on many items: in this process, in several, or on a cluster.
 
 ``--engine.type=local --engine.workers=8``, ``--engine.type=slurm --engine.partition=cpu``, ``--engine.type=ray``
 
 Results come in the order of the items. An item that fails does not stop the others; at the end one `EngineError` names
-every item that failed. What was done lies in the store, so the next run does only the rest.
+every item that failed. Finished work is in the store, so the next run does only the rest.
 """
 
 import abc
@@ -169,7 +169,7 @@ def map_stage(
     engine: Engine | None = None,
     on_done: Callable[[Artefact, Artefact], None] | None = None,
 ) -> list[Artefact]:
-    """One stage over many inputs, one artefact each, in order: the resume of a pipeline per recording or shard.
+    """Run one stage on many inputs, one artefact each, in order. Artefacts that are in the store already are not made again.
 
     Args:
         store: where the artefacts go; what it has already is not made again.

@@ -1,10 +1,10 @@
-"""What can be wrong with a store, an artefact, a stage's config, or the items given to an engine."""
+"""Errors of stores, artefacts, stage configurations and engines."""
 
 from taccorl.errors import TaccorlError
 
 
 class LineageError(TaccorlError):
-    """A store, a source or an artefact that is not what it should be."""
+    """A store, source or artefact that is missing, damaged or changed."""
 
 
 class ConfigError(LineageError, TypeError):

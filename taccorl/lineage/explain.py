@@ -1,7 +1,7 @@
 """What an artefact was made from, down to the raw recordings, and whether anything changed since: a tree as text.
 
 ``✗`` marks what no longer matches its record: a changed, missing or added file, or a raw source that is gone. An
-artefact that left the store is no fault: the dataset carries its record.
+artefact that was removed from the store is no fault: the dataset contains its record.
 """
 
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ class Origin:
     inputs: list["Origin"] = field(default_factory=list)
 
     def num_problems(self) -> int:
-        """How many things no longer match, here and in everything below."""
+        """Number of entries that no longer match their record, here and in all ancestors."""
         return len(self.problems) + sum(origin.num_problems() for origin in self.inputs)
 
 

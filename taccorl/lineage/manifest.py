@@ -1,4 +1,4 @@
-"""The record that lies in every artefact: which stage made it, with what config, from which inputs, and its files."""
+"""Manifest: the record in every artefact of its stage, configuration, inputs and files."""
 
 import contextlib
 import functools
@@ -25,7 +25,7 @@ RECORDED_PACKAGES = ("numpy", "scipy", "av", "h5py", "mcap", "rosbags", "pyarrow
 
 
 def manifest_place(folder: Path) -> str | None:
-    """Where in ``folder`` its manifest lies; None if it has none."""
+    """Relative path of the manifest in ``folder``; None if it has none."""
     for place in MANIFEST_PLACES:
         if _load(folder, place):
             return place
@@ -67,7 +67,7 @@ def write_manifest(folder: Path, place: str, manifest: dict[str, Any]) -> None:
 
 
 def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str]:
-    """``{relative path: digest}`` of what counts in a source folder or artefact as it lies there today.
+    """``{relative path: digest}`` of the present files of a source folder or artefact, as far as they count.
 
     That is every visible file and every file its manifest lists, without the manifest: so an untouched artefact has
     today the digest that its manifest states.

@@ -39,7 +39,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """Why there is no result for one item."""
+    """Reason why one item has no result."""
 
     reason: str
     trace: str | None = None
@@ -50,8 +50,8 @@ class Failed:
 
 @dataclass(frozen=True, kw_only=True)
 class Care:
-    """How patient to be with an item that kills its process, or never ends. It takes a process: in the caller's own there is
-    nobody to survive it."""
+    """Retry policy for an item that kills its process or does not end. It needs worker processes: in the caller's own process
+    nothing would survive such an item."""
 
     limit_s: float = math.inf
     """Wall clock after which a worker is killed with its item."""

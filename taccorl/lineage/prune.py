@@ -1,4 +1,4 @@
-"""Free the store of artefacts that no dataset was made from, and of what dead runs left behind.
+"""Delete from the store the artefacts that no dataset was made from, and leftovers of runs that died.
 
 What the store published is kept for as long as it lies where it was published; further datasets (moved, copied) are
 kept if they are named.
@@ -26,7 +26,7 @@ LEFTOVER = re.compile(rf"\.({KEY.pattern})\..+")
 
 @dataclass(frozen=True)
 class Unneeded:
-    """A folder in the store that may go."""
+    """A folder in the store that may be deleted."""
 
     path: Path
     key: str

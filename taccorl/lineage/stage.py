@@ -1,4 +1,4 @@
-"""A stage is a named step of a pipeline; an artefact is what it made, or a raw source."""
+"""Stage: a named step of a pipeline. Artefact: its result, or a raw source."""
 
 import re
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
 
 @dataclass(frozen=True)
 class Stage:
-    """A named step. Raise ``version`` when the meaning of its code changes: old artefacts then no longer count."""
+    """A named step. Increase ``version`` when its code gives other results: old artefacts are then not used."""
 
     name: str
     fn: Callable[[Any, list[Path], Path], None]
@@ -39,7 +39,7 @@ class Artefact:
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """What made it; empty for a raw source."""
+        """Manifest of the artefact; empty for a raw source."""
         return read_manifest(self.path)
 
     def __str__(self) -> str:

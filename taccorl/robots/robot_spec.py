@@ -1,4 +1,4 @@
-"""What the code knows of a robot: arms, joints, limits, gains, cameras, pads, and which number of an action is which.
+"""Description of a robot: arms, joints, limits, gains, cameras, pads, and the order of the numbers of an action.
 
 Frames: *hand* is the last link of an arm. TCP: middle between the pads, z = approach direction, the fingers close along y.
 Letters in shapes: A numbers of an action, arm after arm, of each its joints [rad], base to hand, then its gripper's opening [m].
@@ -57,7 +57,7 @@ class PadLayout:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows, columns."""
+        """Number of rows and columns."""
         return self.rows, self.columns
 
     @property
@@ -66,7 +66,7 @@ class PadLayout:
 
     @property
     def length_m(self) -> float:
-        """From palm to tip."""
+        """Length of the pad from palm to tip [m]."""
         return self.rows * self.pitch_m
 
     @property

@@ -1,4 +1,5 @@
-"""Work on N simulations in blocks, one a thread. It pays for compiled code without Python's lock (``numba.njit(nogil=True)``)."""
+"""Run work on N simulations in blocks, one block per thread. Useful for compiled code that releases Python's lock
+(``numba.njit(nogil=True)``)."""
 
 import itertools
 from collections.abc import Callable
@@ -8,7 +9,7 @@ _LEAST = 4  # simulations in a block: handing over a block costs 20 µs, the tou
 
 
 class Blocks:
-    """Threads that share the simulations out; with one thread, or few simulations, all is done by the caller.
+    """Pool of threads among which simulations are divided. With one thread or few simulations the caller does all the work.
 
     Args:
         num_threads: ≥ 1.
@@ -19,7 +20,7 @@ class Blocks:
         self._pool: ThreadPoolExecutor | None = None
 
     def run(self, work: Callable[[int, int], object], num_sims: int) -> None:
-        """``work(start, end)`` for blocks that make up 0 … ``num_sims``; each writes only what belongs to its own."""
+        """Call ``work(start, end)`` for blocks that cover 0 … ``num_sims``; each call writes only the rows of its own block."""
         count = min(self.num_threads, num_sims // _LEAST)
         if count <= 1:
             work(0, num_sims)

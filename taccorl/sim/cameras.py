@@ -48,7 +48,7 @@ class Intrinsics:
     cy_px: float
 
     def scaled(self, rows: int, columns: int) -> "Intrinsics":
-        """The same view at another size: edges fall on edges, so centres move by (c + ½)·s − ½ (OpenCV's resize)."""
+        """Intrinsics of the same view at another size: a pixel centre c moves to (c + ½)·s − ½, as in OpenCV's resize."""
         down, right = rows / self.rows, columns / self.columns
         return Intrinsics(
             rows=rows,
@@ -60,7 +60,8 @@ class Intrinsics:
         )
 
     def letterboxed(self, rows: int, columns: int) -> "Intrinsics":
-        """What ingest makes of it: scaled into ``rows`` × ``columns`` with the aspect kept, and moved by the black bars."""
+        """Intrinsics after ingest's letterbox: scaled into ``rows`` × ``columns`` with the aspect kept, and moved by the
+        black bars."""
         window = letterbox_window((self.rows, self.columns), (rows, columns))
         inner = self.scaled(window.rows, window.columns)
         return Intrinsics(
@@ -131,7 +132,7 @@ def sensor_intrinsics(model: str, rows: int, columns: int) -> Intrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOffset:
-    """A small error of a mount: what calibration finds, and what a surrogate has that the twin does not know of.
+    """Small error of a camera mount, in the camera's own frame: found by calibration, or hidden in a surrogate robot.
 
     In the nominal camera's own frame: R = R₀·exp(ω), p = p₀ + R₀·t. All zero: absent, the pose is the nominal one.
     """
@@ -178,7 +179,7 @@ class CameraConfig:
             )
 
     def recorded_intrinsics(self) -> Intrinsics:
-        """Of the stream as recorded, before the letterbox."""
+        """Intrinsics of the stream as recorded, before the letterbox."""
         return self.intrinsics or sensor_intrinsics(self.model, *self.recording_size)
 
     def pose(self) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """MIT impedance control τ = K_p (q* − q) − K_d q̇ + T_ref as MuJoCo's affine actuator, the same in C and on a GPU.
 
-Paper App. B.1. The gains are effective values of the whole drive, found by the paper's identification, not what is sent to
-a motor. They damp every joint far beyond critically: a joint follows its target with the time constant K_d / K_p ≈ 0.1 s and
-rests T_ref / K_p away from it.
+Paper App. B.1. The gains are effective values of the whole drive, found by the paper's identification, not those sent to
+a motor. Every joint is strongly over-damped: it follows its target with the time constant K_d / K_p ≈ 0.1 s and has the
+steady-state offset T_ref / K_p.
 """
 
 from dataclasses import dataclass, field

@@ -22,8 +22,8 @@ class TaccorlEnv(gymnasium.Env):
     """``task`` in the twin, one simulation; ``TaccorlVectorEnv`` with N = 1, so equal to it bit for bit.
 
     Reward is 1 at the step that completes the task, else 0. Terminates with success or failure, truncates when time is up;
-    after that the episode stands still until ``reset``. ``reset(seed=s)`` gives the scene of seed s; without a seed the stream
-    ``episode_seed(s, 0, k)`` goes on. ``info``: as in ``TaccorlVectorEnv``, one value each.
+    after that the episode is frozen until ``reset``. ``reset(seed=s)`` gives the scene of seed s; without a seed the next one
+    of the sequence ``episode_seed(s, 0, k)`` is used. ``info``: as in ``TaccorlVectorEnv``, one value each.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012
@@ -93,7 +93,7 @@ class TaccorlEnv(gymnasium.Env):
         return None if pictures is None else pictures[0].copy()
 
     def close(self) -> None:
-        """Free OpenGL contexts; nothing else can be done with it afterwards."""
+        """Free OpenGL contexts. The environment cannot be used afterwards."""
         self._envs.close()
 
 
@@ -109,7 +109,7 @@ def env_id(task: str) -> str:
 
 
 def register_envs() -> None:
-    """Register every task with gymnasium; again is harmless."""
+    """Register every task with gymnasium. A second call changes nothing."""
     for name in tasks:
         if env_id(name) not in gymnasium.registry:
             gymnasium.register(

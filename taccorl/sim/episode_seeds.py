@@ -1,4 +1,4 @@
-"""Which scene each environment's next episode has: a stream of seeds that depends on nothing but where it began."""
+"""Deterministic sequence of scene seeds for each environment, a function of the first seed and the episode's number only."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ def episode_seed(root: int, index: int, episode: int) -> int:
 
 
 class EpisodeSeeds:
-    """Of N environments.
+    """Seed sequences of N environments.
 
     Begun with one number s, environment i's k-th episode has ``episode_seed(s, i, k)``. Begun with a number sᵢ for each,
     environment i begins with sᵢ itself and goes on with ``episode_seed(sᵢ, 0, k)``, k = 1, 2, …
@@ -27,7 +27,7 @@ class EpisodeSeeds:
         self.begin(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed, range(num_envs))
 
     def begin(self, seed: int | Sequence[int], ids: Sequence[int] | range) -> None:
-        """Start the streams of ``ids`` over.
+        """Restart the seed sequences of environments ``ids``.
 
         Raises:
             TaccorlError: a negative seed, or not one for each of the N environments.

@@ -1,4 +1,4 @@
-"""Shapes that pads can feel, from a compiled MuJoCo model: capsules, cylinders, and convex solids that may tile a part.
+"""Shapes that pads can detect, read from a compiled MuJoCo model: capsules, cylinders, and convex solids that may tile a part.
 
 Solids of one body that touch or overlap are one part, whose inner faces are no surface (``part_surface``).
 """
@@ -27,7 +27,7 @@ _ROUNDING_M = 3e-8  # of mesh vertices 0.2 m from their origin
 
 
 def shapes_of(model: mujoco.MjModel, geoms: Sequence[int]) -> list[Shapes]:
-    """The shapes of these geoms by kind, as the compiled model has them; sizes that differ between sims are not known here.
+    """Shapes of these geoms by kind, with the compiled model's sizes; sizes that differ between simulations are not supported.
 
     Raises:
         TaccorlError: a geom of a kind that has no exact depth here, or a mesh that is not convex.

@@ -1,4 +1,4 @@
-"""A part in the right hand, in the air: where creep, slip and what the pads read are measured."""
+"""Test rig: a part held by the right hand in the air, to measure creep, slip and the pads' readings."""
 
 import mujoco
 import numpy as np
@@ -42,7 +42,7 @@ def gripped(
 
 
 def rest(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float) -> None:
-    """Let time pass."""
+    """Simulate ``duration_s`` with constant controls."""
     mujoco.mj_step(model, data, nstep=round(duration_s / model.opt.timestep))
     mujoco.mj_forward(model, data)
 

@@ -57,7 +57,7 @@ class LeRobotEnv(TaccorlEnv):
 class LeRobotVectorEnv(TaccorlVectorEnv):
     """``TaccorlVectorEnv`` with LeRobot's raw names; always with pictures.
 
-    An episode that is over stands still: LeRobot's rollout steps until the last one is, and ignores what follows the first end.
+    A finished episode is frozen: LeRobot's rollout steps until the last one is, and ignores what follows the first end.
     """
 
     def __init__(self, task: str, num_envs: int, **settings: Any) -> None:

@@ -1,6 +1,6 @@
 """The OpenGL side of rendering: a context without a window, MuJoCo's drawing of one view, a sheet that collects many.
 
-Nothing here is touched, and no OpenGL library is loaded, before the first picture is asked for.
+No OpenGL library is loaded before the first picture is rendered.
 """
 
 import contextlib
@@ -59,7 +59,7 @@ class Canvas:
 
     @contextlib.contextmanager
     def current(self) -> Iterator[None]:
-        """This thread draws here, and afterwards where it drew before."""
+        """Context manager: make this OpenGL context current in this thread, and restore the previous one afterwards."""
         if self._process != os.getpid():
             raise _forked()
         with self._context.as_current():
@@ -109,7 +109,7 @@ class Canvas:
         return geom_of[number[::-1]], depth_m[::-1]
 
     def _sheet_for(self, num_views: int) -> "_Sheet":
-        """One that holds ``num_views``, or as many of them as one sheet may."""
+        """Sheet for ``num_views`` views, or for the most that one sheet can hold."""
         across = min(num_views, self._most[1])
         down = min(-(-num_views // across), self._most[0])
         if self._sheet is None or self._sheet.capacity < down * across:

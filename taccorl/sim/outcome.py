@@ -1,4 +1,4 @@
-"""From what predicates see at one instant to what became of an episode: held for half a second, failed, or out of time."""
+"""From predicates at one instant to the outcome of an episode: success that held for half a second, failure, or time limit."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ BAD_ACTION = "bad_action"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of each of N episodes so far."""
+    """Outcome of each of N episodes so far."""
 
     success: np.ndarray
     """(N,) bool: the goal has held for 0.5 s after release, and nothing had failed before."""
@@ -34,7 +34,7 @@ class Outcome:
 
 
 class Judge:
-    """Counters over control steps, one row a simulation."""
+    """Derives outcomes of N episodes from the predicates of each control step; keeps the counters that this needs."""
 
     def __init__(self, task: Task, num_sims: int, control_hz: int) -> None:
         self.task, self.control_hz = task, control_hz
@@ -64,12 +64,12 @@ class Judge:
         self.verdict = self.task.look(scene)
 
     def restart_clock(self) -> None:
-        """Time limit, and what must have held or lasted, begin anew from here; subtasks that are done stay done."""
+        """Restart the time limit and the hold counters of success and failure; finished subtasks stay finished."""
         self.steps[:] = self.held[:] = 0
         self.lasted[:] = 0
 
     def update(self, scene: "Simulation", ids: np.ndarray | None = None) -> None:
-        """After a control step of ``ids`` (all by default). An episode that is over keeps its outcome."""
+        """Update the outcomes after a control step of ``ids`` (all by default). A finished episode keeps its outcome."""
         verdict = self.verdict = self.task.look(scene)
         stepped = np.zeros(len(self.held), dtype=bool)
         stepped[slice(None) if ids is None else ids] = True
@@ -95,7 +95,7 @@ class Judge:
                     self.subtask[waiting & subtask.done(scene), a] = k + 1
 
     def fail(self, ids: np.ndarray, category: str) -> None:
-        """End the episodes of ``ids`` that are not over."""
+        """End the unfinished episodes of ``ids`` as failures."""
         self.failure[ids[~self.outcome.over[ids]]] = category
 
     def snapshot(self, ids: np.ndarray) -> dict[str, np.ndarray]:

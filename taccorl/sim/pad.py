@@ -1,5 +1,5 @@
-"""What the taxels of the pads feel: depth δ [m] and rate δ̇ [m/s] of the parts past the undeformed pad, a pure function of
-(qpos, qvel). Batched over sims; exact (``signed_distance``), because MuJoCo's ``<tactile>`` is 34–78 % off on boxes.
+"""Penetration depth δ [m] and depth rate δ̇ [m/s] of every taxel, relative to the undeformed pad surface: a pure function of
+(qpos, qvel). Batched over simulations; exact (``signed_distance``), because MuJoCo's ``<tactile>`` is 34–78 % off on boxes.
 
 Names in the model, for pad ``P``: site ``P`` on the finger, the taxel frame in the middle of the undeformed surface (z out
 of the pad towards the other finger, y from palm to tip, x across), and geom ``P``, the pad's box. The pad is sprung if its
@@ -100,8 +100,9 @@ def without_sinking(touch: Touch, plate: Touch) -> Touch:
 class PadArray:
     """The pads of one model, in the order of their names.
 
-    Each feels every colliding geom (contype or conaffinity) but those of its own arm, that is of its kinematic tree; of its
-    own arm it feels the boxes of the other pads. Sizes are those of the compiled model, the same in all sims; poses are not.
+    Each detects every colliding geom (contype or conaffinity) except those of its own arm, that is of its kinematic tree; of its
+    own arm it detects only the boxes of the other pads. Sizes are those of the compiled model, the same in all sims; poses
+    are not.
 
     Solids of one body that touch or overlap are one part, whose inner faces are no surface; of other shapes that overlap (a
     cylinder in a box) the deeper one is felt, which near their common line is less than the depth in both together.
@@ -183,7 +184,7 @@ class PadArray:
         return felt
 
     def touch(self, state: Kinematics, start: int = 0, end: int | None = None) -> Touch:
-        """What the sensor's law works on: depth and rate, on sprung pads without the part's sinking into the plate.
+        """Input of the sensor's law: depth and rate; on sprung pads without the part's penetration into the plate.
 
         Args:
             start: of the simulations ``start`` … ``end`` (all by default); several threads may work on blocks of them.
@@ -191,7 +192,7 @@ class PadArray:
         return self._past_surface(state, start, end, off_sinking=True)
 
     def penetration(self, state: Kinematics) -> Touch:
-        """Depth D and rate past the undeformed surface, the part's sinking into the plate included.
+        """Depth D and rate relative to the undeformed surface, including the part's penetration into the plate.
 
         Raises:
             TaccorlError: the fields are all zero: bound after the batch's last call.
@@ -199,7 +200,7 @@ class PadArray:
         return self._past_surface(state, 0, None, off_sinking=False)
 
     def compression(self, state: Kinematics) -> Touch:
-        """How far the plates of the sprung pads are pressed in at each taxel, and how fast: (N, P', K) float32.
+        """Compression [m] and compression rate [m/s] of the sprung pads' plates at each taxel: (N, P', K) float32.
 
         In the taxel frame a plate is the plane n · p = n · p₀, so c(x, y) = (n_x x + n_y y − n · p₀) / n_z. Its points move with
         v + ω × p, so that at a fixed taxel ċ = −(n · v + (n × ω) · p) / n_z with p = (x, y, −c).

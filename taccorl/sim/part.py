@@ -1,4 +1,4 @@
-"""What a part is: geometry, mass, and where to hold and mate it; and how it goes into a MuJoCo spec.
+"""A part: geometry, mass, grasp and mating poses; and how it is added to a MuJoCo spec.
 
 A part is plain numbers (``Part``); ``add_part`` puts it into a spec. Lengths in metres, poses are (4, 4) matrices ``a_from_b``.
 Conventions that experts and predicates rely on:
@@ -87,7 +87,7 @@ class Grasp:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Part:
-    """One body: its solids, and what experts and predicates need to know, all in the part's own frame."""
+    """One rigid part: its solids, and the grasp and mating poses for experts and predicates, all in the part's own frame."""
 
     name: str
     solids: list[Solid]
@@ -112,7 +112,7 @@ class Part:
 
 
 class Fit(NamedTuple):
-    """How a mate stands in a hole; each an array of the poses' leading shape."""
+    """Pose error of a mate in a hole: arrays with the leading shape of the poses."""
 
     depth_m: np.ndarray
     """Positive inside."""

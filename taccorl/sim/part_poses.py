@@ -29,7 +29,7 @@ class _Posed(Protocol):
 
 
 def posed_bodies(task: "Task | type[Task]") -> tuple[str, ...]:
-    """Bodies whose poses are given, in order."""
+    """Bodies whose poses are part of the observation, in order."""
     return (*task.parts, *task.clamped)
 
 
@@ -39,7 +39,7 @@ def part_pose_names(task: "Task | type[Task]") -> tuple[str, ...]:
 
 
 def part_poses(sim: _Posed) -> np.ndarray:
-    """(N, 9 · bodies) float32 poses now."""
+    """(N, 9 · bodies) float32: present poses of the bodies, in the order of ``part_pose_names``."""
     numbers = []
     for body in posed_bodies(sim.task):
         pose = sim.poses(body)

@@ -1,4 +1,4 @@
-"""Surface of a part that several convex solids make up: no face or piece of one that another solid covers.
+"""Outer surface of a part that consists of several convex solids: faces, or pieces of them, that no other solid covers.
 
 Each face is cut along the other solids that touch or overlap it. What lies open stays in convex pieces; what is covered, the
 whole face or places in it, is a *seam*: there a point's depth is its distance to the surface of the whole part.
@@ -158,7 +158,7 @@ class _Cells(NamedTuple):
 
 
 class Covered(NamedTuple):
-    """What others cover of one solid's faces."""
+    """Areas of one solid's faces that other solids cover."""
 
     wholly: np.ndarray
     """(F,) bool, or in so many places that it may as well be."""
@@ -174,7 +174,7 @@ class Covered(NamedTuple):
 
 
 def surface_of(solids: Sequence[Polyhedron]) -> tuple[Surface, list[Covered]]:
-    """Surface of the union of convex solids in one frame, and per solid what others cover of it."""
+    """Surface of the union of convex solids in one frame, and for each solid the areas of its faces that others cover."""
     low = np.array([np.min([c.min(axis=0) for c in solid.corners_m], axis=0) for solid in solids]) - TOUCH_M
     high = np.array([np.max([c.max(axis=0) for c in solid.corners_m], axis=0) for solid in solids]) + TOUCH_M
     pieces: list[tuple[np.ndarray, np.ndarray]] = []  # corners, normal

@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One row of the table: a uniform draw with the probability that it is made at all."""
+    """One row of the table: a uniform distribution, and the probability with which it is applied."""
 
     name: str
     low: tuple[float, ...]
@@ -71,7 +71,7 @@ PAPER_ROWS: dict[str, tuple[Row, ...]] = {
 def draw(rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0) -> dict[str, np.ndarray]:
     """One draw of every row; ``scale`` shrinks the ranges about their absent value, 0 gives the nominal scene.
 
-    The generator is used the same number of times whatever the probabilities, so that one row does not move another.
+    The number of random draws does not depend on the probabilities, so that one row does not change another.
     """
     values = {}
     for row in rows:

@@ -1,4 +1,5 @@
-"""Pictures of many simulations, as ingest would store them: each view drawn alone, collected on one sheet, read back once.
+"""Rendered images of many simulations in the format that ingest stores: each view is drawn alone, copied to one sheet, read
+back once.
 
 Classic renderer without shadows, reflections or multisampling, which cost 3 to 20 times as much in software (llvmpipe,
 measured). OpenGL comes through EGL unless MUJOCO_GL names another, and is touched only when the first picture is asked for.
@@ -126,7 +127,7 @@ class Renderer:
 
     @property
     def driver(self) -> str:
-        """Who draws, for the record: OpenGL's name of its renderer and version."""
+        """Name and version of the OpenGL renderer, for provenance."""
         return self._canvas().driver
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A recorded command sequence through the twin, aligned in time with the measurement.
+"""Replay: simulate a recorded command sequence in the twin, aligned in time with the measurement.
 
 Sample k of the result is the twin at exactly the time of command k, before the command acts: positions that a driver measured
 when it sent the command are compared with it row by row. (MuJoCo's own ``sensordata`` after a step is the state before it;
@@ -20,7 +20,7 @@ _COMMAND_HZ = 150.0  # as Simulation.step sends them
 
 @dataclass(frozen=True)
 class Replay:
-    """What the twin did, row by row with its commands."""
+    """Result of a replay: the twin's signals, one row per command."""
 
     time_s: np.ndarray
     """(T,)."""
@@ -35,7 +35,7 @@ class Replay:
 def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarray | None = None) -> Replay:
     """Feed ``targets`` (T, 14) [rad, m] at ``rate_hz`` into simulation 0 from its present scene; reset it first.
 
-    Between two of them the command goes in a straight line, in steps of at most 1/150 s: rows of a dataset are samples of a
+    Between two of them the command is interpolated linearly, in steps of at most 1/150 s: rows of a dataset are samples of a
     command that moved on at 200 Hz. From 150 Hz on each is held.
 
     Args:
@@ -71,7 +71,7 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
 
 
 def replay_episode(sim: Simulation, episode: Episode) -> Episode:
-    """The twin's version of a measured episode: the same commands, the twin's own joints and touch, no pictures.
+    """Replay an episode: its commands, with the twin's joint states and touch instead of the measured ones, without pictures.
 
     The action of row t is reached at row t + 1 (``DatasetSpec.action_time``): in force at row t is the action of row t − 1. No
     row holds the command in force at row 0; the first action is taken for it, which is exact where an episode begins at rest.

@@ -19,7 +19,7 @@ from taccorl.sim.settings import check_numbers
 
 @dataclass(kw_only=True)
 class RobotConfig:
-    """Both arms, their grippers and pads."""
+    """Physical parameters of both arms, their grippers and pads."""
 
     inertias: str = "manufacturer"
     """Mass set: ``manufacturer`` (3.6 kg moving) or ``menagerie`` (2.2 kg moving)."""

@@ -1,4 +1,4 @@
-"""Which scene a stored state belongs to, as one number: states of one scene have no meaning in another."""
+"""Digest of a scene, stored with each state as one number, because a state can only be restored into its own scene."""
 
 import dataclasses
 import hashlib
@@ -18,7 +18,7 @@ _BITS = 52  # a float64 holds so many exactly
 def scene_digest(task: "Task", config: "TwinConfig", scale: float) -> float:
     """Of task, difficulty, twin and randomisation: k / 2⁵², 0 ≤ k < 2⁵², from SHA-256. Equal ones have the same bits.
 
-    What is only said about an effect (interval, evidence) does not count: nothing moves differently for it.
+    An effect's interval and evidence are not included: they do not change the motion.
     A fraction, so that it stays within the range that a dataset declares for ``sim.state``.
     """
     bare = [dataclasses.replace(effect, interval={}, evidence="") for effect in config.effects]

@@ -1,4 +1,4 @@
-"""What can be seen of N simulations: encoders, touch, pictures, and the privileged poses and contacts that predicates look at."""
+"""Read-only accessors of N simulations: joint states, touch, images, and privileged poses and contacts for predicates."""
 
 from collections.abc import Iterator, Sequence
 
@@ -20,7 +20,7 @@ from taccorl.sim.twin import TwinConfig
 
 
 class SeenScene:
-    """The looking half of ``Simulation``, which fills these attributes. Nothing here changes a simulation."""
+    """Read-only accessors of ``Simulation``, its subclass, which sets these attributes. No method changes a simulation."""
 
     task: Task
     config: TwinConfig
@@ -43,11 +43,11 @@ class SeenScene:
 
     @property
     def row_size(self) -> int:
-        """Numbers in a stored state; ``Simulation`` knows."""
+        """Number of values in a stored state; implemented by ``Simulation``."""
         raise NotImplementedError
 
     def row_memory(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """What effects remember in stored states; ``Simulation`` knows."""
+        """Memory of effects in stored states; implemented by ``Simulation``."""
         raise NotImplementedError
 
     def proprioception(self) -> np.ndarray:
@@ -59,8 +59,8 @@ class SeenScene:
         return self.arrays["actuator_force"][:, self.action_actuators]
 
     def reading(self) -> np.ndarray:
-        """(N, 4, 32, 12) float32 what the pads read before gain, noise and rounding: a pure function of the state, and of
-        the past where effects remember it."""
+        """(N, 4, 32, 12) float32 readings of the pads before gain, noise and rounding: a pure function of the state, and of
+        the memory of effects."""
         spec = self.sensor.spec
         reading = np.empty((self.num_sims, len(ROBOT.pads), spec.rows, spec.columns), np.float32)
 
@@ -109,7 +109,7 @@ class SeenScene:
     ) -> Iterator[dict[str, np.ndarray]]:
         """Camera → (rows, columns, 3) uint8 for each of the stored rows (T, row_size) of ``state_rows``.
 
-        The simulations stay as they are. States of another twin are drawn as well: its cameras may be what is new.
+        The simulations do not change. States of a twin with other cameras are accepted.
 
         Raises:
             TaccorlError: rows of another size.

@@ -1,4 +1,4 @@
-"""Numbers of a config, refused by name where physics has no use for them."""
+"""Range checks for numbers in a configuration: finite, non-negative or positive."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ def check_numbers(
     not_negative: Sequence[str] = (),
     positive: Sequence[str] = (),
 ) -> None:
-    """Fields of ``config``, numbers or lists of them, are finite, and ≥ 0 or > 0 where that is asked for.
+    """Check that the named fields of ``config`` (numbers or lists of them) are finite, ≥ 0 or > 0.
 
     Raises:
         TaccorlError: names the field in its ``section``, and the value.
@@ -26,7 +26,7 @@ def check_numbers(
             value = getattr(config, name)
             for number in value if isinstance(value, list | tuple) else (value,):
                 if not (_finite(number) and (number > above or (number == above and names is not positive))):
-                    raise TaccorlError(f"{section}.{name}: {value} is not wanted here; give a finite number{wanted}")
+                    raise TaccorlError(f"{section}.{name}: {value} is out of range; give a finite number{wanted}")
 
 
 def _finite(value: Any) -> bool:

@@ -26,7 +26,7 @@ _PAIRS_AT_ONCE = 64  # of six faces and 384 taxels they are 0.6 MB: a core's cac
 
 
 class Felt(NamedTuple):
-    """Depth [m] and rate [m/s], each (n, K). Depth ≤ 0 means outside, its value and its rate mean nothing there."""
+    """Depth [m] and depth rate [m/s], each (n, K). Where depth ≤ 0 the point is outside, and both values are undefined."""
 
     depth_m: np.ndarray
     depth_rate_mps: np.ndarray
@@ -41,7 +41,8 @@ class Shapes(Protocol):
         ...
 
     def feel(self, shape: np.ndarray, position: np.ndarray, velocity: np.ndarray, grid: np.ndarray) -> Felt:
-        """What n pads feel of one shape each: (n,) numbers of shapes, (n, 3, 3) matrices, (3, K) rows x, y, 1; float32."""
+        """Depth and depth rate of the taxels of n pads, each in one shape: (n,) indices of shapes, (n, 3, 3) matrices, (3, K)
+        rows x, y, 1."""
         ...
 
 

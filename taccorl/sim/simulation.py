@@ -37,7 +37,7 @@ _BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat", "actuator_force
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All that is needed to go on bit-exactly from here; rows belong to ``ids`` of the simulation it was taken from."""
+    """Complete state of some simulations, from which they continue bit-exactly; one row per simulation."""
 
     physics: np.ndarray
     """(n, nstate) ``mjSTATE_INTEGRATION``: positions, velocities, controls, histories, warm start."""
@@ -52,7 +52,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Watch:
-    """Wants to see the simulation after some of the physics steps of a control step."""
+    """Callback for given physics steps within a control step."""
 
     at: Sequence[int]
     """Physics steps since the control step began, ≥ 1."""
@@ -219,10 +219,10 @@ class Simulation(SeenScene):
     # stepping --------------------------------------------------------------------------------------------------------
 
     def step(self, action: np.ndarray, ids: np.ndarray | None = None, watch: Watch | None = None) -> None:
-        """One control step (1/30 s) with targets ``action`` (N, A) [rad, m], reached in a straight line over the step.
+        """One control step (1/30 s) with targets ``action`` (N, A) [rad, m], linearly interpolated over the step.
 
-        Simulations that are not of ``ids`` (all by default) stand still, judge and targets included; their rows are not used.
-        ``watch`` sees the state in between; it changes nothing.
+        Simulations outside ``ids`` (all by default) are frozen, with their targets and outcomes; their rows are not used.
+        ``watch`` is called for the states in between; it must not change them.
         """
         goal = self._checked(action, ids)
         now = self.targets.copy()
@@ -317,14 +317,14 @@ class Simulation(SeenScene):
     # state -----------------------------------------------------------------------------------------------------------
 
     def snapshot(self, ids: np.ndarray | None = None) -> Snapshot:
-        """Everything needed to go on from here."""
+        """Complete state of all simulations, for ``restore``."""
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         memory = self.effects.snapshot(ids) | {"targets": self.targets[ids].copy()}
         scene = np.full(len(memory["targets"]), self.scene)
         return Snapshot(self.batch.state[ids].copy(), self.judge.snapshot(ids), self.seeds[ids].copy(), memory, scene)
 
     def check_snapshot(self, snapshot: Snapshot, ids: np.ndarray | None = None) -> None:
-        """``restore`` will take it for ``ids``.
+        """Check that ``restore`` accepts the snapshot for ``ids``.
 
         Raises:
             TaccorlError: as ``restore``.
@@ -384,8 +384,7 @@ class Simulation(SeenScene):
         return self.state_rows(np.array([0])).shape[1]
 
     def state_rows(self, ids: np.ndarray | None = None) -> np.ndarray:
-        """(n, row_size) float64 what a dataset keeps of a simulation at one instant: ``scene_digest``, physics,
-        then what effects remember.
+        """(n, row_size) float64 states as stored in a dataset: ``scene_digest``, physics state, memory of effects.
 
         With the seed, which stands for friction and masses, it restores the simulation bit-exactly but for the judge's counters.
         """
@@ -394,7 +393,7 @@ class Simulation(SeenScene):
         return np.concatenate([snapshot.scene[:, None], snapshot.physics, *memory], axis=1)
 
     def restore_rows(self, rows: np.ndarray, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Put ``ids`` (all by default) into stored states; the judge begins anew.
+        """Put ``ids`` (all by default) into stored states; the outcome counters restart.
 
         Raises:
             TaccorlError: rows of another task, difficulty, twin or randomisation; nothing is changed.

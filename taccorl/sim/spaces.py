@@ -1,4 +1,4 @@
-"""What an environment of the twin shows and takes, as gymnasium spaces, under the names of data_specs/taccorl_bimanual.yaml."""
+"""Observation and action spaces of the twin's environments, with the names of data_specs/taccorl_bimanual.yaml."""
 
 import numpy as np
 from gymnasium.spaces import Box, Dict
@@ -14,7 +14,7 @@ Observation = dict[str, np.ndarray]
 
 
 def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
-    """Of one environment: joints [rad] and openings [m], counts above baseline, rgb8 pictures.
+    """Observation space of one environment: joints [rad] and openings [m], counts above baseline, rgb8 pictures.
 
     Args:
         part_numbers: of the parts' poses; None: they are not observed.
@@ -32,5 +32,5 @@ def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
 
 
 def action_space() -> Box:
-    """Of one environment: targets within the joint limits [rad] and the grippers' openings [m]."""
+    """Action space of one environment: targets within the joint limits [rad] and the grippers' openings [m]."""
     return Box(ROBOT.action_low.astype(np.float32), ROBOT.action_high.astype(np.float32))

@@ -18,7 +18,7 @@ from taccorl.sim.vector_env import Chunk
 
 
 class TouchHistory:
-    """One window each, on the CPU. Before there have been L readings of an episode its first one is repeated."""
+    """The last L readings of each environment, on the CPU. At the start of an episode the first reading is repeated."""
 
     def __init__(self, num_envs: int, length: int) -> None:
         """
@@ -31,7 +31,7 @@ class TouchHistory:
         """(N, L, K) counts above baseline, oldest first."""
 
     def reset(self, first: np.ndarray, mask: np.ndarray | None = None) -> None:
-        """Begin anew with readings ``first`` (N, K) in the environments of ``mask`` (N,) bool (all by default)."""
+        """Start new windows with readings ``first`` (N, K) in the environments of ``mask`` (N,) bool (all by default)."""
         mask = np.ones(len(self.window), dtype=bool) if mask is None else mask
         self.window[mask] = first[mask, None]
 
@@ -43,7 +43,8 @@ class TouchHistory:
         self.window = np.take_along_axis(both, newest[:, :, None], axis=1)
 
     def follow(self, chunk: Chunk) -> None:
-        """Add what a chunk read; environments that it reset within begin anew with the new episode's first reading."""
+        """Add the readings of a chunk. An environment that was reset within it starts a new window with the new episode's
+        first reading."""
         self.append(chunk.tactile, chunk.num_steps)
         if "_final_obs" in chunk.info:
             self.reset(chunk.observation[TACTILE_KEY], chunk.info["_final_obs"])

@@ -23,7 +23,7 @@ _ZERO, _TINY = np.float32(0), np.float32(TINY_M)
 
 
 class FeltGeoms(NamedTuple):
-    """The geoms that pads can feel, in the order of their kinds."""
+    """The geoms that pads can detect, in the order of their kinds."""
 
     geom: np.ndarray
     """(G,) ids."""

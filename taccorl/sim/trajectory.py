@@ -1,4 +1,4 @@
-"""A dense record of one simulation at 200 Hz, the rate of the robot's joint drivers: what recordings and replays are cut from.
+"""Record of one simulation at 200 Hz, the rate of the robot's joint drivers, from which recordings and replays are made.
 
 Letters in shapes: T samples.
 """
@@ -37,7 +37,7 @@ class Trajectory:
 
 @dataclass
 class DenseRecorder:
-    """Collects a ``Trajectory`` of simulation 0 while it is stepped. Changes nothing in it."""
+    """Collects a ``Trajectory`` of simulation 0 while it is stepped, without changing it."""
 
     sim: Simulation
     _rows: list[tuple[np.ndarray, ...]] = field(default_factory=list)
@@ -49,7 +49,7 @@ class DenseRecorder:
         self._see(0)
 
     def watch(self, num_steps: int | None = None) -> Watch:
-        """For the next control step, or for ``num_steps`` physics steps of ``Simulation.advance``."""
+        """``Watch`` for the next control step, or for ``num_steps`` physics steps of ``Simulation.advance``."""
         num_steps = num_steps or self.sim.config.physics.steps_per_control_step
         before, self._steps = self._steps, self._steps + num_steps
         first = -before % self._every or self._every
@@ -64,7 +64,7 @@ class DenseRecorder:
         self._rows.append(tuple(np.array(values) for values in row))
 
     def trajectory(self) -> Trajectory:
-        """All that has been seen so far."""
+        """The trajectory recorded so far."""
         qpos, qvel, reported, targets, reading, effort = (np.stack(column) for column in zip(*self._rows, strict=True))
         # A sample is taken at the end of a command's stretch; the command in force from then on is the next sample's.
         targets = np.concatenate([targets[1:], targets[-1:]])

@@ -44,7 +44,7 @@ class PhysicsConfig:
 
 @dataclass(kw_only=True)
 class TwinConfig:
-    """Everything that defines a twin but its task. ``twin.yaml`` holds one of these."""
+    """Complete definition of a twin except its task; the content of a ``twin.yaml``."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
@@ -62,12 +62,12 @@ class TwinConfig:
                 raise TaccorlError(f"arm_controllers: no arm {arm!r}; {nearest(arm, ROBOT.arms)}")
 
     def controller_of(self, arm: str) -> ControllerConfig:
-        """Gains of one arm."""
+        """Controller gains of one arm."""
         return self.arm_controllers.get(arm, self.controller)
 
 
 def empty_bench(config: TwinConfig) -> mujoco.MjSpec:
-    """Table, arms, actuators: what every task is built on."""
+    """Model specification with table, arms and actuators, to which a task adds its parts."""
     spec = mujoco.MjSpec()
     spec.modelname = "taccorl"
     spec.compiler.degree = False
@@ -95,7 +95,7 @@ def empty_bench(config: TwinConfig) -> mujoco.MjSpec:
 
 
 def build_spec(config: TwinConfig, task: Task) -> mujoco.MjSpec:
-    """The task's scene with everything that can be seen and felt in it."""
+    """Complete model specification of a task's scene: arms, parts, cameras, sensors and effects."""
     spec = empty_bench(config)
     task.add_parts(spec)
     add_cameras(spec, config.cameras)

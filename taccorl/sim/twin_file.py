@@ -1,4 +1,4 @@
-"""``twin.yaml``: a twin as its differences from the nominal one, and the effects that have been found in the robot.
+"""Read and write ``twin.yaml``: a twin as differences from the nominal one, with the effects found in the robot.
 
 ::
 
@@ -43,7 +43,7 @@ _HEADER = """\
 
 
 def load_twin(path: Path) -> TwinConfig:
-    """The twin that a file describes; one that says nothing is the nominal twin.
+    """Load a twin.yaml. An empty file is the nominal twin.
 
     Raises:
         SpecError: the file cannot be read, or holds a key, value or effect that does not exist; with file and line.
@@ -68,7 +68,7 @@ def _says_nothing(path: Path) -> bool:
 
 
 def twin_text(config: TwinConfig) -> str:
-    """What of ``config`` differs from the nominal twin, as ``twin.yaml`` has it.
+    """Content of a ``twin.yaml`` for ``config``: its differences from the nominal twin.
 
     Raises:
         TaccorlError: a number is not finite.
@@ -84,7 +84,7 @@ def twin_text(config: TwinConfig) -> str:
 
 
 def twin_digest(config: TwinConfig) -> str:
-    """16 hexadecimal digits that two twins share only if they are the same."""
+    """Digest of a twin, 16 hexadecimal digits: equal for equal twins."""
     return hashlib.sha256(twin_text(config).encode()).hexdigest()[:16]
 
 

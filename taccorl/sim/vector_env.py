@@ -47,7 +47,7 @@ _NOT_FOR_US = "lerobot_new_rollout"  # LeRobot's rollout marks a new episode by 
 
 
 def shaped(actions: np.ndarray, *leading: int | None) -> np.ndarray:
-    """``actions`` as an array (*leading, 14); None: any number from 1.
+    """``actions`` as an array (*leading, 14). A ``None`` in ``leading`` stands for any size ≥ 1.
 
     Raises:
         TaccorlError: it has another shape.
@@ -63,7 +63,7 @@ def shaped(actions: np.ndarray, *leading: int | None) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """What a chunk of actions led to."""
+    """Result of a chunk of actions: observation, rewards, and which environments ended."""
 
     observation: Observation
     """After the chunk; of an episode that ended, the next one's first."""
@@ -85,7 +85,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
 
     An episode terminates with success or failure (``info["failure"]``) and is truncated when time is up. A simulation that
     diverges fails as ``diverged``, its seed in ``info["seed"]``, its last observation the one before. An action that is NaN or
-    far beyond the limits is not carried out: its episode fails as ``bad_action``, ``info["reason"]`` says why. The others go on.
+    far beyond the limits is not executed: its episode fails as ``bad_action``, ``info["reason"]`` says why. The others go on.
 
     Seeds (``EpisodeSeeds``): after ``reset(seed=s)`` environment i's k-th episode has the scene seed ``episode_seed(s, i, k)``.
     After ``reset(seed=[s0, s1, …])`` environment i begins with scene seed sᵢ itself, so ``info["seed"]`` brings a scene back.
@@ -214,7 +214,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         return chunk.observation, chunk.reward, chunk.terminated, chunk.truncated, chunk.info
 
     def step_chunk(self, actions: np.ndarray, *, final_images: bool = False) -> Chunk:
-        """H control steps with targets (N, H, 14), as a policy gives them. An episode that ends within stands still.
+        """H control steps with targets (N, H, 14), as a policy gives them. An episode that ends within the chunk is frozen
+        until autoreset.
 
         Args:
             final_images: with ``images="on_request"``, render the last observation of episodes that ran out of time, too:
@@ -282,7 +283,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     # what is seen -----------------------------------------------------------------------------------------------------
 
     def observe(self, images: bool = False) -> Observation:
-        """The newest observation of all; with ``images`` the pictures are rendered now (``images="on_request"``)."""
+        """Newest observation of all environments; ``images`` renders the pictures now (for ``images="on_request"``)."""
         if images and self.images == "never":
             raise TaccorlError(
                 'observe: images are "never" to be rendered here; make the environment with "on_request"'
@@ -311,7 +312,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self._unseen[ids] = False
 
     def facts(self) -> dict[str, Any]:
-        """What is known of each episode, privileged: the arrays of ``info``, copied."""
+        """Privileged information on each episode: a copy of the arrays of ``info``."""
         return _each(self._facts, np.copy)
 
     # one episode after another ----------------------------------------------------------------------------------------

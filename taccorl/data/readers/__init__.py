@@ -1,1 +1,1 @@
-"""Recording formats, one file each: register a ``Reader`` with ``@readers.register("name")`` and it takes part."""
+"""Recording formats, one file each: register a ``Reader`` with ``@readers.register("name")`` to add one."""

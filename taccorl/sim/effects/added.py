@@ -1,4 +1,4 @@
-"""The effects that have been added to one twin, acting together: their order, their memory, what they may not do at once."""
+"""All effects of one twin together: the order in which they act, their memory, and combinations that are refused."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -24,8 +24,8 @@ PAST_POSITIONS, PAST_TIME_S = "pictures/positions", "pictures/time_s"  # of ``Pa
 class AddedEffects:
     """Effects of N simulations. Absent ones are left out; what is left acts in the order of ``LAYERS``, then by name.
 
-    A sensor takes it as one of its transforms. Looking at the pads is one thing, their passing time another: only ``scan``,
-    which ``Simulation.advance`` calls at the boards' rate, moves their memory on.
+    A sensor takes it as one of its transforms. Reading the pads does not change the memory of touch effects: only ``scan``,
+    which ``Simulation.advance`` calls at the boards' rate, advances it.
 
     Args:
         time_s: (N,) the simulations' clocks, live.
@@ -59,13 +59,14 @@ class AddedEffects:
         """Where everything was, if a camera shows it; ``Simulation.advance`` keeps it up."""
 
     def command(self, targets: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        """What reaches the controllers of targets (N, A) that stand for ``dt_s`` (N,)."""
+        """Targets (N, A) that reach the controllers when targets (N, A) are sent and held for ``dt_s`` (N,)."""
         for effect, memory in zip(self.present, self._memory, strict=True):
             targets = effect.command(targets, memory, dt_s)
         return targets
 
     def feel(self, ids: np.ndarray, dt_s: float) -> None:
-        """Look at ``ids`` after a physics step of ``dt_s``, or after a reset (0), and write the model of the next step."""
+        """Let effects observe simulations ``ids`` after a physics step of ``dt_s`` (0: after a reset) and change the model
+        for the next."""
         if self._live:
             for effect, memory in zip(self.present, self._memory, strict=True):
                 effect.feel(self._live, memory, ids, dt_s)
@@ -78,19 +79,19 @@ class AddedEffects:
                 effect.rewrite(self._live, memory)
 
     def friction(self, friction: float) -> float:
-        """Sliding friction of parts where the scene's is ``friction``."""
+        """Sliding friction coefficient of parts after all effects, from that of the scene, ``friction``."""
         for effect in self.present:
             friction = effect.friction(friction)
         return friction
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
-        """What is reported of joints and grippers (N, A)."""
+        """Reported joint angles and gripper openings (N, A) [rad, m] for the true ``values`` (N, A)."""
         for effect in self.present:
             values = effect.encoder(values)
         return values
 
     def __call__(self, reading: np.ndarray) -> np.ndarray:
-        """What the pads read now where ideal ones would read ``reading`` (N, P, R, C). Looking changes nothing."""
+        """Reading of the pads (N, P, R, C) for the ideal ``reading`` (N, P, R, C). Does not change the memory."""
         return self._read(reading, self._copied(np.arange(len(reading))), np.arange(len(reading)))
 
     def scan(self, reading: np.ndarray, ids: np.ndarray) -> None:
@@ -117,7 +118,7 @@ class AddedEffects:
         return reading
 
     def picture_age_s(self, camera: str) -> float:
-        """How long ago it was what a camera shows."""
+        """Age [s] of what the camera shows."""
         return sum(effect.picture_age_s() for effect in self.present if camera in effect.acts_on())
 
     def picture(self, pictures: np.ndarray, camera: CameraConfig) -> np.ndarray:
@@ -187,7 +188,7 @@ class AddedEffects:
 
 
 def present(effects: Sequence[Effect]) -> list[Effect]:
-    """Those that are not absent, in the order in which they act.
+    """Effects that are not absent, in the order in which they act.
 
     Raises:
         TaccorlError: two entries of one effect act on the same thing.

@@ -1,4 +1,4 @@
-"""Where everything was a moment ago, for cameras whose pictures are late."""
+"""Recent positions of all bodies, for cameras whose pictures have a latency."""
 
 import math
 
@@ -12,7 +12,9 @@ _GAP_S = (
 
 
 class PastScene:
-    """Positions of N simulations since ``longest_s`` ago. Letters in shapes: H states kept, W numbers in each.
+    """Ring buffer with the positions of N simulations during the last ``longest_s``.
+
+    Letters in shapes: H states kept, W numbers in each.
 
     Args:
         batch: the simulations' physics.
@@ -30,12 +32,12 @@ class PastScene:
         """(N, H)."""
 
     def reset(self, ids: np.ndarray) -> None:
-        """All is as it has been for ever."""
+        """Fill the buffer with the present positions: before the reset nothing moved."""
         self.positions[ids] = self._positions(ids)[:, None]
         self.time_s[ids] = self._now_s[ids, None] - _GAP_S * np.arange(self.time_s.shape[1])[::-1]
 
     def keep(self) -> None:
-        """Take up the present; what stood still or follows at once replaces the newest."""
+        """Store the present positions. They replace the newest ones if those are no older than ``_GAP_S``."""
         is_apart = (self.time_s[:, -1] - self.time_s[:, -2] >= _GAP_S * 0.999) & (self._now_s > self.time_s[:, -1])
         for kept in (self.positions, self.time_s):
             kept[is_apart, :-1] = kept[is_apart, 1:]
@@ -47,7 +49,7 @@ class PastScene:
 
 
 def place_past(data: mujoco.MjData, positions: np.ndarray, time_s: np.ndarray, age_s: float) -> None:
-    """Put a simulation's data where everything was ``age_s`` before the newest of its states (H, W) of times (H,)."""
+    """Set the positions in ``data`` to those ``age_s`` before the newest of the stored states (H, W) of times (H,)."""
     when = time_s[-1] - age_s
     after = int(np.clip(np.searchsorted(time_s, when), 1, len(time_s) - 1))
     span = time_s[after] - time_s[after - 1]

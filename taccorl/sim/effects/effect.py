@@ -171,7 +171,7 @@ class Effect:
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
-        """In the order of the class's fields."""
+        """Parameters of the effect, in the order of the class's fields."""
         fields = [f for f in dataclasses.fields(cls) if "parameter" in f.metadata]
         return tuple(Parameter(name=f.name, **f.metadata["parameter"]) for f in fields)
 
@@ -197,7 +197,7 @@ class Effect:
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Where a search for it starts: one set of parameters each, those left out at their typical values.
+        """Start values of a search: one dict of parameters for each start; parameters left out have their typical values.
 
         By default a third of, all of and three times the typical strength, and for one that has two signs both of them; of a
         torque 3, 10 and 30 % of what the motor is asked for.
@@ -223,7 +223,7 @@ class Effect:
         return [{strength.name: v} for v in values if strength.low <= v <= strength.high]
 
     def drive(self) -> dict[str, float] | None:
-        """Its numbers in the one-joint model of ``taccorl.alignment.joint_kernel``, by the names there, for identification.
+        """Parameters of the effect in the one-joint model of ``taccorl.alignment.joint_kernel``, under the names used there.
 
         None: only MuJoCo knows it, and identification runs MuJoCo. Empty: it changes bodies only, and inertia and weight are
         read from the compiled model.
@@ -231,7 +231,7 @@ class Effect:
         return None
 
     def acts_on(self) -> list[str]:
-        """Joints, arms or pads."""
+        """Names of the joints, arms or pads on which the effect acts."""
         raise NotImplementedError
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
@@ -257,7 +257,7 @@ class Effect:
         """
 
     def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
-        """What arrives at the controllers of the targets (N, A) that are now sent.
+        """Targets (N, A) that arrive at the controllers when the targets (N, A) are sent.
 
         Args:
             targets: joint angles [rad] and openings [m] in the order of actions.
@@ -267,7 +267,7 @@ class Effect:
         return targets
 
     def feel(self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        """Remember of simulations ``ids`` what ``rewrite`` needs. Positions, velocities and forces are current.
+        """Called after a physics step: store in ``memory`` what ``rewrite`` needs of simulations ``ids``. Forces are current.
 
         Args:
             dt_s: of the physics step that has been made; 0 after a reset, when all has been as it is for ever. Only if an effect
@@ -279,7 +279,7 @@ class Effect:
         before this one made of them. Of the memory and the simulations' time only: a restored simulation must go on the same."""
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
-        """What is reported where the joints say ``values`` (N, A) [rad, m]."""
+        """Reported values (N, A) [rad, m] for the true joint angles and openings ``values`` (N, A)."""
         return values
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
@@ -305,7 +305,7 @@ class Effect:
         return picture
 
     def picture_age_s(self) -> float:
-        """How long ago it was what the cameras in ``acts_on`` show."""
+        """Age [s] of the pictures of the cameras in ``acts_on``."""
         return 0.0
 
 
@@ -351,11 +351,11 @@ class JointEffect(ArmEffect):
 
     @property
     def columns(self) -> list[int]:
-        """Where the chosen joints stand in targets and reported values."""
+        """Indices of the chosen joints in targets and reported values."""
         return [ROBOT.action_names.index(name) for name in self.acts_on()]
 
     def chosen(self, spec: mujoco.MjSpec) -> Iterator[mujoco.MjsJoint]:
-        """The joints' own entries of the model."""
+        """Joints of the model specification on which the effect acts."""
         for name in self.acts_on():
             yield spec.joint(name)
 
@@ -384,7 +384,7 @@ class TouchEffect(Effect):
 
     @property
     def slots(self) -> list[int]:
-        """Where the chosen pads stand in the reading."""
+        """Indices of the chosen pads in the reading."""
         return [ROBOT.pads.index(pad) for pad in self.pads]
 
     def within(self, window: tuple[slice, slice]) -> "TouchEffect | None":

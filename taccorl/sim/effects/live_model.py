@@ -8,7 +8,8 @@ from mujoco.batch import Batch
 
 
 class LiveModel:
-    """What the hooks ``feel`` and ``rewrite`` of effects see and change of N simulations.
+    """Access of the hooks ``feel`` and ``rewrite`` of effects to N simulations: state that they read, model fields that they
+    change.
 
     Args:
         rewritten: fields of ``mujoco.MjModel`` that effects rewrite, or ``qfrc_applied`` of ``mujoco.MjData``.
@@ -38,7 +39,7 @@ class LiveModel:
         return self._seen[name]
 
     def make_nominal(self) -> None:
-        """Every rewritten field has the compiled model's values again."""
+        """Set every rewritten field back to the compiled model's values."""
         for name, values in self._own.items():
             values[:] = self._nominal[name]
 
@@ -89,6 +90,6 @@ class LiveModel:
         return torque + np.where(apart, self.seen("qfrc_gravcomp")[:, dofs], 0.0)
 
     def scale_carried(self, joints: Sequence[str], carried_nm: np.ndarray, factor: np.ndarray | float) -> None:
-        """Let the motors carry ``factor`` times what they carry of the weight, of which MuJoCo gives ``carried_nm`` anyway."""
+        """Scale the motors' gravity compensation by ``factor``; ``carried_nm`` is what MuJoCo already applies."""
         applied, dofs = self.own("qfrc_applied"), self.dofs(joints)
         applied[:, dofs] = factor * (applied[:, dofs] + carried_nm) - carried_nm

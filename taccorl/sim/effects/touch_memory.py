@@ -10,7 +10,7 @@ from taccorl.sim.effects.effect import Memory, TouchEffect
 
 @dataclass(kw_only=True)
 class RememberingEffect(TouchEffect):
-    """Base of effects with a memory: they say what many scans in a row come out as, and one scan is a row of one.
+    """Base of touch effects with memory: they compute a whole sequence of scans at once; one scan is a sequence of length 1.
 
     Thousands of calls for a recording become one (``taccorl.alignment.touch_model``), by the same code as in the simulation. An
     effect with a memory that is not of this class works as well, scan by scan.
@@ -18,7 +18,7 @@ class RememberingEffect(TouchEffect):
 
     @abstractmethod
     def scans(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
-        """What the chosen pads P read in S scans one after the other, a new array (S, N, P, R, C) of the same type.
+        """Readings of the chosen pads P in S consecutive scans, a new array (S, N, P, R, C) of the same type.
 
         Args:
             own: (S, N, P, R, C) what ideal ones would read.

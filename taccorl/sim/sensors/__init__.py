@@ -1,6 +1,6 @@
 """Sensors of the twin, one file each: register a ``SensorConfig`` with ``@sensors.register("name")`` and it takes part.
 
-What every sensor does, in this order (``Sensor.sense``):
+Steps of every sensor, in this order (``Sensor.sense``):
 
 1. law: depth and rate of the taxels → reading, a number per taxel, 0 where nothing touches;
 2. transforms: effects of the sensor's material and wiring, reading → reading, one after the other;
@@ -38,7 +38,7 @@ class Transform(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TactileFrames:
-    """What all pads send at one instant."""
+    """Readings of all pads at one instant, in converter counts."""
 
     counts: np.ndarray
     """(N, P, R, C) uint8 or uint16 counts on the wire, in the pads' own layout."""
@@ -70,7 +70,7 @@ def as_wire(frames: np.ndarray, spec: SensorSpec) -> np.ndarray:
 
 
 class Sensor(abc.ABC):
-    """Pads of one kind. Holds what is built into this one: resting counts, transforms."""
+    """Simulated tactile pads of one kind: resting counts of this unit, and transforms (effects) between law and gain."""
 
     def __init__(
         self, spec: SensorSpec, pads: Sequence[str], baseline: np.ndarray, transforms: Sequence[Transform]
@@ -85,7 +85,8 @@ class Sensor(abc.ABC):
 
     @abc.abstractmethod
     def clean_counts(self, reading: np.ndarray) -> np.ndarray:
-        """Counts above rest, without noise, rounding and limits: what a driver model of its own starts from. Same shape."""
+        """Counts above baseline without noise, rounding and limits, for callers that simulate the converter themselves. Same
+        shape."""
 
     @abc.abstractmethod
     def digitise(self, reading: np.ndarray, noise: Noise) -> np.ndarray:
@@ -94,7 +95,7 @@ class Sensor(abc.ABC):
     def sense(
         self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, noise: Noise, time_s: np.ndarray | None = None
     ) -> TactileFrames:
-        """What the pads send for depth [m] and rate [m/s] of their taxels (N, P, K).
+        """Counts of the pads for depth [m] and depth rate [m/s] of their taxels (N, P, K).
 
         Given as a history (S, N, P, K) with ``time_s`` (S,), rising, of which 0 is the stamp (the end of the scan), each row
         of the wire reads at its own instant of the scan. Without ``time_s`` the whole pad reads at once.
@@ -136,7 +137,7 @@ sensors: Registry[type[SensorConfig]] = Registry("sensor", "taccorl.sim.sensors"
 
 
 def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Normal numbers (N, ...) float32, sim after sim; None without noise.
+    """Standard normal random numbers (N, ...) float32, one simulation after the other; None without noise.
 
     Raises:
         TaccorlError: another number of generators than sims.

@@ -1,4 +1,4 @@
-"""Tasks, one file each: parts, reset, what counts as success and failure, each arm's subtasks."""
+"""Tasks, one file each: parts, reset, predicates of success and failure, subtasks of each arm."""
 
 from taccorl.plugins import Registry
 from taccorl.sim.tasks.task import Task

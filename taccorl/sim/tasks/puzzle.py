@@ -77,7 +77,7 @@ class Puzzle(Task):
         return Reset(poses=poses, friction=float(draw["friction"][0]))
 
     def fits(self, scene: Scene, which: Sequence[int] = range(len(PIECES))) -> Fit:
-        """How pieces (all by default) stand in their own holes; arrays (N, len(which)) in the order of ``PIECES``."""
+        """Pose errors of pieces (all by default) in their own holes; arrays (N, len(which)) in the order of ``PIECES``."""
         k = list(which)
         pieces = np.stack([scene.poses(PIECES[i]) for i in k], axis=1)
         fit = measure_fit(scene.poses("tray")[:, None] @ self._tray_from_hole[k], pieces @ self._piece_from_mate[k], 1)
@@ -86,7 +86,7 @@ class Puzzle(Task):
         return fit._replace(turn_rad=np.where(self._is_round[k], 0.0, turn_rad))
 
     def inside(self, fit: Fit) -> np.ndarray:
-        """Whether pieces that fit like this are in: at most 2.5 mm above the floor, tilted by less than 3°."""
+        """Whether pieces with these pose errors are inserted: at most 2.5 mm above the floor, tilted by less than 3°."""
         # The other two are wider than any clearance: only what is in its own hole is within.
         turned = np.abs(fit.turn_rad) < _TURN_RAD
         return (fit.depth_m > self.in_depth_m) & (fit.tilt_rad < _TILT_RAD) & (fit.lateral_m < _LATERAL_M) & turned
@@ -118,7 +118,7 @@ class Puzzle(Task):
         return inside & ~scene.pads_touching(shape).any(axis=1)
 
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
-        """Of each piece: grasp, place. One hand places at a time: triangle, then circle (left), then heart."""
+        """Subtasks: grasp and place for each piece. One hand places at a time: triangle, then circle (left), then heart."""
 
         def pair(shape: str, after: str | None = None) -> tuple[Subtask, Subtask]:
             def lifted(scene: Scene) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a task is: parts on the bench, a reset distribution, predicates on the simulator's state, subtasks of each arm.
+"""Base class of tasks: parts on the bench, a reset distribution, predicates on the simulator's state, subtasks of each arm.
 
 Letters in shapes: N simulations.
 """
@@ -21,7 +21,7 @@ AT_REST_MPS = 0.02  # a part that moves faster than this against its holder is i
 
 
 class Scene(Protocol):
-    """What predicates may look at: the privileged state of N simulations after a control step."""
+    """Input of the predicates: the privileged state of N simulations after a control step."""
 
     num_sims: int
 
@@ -44,7 +44,7 @@ class Scene(Protocol):
 
 @dataclass(frozen=True)
 class Contact:
-    """Of one pair of bodies: deepest penetration [m], net force [N] and whether they touch, each (N,)."""
+    """Contact of one pair of bodies: deepest penetration [m], net force [N] and whether they touch, each (N,)."""
 
     touching: np.ndarray
     penetration_m: np.ndarray
@@ -53,7 +53,7 @@ class Contact:
 
 @dataclass(frozen=True, kw_only=True)
 class Subtask:
-    """One stretch of one arm's work, as MimicGen cuts demonstrations: it ends when ``done`` turns true."""
+    """One segment of one arm's motion, as MimicGen cuts demonstrations: it ends when ``done`` becomes true."""
 
     name: str
     object_ref: str | None
@@ -61,7 +61,7 @@ class Subtask:
     done: Callable[[Scene], np.ndarray]
     """(N,) bool."""
     held: str | None = None
-    """Body in this arm's hand meanwhile."""
+    """Body that this arm holds during the subtask."""
     coordinated_with: str | None = None
     """Subtask of the other arm that must run at the same time (MimicGen's COORDINATION)."""
     after: str | None = None
@@ -70,7 +70,7 @@ class Subtask:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the predicates say now, before anything had to hold for half a second."""
+    """Values of a task's predicates at one instant. ``Judge`` decides from them when a goal or failure has held long enough."""
 
     goal: np.ndarray
     """(N,) bool: in place, at rest, no pad touches it."""
@@ -84,7 +84,7 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Reset:
-    """Where an episode begins."""
+    """Initial scene of an episode."""
 
     poses: dict[str, np.ndarray]
     """Part or clamped body → world pose (7,): position [m], quaternion wxyz."""
@@ -129,11 +129,11 @@ class Task(ABC):
 
     @abstractmethod
     def reset(self, draw: dict[str, np.ndarray]) -> Reset:
-        """The scene that belongs to a draw of ``rows``."""
+        """Initial scene for a draw of ``rows``."""
 
     @abstractmethod
     def look(self, scene: Scene) -> Verdict:
-        """Predicates of success and failure."""
+        """Evaluate the predicates of success and failure."""
 
     @abstractmethod
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
@@ -141,7 +141,7 @@ class Task(ABC):
 
 
 def at_rest(scene: Scene, part: str, holder: str) -> np.ndarray:
-    """(N,) whether a part moves slower than 20 mm/s against what holds it."""
+    """(N,) whether a part moves slower than 20 mm/s relative to the body that holds it."""
     off = scene.velocities(part) - scene.velocities(holder)
     return np.einsum("ni,ni->n", off, off) < AT_REST_MPS**2
 

@@ -68,14 +68,14 @@ class TestTube(Task):
         )
 
     def fit(self, scene: Scene) -> Fit:
-        """How the tube stands in the middle hole."""
+        """Pose error of the tube in the middle hole."""
         mate = self.tube.mate
         assert mate is not None
         hole = scene.poses("rack") @ self.rack.holes[_HOLE].part_from_hole
         return measure_fit(hole, scene.poses("tube") @ mate.part_from_mate, mate.num_turns)
 
     def inside(self, fit: Fit) -> np.ndarray:
-        """(N,) whether a tube that stands like this is far enough in the hole."""
+        """(N,) whether a tube with these pose errors is far enough in the hole."""
         upright = fit.tilt_rad < _IN_TILT_RAD
         return (fit.depth_m >= _IN_DEPTH_M) & upright & (fit.lateral_m < _IN_LATERAL_M)
 
