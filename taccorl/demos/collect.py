@@ -1,7 +1,7 @@
 """Demonstrations in the twin into a LeRobot dataset, or into recordings as the robot's drivers would write them.
 
-Every attempt is a pure function of the configuration and its own seed, and lies in the store once it is done: a run that was
-stopped goes on, and the same command gives the same dataset.
+Every attempt is a pure function of the configuration and its own seed, and is in the store once it is finished: a run that was
+stopped continues, and the same command gives the same dataset.
 """
 
 import abc
@@ -47,20 +47,20 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Source(draccus.ChoiceRegistry, abc.ABC):
-    """Who demonstrates: --source.type=expert, keyboard, gamepad, leader."""
+    """Source of demonstrations: --source.type=expert, keyboard, gamepad, leader."""
 
     repeatable: ClassVar[bool] = True
     """The same seed gives the same actions."""
 
     @abc.abstractmethod
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        """Actions (14,) of one attempt, looking at the simulation between them; ends when the demonstrator has finished."""
+        """Actions (14,) of one attempt; reads the simulation between them. Ends when the demonstrator has finished."""
 
 
 @Source.register_subclass("expert")
 @dataclass(frozen=True, kw_only=True)
 class ExpertSource(Source):
-    """The task's scripted expert, human-like and correcting by touch."""
+    """The task's scripted expert, with human-like errors that it corrects when it is blocked."""
 
     hands: ScriptedExpertConfig = field(default_factory=ScriptedExpertConfig)
     """How human the hands are."""
@@ -76,7 +76,7 @@ class ExpertSource(Source):
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What to collect."""
+    """Settings of a collection: task, number of episodes, source, twin."""
 
     task: str
     episodes: int = 20
@@ -109,7 +109,7 @@ class Plan:
         return load_twin(self.twin) if self.twin else TwinConfig()
 
     def make(self) -> Simulation:
-        """Its simulation.
+        """Make the simulation of this plan.
 
         Raises:
             TaccorlError: unknown task or difficulty, with the near name.
@@ -118,11 +118,11 @@ class Plan:
 
     @property
     def num_attempts(self) -> int | None:
-        """How many there can be; None: as many as it takes."""
+        """Largest number of attempts; None: as many as needed."""
         return None
 
     def hopeless(self, attempts: int, successes: int) -> bool:
-        """Whether a demonstrator that works by itself fails so often that something is wrong. A person may try for ever."""
+        """True if an automatic demonstrator fails so often that something must be wrong. For a person there is no limit."""
         return self.source.repeatable and attempts >= _MANY and successes < attempts / 4
 
     def attempt_seed(self, k: int) -> int:
@@ -133,7 +133,7 @@ class Plan:
 
 @dataclass
 class Attempt(EpisodeRecorder):
-    """What was recorded of an attempt, and how it ended."""
+    """Recorded data of one attempt, and its outcome."""
 
     outcome: str = "unfinished"
     """As ``outcome_of``, or ``unreachable``: the demonstrator wanted a pose that its arm does not reach."""
@@ -141,7 +141,7 @@ class Attempt(EpisodeRecorder):
     """Which pose."""
 
     def is_kept(self, plan: Plan) -> bool:
-        """Whether ``plan`` wants it as an episode; one that ended before its first row is none."""
+        """Whether ``plan`` keeps the attempt as an episode. An attempt without rows is never kept."""
         return self.outcome == "success" or (plan.keep_failures and bool(self.rows))
 
 
@@ -320,7 +320,7 @@ def _report(plan: Plan, entries: list[dict[str, Any]]) -> dict[str, Any]:
 def collect_recordings(plan: Plan, out: Path, progress: Progress = print) -> list[Path]:
     """``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` …, as the robot's drivers would write them.
 
-    Failures, if they are kept, lie between them and are not counted.
+    Failures, if they are kept, are numbered with them and not counted.
 
     Raises:
         TaccorlError: ``out`` holds something already.

@@ -62,7 +62,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class PolicyEpisode:
-    """What a policy did in one scene, to its end."""
+    """Actions of a policy in one scene, up to the end of its episode."""
 
     seed: int
     """Of the scene."""
@@ -76,7 +76,7 @@ class PolicyEpisode:
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectionPlan:
-    """What is corrected, and where."""
+    """Settings of a round of corrections: policy, task, scenes, twin."""
 
     task: str
     policy: str
@@ -137,16 +137,16 @@ class CorrectionPlan:
         return load_twin(self.twin) if self.twin else TwinConfig()
 
     def make(self) -> Simulation:
-        """Its simulation."""
+        """Make the simulation of this plan."""
         return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
 
     def contract(self, sim: Simulation) -> DatasetSpec:
-        """What a row of the dataset holds."""
+        """Data spec of the dataset's rows."""
         spec = load_dataset_spec(find_spec("taccorl_bimanual"))
         return with_simulator(spec, sim, pictures=self.images, parts=self.part_poses)
 
     def scene_config(self) -> dict[str, Any]:
-        """What the policy's episodes depend on besides the policy and their seeds."""
+        """Settings on which the policy's episodes depend, besides the policy and their seeds; part of the store's key."""
         return {
             "task": self.task,
             "difficulty": self.difficulty,
@@ -158,7 +158,7 @@ class CorrectionPlan:
         }
 
     def config(self, k: int) -> dict[str, Any]:
-        """What the correction of episode ``k`` depends on besides the policy's episodes."""
+        """Settings on which the correction of episode ``k`` depends, besides the policy's episodes; part of the store's key."""
         own = {"policy_digest": self.policy_digest, "takeover": self.takeover, "images": self.images, "origin": ORIGIN}
         own |= {"part_poses": True} if self.part_poses else {}
         own |= {"rows": self.rows} if self.rows == "actions" else {}
@@ -166,7 +166,7 @@ class CorrectionPlan:
 
 
 def write_policy_episodes(episodes: Sequence[PolicyEpisode], folder: Path) -> None:
-    """As files of ``folder``: episodes.json and the rows of all episodes one after another."""
+    """Write the policy's episodes into ``folder``: episodes.json, and the rows of all episodes one after another."""
     table = [{"seed": e.seed, "outcome": e.outcome, "steps": len(e.actions)} for e in episodes]
     _dump(folder / "episodes.json", table)
     np.save(folder / "actions.npy", np.concatenate([e.actions for e in episodes]))
@@ -184,7 +184,7 @@ def read_policy_episode(folder: Path, k: int) -> PolicyEpisode:
 
 @dataclass
 class Correction:
-    """What became of one of the policy's episodes."""
+    """Result of correcting one of the policy's episodes."""
 
     outcome: str
     """``success``; ``policy succeeded``: nothing to correct; ``not taken over``: the expert cannot go on from there; else how the

@@ -1,4 +1,4 @@
-"""One demonstration in the twin as an ``Episode``: what the policy would have seen and done, and the simulator's own state.
+"""Record a demonstration in the twin as an ``Episode``: observations, actions, and the simulator's state.
 
 A row is the observation before an action, and the action: the target that is reached at the next row (``action_time: next_row``).
 Pictures are drawn afterwards, row by row, from the stored states: only what is kept costs rendering, and a dataset can be
@@ -70,7 +70,7 @@ def with_simulator(
 
 @dataclass
 class EpisodeRecorder:
-    """Steps simulation 0 and keeps what a dataset needs. Make one after each reset."""
+    """Steps simulation 0 and records the rows of an episode. Make a new one after each reset."""
 
     sim: Simulation
     spec: DatasetSpec
@@ -119,7 +119,7 @@ class EpisodeRecorder:
         self.rows.append(row)
 
     def trajectory(self) -> Trajectory:
-        """The dense record."""
+        """The dense record at 200 Hz."""
         assert self._dense is not None, "make the recorder with dense=True"
         return self._dense.trajectory()
 

@@ -1,4 +1,4 @@
-"""How good a task's expert is: success, what it costs, how hard it presses. All simulated."""
+"""Score of a task's expert: success rate, cost, contact forces. All simulated."""
 
 from collections import Counter
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What became of every episode of an evaluation, as rows, and their summaries. One line of JSON is one episode."""
+"""Outcomes of all episodes of an evaluation as rows, and their summaries. One line of JSON is one episode."""
 
 import json
 from collections import Counter
@@ -60,7 +60,7 @@ class EpisodeRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """Of the episodes of one policy in one task."""
+    """Summary of the episodes of one policy in one task."""
 
     policy: str
     task: str
@@ -77,7 +77,7 @@ class Summary:
 
     @classmethod
     def of(cls, rows: Sequence[EpisodeRow]) -> "Summary":
-        """Of rows (≥ 1) that have policy and task in common."""
+        """Summarise rows (≥ 1) of the same policy and task."""
         (policy, task), *others = {(row.policy, row.task) for row in rows}
         assert not others, "rows of one policy and one task"
         good = [row.time_s for row in rows if row.success]
@@ -140,13 +140,13 @@ def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[s
 
 
 def write_rows(rows: Iterable[EpisodeRow], path: Path) -> None:
-    """One line of JSON for each."""
+    """Write one line of JSON per row."""
     lines = [json.dumps(row.to_json(), ensure_ascii=False) for row in rows]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_rows(path: Path) -> list[EpisodeRow]:
-    """What ``write_rows`` wrote.
+    """Read rows that ``write_rows`` wrote.
 
     Raises:
         TaccorlError: a line that is not a row.

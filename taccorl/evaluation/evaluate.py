@@ -1,4 +1,4 @@
-"""Policies × tasks × scene seeds → rows; a stored evaluation of the same scenes as the other side of a comparison."""
+"""Evaluate policies on tasks and scene seeds; read a stored evaluation of the same scenes for a comparison."""
 
 import dataclasses
 import json
@@ -72,7 +72,7 @@ class Scenes:
         return load_twin(self.twin) if self.twin else TwinConfig()
 
     def environments(self, task: str, num_envs: int, *, images: bool, part_poses: bool = False) -> TaccorlVectorEnv:
-        """That stand still once their episode is over.
+        """Environments whose simulations are frozen after the end of their episode.
 
         Raises:
             TaccorlError: as ``TaccorlVectorEnv``.

@@ -28,11 +28,11 @@ class ExpertActor:
         self._actions: Iterator[np.ndarray] = iter(())
 
     def looks_now(self) -> bool:
-        """Never."""
+        """False: the expert uses no pictures."""
         return False
 
     def restart(self) -> None:
-        """Nothing: its random numbers follow from the scene's seed."""
+        """Does nothing: random numbers follow from the scene's seed."""
 
     def begin(self, envs: TaccorlVectorEnv) -> None:
         """

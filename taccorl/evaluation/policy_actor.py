@@ -226,11 +226,11 @@ class PolicyActor:
         return getattr(self._config, "n_obs_steps", None) != 1 or not isinstance(queue, deque) or not queue
 
     def restart(self) -> None:
-        """Put random numbers back to where they were when this was made."""
+        """Restore the state of the random numbers at construction."""
         set_rng_state(self._random_state)
 
     def begin(self, envs: TaccorlVectorEnv) -> None:
-        """Forget the last episode.
+        """Reset the policy at the start of an episode.
 
         Raises:
             TaccorlError: the policy was trained on the poses of other parts.

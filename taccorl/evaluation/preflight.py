@@ -1,4 +1,5 @@
-"""A checkpoint beside the environment, before any rollout: cameras, state, touch, action, rate, normalisation, robot.
+"""Preflight: compare a checkpoint with the environment before any rollout (cameras, state, touch, action, rate,
+normalisation, robot).
 
 Free of torch: a checkpoint's side comes as ``PolicyFacts``.
 """
@@ -24,7 +25,7 @@ _IMAGES = "observation.images."
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyFacts:
-    """What a checkpoint says of its inputs and outputs. None: it does not say."""
+    """Inputs and outputs as stated by a checkpoint. None: not stated."""
 
     inputs: dict[str, tuple[int, ...]]
     """LeRobot key → shape; pictures (3, rows, columns)."""
@@ -53,7 +54,7 @@ class Check:
 
 
 def preflight(policy: PolicyFacts, twin: TwinConfig) -> list[Check]:
-    """Both sides, line by line."""
+    """Compare checkpoint and environment, one ``Check`` per property."""
     return [
         _cameras(policy, twin),
         _same("state", _shape(policy.inputs.get(STATE_KEY)), _shape(ROBOT.action_low.shape), optional=True),

@@ -1,4 +1,4 @@
-"""One batch of episodes: any actor in ``TaccorlVectorEnv``, each episode to its own end.
+"""Roll out one batch of episodes: any actor in ``TaccorlVectorEnv``, each episode up to its own end.
 
 Letters in shapes: N environments, T control steps of an episode.
 """
@@ -21,7 +21,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Acted:
-    """What an actor does in one control step."""
+    """Actions of an actor in one control step."""
 
     actions: np.ndarray
     """(N, 14) targets [rad, m]."""
@@ -65,7 +65,7 @@ class Actor(Protocol):
         ...
 
     def act(self, observation: Observation) -> Acted:
-        """The next action of each environment; of those that are over, anything."""
+        """Next action of each environment; rows of finished environments are ignored."""
         ...
 
 

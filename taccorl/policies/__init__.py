@@ -1,1 +1,1 @@
-"""Policies that feel, as LeRobot policies."""
+"""Policies with tactile input, as LeRobot policies."""

@@ -120,7 +120,7 @@ def random_policy(backbone: str, device: str, *, tactile: bool) -> Any:
 
 
 def _lerobots_pi05() -> Any:
-    """LeRobot's own policy in the same size, untouched."""
+    """LeRobot's own policy in the same size, unchanged."""
     import torch
     from lerobot.policies.pi05.configuration_pi05 import PI05Config
     from lerobot.policies.pi05.modeling_pi05 import PI05Policy

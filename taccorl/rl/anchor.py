@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 class Anchor(Protocol):
-    """Something that adds its gradient to that of PPO."""
+    """Interface of a loss that adds its gradient to that of PPO."""
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
         """Add the gradient of β · ℓ of one optimiser step's rows; the loss ℓ, without β."""

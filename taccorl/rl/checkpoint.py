@@ -1,4 +1,4 @@
-"""Checkpoints of post-training: a LeRobot policy folder, and what is needed to go on bit for bit.
+"""Checkpoints of post-training: a LeRobot policy folder, and the state from which a run continues bit for bit.
 
     checkpoints/000010/pretrained_model/       policy and processors, as lerobot-train writes them
     checkpoints/000010/training_state/state.pt critic, optimisers, random states, environments, counters

@@ -1,4 +1,4 @@
-"""Size of the exploration noise where it counts: targets of the joints [rad] and the position of the hand [mm].
+"""Size of the exploration noise in physical units: joint targets [rad] and position of the hand [mm].
 
 The policy's numbers are normalised, each step of a chunk by its own deviation; what a level of noise does to the arm follows only
 after un-normalising. Here the same decisions are sampled twice from the same initial noise, with the stochastic step and without.

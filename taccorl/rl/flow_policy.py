@@ -1,4 +1,4 @@
-"""A flow-matching policy as PPO uses it: sample with Flow-SDE, score what was sampled, and give the critic its features.
+"""Flow-matching policy for PPO: sampling with Flow-SDE, log-probabilities of samples, and features for the critic.
 
 Sampling and scoring run the same computation: one pass over the prefix, whose keys and values are kept, then the action expert
 for each denoising step, in evaluation mode. So the ratio of probabilities before the first update is 1 up to the rounding of
@@ -56,7 +56,7 @@ class FlowPolicy(ABC):
 
     @torch.no_grad()
     def features(self, batch: Batch) -> Tensor:
-        """(B, F) for the critic."""
+        """Features (B, F) for the critic."""
         return self.each(batch, lambda rows, velocity, features_BF: (features_BF,))[0]
 
     def log_prob(self, batch: Batch, sde: FlowSDE, before_BSHD: Tensor, after_BSHD: Tensor, step_BS: Tensor) -> Tensor:

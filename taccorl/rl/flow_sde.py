@@ -47,7 +47,7 @@ class Draws(NamedTuple):
     """Index k of the step that each noise belongs to; −1: unused."""
 
     def rows(self, rows: Any) -> "Draws":
-        """Those of some rows."""
+        """The draws of some rows."""
         return Draws(*(x[rows] for x in self))
 
 
@@ -80,7 +80,7 @@ class FlowSDE:
         return [self.level * math.sqrt(-self.dt * t / r) for t, r in zip(self.times, rest, strict=True)]
 
     def draw(self, num_rows: int, shape: tuple[int, int], generator: torch.Generator, device: Any = "cpu") -> Draws:
-        """Of ``num_rows`` samples of ``shape`` (H, D), from a generator on the CPU: the same numbers on every device."""
+        """Draw the random numbers for ``num_rows`` samples of ``shape`` (H, D), on the CPU: the same on every device."""
         initial = torch.randn(num_rows, *shape, generator=generator)
         noise = torch.randn(num_rows, self.num_stochastic, *shape, generator=generator)
         if self.num_stochastic == 1:

@@ -58,7 +58,7 @@ class Decisions:
         return len(self.log_prob_M)
 
     def rows(self, rows: Tensor) -> "Decisions":
-        """Some of them."""
+        """The decisions with these indices."""
         others = {k: x[rows] for k, x in vars(self).items() if k != "batch"}
         return Decisions(batch={k: x[rows] for k, x in self.batch.items()}, **others)
 
@@ -90,7 +90,7 @@ class PPO:
 
     @property
     def actor_lr(self) -> float:
-        """Of the next steps."""
+        """Learning rate of the actor for the next steps."""
         return self.actor_optimizer.param_groups[0]["lr"]
 
     @actor_lr.setter
@@ -247,7 +247,7 @@ class PPO:
         return False
 
     def state_dict(self) -> dict[str, Any]:
-        """All but the policy's weights."""
+        """State of critic, optimisers and counters, without the policy's weights."""
         return {
             "critic": self.critic.state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
@@ -256,7 +256,7 @@ class PPO:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """What ``state_dict`` gave."""
+        """Restore a state from ``state_dict``."""
         self.critic.load_state_dict(state["critic"])
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])

@@ -54,7 +54,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Seen:
-    """What policy and critic see of some environments."""
+    """Inputs of policy and critic for some environments."""
 
     batch: Batch
     privileged_NP: Tensor
@@ -62,7 +62,7 @@ class Seen:
 
 @dataclass(frozen=True, kw_only=True)
 class Acted:
-    """What N chunks led to."""
+    """Result of N executed chunks."""
 
     reward_N: Tensor
     terminated_N: Tensor
@@ -86,7 +86,7 @@ class World(Protocol):
         ...
 
     def observe(self) -> Seen:
-        """Of all environments, now."""
+        """Present inputs of all environments."""
         ...
 
     def act(self, actions_NHA: Tensor) -> Acted:
@@ -100,7 +100,7 @@ class World(Protocol):
 
 @dataclass(frozen=True)
 class Rollout:
-    """T · N decisions, and what became of the episodes that ended within."""
+    """T · N decisions, and outcomes of the episodes that ended within."""
 
     decisions: Decisions
     outcomes: Counter[str]

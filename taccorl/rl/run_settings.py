@@ -1,4 +1,4 @@
-"""``settings.json`` in a run's folder: what a run of post-training was begun with, and what resuming it takes from there."""
+"""``settings.json`` in a run's folder: the settings with which a run of post-training was started, used when it is resumed."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ _TWIN_DIGEST = "env.twin_sha256"
 
 
 def write(settings: PostTrainSettings) -> None:
-    """In one step: a full disk leaves the file of before."""
+    """Write the settings atomically: on a full disk the previous file remains."""
     new = settings.out / f".{SETTINGS}.new"
     new.write_text(json.dumps(_to_json(settings), indent=1) + "\n", encoding="utf-8")
     new.replace(settings.out / SETTINGS)

@@ -35,7 +35,7 @@ class PolicySettings:
 
 @dataclass(kw_only=True)
 class EnvSettings:
-    """The twin, and how many of it."""
+    """Settings of the environments: task, twin, number of environments and processes."""
 
     task: str | None = None
     """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's."""
@@ -86,7 +86,7 @@ class EnvSettings:
 
 @dataclass(kw_only=True)
 class FlowSDESettings:
-    """Exploration."""
+    """Settings of the exploration noise."""
 
     num_steps: int = 4
     """K_denoise. The policy's num_inference_steps is set to it."""

@@ -1,4 +1,4 @@
-"""States of the policy's own episodes, in which later episodes begin: after each arm's first grasp, before an arm is done.
+"""States from the policy's own episodes in which later episodes start: after each arm's first grasp, before an arm has finished.
 
 Most decisions of an episode are transport, which a policy that was trained on demonstrations knows. Episodes that begin where the
 parts are about to meet have several times as many decisions where it fails. The states are the policy's own, so that they are
@@ -19,7 +19,8 @@ _TIME_LEFT = 1 / 3
 
 
 class StartStates:
-    """A ring of states of single environments, each with its window of touch; and who begins in one."""
+    """Ring buffer of states of single environments with their windows of touch, and the choice of environments that start in
+    one."""
 
     def __init__(self, share: float, size: int) -> None:
         """
@@ -31,7 +32,7 @@ class StartStates:
         self.restart(0)
 
     def restart(self, seed: int | tuple[int, ...]) -> None:
-        """Forget all states."""
+        """Delete all states."""
         self._rng = np.random.default_rng(seed)
         self._kept: list[tuple[Snapshot, np.ndarray]] = []
         self._next = 0
@@ -62,17 +63,17 @@ class StartStates:
         return chosen_N, self._rng.integers(len(self._kept), size=chosen_N.sum()).tolist() if chosen_N.any() else []
 
     def states(self, numbers: list[int]) -> tuple[Snapshot, np.ndarray]:
-        """Their snapshot, and windows (n, L, K)."""
+        """Snapshot of these states, and their windows (n, L, K)."""
         chosen = [self._kept[k] for k in numbers]
         return _joined([snapshot for snapshot, _ in chosen]), np.stack([window for _, window in chosen])
 
     def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on bit for bit."""
+        """State from which a run continues bit for bit."""
         kept = [(dataclasses.asdict(snapshot), window) for snapshot, window in self._kept]
         return {"kept": kept, "next": self._next, "generator": self._rng.bit_generator.state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """What ``state_dict`` gave."""
+        """Restore a state from ``state_dict``."""
         self._kept = [(Snapshot(**fields), window) for fields, window in state["kept"]]
         self._next = state["next"]
         self._rng.bit_generator.state = state["generator"]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class StepUndo:
-    """Copies of what an optimiser moves."""
+    """Copies of an optimiser's weights and moments, to restore them."""
 
     def __init__(self, optimizer: torch.optim.Optimizer) -> None:
         self._optimizer = optimizer
@@ -35,7 +35,7 @@ class StepUndo:
 
     @torch.no_grad()
     def restore(self) -> None:
-        """Go back to what ``keep`` saw last. Learning rates stay as they are."""
+        """Restore weights and moments of the last ``keep``. Learning rates stay as they are."""
         for p, kept, state in zip(self._parameters(), self._weights, self._states, strict=True):
             p.copy_(kept)
             if not state:  # there were no moments yet

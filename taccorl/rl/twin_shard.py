@@ -25,7 +25,7 @@ from taccorl.sim.vector_env import TaccorlVectorEnv
 
 @dataclass(frozen=True)
 class ShardSeen:
-    """What is seen of some environments."""
+    """Observations of some environments."""
 
     observation: Observation
     window_NLK: np.ndarray
@@ -34,7 +34,7 @@ class ShardSeen:
 
 @dataclass(frozen=True, kw_only=True)
 class ShardActed:
-    """What N chunks led to; fields as of ``rollout.Acted``."""
+    """Result of N executed chunks; fields as of ``rollout.Acted``."""
 
     reward_N: np.ndarray
     terminated_N: np.ndarray
@@ -117,7 +117,7 @@ class TwinShard:
 
     @property
     def part_names(self) -> tuple[str, ...]:
-        """Of the poses of the task's parts."""
+        """Names of the numbers of the parts' poses."""
         return part_pose_names(self.envs.sim.task)
 
     @property
@@ -126,14 +126,14 @@ class TwinShard:
         return self.envs.sim.judge.limit_steps
 
     def restart(self, seed: int) -> None:
-        """Begin the stream of scenes ``seed``."""
+        """Start new episodes with the seed sequence of ``seed``."""
         self._root, self._episode_N[:], self._began_later_N[:] = seed, 0, False
         self.starts.restart((seed, self._first))
         observation, _ = self.envs.reset(seed=self._seeds())
         self._window_NLK = self._repeated(observation[TACTILE_KEY])
 
     def observe(self) -> ShardSeen:
-        """Of all environments, now."""
+        """Present observations of all environments."""
         return self._seen(np.arange(self.num_envs))
 
     def _seen(self, ids: np.ndarray) -> ShardSeen:
@@ -199,7 +199,7 @@ class TwinShard:
         return np.nan_to_num(numbers[ids], nan=0.0, posinf=0.0, neginf=0.0)  # of a diverged simulation
 
     def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on bit for bit; no episode is over between two calls of ``act``."""
+        """State from which a run continues bit for bit; between two calls of ``act`` no episode is finished."""
         snapshot = self.envs.sim.snapshot()
         fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
         return {
@@ -212,7 +212,7 @@ class TwinShard:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """What ``state_dict`` gave.
+        """Restore a state from ``state_dict``.
 
         Raises:
             TaccorlError: of another number of environments, task, difficulty, twin or randomisation.

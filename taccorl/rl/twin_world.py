@@ -94,7 +94,7 @@ class TwinWorld:
         return [each.result() for each in waiting]
 
     def restart(self, seed: int) -> None:
-        """Begin the stream of scenes ``seed``."""
+        """Start new episodes with the seed sequence of ``seed``."""
         self._each(lambda shard, *_: shard.restart(seed))
         self.watch.reset()
 
@@ -153,11 +153,11 @@ class TwinWorld:
         return Seen(batch, torch.from_numpy(privileged_NP).float().to(self._device))
 
     def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on bit for bit; no episode is over between two calls of ``act``."""
+        """State from which a run continues bit for bit; between two calls of ``act`` no episode is finished."""
         return {"shards": self._each(lambda shard, *_: shard.state_dict()), "watch": copy.deepcopy(vars(self.watch))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """What ``state_dict`` gave.
+        """Restore a state from ``state_dict``.
 
         Raises:
             TaccorlError: of another number of environments or shards, task, difficulty, twin or randomisation.

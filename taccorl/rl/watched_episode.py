@@ -1,4 +1,4 @@
-"""Episodes of environment 0 of the rollouts, to look at: as ``taccorl evaluate`` shows failures, and with the critic's values.
+"""Episodes of environment 0 of the rollouts for Rerun, with the critic's values.
 
 A rollout keeps only seed, actions and values. They are executed again apart from it, bit for bit, so that it costs the rollout
 nothing and changes none of its random numbers.
@@ -40,7 +40,7 @@ class WatchedEpisode:
 
 @dataclass
 class EpisodeWatch:
-    """The episode that environment 0 is in, and the first one that ended since ``take``."""
+    """Records the present episode of environment 0, and keeps the first one that ended since ``take``."""
 
     chunks: list[np.ndarray] = field(default_factory=list)
     values: list[np.ndarray] = field(default_factory=list)
@@ -48,17 +48,17 @@ class EpisodeWatch:
     ended: WatchedEpisode | None = None
 
     def reset(self) -> None:
-        """Another episode begins."""
+        """Start recording a new episode."""
         self.chunks, self.values, self.value = [], [], math.nan
 
     def stepped(self, actions_nA: np.ndarray) -> None:
-        """Actions that were executed, of one decision."""
+        """Record the executed actions of one decision."""
         self.chunks.append(actions_nA.copy())
         self.values.append(np.full(len(actions_nA), self.value, dtype=np.float32))
         self.value = math.nan
 
     def end(self, seed: int, outcome: str, partial: int) -> None:
-        """The episode is over."""
+        """End the present episode."""
         if self.ended is None and self.chunks:
             actions_TA, values_T = np.concatenate(self.chunks), np.concatenate(self.values)
             self.ended = WatchedEpisode(seed, outcome, partial, actions_TA, values_T)
@@ -70,7 +70,7 @@ class EpisodeWatch:
 
 
 def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, images: bool) -> Episode:
-    """Its rows, with the feature ``rl.value``.
+    """Execute a watched episode again; returns its rows with the feature ``rl.value``.
 
     Args:
         scenes: of the rollout; those with another seed than the episode's do not matter.

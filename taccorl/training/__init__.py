@@ -1,1 +1,1 @@
-"""Training on datasets and in the twin."""
+"""Training: datasets of both domains, dataset reader, frame cache, LeRobot's commands as steps."""

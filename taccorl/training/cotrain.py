@@ -1,6 +1,6 @@
-"""The dataset of co-training: real and simulated episodes in one, each row told apart, with exact statistics.
+"""Merge real and simulated datasets for co-training: each row is marked with its domain, statistics are exact.
 
-``taccorl merge`` makes it, ``lerobot-train --policy.type=tactile_pi05 --policy.sim_weight=…`` weighs its rows
+``taccorl merge`` makes it, ``lerobot-train --policy.type=tactile_pi05 --policy.sim_weight=…`` weights its rows
 (``taccorl.policies.tactile_pi05.mixture``).
 """
 
@@ -31,7 +31,7 @@ VERSION = 2  # of the stage
 
 @dataclass(frozen=True)
 class Part:
-    """A dataset that went in."""
+    """One input dataset of the merge."""
 
     dataset: str
     is_sim: bool
@@ -42,7 +42,7 @@ class Part:
 
 
 def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) -> list[Part]:
-    """``merge_domains`` as a stage: not done again where it has been done, and ``taccorl lineage explain`` tells of it.
+    """Run ``merge_domains`` as a stage: its result is stored and shown by ``taccorl lineage explain``.
 
     Raises:
         DatasetError: as ``merge_domains``.
@@ -65,7 +65,7 @@ def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) 
 
 
 def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
-    """Features that all datasets have, if they can be merged.
+    """Check that the datasets can be merged; returns the features that all of them have.
 
     Raises:
         DatasetError: as ``merge_domains``.
@@ -96,7 +96,7 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
 
 
 def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[Part]:
-    """Datasets of both domains → one at ``out``, with ``observation.is_sim`` and what all of them hold.
+    """Merge datasets of both domains into one at ``out``, with their common features and ``observation.is_sim``.
 
     A simulator's own columns (``sim.*``) and optional features that not all of them hold are left out. Statistics are computed
     anew over all rows: LeRobot 0.6.1 takes the mean of the datasets' quantiles, which is no quantile of theirs together.

@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class CacheRequest:
-    """Where frames are to be held, and how large."""
+    """Request for cached frames: place (gpu, host, disk), resolution, store."""
 
     place: Place
     resolution: tuple[int, int] | None
@@ -60,7 +60,7 @@ class CacheRequest:
 
 @dataclass(frozen=True)
 class FramesConfig:
-    """Of the stage ``frames``."""
+    """Configuration of the stage ``frames``."""
 
     resolution: tuple[int, int] | None
 
@@ -91,12 +91,12 @@ FRAMES = Stage(name="frames", fn=_write_frames, version=1)
 
 
 def frames_file(folder: Path, key: str) -> Path:
-    """Of a camera, in the artefact: (N, 3, rows, columns) uint8."""
+    """Path of a camera's frames in the artefact: (N, 3, rows, columns) uint8."""
     return folder / f"{key}.npy"
 
 
 def empty_frames(folder: Path, key: str, num_rows: int, resolution: tuple[int, int]) -> np.memmap:
-    """That file, of zeros, to be written."""
+    """Create that file, filled with zeros, as a writable memory map."""
     shape = (num_rows, 3, *resolution)
     return np.lib.format.open_memmap(frames_file(folder, key), mode="w+", dtype=np.uint8, shape=shape)
 
@@ -161,7 +161,7 @@ def resized(pictures: np.ndarray, resolution: tuple[int, int] | None) -> np.ndar
 
 
 class Frames:
-    """The pictures of a dataset where they are wanted.
+    """Frames of a dataset in the requested place.
 
     Args:
         arrays: camera → (N, 3, rows, columns) uint8.
@@ -190,7 +190,7 @@ class Frames:
 
 
 def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_rows: int, numbers_bytes: int) -> Frames:
-    """Frames of the dataset at ``root``, decoded now if no run did before.
+    """Open the frames of the dataset at ``root``; they are decoded if they are not in the store.
 
     Raises:
         DatasetError: damaged videos, or frames of another number than the dataset has rows.

@@ -1,4 +1,4 @@
-"""LeRobot's own commands as steps of a pipeline: what is finished is not done again, what was stopped goes on."""
+"""LeRobot's own commands as steps of a pipeline: a finished run is not repeated, a stopped one continues."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ FIRST_SEED = 1000
 class Training:
     """One run of lerobot-train.
 
-    Its folder is named after all that decides, so that other data or another recipe never finds this run's policy.
+    Its folder's name depends on data, recipe and options, so that other settings never use this run's policy.
     """
 
     def __init__(self, recipe: Path, dataset: Path, words: Sequence[str], out: Path) -> None:
@@ -45,7 +45,7 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """Done so far."""
+        """Number of training steps done so far."""
         told = self.folder / "checkpoints/last/training_state/training_step.json"
         return int(json.loads(told.read_text(encoding="utf-8"))["step"]) if told.is_file() else 0
 

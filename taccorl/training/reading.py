@@ -7,7 +7,7 @@ that are wanted, videos stay open, and a policy's ``window_delta_indices`` names
 is the same, to the bit and the type; tests compare. With ``--dataset.cache=gpu|host|disk`` whole batches are gathered from
 numbers and decoded frames (``frame_cache``) instead of row by row.
 
-``TACCORL_NO_PATCH=1`` leaves LeRobot as it is. So does any other version of LeRobot than the one that was compared.
+With ``TACCORL_NO_PATCH=1``, or with a version of LeRobot other than the tested one, LeRobot is not changed.
 """
 
 import bisect
@@ -47,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 
 def install() -> bool:
-    """Let LeRobot make its datasets with ``FastReader``; once, however often it is called. False: left as it is."""
+    """Let LeRobot make its datasets with ``FastReader``; once, however often it is called. False: not changed."""
     from lerobot.datasets import factory, lerobot_dataset, video_utils
 
     if os.environ.get("TACCORL_NO_PATCH") == "1":
@@ -107,7 +107,7 @@ _reads_pictures = True
 
 
 def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """LeRobot's ``make_dataset``, whose reader knows what ``--dataset.cache`` asks for."""
+    """LeRobot's ``make_dataset`` with the reader set up for ``--dataset.cache``."""
 
     def make_with_cache(cfg: Any) -> Any:
         global _requested, _reads_pictures
@@ -122,7 +122,7 @@ def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def cache_request(cfg: Any) -> CacheRequest | None:
-    """What a training's options ask for.
+    """Cache request of a training's options.
 
     Raises:
         TaccorlError: no such place, or options that go with no cache.
@@ -150,7 +150,7 @@ class WholeBatch(dict):
     """A batch as LeRobot's loader gives it, already collated."""
 
     def pin_memory(self) -> "WholeBatch":
-        """What is on the CPU, pinned."""
+        """Pin the tensors that are on the CPU."""
         pinned = {k: v.pin_memory() for k, v in self.items() if isinstance(v, Tensor) and v.device.type == "cpu"}
         return WholeBatch({**self, **pinned})
 
@@ -259,7 +259,7 @@ def _warn_unverified(root: Path) -> None:
 
 
 class FastReader(DatasetReader):
-    """LeRobot's reader, where a dataset is numbers and colour videos; anything else goes LeRobot's own way."""
+    """LeRobot's reader, replaced by a faster one for datasets of numbers and colour videos; others are read by LeRobot."""
 
     _columns: dict[str, Column] | None = None
     _gathered: "Gathered | None" = None
@@ -480,7 +480,7 @@ class OpenVideos(threading.local):
         self._open: OrderedDict[Path, InputContainer] = OrderedDict()
 
     def picture(self, path: Path, time_s: float, tolerance_s: float) -> Tensor | None:
-        """(3, rows, columns) uint8 of the frame that is nearest to ``time_s``; None: none within the tolerance."""
+        """Frame nearest to ``time_s``, (3, rows, columns) uint8; None if none is within the tolerance."""
         nearest, distance_s = None, tolerance_s
         for frame, frame_s in self._frames(path, time_s):
             if abs(frame_s - time_s) < distance_s:

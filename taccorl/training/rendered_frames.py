@@ -1,4 +1,4 @@
-"""Frames for training, rendered from a dataset's simulator states into the cache: no video is encoded, decoded or needed.
+"""Render frames for training from a dataset's simulator states into the cache, without any video.
 
 The artefact is that of ``frame_cache``: the same stage, key and files, so that ``lerobot-train --dataset.cache=…`` finds it. Each
 worker renders the cameras of whole episodes at the size of the dataset's pictures, resizes them as the policy does, and writes

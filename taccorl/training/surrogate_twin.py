@@ -1,6 +1,6 @@
 """A surrogate of the robot for co-training: the twin with effects that the user's twin lacks, other cameras and another gain.
 
-It is simulated, and what is collected in it has to say so (``ORIGIN``). For finding missing effects there is a surrogate of its
+It is simulated, and data collected in it is labelled so (``ORIGIN``). For finding missing effects there is a surrogate of its
 own physics, ``taccorl surrogate``; it has no scene to demonstrate in.
 """
 
@@ -27,7 +27,7 @@ CAMERA_TURN_RAD, CAMERA_SHIFT_M = 0.02, 0.01
 
 
 def draw_surrogate_twin(secret: int) -> TwinConfig:
-    """Another robot for each ``secret``; ranges are choices, about what the effects call typical.
+    """Draw a surrogate robot: another one for each ``secret``. Ranges are choices around the effects' typical values.
 
     Raises:
         TaccorlError: the secret is negative.

@@ -1,1 +1,1 @@
-"""Rerun and pictures: what an episode looks and feels like."""
+"""Views of episodes: Rerun, figures and pages."""

@@ -1,4 +1,4 @@
-"""How an episode opens: left what it looked and felt like, right everything over time, on one linked time axis."""
+"""Layout of an episode in Rerun: pictures and touch on the left, curves over time on the right, on one linked time axis."""
 
 import itertools
 
@@ -19,7 +19,7 @@ EYE_SIZES, EYE_M = 1.1, 1.15
 
 
 def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blueprint:
-    """Views for what the episode holds.
+    """Blueprint with a view for each kind of data in the episode.
 
     Args:
         at_s: stand still at this time (for pictures); None: play from the start.

@@ -1,4 +1,5 @@
-"""A comparison into Rerun: measured, replayed, residual and noise floor of every signal over time; pads measured and replayed.
+"""Write a comparison for Rerun: measured, replayed, residual and noise floor of every signal over time; pads measured and
+replayed.
 
     /<recording>/<signal>/<kind>/{command,measured,twin,mended}
     /<recording>/<signal>/<kind>/residual/{twin,mended,floor_high,floor_low}
@@ -33,7 +34,7 @@ MOST_ROWS = 5
 
 
 def save_comparison(comparison: Comparison, rrd: Path, after: Comparison | None = None) -> None:
-    """Everything compared, and the arrangement of its views, as one .rrd file.
+    """Write all compared signals and the layout of their views as one .rrd file.
 
     Args:
         after: another twin on the same recordings.

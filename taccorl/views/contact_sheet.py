@@ -1,4 +1,4 @@
-"""One picture that tells an episode: what cameras and pads showed at a few instants, and below, touch and grippers over time.
+"""Contact sheet of an episode: cameras and pads at a few instants, and below, touch and grippers over time.
 
 Rows are instants, spread over the episode, one of them where touch is strongest. All pads share one fixed colour scale.
 """
@@ -51,7 +51,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things stand on the sheet; tests look there."""
+    """Positions of the elements on the sheet, for tests."""
 
     instants: tuple[int, ...]
     """Rows of the episode."""

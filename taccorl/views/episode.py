@@ -1,4 +1,4 @@
-"""An episode into Rerun, column by column: what the robot saw, felt, did and was told, and where it all came from.
+"""Write an episode for Rerun, column by column: pictures, touch, states, commands, events and provenance.
 
     /observation/images/<camera>     pictures: the dataset's own mp4 packets, or JPEG where there is no mp4 (a recording)
     /observation/tactile/<pad>       heatmaps, counts above baseline, one fixed colour scale
@@ -38,7 +38,7 @@ EVENT_COLORS = (0x2563EBFF, 0x0D9488FF, 0xCA8A04FF, 0x9333EAFF, 0xDB2777FF, 0x65
 
 
 def log_episode(rec: rr.RecordingStream, episode: Episode, *, native: bool = False) -> None:
-    """Everything the episode holds; what it lacks is left out.
+    """Log all data of the episode; missing features are left out.
 
     Args:
         native: for the Rerun program on this machine: a video that it cannot decode here is logged as JPEG pictures.

@@ -1,4 +1,4 @@
-"""Which numbers of a vector belong into one plot: same unit, same arm, short names."""
+"""Group the elements of a vector into plots: same unit, same arm, short names."""
 
 import re
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ MOST_LINES = 8
 
 @dataclass(frozen=True)
 class Group:
-    """Lines of one plot."""
+    """Elements of a vector that share one plot."""
 
     name: str
     unit: str

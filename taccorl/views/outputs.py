@@ -1,4 +1,4 @@
-"""Files that views write: each says where it is from, and none lands on somebody else's file."""
+"""Output files of views: each contains its origin, and no file of the user is overwritten."""
 
 import contextlib
 import errno
@@ -23,11 +23,11 @@ DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 class OutputError(TaccorlError):
-    """A file that is in the way, or for which the disk has no room."""
+    """Error: the output file exists and is not ours, or the disk is full."""
 
 
 def check_free(path: Path) -> None:
-    """May ``path`` be written? Yes if nothing is there, or an earlier file of ours: it says so itself.
+    """Check that ``path`` may be written: nothing is there, or a file that taccorl wrote.
 
     Raises:
         OutputError: something else is there, or there is no such folder.

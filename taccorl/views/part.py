@@ -1,4 +1,4 @@
-"""A stretch of an episode, as an episode."""
+"""A part of an episode, as an episode."""
 
 import dataclasses
 import itertools

@@ -1,4 +1,4 @@
-"""What an episode is and where it came from, as a page for people."""
+"""Provenance of an episode as a page of text."""
 
 import re
 
@@ -17,7 +17,8 @@ def outcome(episode: Episode) -> str:
 
 
 def provenance(episode: Episode) -> str:
-    """Markdown: origin first, then what it is, the sensor's numbers, the channels' timing, and whatever else is known."""
+    """Provenance page in Markdown: origin first, then contents, the sensor's numbers, the channels' timing, and whatever else
+    is known."""
     spec = episode.spec
     lines = [
         f"**origin: {episode.origin or NO_ORIGIN}**",

@@ -1,4 +1,4 @@
-"""What the pads say in every row: active taxels, their sum, the peak, and the contact gate.
+"""Touch signals of every row: active taxels, their sum, the peak, and the contact gate.
 
 Letters in shapes: T rows (time).
 """

@@ -21,7 +21,7 @@ PICTURE_TIMEOUT_S = 180.0
 
 
 class ViewerError(TaccorlError):
-    """Nothing here can show or draw this: names what is missing and the command that installs it."""
+    """Error: no viewer is available. Names what is missing and the command that installs it."""
 
 
 def require_screen() -> None:

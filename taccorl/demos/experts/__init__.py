@@ -1,4 +1,4 @@
-"""Scripted demonstrators, one file a task: they stand in for a teleoperator on machines without one."""
+"""Scripted experts, one file per task: they demonstrate in place of a person who teleoperates."""
 
 from taccorl.demos.experts.scripted import ScriptedExpert
 from taccorl.plugins import Registry

@@ -35,7 +35,7 @@ class AirAssembly(ScriptedExpert):
 
     @abstractmethod
     def holder(self) -> tuple[Part, str, str]:
-        """The part with the hole, its grasp, the hole."""
+        """The part with the hole, its grasp pose, and the hole."""
 
     @abstractmethod
     def world_from_level(self) -> np.ndarray:
@@ -43,11 +43,11 @@ class AirAssembly(ScriptedExpert):
 
     @abstractmethod
     def plug(self) -> tuple[Part, str]:
-        """The part that goes in, its grasp."""
+        """The part that is inserted, and its grasp pose."""
 
     @abstractmethod
     def push_in(self, mating: Mating) -> Script:
-        """From both parts held to the plug in its place, still in the hand."""
+        """Insert the plug, from both parts held to the plug in place and still in the hand."""
 
     def script(self, arm: str) -> Script:
         return self._left() if arm == "left" else self._right()

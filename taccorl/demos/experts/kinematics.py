@@ -21,7 +21,7 @@ _MARGIN_RAD = 0.02  # kept from the joint limits, so that a trembling hand stays
 
 
 class ArmKinematics:
-    """One arm without anything around it."""
+    """Kinematics of one arm, without collisions."""
 
     def __init__(self, arm: str, robot: RobotConfig) -> None:
         spec = mujoco.MjSpec()

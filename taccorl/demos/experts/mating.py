@@ -1,4 +1,4 @@
-"""A held part and the hole it is to go into: how it fits now, and where a hand has to be that aims with an error."""
+"""A held part and its hole: the present pose error, and the pose of a hand that aims with an error."""
 
 from dataclasses import dataclass, field, replace
 from typing import Protocol
@@ -10,7 +10,7 @@ from taccorl.sim.part import Fit, Part, measure_fit
 
 
 class Seen(Protocol):
-    """What is looked at: an expert's scene."""
+    """Interface of the scene that an expert reads."""
 
     def body(self, name: str) -> np.ndarray:
         """World-from-body (4, 4) now."""
@@ -38,7 +38,7 @@ class Mating:
         return scene.body(self.holder) @ self.holder_from_hole, scene.body(self.held) @ self.held_from_mate
 
     def fit(self, scene: Seen) -> Fit:
-        """How the held part stands in the hole now."""
+        """Present pose error of the held part in the hole."""
         return measure_fit(*self._relative(scene), self.num_turns)
 
     def axis(self, scene: Seen) -> np.ndarray:
@@ -55,7 +55,7 @@ class Mating:
 
 @dataclass(frozen=True, kw_only=True)
 class Aim:
-    """Where a hand wants to bring a held part, and how wrong it is about it."""
+    """Target of a hand that inserts a held part, with the hand's aiming error."""
 
     off_m: np.ndarray
     """(2,) error across the hole's axis."""
@@ -69,7 +69,7 @@ class Aim:
     """(6,) [m, rad], frame of the hole: how far the wrist has given way, about the TCP; never along the axis."""
 
     def pose(self, scene: Seen, mating: Mating, depth_m: float) -> np.ndarray:
-        """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, as far as the hand knows."""
+        """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, with the hand's aiming error."""
         hole = scene.body(mating.holder) @ mating.holder_from_hole
         mate = transform((*self.off_m, depth_m)) @ turn(self.off_rad) @ self.turned
         pose = hole @ mate @ inverse(mating.held_from_mate) @ self.part_from_tcp
@@ -78,7 +78,7 @@ class Aim:
         return pose
 
     def giving_way(self, scene: Seen, mating: Mating, push_world: np.ndarray) -> "Aim":
-        """The wrist lets itself be moved by ``push_world`` (6,) [m, rad], but not back out of the hole."""
+        """The aim after the compliant wrist was displaced by ``push_world`` (6,) [m, rad], except along the hole's axis."""
         world_from_hole = (scene.body(mating.holder) @ mating.holder_from_hole)[:3, :3]
         sideways = world_from_hole.T @ push_world[:3] * (1, 1, 0)
         return replace(self, given=self.given + np.r_[sideways, world_from_hole.T @ push_world[3:]])

@@ -1,4 +1,4 @@
-"""Do Puzzle: pieces are picked up by their knobs, pressed onto the tray and felt into their holes."""
+"""Do Puzzle: pieces are picked up by their knobs, pressed onto the tray and moved until they drop into their holes."""
 
 from collections.abc import Generator
 from dataclasses import replace

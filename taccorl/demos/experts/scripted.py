@@ -1,8 +1,9 @@
-"""The scripted demonstrator: two hands that move like a person at leader arms, feel when a part is blocked, and correct.
+"""The scripted expert: two hands that move like a person at leader arms, detect when a part is blocked, and correct their aim.
 
 Each arm is a generator of ``Wish``es (TCP pose, gripper opening), one a control step; ``act`` turns both into 14 joint targets.
-It sees the true poses, as a person sees the bench, but aims with an error: where a mating part is off it notices only by
-being blocked, as a person feels it, backs off and errs less on the next try. Those corrections are what a policy with touch is
+It sees the true poses, as a person sees the bench, but aims with an error: it detects a wrong aim only when
+the part is blocked, as a person does, backs off and has a smaller error in the next try. Those corrections are what a policy
+with touch is
 to learn. Figures of the human likeness: research notes on teleoperation in the issue, tuned to ~2 corrections per insertion.
 """
 
@@ -42,7 +43,7 @@ _OPEN_ENOUGH_M = 0.003  # narrower than open
 
 @dataclass(kw_only=True)
 class ScriptedExpertConfig:
-    """How human the hands are. All zero: exact."""
+    """Human-like errors and speeds of the hands. All zero: exact."""
 
     speed: float = 1.0
     """Factor on every speed."""
@@ -78,7 +79,7 @@ EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, 
 
 @dataclass
 class Hand:
-    """What an arm is asked for now."""
+    """Present target of one arm."""
 
     pose: np.ndarray
     """World-from-TCP (4, 4), without tremor."""
@@ -103,7 +104,7 @@ Script = Iterator[None]
 
 
 def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
-    """Where a first-order lag is after one control step in which its target goes straight from ``before`` to ``after``.
+    """State of a first-order lag after one control step in which its target moves linearly from ``before`` to ``after``.
 
     ẋ = (u − x) / τ with u̇ = s constant has the solution x = u − τ s + (x₀ − u₀ + τ s) e^(−t/τ).
     """
@@ -112,7 +113,7 @@ def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.n
 
 
 class ScriptedExpert(ABC):
-    """One episode's demonstrator. ``act()`` gives the next action until ``done``.
+    """Scripted expert for one episode. ``act()`` returns the next action until ``done``.
 
     Subclasses write ``script(arm)``: a generator that moves ``self.hands[arm]`` and yields once a control step.
     """
@@ -139,10 +140,10 @@ class ScriptedExpert(ABC):
 
     @abstractmethod
     def script(self, arm: str) -> Script:
-        """The arm's work, one yield a control step."""
+        """Motion of one arm as a generator: one yield per control step."""
 
     def finish(self, arm: str, subtask: str) -> Script:
-        """The rest of a subtask, from what is held close before its mate. An arm's last subtask ends with its retreat.
+        """The rest of a subtask, starting with the held part close before its mate. An arm's last subtask ends with its retreat.
 
         Raises:
             TaccorlError: this demonstrator can only begin at the beginning.
@@ -151,17 +152,17 @@ class ScriptedExpert(ABC):
 
     @classmethod
     def can_finish(cls) -> bool:
-        """Whether it can begin in the middle."""
+        """Whether the expert can start in the middle of a subtask (``finish``)."""
         return cls.finish is not ScriptedExpert.finish
 
     def start(self) -> None:
-        """After a reset of the simulation."""
+        """Start both arms' scripts after a reset of the simulation."""
         self.stand_by()
         self._scripts = {arm: self.script(arm) for arm in ROBOT.arms}
         self.running = set(ROBOT.arms)
 
     def stand_by(self) -> None:
-        """After a reset of the simulation, where another moves the arms until ``take_over``."""
+        """Start after a reset of the simulation; another controller moves the arms until ``take_over``."""
         command = self.sim.arrays["ctrl"][0, self.sim.action_actuators]
         self.hands = {}
         for arm in ROBOT.arms:
@@ -183,7 +184,7 @@ class ScriptedExpert(ABC):
         self.flags, self.events = set(), []
 
     def take_over(self, arm: str, subtask: str, pose: np.ndarray, opening_m: float) -> None:
-        """Finish ``subtask`` with an arm that another has sent to ``pose`` (4, 4) last, in free motion."""
+        """Finish ``subtask`` with an arm whose last target, set by another controller, was ``pose`` (4, 4) in free motion."""
         joints = self.sim.proprioception()[0, ROBOT.joint_slice(arm)].copy()
         self.hands[arm] = Hand(
             pose=pose,
@@ -197,7 +198,7 @@ class ScriptedExpert(ABC):
         self.running.add(arm)
 
     def remaining(self, arm: str) -> Script:
-        """What is left of the arm's work in the simulation's present state, wherever that is in the task.
+        """Remaining motion of one arm from the simulation's present state, anywhere in the task.
 
         Raises:
             LostError: the task cannot be completed from there.
@@ -207,7 +208,7 @@ class ScriptedExpert(ABC):
 
     @classmethod
     def can_resume(cls) -> bool:
-        """Whether it can begin anywhere."""
+        """Whether the expert can start from any state (``remaining``)."""
         return cls.remaining is not ScriptedExpert.remaining
 
     def resume(self) -> None:
@@ -224,7 +225,7 @@ class ScriptedExpert(ABC):
 
     @property
     def done(self) -> bool:
-        """Both arms have nothing left to do."""
+        """True if both arms have finished."""
         return not self.running
 
     def act(self) -> np.ndarray:
@@ -290,7 +291,7 @@ class ScriptedExpert(ABC):
     def settle(
         self, arm: str, tolerance_m: float = 0.0004, longest_s: float = 1.2, tolerance_rad: float = 0.006
     ) -> Script:
-        """Wait until the hand is where it was sent, as a person does before something delicate."""
+        """Wait until the hand has reached its target, as a person does before a delicate step."""
         for _ in range(round(longest_s * CONTROL_HZ)):
             error = deflection(self.hands[arm].goal, self.tcp(arm))
             if np.linalg.norm(error[:3]) < tolerance_m and np.linalg.norm(error[3:]) < tolerance_rad:
@@ -319,7 +320,7 @@ class ScriptedExpert(ABC):
         return max(width_m - squeeze, 0.0)
 
     def firm(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
-        """Squeeze what another has gripped as ``close`` does, unless it is squeezed as firmly already."""
+        """Increase the grip force on a part that another controller has gripped to that of ``close``, if it is lower."""
         if self.hands[arm].opening_m > self._squeezed(width_m, force_n) + _LOOSE_M:
             yield from self.close(arm, width_m, force_n)
 
@@ -329,7 +330,7 @@ class ScriptedExpert(ABC):
             yield from self.open(arm)
 
     def rise(self, arm: str, height_m: float, speed_mps: float = 0.12) -> Script:
-        """Straight up."""
+        """Move the hand straight up."""
         up = self.hands[arm].pose.copy()
         up[2, 3] += height_m
         yield from self.move(arm, up, speed_mps=speed_mps)
@@ -356,10 +357,9 @@ class ScriptedExpert(ABC):
     def insert(self, arm: str, mating: Mating, *, depth_m: float, enough_m: float, start_m: float = -0.02) -> Script:
         """Bring a held part before a hole and push it in until ``enough_m``; it is pushed towards ``depth_m`` at most.
 
-        Sideways and in rotation the hand gives way to what it feels, as a relaxed wrist does, so that the part finds its way
-        once it is in the mouth. When it is blocked, it backs off, looks at the part in its hand again, which may have turned,
-        and aims again with a smaller error. Afterwards the hand is still steady and learns nothing of its bias.
-        A part that is in the mouth already, and straight, is pushed on from where it is.
+        Sideways and in rotation the hand is compliant, as a relaxed wrist is, so that the part aligns itself once it is in the
+        mouth. When it is blocked, it backs off, reads the pose of the part in the hand again, which may have turned, and aims
+        again with a smaller error. A part that is in the mouth already, and straight, is pushed on from where it is.
         """
         hand, config = self.hands[arm], self.config
         depth, aim = start_m, self._first_aim(arm, mating)
@@ -419,7 +419,7 @@ class ScriptedExpert(ABC):
         return aim
 
     def regain(self, arm: str) -> Script:
-        """What comes between a block and the next look; experts whose other hand holds the hole have it come to rest, too."""
+        """Motion between a block and the next try. Experts whose other hand holds the hole wait until that hand is at rest."""
         yield from self.settle(arm, longest_s=0.2)
 
     def _held_back_m(self, arm: str, mating: Mating, aim: Aim, pushed: np.ndarray) -> float:
@@ -442,20 +442,20 @@ class ScriptedExpert(ABC):
         return replace(aim, part_from_tcp=part_from_tcp, turned=mating.turned(self), given=np.zeros(6))
 
     def pushed(self, arm: str) -> np.ndarray:
-        """(6,) [m, rad], world: how far contact holds the TCP from where the arm would be without. What a hand feels."""
+        """(6,) [m, rad], world: displacement of the TCP by contact forces."""
         return deflection(self.kinematics[arm].pose(self.hands[arm].predicted_rad), self.tcp(arm))
 
     # what a person sees and errs about ---------------------------------------------------------------------------------
 
     def near(self, pose: np.ndarray, spread_m: float | None = None, spread_rad: float = 0.0) -> np.ndarray:
-        """A pose met with human spread (way points by default)."""
+        """``pose`` with a random human deviation (that of way points by default)."""
         spread_m = self.config.waypoint_m if spread_m is None else spread_m
         off = pose @ turn(self.rng.normal(size=3) * spread_rad)
         off[:3, 3] += self.rng.normal(size=3) * spread_m
         return off
 
     def felt(self, arm: str, what: str) -> None:
-        """Note a correction by touch."""
+        """Record a correction as an event."""
         self.events.append((self.step_count, f"{arm}: {what}"))
 
     def grasp(

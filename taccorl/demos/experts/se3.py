@@ -1,4 +1,4 @@
-"""Rigid transforms as (4, 4) matrices: the few operations that motions are made of. Frames as ``a_from_b``.
+"""Rigid transforms as (4, 4) matrices. Frames are named ``a_from_b``.
 
 Rotation vectors are written out instead of taken from scipy: an expert needs some ten of them a control step, and scipy's
 own take 55 µs each, a sixth of it here.
@@ -14,7 +14,7 @@ _NEARLY_HALF_TURN = 1e-4  # sine below which a half turn's axis is not to be had
 
 
 def transform(pos_m: np.ndarray | tuple, rotation: np.ndarray | None = None) -> np.ndarray:
-    """From a position and a rotation matrix (identity by default)."""
+    """Transform (4, 4) from a position and a rotation matrix (identity by default)."""
     pose = np.eye(4)
     pose[:3, 3] = pos_m
     if rotation is not None:
@@ -59,7 +59,7 @@ def rotvec(rotation_from: np.ndarray, rotation_to: np.ndarray) -> np.ndarray:
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """Straight in position, constant axis in rotation; share 0 is the start, 1 the end."""
+    """Interpolate two poses: linear in position, constant axis in rotation; share 0 is the start, 1 the end."""
     pose = start @ turn(share * rotvec(start, end))
     pose[:3, 3] = (1 - share) * start[:3, 3] + share * end[:3, 3]
     return pose

@@ -34,7 +34,7 @@ _OPEN_M = 0.040  # at the rack, wide enough for the cap: the left hand is near
 
 @experts.register("test_tube")
 class TestTubeExpert(ScriptedExpert):
-    """The left hand steadies the rack all the while."""
+    """Expert of the task: the left hand holds the rack, the right hand inserts the tube."""
 
     __test__ = False
     task = "test_tube"

@@ -1,5 +1,6 @@
-"""Few demonstrations into many: MimicGen for two hands that feel, with held objects carried over instead of hands.
+"""MimicGen for two hands: generate many demonstrations from few. The path of the held object is transferred, not that of the
+hand.
 
-Meaning and field names are IsaacLab Mimic's (DexMimicGen): each arm has subtasks, constraints tie them together. Read ``spec``
-for what can be asked for, ``director`` for what is done with it, ``attempt`` for how it runs in the twin.
+Meaning and field names are IsaacLab Mimic's (DexMimicGen): each arm has subtasks, constraints tie them together. ``spec``
+has the settings, ``director`` applies them, ``attempt`` runs them in the twin.
 """

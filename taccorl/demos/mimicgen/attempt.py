@@ -1,6 +1,6 @@
-"""One attempt in the twin: physics and gates only, a pure function of (spec, sources, twin, seed, k).
+"""One attempt in the twin: physics and acceptance criteria only, a pure function of (spec, sources, twin, seed, k).
 
-Touch and pictures are only for what is kept: rows come from executing its stored actions again (``execute.py``).
+Touch and pictures are computed only for kept attempts: rows come from executing its stored actions again (``execute.py``).
 """
 
 import functools
@@ -42,7 +42,7 @@ def attempt_seeds(root: int, task: str, k: int) -> tuple[int, np.random.Generato
 
 @dataclass
 class Attempted:
-    """What became of an attempt."""
+    """Result of one attempt: outcome, actions, provenance."""
 
     k: int
     scene_seed: int
@@ -70,7 +70,7 @@ def state_digest(sim: Simulation) -> str:
 
 
 class TwinScene:
-    """Simulation 0 as the director sees it."""
+    """Interface of simulation 0 to the director: poses of hands and parts."""
 
     def __init__(self, sim: Simulation) -> None:
         self.sim = sim
@@ -87,7 +87,7 @@ class TwinScene:
 
 
 class Hands:
-    """Wishes into joint targets: inverse kinematics, and what the joints rest off."""
+    """Convert arm targets to joint commands: inverse kinematics, and correction of the steady-state joint offset."""
 
     def __init__(
         self,

@@ -1,7 +1,8 @@
-"""Sources into a dataset of N new successes: attempts in the store, on any engine, the first N by number.
+"""Generate a dataset of N new successes from sources: attempts in the store, on any engine; the first N successes by number.
 
-An attempt's key is made of all that decides: the spec, the sources' content, the twin, the seed, its number. So a run that was
-killed goes on where it was, another spec or other sources never mix with it, and any number of workers gives the same dataset.
+An attempt's key contains everything that it depends on: the spec, the sources' content, the twin, the seed, its number. So a
+run that was
+killed continues, another spec or other sources never mix with it, and any number of workers gives the same dataset.
 An attempt that kills its process twice (``crashed``) or does not end (``hung``) is counted like any other that failed.
 Attempts are physics; rows of a success, with touch and pictures, are another artefact, which ``rows: actions`` leaves out.
 """
@@ -64,7 +65,7 @@ Rows = Literal["dataset", "actions"]
 
 @dataclass(frozen=True)
 class Made:
-    """An attempt in the store."""
+    """A finished attempt in the store."""
 
     folder: Path
     """As ``run_attempt`` says, without rows."""
@@ -76,7 +77,7 @@ class Made:
 
 @dataclass(frozen=True, kw_only=True)
 class AugmentPlan:
-    """What to generate."""
+    """Settings of a generation: task, number of episodes, spec, twin, seed."""
 
     spec: MimicSpec
     episodes: int = 200
@@ -106,7 +107,7 @@ class AugmentPlan:
 
     @functools.cached_property
     def space(self) -> ResetSpace:
-        """What attempts differ in; without rows where nothing is drawn."""
+        """Reset space of the task; without rows that are not randomised."""
         return ResetSpace(self._rows if self.randomization > 0 else (), self.randomization)
 
     @functools.cached_property
@@ -114,11 +115,11 @@ class AugmentPlan:
         return tuple(tasks.get(self.spec.task)(self.difficulty).rows)
 
     def scene_seed(self, k: int) -> int:
-        """Of attempt ``k``."""
+        """Scene seed of attempt ``k``."""
         return attempt_seeds(self.seed, self.spec.task, k)[0]
 
     def draw(self, k: int) -> dict[str, np.ndarray]:
-        """What attempt ``k`` draws, as its simulation will."""
+        """Random draw of attempt ``k`` at its reset, without simulating it."""
         return draw(self._rows, np.random.default_rng(self.scene_seed(k)), self.randomization)
 
     def twin_config(self) -> TwinConfig:
@@ -127,24 +128,24 @@ class AugmentPlan:
 
     @property
     def stage(self) -> Stage:
-        """That publishes the successes."""
+        """Stage that publishes the successes."""
         return _AUGMENTED if self.rows == "dataset" else _ACTIONS
 
     def make(self) -> Simulation:
-        """Its simulation."""
+        """Make the simulation of this plan."""
         task = tasks.get(self.spec.task)(self.difficulty)
         check_task(self.spec, task)
         return Simulation(task, self.twin_config(), scale=self.randomization)
 
     def contract(self, sim: Simulation) -> DatasetSpec:
-        """What a new episode's rows hold."""
+        """Data spec of a new episode's rows."""
         disturbs = self.spec.datagen_config.disturbance.joint_rad > 0
         return with_simulator(
             load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=self.images, executed=disturbs
         )
 
     def config(self, k: int) -> dict[str, Any]:
-        """What attempt ``k`` depends on besides the sources; not on how many there are."""
+        """Settings on which attempt ``k`` depends, besides the sources; not the number of attempts."""
         return canonical(
             {
                 "task": self.spec.task,
@@ -234,7 +235,7 @@ def _successes(entries: list[dict[str, Any]]) -> int:
 
 
 def check_out(plan: AugmentPlan, source: Path, out: Path, store: Store) -> None:
-    """Refuses what cannot be the dataset of this plan, before hours of attempts end at the store's refusal.
+    """Fail early if ``out`` is occupied by something other than a dataset of this plan.
 
     Raises:
         InTheWayError: says what is at ``out``.
@@ -261,7 +262,7 @@ def _may_be_of(plan: AugmentPlan, sources: Artefact, out: Path, store: Store) ->
 
 
 def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> list[Made]:
-    """The plan's first ``num`` attempts, out of the store; nothing is made.
+    """Read the plan's first ``num`` attempts from the store, without making any.
 
     Raises:
         TaccorlError: one of them is not there, or the plan has all its successes after fewer attempts.
@@ -323,7 +324,7 @@ def _lost_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int, en
 
 
 def demonstration_of(folder: Path) -> Demonstration:
-    """An attempt as it is stored."""
+    """Read a stored attempt as a demonstration."""
     entry, intended = _entry(folder), folder / "intended.npy"
     return Demonstration(
         attempt=entry["attempt"],

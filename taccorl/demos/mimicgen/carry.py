@@ -1,4 +1,4 @@
-"""Carrying a motion over to a new scene: transforms of objects, of what a hand holds, bridges, and which source is nearest.
+"""Retargeting of a motion to a new scene: transforms of objects and held objects, bridges, and choice of the nearest source.
 
 Pure functions of (4, 4) poses ``a_from_b``.
 """
@@ -17,19 +17,20 @@ _ROUNDING = 1e-6
 
 
 class Distance(NamedTuple):
-    """Between two poses."""
+    """Distance of two poses: position [m] and rotation [rad]."""
 
     position_m: float
     rotation_rad: float
 
 
 def distance(one: np.ndarray, other: np.ndarray) -> Distance:
-    """How far one pose is from another."""
+    """Distance of one pose from another."""
     return Distance(float(np.linalg.norm(one[:3, 3] - other[:3, 3])), float(np.linalg.norm(rotvec(one, other))))
 
 
 def look_alike(pose: np.ndarray, reference: np.ndarray, num_turns: int) -> np.ndarray:
-    """Of the turns of ``pose`` about its own z that look the same, the one nearest to ``reference``'s rotation; 0: any turn."""
+    """Rotate ``pose`` about its own z axis by one of its symmetries, so that it is nearest to ``reference``'s rotation; 0:
+    any angle."""
     if num_turns == 1:
         return pose
     off = pose[:3, :3].T @ reference[:3, :3]
@@ -44,7 +45,7 @@ def object_delta(new: np.ndarray, source: np.ndarray, num_turns: int = 1) -> np.
 
 
 def translation(delta: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Only the shift of the object at ``source`` that ``delta`` makes."""
+    """The translation of the object at ``source`` in ``delta``, without its rotation."""
     shift = np.eye(4)
     shift[:3, 3] = (delta @ source)[:3, 3] - source[:3, 3]
     return shift
@@ -83,7 +84,7 @@ def minimum_jerk(x: float) -> float:
 
 
 def one_of_nearest(distances: Sequence[Distance], how: SelectionSpec, rng: np.random.Generator) -> int:
-    """Index of one of the ``nn_k`` nearest, each as likely."""
+    """Index of one of the ``nn_k`` nearest sources, drawn uniformly."""
     size = [how.pos_weight * d.position_m + how.rot_weight * d.rotation_rad for d in distances]
     nearest = np.argsort(size, kind="stable")[: how.nn_k]
     return int(nearest[rng.integers(len(nearest))])

@@ -1,4 +1,4 @@
-"""What became of a run's attempts, and where in the reset space they began: yields with intervals, box by box."""
+"""Yield of a run's attempts over the reset space: success rates with intervals in each box."""
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,13 +40,13 @@ class Share:
         return f"{self.successes} of {self.attempts}: {told}"
 
     def told(self) -> dict[str, Any]:
-        """For JSON."""
+        """The share as JSON values."""
         return asdict(self) | {"rate": self.rate if self.attempts else None, "interval_95": self.interval}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bin:
-    """A box of the reset space in one row of the paper's table, and what became of attempts that began there."""
+    """A box of the reset space (one row of the paper's table), and the outcomes of attempts that began in it."""
 
     row: str
     unit: str
@@ -57,7 +57,7 @@ class Bin:
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """What the report needs of one."""
+    """Data of one attempt for the report."""
 
     k: int
     outcome: str
@@ -78,12 +78,12 @@ class Attempt:
 
     @property
     def command(self) -> str:
-        """Opens it in Rerun."""
+        """Command that shows the attempt in Rerun."""
         return f"taccorl view {shlex.quote(str(self.folder))}"
 
 
 def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: int) -> list[Attempt]:
-    """Out of the store. What was drawn follows from the seeds, of attempts that broke as well."""
+    """Read attempts from the store. Draws follow from the seeds, also for attempts whose process died."""
     found = []
     for made in made_attempts(plan, source, store, num_attempts):
         entry = made.entry
@@ -121,12 +121,12 @@ def bins_of(plan: AugmentPlan, attempts: Sequence[Attempt]) -> Iterator[Bin]:
 
 
 def share_of(attempts: Sequence[Attempt]) -> Share:
-    """Of these."""
+    """Share of successes among these attempts."""
     return Share(successes=sum(a.success for a in attempts), attempts=len(attempts))
 
 
 def evenness(plan: AugmentPlan, draws: Sequence[Mapping[str, np.ndarray]]) -> dict[str, Any]:
-    """How evenly episodes that drew this lie in the boxes, for JSON: the emptiest box, and how many are at least half full.
+    """Evenness of episodes over the boxes, as JSON values: the emptiest box, and how many are at least half full.
     The fair share of a box: all episodes over the boxes of its row."""
     counts = plan.space.count(plan.space.boxes(drawn) for drawn in draws)
     shares = [count * len(count) / max(len(draws), 1) for count in counts]
@@ -149,7 +149,7 @@ def evenness(plan: AugmentPlan, draws: Sequence[Mapping[str, np.ndarray]]) -> di
 
 
 def stratified(plan: AugmentPlan, attempts: Sequence[Attempt]) -> dict[str, Any] | None:
-    """What filling the poor boxes did, for JSON; None where it was not asked for."""
+    """Effect of --stratify, as JSON values; None without it."""
     if not plan.stratify:
         return None
     first = attempts[: first_attempts(plan.episodes)]

@@ -1,7 +1,7 @@
-"""One attempt, step by step: which source, which transform, where each hand goes now. Knows poses, but no simulator.
+"""Director of one attempt: chooses source and transform of each subtask and computes each hand's target. Uses poses only.
 
-``Director.step(scene)`` is asked once a control step and gives a ``Wish`` for each arm; whoever executes it (the twin, or a
-test's ideal hands) shows the scene that came of it in the next step.
+``Director.step(scene)`` is called once per control step and returns a ``Wish``, the target of one arm, for each arm. The caller
+(the twin, or a test's ideal hands) executes it and passes the resulting scene to the next step.
 """
 
 import math
@@ -35,7 +35,7 @@ _HANDED_OVER_STEPS = 2  # of a path: one in which another takes over, one when i
 
 
 class SeenPoses(Protocol):
-    """The scene as it is now."""
+    """Interface of the present scene: poses of hands and bodies."""
 
     def tcp(self, arm: str) -> np.ndarray:
         """World-from-TCP (4, 4)."""
@@ -51,7 +51,7 @@ class SeenPoses(Protocol):
 
 
 class Kinematics(Protocol):
-    """One arm's."""
+    """Interface of one arm's kinematics."""
 
     def pose(self, joints_rad: np.ndarray) -> np.ndarray:
         """World-from-TCP (4, 4)."""
@@ -64,7 +64,7 @@ class Kinematics(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Wish:
-    """What an arm is to do in a control step."""
+    """Target of one arm for a control step: TCP pose or joint angles, and gripper opening."""
 
     goal: np.ndarray
     """World-from-TCP (4, 4)."""
@@ -77,19 +77,19 @@ class Wish:
 
 
 class ContactHands(Protocol):
-    """Moves hands in contact in the source's stead."""
+    """Interface of a controller that moves the hands in contact instead of the source."""
 
     @property
     def corrections(self) -> list[tuple[int, str]]:
-        """(row of the action, what was felt)."""
+        """Corrections so far: (row of the action, description)."""
         ...
 
     def take(self, arm: str, subtask: str, wish: Wish) -> None:
-        """From the coming control step to the end of that subtask; ``wish`` was the arm's last."""
+        """Take over the arm from the next control step to the end of the subtask; ``wish`` was its last target."""
         ...
 
     def step(self) -> Mapping[str, Wish]:
-        """Once a control step: what each arm that has not finished is to do."""
+        """Targets of the arms that it controls and that have not finished; called once per control step."""
         ...
 
 
@@ -106,7 +106,7 @@ class Ahead:
 
 @dataclass
 class Choice:
-    """What an attempt does in one subtask; goes into the provenance."""
+    """Choices of an attempt for one subtask, stored in the provenance."""
 
     source: int
     segment: Segment
@@ -159,7 +159,7 @@ class _Hand:
 
 
 class Director:
-    """Of one attempt. Arrays in, arrays out; all chance comes from ``rng``."""
+    """Computes the arms' targets of one attempt. All random numbers come from ``rng``."""
 
     def __init__(
         self,
@@ -199,11 +199,12 @@ class Director:
 
     @property
     def done(self) -> bool:
-        """Nothing is left to do; the hands stay where they are."""
+        """True if all subtasks have ended; targets then stay constant."""
         return self.schedule.done
 
     def step(self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None) -> dict[str, Wish]:
-        """Each arm's wish for the coming control step. ``joints_rad``: (6,) of each arm's last wish, if joints are told.
+        """Each arm's target for the next control step. ``joints_rad``: (6,) joint angles of each arm's last target, if it had
+        any.
 
         Raises:
             DeadlockError: the arms wait for each other.
@@ -229,7 +230,7 @@ class Director:
         return wishes
 
     def ahead(self, arm: str) -> Ahead:
-        """What comes on the arm's path after the steps so far."""
+        """Steps until the arm must be exact, from its present path."""
         hand, cue = self._hands[arm], self.schedule.upcoming(arm)
         if arm in self._handed_over:
             return Ahead(0, 0)

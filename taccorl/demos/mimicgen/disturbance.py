@@ -1,4 +1,4 @@
-"""Disturbance of the arms in transport, so that new episodes show the way back.
+"""Disturbance of the arms in transport, so that new episodes contain recoveries.
 
     executed(t) = intended(t) + strength(t) · drift(t)         the dataset's ``action`` is what was intended
 
@@ -33,7 +33,7 @@ _MOVES_M = 2e-4  # of an opening in a step
 
 
 class Disturbance:
-    """Of one attempt. Once a control step: ``update``, then ``executed``."""
+    """Disturbance of one attempt. Call once per control step: ``update``, then ``executed``."""
 
     def __init__(self, spec: DisturbanceSpec, rng: np.random.Generator) -> None:
         self._spec, self._rng = spec, rng
@@ -47,7 +47,7 @@ class Disturbance:
 
     @property
     def pushed(self) -> list[str]:
-        """Arms that are pushed off their way now."""
+        """Arms that are disturbed now."""
         return [arm for arm, strength in zip(ROBOT.arms, self.strength, strict=True) if strength > 0]
 
     def update(self, wishes: Mapping[str, Wish], ahead: Mapping[str, Ahead], is_exact: np.ndarray) -> None:
@@ -79,8 +79,10 @@ class Disturbance:
 
 
 class Exact:
-    """When an arm may not be pushed: it grips what something else holds fast, the table for one; or what belongs together has met
-    and a hand still holds one of it. Inside its play a plug does not touch all the time, so that they have met is remembered."""
+    """Decides when an arm may not be disturbed: it grips what something else holds fast, the table for one; or mating parts
+    have met
+    and a hand still holds one of them. Inside its play a plug does not touch all the time, so that they have met is
+    remembered."""
 
     def __init__(self, sim: Simulation) -> None:
         """After a reset."""

@@ -1,6 +1,7 @@
-"""Stored actions into a LeRobot dataset, on the machine where it is needed: each demonstration is executed once, on any engine.
+"""Make a LeRobot dataset from stored actions where it is needed: each demonstration is executed once, on any engine.
 
-Demonstrations that are no success here, or do not pass the gates, are left out and counted: another CPU may differ in the last
+Demonstrations that do not succeed here, or do not meet the acceptance criteria, are left out and counted: another CPU may
+differ in the last
 bit (``execution.py``). The numbers are the same whatever becomes of the pictures: encoded as video, rendered later into the
 cache of training frames (``taccorl.training.rendered_frames``), or left out.
 """
@@ -45,7 +46,7 @@ _SAME = ("task", "difficulty", "twin", "randomization")  # of all sources
 
 @dataclass(frozen=True)
 class Executed:
-    """One demonstration, executed again."""
+    """Result of executing one demonstration again."""
 
     artefact: Artefact
     """entry.json, and of a success dataset/ and episodes.json."""
@@ -55,7 +56,7 @@ class Executed:
 
 @dataclass(frozen=True, kw_only=True)
 class ExecutePlan:
-    """What to make of stored actions."""
+    """Settings of an execution of stored actions: pictures, resolution, sources."""
 
     sources: tuple[Path, ...]
     """Folders of stored actions of one task, difficulty, twin and randomisation."""
@@ -70,7 +71,7 @@ class ExecutePlan:
             raise TaccorlError(f"--pictures={self.pictures}: {nearest(self.pictures, get_args(PicturesAs))}")
 
     def contract(self, sim: Simulation, *, pictures: bool, executed: bool) -> DatasetSpec:
-        """What a row holds.
+        """Data spec of the dataset's rows.
 
         Args:
             executed: what was executed beside the action: if the arms were disturbed in one of the sources.
@@ -92,7 +93,7 @@ class ExecutePlan:
 def execute_stored(
     plan: ExecutePlan, out: Path, store: Store, engine: Engine | None = None, progress: Callable[[str], None] = print
 ) -> tuple[dict[str, Any], dict[str, float]]:
-    """A LeRobot dataset at ``out``; returns its report and the mean seconds of each part of the executions that were made now.
+    """Publish a LeRobot dataset at ``out``; returns its report and the mean seconds of each part of the executions made now.
 
     Raises:
         DatasetError: no stored actions, or changed since they were written; none of them is a success here.

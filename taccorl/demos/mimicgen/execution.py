@@ -1,7 +1,7 @@
-"""Execute a stored demonstration again: its rows with touch, and whether it still is the success that it was.
+"""Execute a stored demonstration again: compute its rows with touch, and check that it still succeeds.
 
-MuJoCo on another CPU may differ in the last bit, and contact makes a bit grow. So the last state is compared, and where it is
-another one, what counts is the success and the gates.
+MuJoCo on another CPU may differ in the last bit, and contact amplifies the difference. So the last state is compared; if it
+differs, success and acceptance criteria decide.
 """
 
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ _PAD_NOISE = 2  # with the scene's seed
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Demonstration:
-    """What is stored of a success."""
+    """A stored success: scene seed, actions, last state, provenance."""
 
     attempt: int
     scene_seed: int
@@ -40,7 +40,7 @@ class Demonstration:
 
 @dataclass(kw_only=True)
 class Execution:
-    """What became of a demonstration that was executed again."""
+    """Result of a demonstration that was executed again."""
 
     recorder: EpisodeRecorder
     outcome: str
@@ -83,7 +83,7 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
 
 
 def act_out(sim: Simulation, actions: np.ndarray) -> None:
-    """A policy's actions (T, 14) without rows; then whoever takes over has the task's full time."""
+    """Execute a policy's actions (T, 14) without recording rows; afterwards the task's full time limit starts again."""
     limit_steps = sim.judge.limit_steps
     sim.judge.limit_steps = max(limit_steps, len(actions) + 1)  # the policy may have had more than the task's own
     for action in actions:

@@ -1,8 +1,7 @@
-"""``contact_mode: closed_loop_expert``: the task's scripted expert moves the hands in contact, in the source's stead.
+"""``contact_mode: closed_loop_expert``: in contact the task's scripted expert moves the hands instead of the source.
 
-A source's motion feels nothing: what the pads read follows from the actions. The expert notices a block by how far the hand is
-pushed back, backs off and aims again, so here actions follow from touch, too. It aims with a human error of its own, and its
-hands tremble: both drawn from the attempt's generator.
+A source's motion does not react to contact. The expert detects a block from how far the hand is pushed back, backs off and aims
+again, so that actions depend on contact. Its aiming error and tremor are drawn from the attempt's generator.
 """
 
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ from taccorl.sim.simulation import Simulation
 
 
 class ExpertContact:
-    """One attempt's expert. It says where the hands are to be; whoever executes it knows how far from a command they rest."""
+    """Expert of one attempt. Returns poses of the hands; the caller corrects the steady-state joint offset."""
 
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
         """After a reset."""
@@ -24,15 +23,15 @@ class ExpertContact:
 
     @property
     def corrections(self) -> list[tuple[int, str]]:
-        """(row of the action, what was felt)."""
+        """Corrections so far: (row of the action, description)."""
         return self._expert.events
 
     def take(self, arm: str, subtask: str, wish: Wish) -> None:
-        """From the coming control step to the end of that subtask; ``wish`` was the arm's last."""
+        """Take over the arm from the next control step to the end of the subtask; ``wish`` was its last target."""
         self._expert.take_over(arm, subtask, wish.goal, wish.opening_m)
 
     def step(self) -> Mapping[str, Wish]:
-        """Once a control step: what each arm that has not finished is to do."""
+        """Targets of the arms that it controls and that have not finished; called once per control step."""
         expert = self._expert
         if expert.done:
             expert.step_count += 1

@@ -1,4 +1,4 @@
-"""Sources out of a dataset that ``taccorl collect`` made: every pose follows from the stored state, none is measured.
+"""Read sources from a dataset of ``taccorl collect``. Every pose is computed from the stored simulator state.
 
 Needed columns: ``sim.state``, ``sim.seed``, ``sim.subtask``, ``action``. Poses and contacts are computed from the state with
 the model of the very twin that the dataset was made in.
@@ -29,7 +29,7 @@ COLUMNS = ("sim.state", "sim.seed", "sim.subtask", "action")
 
 
 def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
-    """Every successful episode of a dataset as a source.
+    """Read every successful episode of a dataset as a source.
 
     Raises:
         DatasetError: no simulator state, another task, or a twin that is no longer the same; with the way out.
@@ -44,7 +44,7 @@ def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
 
 
 def open_sources(root: Path, task: str) -> Dataset:
-    """The dataset, if it has what sources need. Reads ``meta/`` only.
+    """Open a dataset and check that it has the columns that sources need. Reads ``meta/`` only.
 
     Raises:
         DatasetError: no dataset, no simulator state, or disturbed; with the way out.
@@ -65,7 +65,7 @@ def open_sources(root: Path, task: str) -> Dataset:
 
 
 def simulation_of(episode: Episode, task: str) -> Simulation:
-    """The simulation that a collected episode was made in.
+    """Make the simulation in which an episode was collected.
 
     Raises:
         DatasetError: of another task, or nobody wrote down in which simulation.
@@ -81,7 +81,7 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
 
 
 def simulation_told(told: Mapping[str, Any]) -> Simulation:
-    """The simulation that ``task``, ``difficulty``, ``twin`` (a file's text) and ``randomization`` describe."""
+    """Make the simulation of ``task``, ``difficulty``, ``twin`` (text of a twin.yaml) and ``randomization``."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "twin.yaml"
         path.write_text(told["twin"], encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a success must keep to be kept: forces, penetration, joint limits and speeds, and no contact that has no place in it."""
+"""Acceptance criteria (gates) of generated successes: forces, penetration, joint limits and speeds, unintended contact."""
 
 from dataclasses import asdict, dataclass, field
 
@@ -26,7 +26,7 @@ class Measured:
     """A joint whose command was at its limit; empty: none."""
 
     def told(self) -> dict[str, object]:
-        """For the provenance."""
+        """The values as JSON values, for the provenance."""
         return asdict(self)
 
     def refused(self, gates: GatesSpec) -> tuple[str, str] | None:
@@ -44,7 +44,7 @@ class Measured:
 
 @dataclass
 class GateKeeper:
-    """Watches simulation 0 while it is stepped. Changes nothing in it."""
+    """Measures what the gates need while simulation 0 is stepped, without changing it."""
 
     sim: Simulation
     measured: Measured = field(default_factory=Measured)
@@ -54,7 +54,7 @@ class GateKeeper:
         self._joints = [self.sim.model.joint(name).dofadr[0] for name in names]
 
     def watch(self) -> Watch:
-        """For the next control step."""
+        """``Watch`` for the next control step."""
         num_steps = self.sim.config.physics.steps_per_control_step
         return Watch(range(_EVERY, num_steps + 1, _EVERY), self._look)
 
@@ -67,7 +67,7 @@ class GateKeeper:
         self.measured.joint_speed_radps = max(self.measured.joint_speed_radps, speed_radps)
 
     def see_actions(self, actions: np.ndarray) -> None:
-        """All of them (T, 14)."""
+        """Take all actions (T, 14) of the episode, for the limits of joint speed."""
         at_limit = ((actions <= ROBOT.action_low) | (actions >= ROBOT.action_high)).any(0) & _JOINTS
         self.measured.at_limit = ", ".join(np.array(ROBOT.action_names)[at_limit].tolist())
 

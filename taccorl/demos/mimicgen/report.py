@@ -1,6 +1,6 @@
-"""What a run of MimicGen gave: yield, where in the reset space it is poor, sources, failures one by one, cost. HTML and JSON.
+"""Report of a run of MimicGen: yield over the reset space, sources, failures one by one, cost. HTML and JSON.
 
-The page needs no other file; ``….json`` holds every number of it. Both lie beside the dataset. All simulated.
+The page needs no other file; ``….json`` holds every number of it. Both are written beside the dataset. All simulated.
 """
 
 import base64
@@ -30,7 +30,7 @@ _GOOD, _BAD, _CELL = "#0072b2", "#d55e00", "#009e73"
 
 
 class Spent(NamedTuple):
-    """What a run of ``taccorl augment`` took."""
+    """Time that a run of ``taccorl augment`` took."""
 
     cpu_s: float
     """Of all its processes."""
@@ -38,7 +38,7 @@ class Spent(NamedTuple):
 
 
 def pages_of(out: Path) -> tuple[Path, Path]:
-    """HTML and JSON beside the dataset at ``out``.
+    """Paths of the report's HTML and JSON files beside the dataset at ``out``.
 
     Raises:
         TaccorlError: a file that is not ours lies there.
@@ -69,7 +69,7 @@ def write_report(
 
 
 def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None) -> dict[str, Any]:
-    """Everything on the page, as JSON knows it."""
+    """All numbers of the page, as JSON values."""
     share, chosen = share_of(attempts), stratified(plan, attempts)
     # Attempts that were chosen for what they draw say nothing of the yield of the paper's randomisation.
     plain = attempts[: chosen["first_attempts"]] if chosen else attempts

@@ -1,7 +1,7 @@
-"""How far an arm's joints rest from their targets: what a hand's goal and the command that brings it there differ by.
+"""Steady-state offset of an arm's joints from their targets: command = goal − offset.
 
-The controller's feed-forward torque lets joint 5 rest 11 mrad off, 3 mm at the fingertips, and other joints by less; a twin
-with other gains lets them rest elsewhere. So goals, not commands, are carried over, and the rest is learnt where they are used.
+The controller's feed-forward torque causes an offset of 11 mrad in joint 5, 3 mm at the fingertips, and less in other joints; in
+a twin with other gains it differs. So goals, not commands, are retargeted, and the offset is estimated where they are used.
 """
 
 import math
@@ -26,34 +26,35 @@ def joint_addresses(model: mujoco.MjModel, arm: str) -> np.ndarray:
 
 
 class RestOffset:
-    """Of one arm's joints (6,): command = goal − offset. A first-order lag behind the goals is told apart from it."""
+    """Estimate of the offset of one arm's joints (6,): command = goal − offset. The first-order lag behind moving goals is
+    not part of it."""
 
     def __init__(self, joints_rad: np.ndarray, command_rad: np.ndarray, lag_s: np.ndarray) -> None:
-        """At rest: where the joints are, what is commanded, and the controller's time constants K_d / K_p."""
+        """Start at rest, with joint angles, commands, and the controller's time constants K_d / K_p."""
         self.offset_rad = joints_rad - command_rad
         self._goal, self._predicted, self._lag_s = joints_rad, joints_rad, lag_s
         self._step_rad = 0.0
 
     @property
     def is_still(self) -> bool:
-        """Whether the last goal hardly moved: whether there is anything to ``see``."""
+        """True if the last goal hardly moved, so that ``see`` can update the estimate."""
         return self._step_rad < _STILL_RAD
 
     def see(self, joints_rad: np.ndarray) -> None:
-        """Before a command, where nothing is touched: what is not where a lag would have it rests off. An arm that moves teaches
-        nothing: its lag is not exactly of first order."""
+        """Update the estimate before a command, without contact: the deviation of the joints from a first-order lag. A moving arm
+        gives no estimate, because its lag is not exactly of first order."""
         if self.is_still:
             self.offset_rad = self.offset_rad + _LEARNED * (joints_rad - self._predicted)
 
     def command(self, goal_rad: np.ndarray) -> np.ndarray:
-        """(6,) what to send so that the joints come to ``goal_rad``."""
+        """(6,) command that brings the joints to ``goal_rad``."""
         self._predicted = follow(self._predicted, self._goal, goal_rad, self._lag_s)
         self._step_rad = float(np.abs(goal_rad - self._goal).max())
         self._goal = goal_rad
         return goal_rad - self.offset_rad
 
     def goal(self, command_rad: np.ndarray) -> np.ndarray:
-        """(6,) what ``command`` was asked for, from what it sent."""
+        """(6,) goal for which ``command`` returned this command."""
         goal_rad = command_rad + self.offset_rad
         self.command(goal_rad)
         return goal_rad

@@ -1,8 +1,8 @@
-"""Which arm does which step of which subtask next: a state machine without a simulator, poses or time.
+"""Schedule of the arms' subtasks: a state machine that decides which arm makes which step next. No simulator, poses or time.
 
 An arm does its subtasks in order. When one begins its trajectory is *planned*: how many steps it has, and how many of its last
-ones run together with the other arm. Constraints hold an arm back; who is held repeats what it did last. Nobody who can move
-and nobody to plan for is a deadlock, and named.
+ones run together with the other arm. Constraints hold an arm back; a held arm repeats its last target. If no arm can move
+and none can be planned, a deadlock is reported.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -16,12 +16,12 @@ Place = tuple[str, int]
 
 
 class DeadlockError(TaccorlError):
-    """Arms that wait for each other for ever."""
+    """Error: the arms wait for each other."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Constraint:
-    """Between two subtasks of two arms."""
+    """Constraint between a subtask of one arm and one of the other."""
 
     former: Place
     latter: Place
@@ -34,7 +34,7 @@ class Constraint:
 
 
 class Cue(NamedTuple):
-    """What an arm does in this control step."""
+    """Step of an arm in this control step: subtask and index of the step."""
 
     subtask: int
     step: int
@@ -61,7 +61,7 @@ class _Arm:
 
 @dataclass
 class Schedule:
-    """Of two arms. Ask ``to_plan``, answer with ``plan``, then ``tick``; until ``done``."""
+    """Schedule of two arms. Call ``to_plan``, then ``plan`` for each arm that it names, then ``tick``, until ``done``."""
 
     signals: Mapping[str, Sequence[str]]
     """Arm → names of its subtasks."""
@@ -73,7 +73,7 @@ class Schedule:
 
     @property
     def done(self) -> bool:
-        """Every arm has ended its last subtask."""
+        """True if every arm has ended its last subtask."""
         return all(arm.done for arm in self._arms.values())
 
     def subtask(self, arm: str) -> int:
@@ -81,7 +81,7 @@ class Schedule:
         return self._arms[arm].subtask
 
     def upcoming(self, arm: str) -> Cue | None:
-        """What the arm does when it is next allowed to; None: nothing is planned."""
+        """Next step of the arm; None: nothing is planned."""
         state = self._arms[arm]
         return None if state.num_steps is None else Cue(state.subtask, state.step)
 
@@ -91,7 +91,8 @@ class Schedule:
         return [arm for arm in idle if not self._kept_from_beginning(arm)]
 
     def plan(self, arm: str, num_steps: int, num_together: int = 0) -> None:
-        """The arm's present subtask has ``num_steps`` steps, the last ``num_together`` of them at the partner's side."""
+        """Set the length of the arm's present subtask: ``num_steps`` steps, the last ``num_together`` of them together with
+        the other arm."""
         if num_steps < 1 or not 0 <= num_together <= num_steps:
             raise TaccorlError(
                 f"schedule: {arm}: {num_together} of {num_steps} steps together; give 0 ≤ it ≤ them, ≥ 1"
@@ -192,7 +193,7 @@ class Schedule:
 
 
 def rehearse(signals: Mapping[str, Sequence[str]], constraints: Sequence[Constraint]) -> None:
-    """Run through with one step a subtask.
+    """Run the schedule with one step per subtask, to find deadlocks.
 
     Raises:
         DeadlockError: it would never end, whatever the lengths.

@@ -1,4 +1,4 @@
-"""How good generation is in one setting: yield under all gates, what it costs, whether what is kept holds. All simulated."""
+"""Score of a generation: yield under all gates, cost, and whether kept episodes are reproduced. All simulated."""
 
 import dataclasses
 from collections import Counter
@@ -19,7 +19,7 @@ from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 
 @dataclass
 class Score:
-    """Of a number of attempts."""
+    """Yield, failures and cost of a number of attempts."""
 
     outcomes: list[str] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)

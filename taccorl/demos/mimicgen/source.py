@@ -1,4 +1,4 @@
-"""Source demonstrations as poses over time, cut into subtasks: pure arrays, whoever recorded them.
+"""Source demonstrations as arrays of poses over time, cut into subtasks.
 
 Letters in shapes: T rows. Row t holds the scene before action t.
 """
@@ -17,7 +17,7 @@ _AT_REST_ROWS = 4  # a gripper that has not moved for so long, and then does, be
 
 @dataclass(frozen=True, eq=False)
 class ArmTrack:
-    """What one arm did."""
+    """Poses, gripper openings and commands of one arm over time."""
 
     tcp: np.ndarray
     """(T, 4, 4) world-from-TCP."""
@@ -61,7 +61,7 @@ class Source:
 
     @property
     def as_commanded(self) -> "Source":
-        """With commands for goals."""
+        """The source with commands in place of goals."""
         arms = {
             arm: replace(track, goal=track.command, joints_rad=track.command_rad) for arm, track in self.arms.items()
         }
@@ -120,7 +120,7 @@ def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, .
 
 
 class SourcePool:
-    """Sources that fit a spec, cut by it."""
+    """Sources cut into subtasks by a spec."""
 
     def __init__(self, spec: MimicSpec, sources: Sequence[Source]) -> None:
         """
@@ -143,7 +143,8 @@ class SourcePool:
     def segment(self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]) -> Segment:
         """Rows of source ``i`` that are subtask ``k`` of ``arm``, each subtask's end moved by its offset.
 
-        What waited for another arm's subtask begins where that one ended: before, the arm only stood by. Subtasks that are to
+        A subtask that had to wait for another arm begins where that arm's subtask ended: before, the arm only waited.
+        Subtasks that are to
         begin together begin at the later one's beginning.
         """
         start, end = self._begin(i, arm, k, offsets), self._end(i, arm, k, offsets)

@@ -1,4 +1,4 @@
-"""How demonstrations of a task become new ones: ``data_specs/mimicgen/<task>.yaml``, with IsaacLab Mimic's field names.
+"""Settings of generation for a task: ``data_specs/mimicgen/<task>.yaml``, with IsaacLab Mimic's field names.
 
 Every distance is in metres, every angle in radians; a step is a control step, 1/30 s.
 """
@@ -28,7 +28,7 @@ Strategy = Literal["random", "nearest_neighbor_object", "nearest_neighbor_robot_
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionSpec:
-    """How a strategy chooses among sources."""
+    """Parameters with which a strategy chooses among sources."""
 
     nn_k: int = 3
     """One of so many nearest sources, each as likely."""
@@ -40,7 +40,7 @@ class SelectionSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SubtaskSpec:
-    """One stretch of one arm's work."""
+    """One subtask of one arm."""
 
     subtask_term_signal: str | None
     """The task's subtask (``taccorl.sim.tasks``) that this one is; it ends when that one's ``done`` turns true. Null, last of
@@ -63,7 +63,7 @@ class SubtaskSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class ConstraintSpec:
-    """What ties two subtasks together."""
+    """Constraint between two subtasks: order, or execution at the same time."""
 
     eef_subtask_constraint_tuple: tuple[tuple[str, int], tuple[str, int]]
     """(arm, number of its subtask from 0), twice; of a sequence the former first."""
@@ -83,7 +83,7 @@ class ConstraintSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeSpec:
-    """From where a hand is to where a segment begins: minimum jerk, as long as these peak speeds need."""
+    """Motion from the hand's present pose to the start of a segment: minimum jerk, limited by these peak speeds."""
 
     speed_mps: float = 0.25
     turn_radps: float = 1.5
@@ -112,8 +112,8 @@ class SplitNoiseSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class DisturbanceSpec:
-    """What pushes the arms off their way in transport in new episodes, so that these show the way back (``disturbance.py``):
-    ``action`` is what was intended, ``sim.executed`` what was sent."""
+    """Disturbance of the arms in transport in new episodes, so that these contain recoveries (``disturbance.py``): ``action`` is
+    the intended target, ``sim.executed`` the target that was sent."""
 
     joint_rad: float = 0.0
     """Standard deviation of each joint's drift; 0: none. 0.02 moves a hand by about 10 mm."""
@@ -123,7 +123,7 @@ class DisturbanceSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class GenerationSpec:
-    """What holds for all subtasks."""
+    """Settings for all subtasks."""
 
     generation_select_src_per_subtask: bool = False
     """Choose a source anew for each subtask; else once."""
@@ -151,7 +151,7 @@ class GenerationSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class GatesSpec:
-    """What a success must keep to be kept. Physical limits of the parts, the arms and the solver."""
+    """Limits that a success must meet to be kept: forces, penetration, joint limits and speeds."""
 
     max_force_n: float = 80.0
     """Net force between mating parts."""
@@ -163,7 +163,7 @@ class GatesSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class MimicSpec:
-    """Everything that generation of one task depends on, but for the twin and the sources."""
+    """Complete settings of generation for one task, except the twin and the sources."""
 
     spec_version: int
     task: str
@@ -182,7 +182,7 @@ class MimicSpec:
 
     @property
     def constraints(self) -> tuple[Constraint, ...]:
-        """As the schedule wants them."""
+        """Constraints in the form that ``Schedule`` takes."""
         return tuple(
             Constraint(
                 former=c.eef_subtask_constraint_tuple[0],
@@ -200,7 +200,7 @@ class MimicSpec:
         return {arm: tuple(s.name for s in subtasks) for arm, subtasks in self.subtask_configs.items()}
 
     def coordination(self, arm: str, k: int) -> ConstraintSpec | None:
-        """What ties subtask ``k`` of ``arm`` to one of the other arm at the same time."""
+        """Constraint that ties subtask ``k`` of ``arm`` to a simultaneous subtask of the other arm; None without one."""
         return next((c for c in self._of(arm, k) if c.constraint_type == "coordination"), None)
 
     def formers(self, arm: str, k: int) -> list[tuple[str, int]]:
@@ -213,7 +213,7 @@ class MimicSpec:
 
 
 def load_mimic_spec(name: str | Path) -> MimicSpec:
-    """The spec of that file, or the shipped one of that task.
+    """Load a spec by path, or the shipped one by the task's name.
 
     Raises:
         SpecError: with file, line, the key, and the way out.
@@ -296,7 +296,7 @@ def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
         if not value >= 0 or (name in positive and value == 0):
             yield (
                 f"datagen_config/{name}",
-                f"{value:g} is not wanted; give a number {'> 0' if name in positive else '≥ 0'}",
+                f"{value:g} is out of range; give a number {'> 0' if name in positive else '≥ 0'}",
             )
     disturbance = generation.disturbance
     if disturbance.joint_rad == 0 and disturbance != DisturbanceSpec():
@@ -329,7 +329,7 @@ def _counts(spec: MimicSpec) -> str:
 
 
 def check_task(spec: MimicSpec, task: Task) -> None:
-    """The spec is of this task: the same subtasks in the same order, objects that it has.
+    """Check that the spec is of this task: the same subtasks in the same order, and only objects that it has.
 
     Raises:
         SpecError: names what the task does not have, and what is near.
@@ -362,7 +362,7 @@ def check_task(spec: MimicSpec, task: Task) -> None:
 
 
 def check_closed_loop(spec: MimicSpec) -> None:
-    """An expert that is to move the hands in contact can.
+    """Check that the task's expert can move the hands in contact, if the spec wants that (``closed_loop_expert``).
 
     Raises:
         SpecError: the task's expert cannot begin in the middle, or other options contradict it.

@@ -35,7 +35,7 @@ MIMICGEN, CORRECTION = "mimicgen", "correction"
 
 @dataclass(frozen=True, eq=False)
 class StoredActions:
-    """Such a folder, read."""
+    """Content of a folder of stored actions."""
 
     root: Path
     meta: dict[str, Any]

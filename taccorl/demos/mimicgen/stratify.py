@@ -1,8 +1,9 @@
-"""The reset space cut into boxes, and which attempts fill the poor ones: ``taccorl augment --stratify=true``.
+"""Stratified generation: the reset space cut into boxes, and attempts chosen to fill boxes with few episodes
+(``--stratify=true``).
 
 The paper draws uniformly; where attempts fail more often, fewer episodes are left. What attempt k draws is known without
-simulating it, so that after a first half of the attempts as they come, each round looks at the next numbers, simulates those
-whose draws lie where episodes are missing most, and passes the others over.
+simulating it, so that after a first half of the attempts as they come, each round considers the next numbers, simulates those
+whose draws lie where most episodes are missing, and skips the others.
 
     fair share of a box   N / boxes of its row, for N episodes wanted
     need of a box         max(0, 1 − episodes kept there / fair share); 0 once it is given up
@@ -49,7 +50,7 @@ class ResetSpace:
         return (SPLITS.get(len(row.low), 1),) * len(row.low)
 
     def num_boxes(self, row: Row) -> int:
-        """Of a row."""
+        """Number of boxes of a row."""
         return math.prod(self.shape(row))
 
     def edges(self, row: Row, box: int) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +61,7 @@ class ResetSpace:
         return start, start + size
 
     def boxes(self, drawn: Mapping[str, np.ndarray]) -> Boxes:
-        """Where a draw lies."""
+        """Box of each row in which a draw lies."""
         found = []
         for row in self.rows:
             (low, high), shape = self.limits(row), self.shape(row)
@@ -83,7 +84,7 @@ def first_attempts(episodes: int) -> int:
 
 
 def given_up(kept: np.ndarray, failed: np.ndarray) -> np.ndarray:
-    """(boxes,) where hardly any attempt succeeds: no more are made for their sake."""
+    """(boxes,) bool: boxes in which hardly any attempt succeeds, and for which no more attempts are chosen."""
     return (failed >= GIVE_UP_FAILED) & (kept < GIVE_UP_YIELD * (kept + failed))
 
 

@@ -1,4 +1,4 @@
-"""Who touches whom in a state of the twin, and which hand grips something that it cannot move freely."""
+"""Contacts in a state of the twin, and whether a hand grips a part that something else holds."""
 
 import mujoco
 import numpy as np
@@ -8,7 +8,7 @@ from taccorl.sim.simulation import Simulation
 
 
 class Touching:
-    """Of the state that was looked at last; changes nothing in the simulation."""
+    """Contacts of one stored state, computed by ``look``. Does not change the simulation."""
 
     def __init__(self, sim: Simulation) -> None:
         self.model, self.data, self._size = sim.model, mujoco.MjData(sim.model), sim.batch.nstate
@@ -19,18 +19,19 @@ class Touching:
         self.pairs: set[frozenset[str]] = set()
 
     def look(self, row: np.ndarray) -> None:
-        """At a stored row (row_size,) of ``Simulation.state_rows``; ``data`` then has its poses."""
+        """Compute the contacts of a stored row (row_size,) of ``Simulation.state_rows``; ``data`` then has its poses."""
         mujoco.mj_setState(self.model, self.data, row[1 : 1 + self._size], mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_collision(self.model, self.data)
         self.pairs = {frozenset(self._owner[geom] for geom in contact.geom) for contact in self.data.contact}
 
     def free(self, part: str) -> bool:
-        """Touches nothing but arms."""
+        """True if the body touches nothing except arms."""
         return all(pair & set(ROBOT.arms) for pair in self.pairs if part in pair)
 
     def holds_fast(self, arm: str) -> bool:
-        """Whether the arm touches a part that something else touches, too: a hand that wants to be elsewhere stays where it is,
-        and what it learnt there of its rest would be an ever stronger push."""
+        """Whether the arm touches a part that something else touches too. Such a hand cannot reach its target, so its offset
+        must not
+        be estimated: the command would push ever harder."""
         held = [part for part in self._parts if {arm, part} in self.pairs]
         return any(part in pair and arm not in pair for part in held for pair in self.pairs)

@@ -1,1 +1,1 @@
-"""π0.5 with touch (paper §3.2): LeRobot's own pi05, of which only the embedding of prefix and suffix is another one."""
+"""π0.5 with touch (paper §3.2): LeRobot's own pi05 with changed embeddings of prefix and suffix."""

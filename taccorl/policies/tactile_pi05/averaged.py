@@ -27,7 +27,7 @@ class Averaged(nn.Module):
 
     @torch.no_grad()
     def update(self, network: nn.Module) -> None:
-        """After a step of the optimiser."""
+        """Update the mean after a step of the optimiser."""
         self.num_updates += 1
         # A tensor, so that nothing is read back from a GPU.
         decay = ((1 + self.num_updates) / (10 + self.num_updates)).clamp(max=self.decay)

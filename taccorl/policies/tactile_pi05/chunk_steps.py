@@ -1,4 +1,4 @@
-"""Each step of a chunk normalised by itself.
+"""Normalisation of each step of an action chunk with its own mean and deviation.
 
 LeRobot normalises all steps of a chunk by one range for each number of an action. Of relative actions the first step is
 several times smaller than the last, so errors of the first steps hardly count. Here step h, number a becomes
@@ -22,7 +22,7 @@ LEAST_STD = 0.01
 
 
 class ChunkSteps(nn.Module):
-    """μ and σ, (H, A), in a policy's checkpoint. Before a dataset has told them: 0 and 1."""
+    """μ and σ, (H, A), stored in a policy's checkpoint. Until they are read from a dataset: 0 and 1."""
 
     mean_HA: Tensor
     std_HA: Tensor

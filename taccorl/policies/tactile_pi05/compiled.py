@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 
 class Compiled:
-    """``compute`` by torch.compile on a GPU, as it is elsewhere, and where compiling fails (no C compiler, say)."""
+    """Callable that runs ``compute`` compiled by torch.compile on a GPU, and uncompiled elsewhere or where compiling fails."""
 
     def __init__(self, compute: Callable[..., Any]) -> None:
         self._plain = compute
@@ -71,7 +71,7 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
     """Pictures go through ``embed_images`` only, as each camera has weights of its own."""
 
     def fuses(self, device: torch.device) -> bool:
-        """Whether a joint forward there is this module's, not LeRobot's. Recomputed activations are LeRobot's business."""
+        """Whether this module's joint forward is used instead of LeRobot's. With recomputed activations LeRobot's is used."""
         models: Any = self.paligemma.model.language_model, self.gemma_expert.model
         checkpoints = any(model.gradient_checkpointing for model in models)
         return self.compiles_layers and self.training and device.type == "cuda" and not checkpoints
@@ -132,7 +132,8 @@ def joint_layer(
     mask_BT1K: Tensor,
     suffix_only: bool,
 ) -> tuple[Tensor | None, Tensor]:
-    """One layer of both, which look at each other: ``compute_layer_complete`` of LeRobot's modeling_pi05.py.
+    """One layer of language model and action expert with shared attention: ``compute_layer_complete`` of LeRobot's
+    modeling_pi05.py.
 
     Args:
         mask_BT1K: what is added to scores, K a multiple of 8.

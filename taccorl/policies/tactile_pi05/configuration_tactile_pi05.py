@@ -30,7 +30,7 @@ _BACKBONES = ("full", "small", "tiny")
 @LRSchedulerConfig.register_subclass("warmup_then_cosine")
 @dataclass
 class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
-    """LeRobot's schedule over the whole training, however long it is, with a warm-up that stays as long as it says.
+    """LeRobot's cosine schedule over the whole training, with a warm-up of fixed length.
 
     LeRobot's own shortens the warm-up with the training: 100 of 3000 steps become 33 of 1000, the paper's 100 are for both.
     """
@@ -68,7 +68,7 @@ class TactileFormat:
 
     @property
     def layout(self) -> tuple[int, int, int]:
-        """Pads, rows, columns."""
+        """Number of pads, rows and columns."""
         return len(self.pads), self.rows, self.columns
 
     @property
@@ -243,7 +243,7 @@ class TactilePI05Config(PI05Config):
         self.image_changes()
 
     def image_changes(self) -> ImageRandomizationConfig | None:
-        """What training does to images; None: nothing.
+        """Image randomisation in training; None: none.
 
         Raises:
             TaccorlError: noise or rotation is out of its range.
@@ -260,28 +260,28 @@ class TactilePI05Config(PI05Config):
 
     @property
     def normalizes_steps(self) -> bool:
-        """``normalize_steps`` as it is meant."""
+        """Whether steps of a chunk are normalised one by one: ``normalize_steps`` or the backbone's default, for relative actions only."""
         wanted = self.backbone != "full" if self.normalize_steps is None else self.normalize_steps
         return wanted and self.use_relative_actions
 
     @property
     def decay_of_average(self) -> float:
-        """``average_decay`` as it is meant."""
+        """Value of ``average_decay``, with the backbone's default resolved."""
         return (0.999 if self.backbone == "small" else 0.0) if self.average_decay is None else self.average_decay
 
     @property
     def tokenizer_name(self) -> str:
-        """The tokenizer that is meant."""
+        """Name of the tokenizer, with the backbone's default resolved."""
         return self.tokenizer or (_PALIGEMMA if self.backbone == "full" else "words")
 
     @property
     def has_discrete_state(self) -> bool:
-        """``discrete_state_input`` as it is meant."""
+        """Value of ``discrete_state_input``, with the backbone's default resolved."""
         return self.backbone == "full" if self.discrete_state_input is None else self.discrete_state_input
 
     @property
     def knows_hands(self) -> bool:
-        """``hand_poses`` as it is meant."""
+        """Value of ``hand_poses``, with the backbone's default resolved."""
         if self.hand_poses is None:
             return not self.has_discrete_state and tuple(self.action_feature_names or ()) == arm_names()
         return self.hand_poses
@@ -331,7 +331,7 @@ class TactilePI05Config(PI05Config):
         )
 
     def validate_features(self) -> None:
-        """Keeps what the policy looks at: state, pictures, the parts' poses and, unless it is vision only, touch.
+        """Keep only the policy's inputs: state, pictures, the parts' poses and, unless it is vision only, touch.
 
         Touch becomes ``ENV``, a kind that LeRobot's normaliser leaves as it is. The rest (a flag, the touch of faster clocks)
         would be normalised for nothing.

@@ -1,4 +1,5 @@
-"""Tokens from a window of touch, E_τ of the paper: "CNN2 temporal token"; and how the base context looks at them."""
+"""Tactile encoder: tokens from a window of touch (E_τ of the paper, "CNN2 temporal token"), and cross-attention into the base
+context."""
 
 import math
 
@@ -13,7 +14,7 @@ _HEADS = 4
 
 
 class TactileEncoder(nn.Module):
-    """Two convolutions over each reading's four pads, then M tokens that each look over all L readings.
+    """Two convolutions over each reading's four pads, then M tokens that each attend to all L readings.
 
     A reading's age is learned and added to it; nothing else tells them apart. Pads are channels: what one pad means for
     the grip depends on its opposite.
@@ -61,7 +62,7 @@ def _shrunk(cells: int) -> int:
 
 
 class TouchIntoContext(nn.Module):
-    """What touch adds to the base context, CrossAttn of the paper's eq. 6. Its output is zero until training changes it."""
+    """Contribution of touch to the base context, CrossAttn of the paper's eq. 6. Its output is zero until training changes it."""
 
     def __init__(self, width: int, heads: int = 8, inner: int = 512) -> None:
         """
@@ -93,7 +94,7 @@ class StateToken(nn.Module):
     """The normalised state as one token: sines and cosines of ½ … 8 turns over each joint's range, and a hidden layer.
 
     As numbers alone, fine differences weigh too little: with the waves errors of a chunk are a fifth smaller after 128 thousand
-    rows (one training each; CHANGELOG).
+    rows (one training each).
     """
 
     _OCTAVES = 5

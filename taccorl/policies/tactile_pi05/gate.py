@@ -1,4 +1,4 @@
-"""Whether anything is touched: the paper's contact gate (eq. 5)."""
+"""Contact gate of the paper (eq. 5): whether any pad is in contact."""
 
 import torch
 

@@ -16,7 +16,7 @@ _WARM_UP_RUNS = 2  # libraries choose their kernels and take their workspaces be
 
 
 class KeptConstants(TorchFunctionMode):
-    """``torch.tensor`` of Python numbers gives the tensor that it gave before.
+    """Context in which ``torch.tensor`` of Python numbers returns the same tensor again instead of a new one.
 
     LeRobot's pi05 makes such constants (attention blocks, times) in every denoising step, and each waits for the GPU; a
     graph cannot record that. Nothing writes into them.

@@ -1,7 +1,7 @@
-"""Where both hands are, from the joint angles: forward kinematics of the arms, in the policy's preprocessor.
+"""Poses of both hands from the joint angles: forward kinematics of the arms, in the policy's preprocessor.
 
 A dataset's state is joint angles, and 1 mrad in each is 1 mm between two hands that meet. From scratch a policy does not learn
-the arms' geometry to that, so it is told (S features):
+the arms' geometry to that accuracy, so it gets the poses (S features):
 
     left TCP, right TCP in the world; right TCP in the frame of the left       position and the first two columns of the rotation
 

@@ -27,7 +27,7 @@ _ORDERS = tuple(permutations(range(3)))  # of brightness, contrast and saturatio
 
 @dataclass(kw_only=True)
 class ImageRandomizationConfig:
-    """How far an image may be changed. Every row applies to every image (the paper's probability is 1.0)."""
+    """Ranges of the image randomisation. Every row applies to every image (the paper's probability is 1.0)."""
 
     crop: float = 0.95
     """f_crop: side of the random crop as a part of the image's side; scaled back to full size. 1: absent."""
@@ -58,7 +58,7 @@ class ImageRandomizationConfig:
 
     @classmethod
     def absent(cls, **rows: Any) -> "ImageRandomizationConfig":
-        """With no rows but these."""
+        """The configuration with only these rows."""
         one = (1.0, 1.0)
         return cls(**{"crop": 1.0, "rotation_deg": 0.0, "brightness": one, "contrast": one, "saturation": one, **rows})
 

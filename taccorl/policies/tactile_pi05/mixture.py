@@ -23,7 +23,7 @@ _ROUNDING = 1e-9  # LeRobot's mean of the means of episodes, all of them 1, may 
 
 @dataclass(frozen=True)
 class Mixture:
-    """A dataset of both domains, and how much each counts."""
+    """Weights of simulated and real rows of a dataset."""
 
     sim_weight: float
     """α."""

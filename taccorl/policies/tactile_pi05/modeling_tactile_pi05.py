@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 
 class TactilePI05Policy(PI05Policy):
-    """The policy that LeRobot trains and scores. Made from a dataset's metadata or a checkpoint."""
+    """π0.5 with touch as a LeRobot policy. Made from a dataset's metadata or from a checkpoint."""
 
     config_class = TactilePI05Config
     name = "tactile_pi05"
@@ -127,14 +127,14 @@ class TactilePI05Policy(PI05Policy):
         return policy.eval()
 
     def reset(self) -> None:
-        """Forget actions and touch of the last episode."""
+        """Clear the queue of actions and the window of touch at the start of an episode."""
         super().reset()
         self._graph: GraphedCall | None = getattr(self, "_graph", None)
         self._felt: deque[Tensor] = deque(maxlen=self.config.tactile_history)
         self._plans_state: Tensor | None = None
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
-        """The co-training loss (see ``mixture``) over ``action_losses``, and what there is to be logged.
+        """The co-training loss (see ``mixture``) over ``action_losses``, and values for the log.
 
         A row's loss is the mean over its action steps without those behind the episode's end (LeRobot's pi05 counts them,
         too). Where there are none, and one domain, that of flow matching is LeRobot's to the bit.

@@ -28,7 +28,7 @@ _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
 
 
 class Touch(NamedTuple):
-    """Touch of a batch as tokens."""
+    """Tactile tokens of a batch, and where there is contact."""
 
     prefix_BMD: Tensor
     suffix_BMD: Tensor
@@ -37,7 +37,7 @@ class Touch(NamedTuple):
 
 
 class TactileConditioning(nn.Module):
-    """All that touch adds to pi05's weights: ``model.tactile.*`` of a checkpoint."""
+    """All weights that touch adds to pi05: ``model.tactile.*`` of a checkpoint."""
 
     def __init__(self, config: TactilePI05Config, prefix_width: int, suffix_width: int) -> None:
         super().__init__()
@@ -54,14 +54,14 @@ class TactileConditioning(nn.Module):
         self.into_context = TouchIntoContext(prefix_width)
 
     def forward(self, readings_BLPRC: Tensor, contact_B: Tensor) -> Touch:
-        """Tokens of normalised readings."""
+        """Compute the tactile tokens of normalised readings."""
         tokens_BMD = self.encoder(readings_BLPRC)
         prefix_BMD, suffix_BMD = tokens_BMD[:, : self.num_prefix], tokens_BMD[:, self.num_prefix :]
         return Touch(self.to_prefix(prefix_BMD), self.to_suffix(suffix_BMD), contact_B)
 
 
 class TactilePI05Pytorch(PI05Pytorch):
-    """LeRobot's model; only ``embed_prefix`` and ``embed_suffix`` know of touch."""
+    """LeRobot's pi05 model with tactile tokens, which ``embed_prefix`` and ``embed_suffix`` add."""
 
     config: TactilePI05Config
     paligemma_with_expert: CompiledBackbone
@@ -91,7 +91,7 @@ class TactilePI05Pytorch(PI05Pytorch):
     def sensing(
         self, state_B1D: Tensor | None, readings_BLPRC: Tensor | None, contact_B: Tensor | None, *, masked: bool = False
     ) -> Iterator[None]:
-        """Whatever is computed inside knows this state and feels these readings.
+        """Context manager: the model uses this state and these tactile readings in all computations inside it.
 
         Args:
             state_B1D: its token. None: it is in the prompt.

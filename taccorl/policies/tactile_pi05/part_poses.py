@@ -41,7 +41,7 @@ _HIDDEN = 512
 
 
 def num_pairs(num_bodies: int) -> int:
-    """Q."""
+    """Q: number of pairs of bodies."""
     return num_bodies * (num_bodies - 1) // 2
 
 

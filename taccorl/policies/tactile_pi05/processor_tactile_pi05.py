@@ -1,4 +1,4 @@
-"""From a row of a dataset or an environment to what the policy takes, and back: LeRobot's steps, touch and the tokenizer."""
+"""Pre- and postprocessor of the policy: LeRobot's steps, conversion of touch, and the tokenizer."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -79,7 +79,7 @@ class _KeepsFeatures(ProcessorStep):
 
 @dataclass
 class RawStateStep(_KeepsFeatures):
-    """At inference, hands the policy the state as it is, too: what its relative actions are relative to.
+    """At inference, also passes the state without normalisation to the policy: its relative actions refer to it.
 
     LeRobot 0.6.1 adds the state of now to every action that comes out of a chunk, but all of them are relative to the state for
     which the chunk was predicted: an arm that has moved since would be sent twice as far. So the policy says with each action how
@@ -95,7 +95,7 @@ class RawStateStep(_KeepsFeatures):
 
 @dataclass
 class TakeStateSincePlanStep(_KeepsFeatures):
-    """Keeps what an action carries beside its numbers, before they change."""
+    """Stores ``STATE_SINCE_PLAN`` of an action before LeRobot's steps change the action."""
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         moved = getattr(transition.get(TransitionKey.ACTION), STATE_SINCE_PLAN, None)
@@ -129,7 +129,7 @@ def _with(transition: EnvTransition, key: TransitionKey, value: Any) -> EnvTrans
 def make_tactile_pi05_pre_post_processors(
     config: TactilePI05Config, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """What LeRobot makes of ``--policy.type=tactile_pi05``: the order is pi05's, touch comes before the prompt.
+    """Make the pre- and postprocessor of ``--policy.type=tactile_pi05``: pi05's steps, with touch before the prompt.
 
     Raises:
         TaccorlError: touch of an unknown format, a tokenizer that cannot be loaded or that the backbone has no room for.

@@ -1,4 +1,4 @@
-"""Weights from files, loudly: LeRobot's loader for pi05 prints what went wrong and goes on with random weights."""
+"""Load weights from files and raise on any mismatch; LeRobot's loader for pi05 prints it and continues with random weights."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +19,7 @@ _POSE_HEAD = "pose_head."
 
 
 def load_base_weights(policy: PI05Policy, source: str) -> None:
-    """Plain π0.5 into ``policy``: everything but touch comes from it, and all of it is used but for its language heads.
+    """Load plain π0.5 into ``policy``: all weights except those of touch. Its language heads are not used.
 
     Args:
         source: folder, file or hub id, such as lerobot/pi05_base.
@@ -36,7 +36,7 @@ def load_base_weights(policy: PI05Policy, source: str) -> None:
 
 
 def load_checkpoint(policy: PI05Policy, source: str, **hub: Any) -> None:
-    """The policy's own weights, all of them and no others; but for the pose head, which actions do not need.
+    """Load the policy's own weights: all of them and no others, except the pose head, which actions do not need.
 
     Raises:
         TaccorlError: they cannot be read, or do not match; nothing was loaded then.

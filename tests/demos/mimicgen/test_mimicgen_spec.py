@@ -73,7 +73,7 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
         (
             "task: assembly_2",
             "task: assembly_2\ndatagen_config: {disturbance: {joint_rad: -0.02}}",
-            r"disturbance → joint_rad: -0\.02 is not wanted; give a number ≥ 0",
+            r"disturbance → joint_rad: -0\.02 is out of range; give a number ≥ 0",
         ),
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {disturbance: {time_s: 0}}", r"give a number > 0"),
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {disturbance: {time_s: 1}}", r"without joint_rad"),
