@@ -207,7 +207,7 @@ def collect(plan: Plan, out: Path, store: Store, progress: Progress = print) -> 
 
 
 def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("the function comes with the attempts")
+    raise NotImplementedError("this stage is run with its function bound to the attempts; it cannot be called directly")
 
 
 _DEMONSTRATION = Stage("demonstration", _not_yet, ATTEMPT_VERSION)
@@ -346,7 +346,9 @@ def collect_recordings(plan: Plan, out: Path, progress: Progress = print) -> lis
             written.append(path)
         k += 1
         if plan.hopeless(k, successes):
-            raise TaccorlError(f"{plan.task}: only {successes} of {k} attempts succeeded; {out} holds what was kept")
+            raise TaccorlError(
+                f"{plan.task}: only {successes} of {k} attempts succeeded; those kept so far are in {out}"
+            )
     return written
 
 

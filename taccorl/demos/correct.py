@@ -108,7 +108,9 @@ class CorrectionPlan:
         """
         tasks.get(self.task)(self.difficulty)
         if not experts.get(self.task).can_resume():
-            raise TaccorlError(f"--task={self.task}: its expert can only begin at the beginning; write its remaining()")
+            raise TaccorlError(
+                f"--task={self.task}: its expert cannot take over within a task; implement its remaining()"
+            )
         if self.takeover not in TAKEOVERS:
             raise TaccorlError(f"--takeover={self.takeover}: {nearest(self.takeover, TAKEOVERS)}")
         if self.rows not in ROWS:
@@ -391,7 +393,7 @@ def _lost_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int
 
 
 def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("the function comes with the plan")
+    raise NotImplementedError("this stage is run with its function bound to the plan; it cannot be called directly")
 
 
 _CORRECTION = Stage("correction", _not_yet, VERSION)

@@ -37,7 +37,7 @@ def policy_episodes(
 
 
 def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("the function comes with the policy")
+    raise NotImplementedError("this stage is run with its function bound to the policy; it cannot be called directly")
 
 
 _STAGE = Stage("policy_episodes", _not_yet, VERSION)

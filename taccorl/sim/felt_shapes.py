@@ -42,7 +42,7 @@ def shapes_of(model: mujoco.MjModel, geoms: Sequence[int]) -> list[Shapes]:
     planes = by_kind.pop(kind.mjGEOM_PLANE, [])
     for geom_type, (geom, *_) in by_kind.items():
         raise TaccorlError(
-            f"geom {_name(model, geom)}: pads cannot feel a {kind(geom_type).name.removeprefix('mjGEOM_').lower()}; make it of "
+            f"geom {_name(model, geom)}: pads cannot detect a {kind(geom_type).name.removeprefix('mjGEOM_').lower()}; make it of "
             "spheres, capsules, cylinders, boxes and convex meshes, or non-colliding (contype = conaffinity = 0)"
         )
     found: list[Shapes] = []
@@ -137,7 +137,7 @@ def _polyhedron_of(model: mujoco.MjModel, geom: int, vertices: bytes) -> Polyhed
     if inside_m > FLAT_M:
         raise TaccorlError(
             f"geom {_name(model, geom)}: mesh {mesh.name!r} is not convex: a facet lies {inside_m * 1e3:.3g} mm inside its "
-            "convex hull, which is what MuJoCo collides and pads feel; cut it into convex meshes (taccorl.sim.shapes.extrude)"
+            "convex hull, which MuJoCo and the pads use; cut it into convex meshes (taccorl.sim.shapes.extrude)"
         )
     return solid
 

@@ -126,7 +126,7 @@ def test_the_format_comes_from_the_dataset_and_stays():
     [
         (
             {"features": {"observation.state": {}}},
-            "has no observation.tactile, the policy feels: --policy.tactile=false",
+            "has no observation.tactile, which --policy.tactile=true needs: --policy.tactile=false",
         ),
         ({"fps": 50}, "has 50 rows a second, the checkpoint was trained with 30"),
         ({"episodes": {"length": [40, 9]}}, "episode 1 has 9 rows, the window of touch 10"),

@@ -74,7 +74,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("dataset", "settings", "said"),
     [
-        ("blind", {}, r"local/blind .*has no observation\.tactile, the policy feels: --policy\.tactile=false.*taccorl ingest"),
+        ("blind", {}, r"local/blind .*has no observation\.tactile, .*--policy\.tactile=false.*taccorl ingest"),
         ("short", {}, r"local/short.*episode 1 has 7 rows, the window of touch 10: leave it out.*--policy\.tactile_history"),
         ("only_sim", {}, r"gives real rows the weight 0\.5, but.*none: merge real data into it, or --policy\.sim_weight=1"),
         ("only_real", {"sim_weight": 0.95}, r"gives simulated rows the weight 0\.95.*or --policy\.sim_weight=0"),

@@ -148,7 +148,7 @@ class ScriptedExpert(ABC):
         Raises:
             TaccorlError: this demonstrator can only begin at the beginning.
         """
-        raise TaccorlError(f"expert of {self.task}: cannot begin in the middle of {subtask!r}; write its finish()")
+        raise TaccorlError(f"expert of {self.task}: cannot begin in the middle of {subtask!r}; implement its finish()")
 
     @classmethod
     def can_finish(cls) -> bool:
@@ -204,7 +204,9 @@ class ScriptedExpert(ABC):
             LostError: the task cannot be completed from there.
             TaccorlError: this demonstrator can only begin at the beginning.
         """
-        raise TaccorlError(f"expert of {self.task}: can only begin at the beginning; write its remaining()")
+        raise TaccorlError(
+            f"expert of {self.task}: cannot take over in the middle of a task; implement its remaining()"
+        )
 
     @classmethod
     def can_resume(cls) -> bool:

@@ -103,7 +103,9 @@ class AugmentPlan:
         if self.rows not in get_args(Rows):
             raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, get_args(Rows))}")
         if self.stratify and not self.space.rows:
-            raise TaccorlError(f"--stratify=true: nothing is drawn at a reset of {self.spec.task}, no box can be poor")
+            raise TaccorlError(
+                f"--stratify=true: nothing is randomised at a reset of {self.spec.task}, so no box can have too few episodes"
+            )
 
     @functools.cached_property
     def space(self) -> ResetSpace:
@@ -278,7 +280,7 @@ def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> li
         for k in numbers:
             attempt = store.find(_ATTEMPT, plan.config(k), [sources])
             if attempt is None:
-                raise TaccorlError(f"{store.root}: attempt {k} is not there any more; augment again makes it again")
+                raise TaccorlError(f"{store.root}: attempt {k} is missing; run taccorl augment again to make it again")
             # As in run_attempt: rows count only where the attempt is a success, whatever rows an attempt before it left.
             wanted = plan.rows == "dataset" and _entry(attempt.path)["outcome"] == "success"
             rows = store.find(_ROWS, plan.config(k), [sources]) if wanted else None
@@ -374,7 +376,7 @@ def _entry(folder: Path) -> dict[str, Any]:
 
 
 def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("the function comes with the attempts")
+    raise NotImplementedError("this stage is run with its function bound to the attempts; it cannot be called directly")
 
 
 _ATTEMPT = Stage("mimicgen", _not_yet, VERSION)

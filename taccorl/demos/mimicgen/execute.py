@@ -205,7 +205,9 @@ def _dataset_config(plan: ExecutePlan) -> dict[str, Any]:
 
 
 def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("the function comes with the demonstrations")
+    raise NotImplementedError(
+        "this stage is run with its function bound to the demonstrations; it cannot be called directly"
+    )
 
 
 _EXECUTION = Stage("execution", _not_yet, 2)

@@ -58,8 +58,8 @@ def open_sources(root: Path, task: str) -> Dataset:
         )
     if EXECUTED in dataset.info["features"]:
         raise DatasetError(
-            f"{root}: its arms were pushed off their way (datagen_config/disturbance): hands are not where they were to be. "
-            "Give the dataset that it was made of, or one without disturbance"
+            f"{root}: its arms were disturbed (datagen_config/disturbance), so hands deviate from their targets. "
+            "Give the dataset from which it was made, or one without disturbance"
         )
     return dataset
 

@@ -373,7 +373,7 @@ def check_closed_loop(spec: MimicSpec) -> None:
     if spec.datagen_config.contact_mode == "closed_loop_expert" and not experts.get(spec.task).can_finish():
         raise SpecError(
             f"{where}: datagen_config → contact_mode: closed_loop_expert, but the expert of {spec.task} cannot begin in the "
-            "middle of a subtask: write its finish(), or take contact_mode: replay"
+            "middle of a subtask: implement its finish(), or set contact_mode: replay"
         )
 
 

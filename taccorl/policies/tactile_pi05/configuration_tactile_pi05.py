@@ -260,7 +260,8 @@ class TactilePI05Config(PI05Config):
 
     @property
     def normalizes_steps(self) -> bool:
-        """Whether steps of a chunk are normalised one by one: ``normalize_steps`` or the backbone's default, for relative actions only."""
+        """Whether steps of a chunk are normalised one by one: ``normalize_steps``, by default as the backbone wants; only for
+        relative actions."""
         wanted = self.backbone != "full" if self.normalize_steps is None else self.normalize_steps
         return wanted and self.use_relative_actions
 
@@ -378,8 +379,9 @@ class TactilePI05Config(PI05Config):
             return
         if TACTILE not in meta.features:
             raise TaccorlError(
-                f"{where} has no {TACTILE}, the policy feels: --policy.tactile=false trains on vision only; a dataset with touch "
-                f"comes from taccorl ingest. It has: {', '.join(k for k in meta.features if k.startswith('observation.'))}"
+                f"{where} has no {TACTILE}, which --policy.tactile=true needs: --policy.tactile=false trains on vision only; "
+                f"taccorl ingest makes datasets with touch. "
+                f"It has: {', '.join(k for k in meta.features if k.startswith('observation.'))}"
             )
         found = TactileFormat.of_feature(meta.features[TACTILE], where)
         if self.tactile_format is not None and self.tactile_format != found:

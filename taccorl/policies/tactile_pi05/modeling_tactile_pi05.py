@@ -391,7 +391,7 @@ class TactilePI05Policy(PI05Policy):
             return None, None
         told = self.config.require_tactile_format()
         if TACTILE not in batch:
-            raise TaccorlError(f"the policy feels, but the batch has no {TACTILE}; it has: {', '.join(batch)}")
+            raise TaccorlError(f"--policy.tactile=true, but the batch has no {TACTILE}; it has: {', '.join(batch)}")
         readings, history, num_taxels = batch[TACTILE], self.config.tactile_history, told.num_taxels
         if readings.ndim == 2 and history == 1:
             readings = readings[:, None]

@@ -208,5 +208,7 @@ def test_a_disturbed_dataset_says_how_and_is_no_source(collected, tmp_path):
     again = attempt_episode(attempts[-1].folder)
     for key in ("action", "sim.executed", "sim.state"):
         np.testing.assert_array_equal(again.arrays[key], episode.arrays[key])
-    with pytest.raises(DatasetError, match=r"pushed off their way .* Give the dataset that it was made of"):
+    with pytest.raises(
+        DatasetError, match=r"disturbed \(datagen_config/disturbance\).* Give the dataset from which it was made"
+    ):
         read_sources(tmp_path / "new", SPEC)

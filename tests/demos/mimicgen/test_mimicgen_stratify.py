@@ -133,12 +133,12 @@ def test_attempts_that_were_passed_over_are_not_looked_for(tmp_path):
     assert found[-1] < 2 + 16
     assert [one.folder for one in made_attempts(some, tmp_path / "sources", store, 6)] == made
     # The plain command would need those that were passed over.
-    with pytest.raises(TaccorlError, match=r"attempt \d+ is not there any more"):
+    with pytest.raises(TaccorlError, match=r"attempt \d+ is missing"):
         made_attempts(plan(episodes=4, stratify=False), tmp_path / "sources", store, 6)
 
 
 def test_where_nothing_is_drawn_there_is_nothing_to_fill():
-    with pytest.raises(TaccorlError, match=r"--stratify=true: nothing is drawn at a reset of assembly_2"):
+    with pytest.raises(TaccorlError, match=r"--stratify=true: nothing is randomised at a reset of assembly_2"):
         plan(randomization=0.0)
 
 
