@@ -8,7 +8,7 @@ export HF_HUB_OFFLINE := 1
 # Compiled modules are kept, whatever the shell says: importing LeRobot takes 25 s without, and tests start many processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test test-slow lint bench pictures lock clean
+.PHONY: help demo test test-slow lint bench pictures notebooks lock clean
 
 demo: .venv/.ready  ## twin → recordings → dataset → checks → Rerun file, and a hidden effect found; into outputs/demo (the default)
 	@echo "demo: the twin demonstrates → recordings → dataset → checks → Rerun; a hidden effect is found. Nothing here comes from a robot."
@@ -38,6 +38,9 @@ pictures: .venv/.ready  ## draw the pictures of the README and docs/effects.md a
 	$(BIN)/python -m pipelines.task_pictures
 	$(BIN)/python -m pipelines.effects_page
 	$(BIN)/python -m pipelines.mend_picture
+
+notebooks: .venv/.ready  ## run the notebooks and store their outputs (ONLY=2: the second)
+	$(BIN)/python tests/notebooks/stored_outputs.py $(ONLY)
 
 # Names and versions only: no addresses, no hashes.
 lock: .venv/.ready  ## newest versions that fit pyproject.toml, into requirements.lock
