@@ -1,10 +1,11 @@
 """``taccorl augment --source=outputs/assembly_2 --task=assembly_2 [--episodes=200] [--out=outputs/assembly_2_augmented]``
 
-A few demonstrations out of the twin (``taccorl collect``) into a LeRobot dataset of many new, successful ones with touch and
-pictures: MimicGen for two hands, held objects carried over. Beside it a report: yield, coverage, failures and how to see them.
+Generate a LeRobot dataset of many new, successful demonstrations with touch and pictures from a few demonstrations in the twin
+(``taccorl collect``): MimicGen for two hands, which keeps the path of held objects. A report of yield, coverage and failures is
+written beside it.
 The dataset is the same for any number of workers: --engine.workers=2, --engine.type=ray, --engine.type=slurm. An attempt that
-kills its process twice, or does not end within ten minutes, is then one that failed; --engine.workers=1 works in the command's
-own process, which nothing outlives.
+kills its process twice, or does not end within ten minutes, counts as failed. With --engine.workers=1 attempts run in the
+command's own process, which such an attempt would end.
 
 --rows=actions writes seeds and float32 actions, 24 kB an episode, instead of a dataset: physics only. ``taccorl execute`` makes
 the dataset on the machine where it is needed.
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class AugmentConfig:
-    """New demonstrations out of a few."""
+    """Generate many demonstrations from a few."""
 
     source: Path
     """Dataset of successful demonstrations from the twin, of this task."""
@@ -56,7 +57,7 @@ class AugmentConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: augmented."""
+    """Run ``taccorl augment``; returns the exit status 0."""
     config = parse(AugmentConfig, argv, positional=None)
     from taccorl.benchmark import cpu_s
     from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts

@@ -1,6 +1,6 @@
 """``taccorl check PATH [--spec=piper_flexitac_mcap]``: what is wrong with a recording or a dataset.
 
-A recording needs its spec; a dataset is checked against the spec it carries.
+A recording needs its spec; a dataset is checked against the spec that is stored in it.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class CheckConfig:
-    """What is wrong with a recording or a dataset."""
+    """Find what is wrong with a recording or a dataset."""
 
     path: Path
     """A LeRobot dataset's folder, or a recording (file, bag folder, folder of recordings)."""
@@ -31,7 +31,7 @@ class CheckConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: nothing worse than a note; 1: warnings or errors."""
+    """Run ``taccorl check``; exit status 0: nothing worse than a note, 1: warnings or errors."""
     config = parse(CheckConfig, argv, positional="path")
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)

@@ -1,10 +1,10 @@
 """``taccorl collect --task=assembly_1 [--source.type=expert] [--episodes=20] [--out=outputs/assembly_1]``
 
-Demonstrations in the twin into a LeRobot dataset with touch, simulator state, subtasks and success. With
+Collect demonstrations in the twin into a LeRobot dataset with touch, simulator state, subtasks and success. With
 ``--as_recording=true`` into MCAP files as the robot's drivers would write them, for ``taccorl ingest``.
 
-A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``; what was done lies in ``outputs/teleop``, and
-``taccorl collect --source.type=actions --source.path=FILE`` makes the episode of it again.
+A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``; actions are stored in ``outputs/teleop``, and
+``taccorl collect --source.type=actions --source.path=FILE`` makes the episode from them again.
 """
 
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ from taccorl.lineage.store import Store
 
 @dataclass(kw_only=True)
 class CollectConfig:
-    """Demonstrations in the twin."""
+    """Collect demonstrations in the twin."""
 
     task: str | None = None
     """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's. Action files say it themselves."""
@@ -52,7 +52,7 @@ class CollectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: collected."""
+    """Run ``taccorl collect``; returns the exit status 0."""
     config = parse(CollectConfig, argv, positional=None)
     if not config.task and not isinstance(config.source, ActionsSource):
         from taccorl.sim.tasks import tasks

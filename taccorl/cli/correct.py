@@ -8,7 +8,7 @@ demonstrations (taccorl merge) and trained on (lerobot-train). Give every round 
     --engine.workers=8        experts in so many processes
     --rows=actions            seeds and actions alone: taccorl execute makes one dataset of demonstrations and corrections
 
-The policy's episodes and each correction lie in the store: a run that was stopped goes on.
+The policy's episodes and each correction are kept in the store: a run that was stopped continues.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from taccorl.lineage.engines import Engine, LocalEngine
 
 @dataclass(kw_only=True)
 class CorrectConfig:
-    """The expert's corrections of a policy."""
+    """Collect the expert's corrections of a policy."""
 
     policy: PolicyChoice = field(default_factory=PolicyChoice)
     """--policy.path=CHECKPOINT."""
@@ -63,7 +63,7 @@ class CorrectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: corrected."""
+    """Run ``taccorl correct``; returns the exit status 0."""
     config = parse(CorrectConfig, argv, positional=None)
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
     from taccorl.data.lerobot_format import check_path

@@ -32,7 +32,7 @@ EXPERT = "expert"
 
 @dataclass(kw_only=True)
 class PolicyChoice:
-    """Which policy."""
+    """The policy to evaluate: a checkpoint or the scripted expert."""
 
     path: Path | None = None
     """A checkpoint's folder pretrained_model."""
@@ -76,7 +76,7 @@ class EvaluateConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: scored."""
+    """Run ``taccorl evaluate``; returns the exit status 0."""
     config = parse(EvaluateConfig, argv, positional=None)
     _check_places(config)
     from taccorl.evaluation.episodes import ROWS_FILE, compare, write_rows

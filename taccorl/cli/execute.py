@@ -2,8 +2,8 @@
 [--part_poses=true]``
 
 Stored actions (``taccorl augment --rows=actions``, ``taccorl correct --rows=actions``; --source as often as there are some) into
-one LeRobot dataset, on the machine where it is needed: every demonstration is executed once, by as many workers as
---engine.workers says. Demonstrations that are no success here are left out and counted.
+one LeRobot dataset, on the machine where it is needed: every demonstration is executed once, in --engine.workers processes.
+Demonstrations that do not succeed here are left out and counted.
 
 --pictures=cache encodes no video: frames are rendered into the cache from which lerobot-train --dataset.cache=gpu|host|disk reads
 them, at the policy's resolution. Only with that option can such a dataset be trained on.
@@ -21,7 +21,7 @@ from taccorl.lineage.engines import Engine, LocalEngine
 
 @dataclass(kw_only=True)
 class ExecuteConfig:
-    """A dataset out of stored actions."""
+    """Make a dataset from stored actions."""
 
     source: list[Path]
     """Folder of stored actions: taccorl augment --rows=actions, taccorl correct --rows=actions; once for each."""
@@ -41,7 +41,7 @@ class ExecuteConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: executed; 1: executed, but demonstrations were left out."""
+    """Run ``taccorl execute``; exit status 0: executed, 1: executed, but demonstrations were left out."""
     config = parse(ExecuteConfig, argv, positional=None)
     resolution = _resolution(config)
     from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored

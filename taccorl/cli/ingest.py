@@ -1,7 +1,7 @@
 """``taccorl ingest recordings/ --spec=piper_flexitac_mcap --out=outputs/my_dataset``
 
 Recordings (MCAP, ROS 2 and ROS 1 bags, HDF5, LeRobot datasets) into one LeRobot v3 dataset with touch.
-``taccorl ingest inspect FILE`` prints what a recording holds and a draft spec.
+``taccorl ingest inspect FILE`` prints the contents of a recording and drafts its specs.
 """
 
 import ctypes
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class IngestConfig:
-    """Recordings into one LeRobot dataset."""
+    """Ingest recordings into one LeRobot dataset."""
 
     paths: list[Path]
     """Files, bag folders, datasets, or folders of those."""
@@ -45,7 +45,7 @@ class IngestConfig:
 
 @dataclass(kw_only=True)
 class InspectConfig:
-    """What a recording holds, and a draft spec."""
+    """Print the contents of a recording, and draft its specs."""
 
     paths: list[Path]
     """Files, bag folders, datasets, or folders of those."""
@@ -59,7 +59,7 @@ class InspectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: all written or split; 1: something was quarantined or refused."""
+    """Run ``taccorl ingest``; exit status 0: all written or split, 1: something was quarantined or refused."""
     if argv and argv[0] == "inspect":
         return _inspect(parse(InspectConfig, argv[1:], positional="paths", prog="taccorl ingest inspect"))
     return _ingest(parse(IngestConfig, argv, positional="paths"))
@@ -112,7 +112,7 @@ def _ingest(config: IngestConfig) -> int:
 
 
 def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
-    """What is certain to be in the way is told before an hour of work, not after it."""
+    """Fail early if the output path is occupied, instead of after an hour of work."""
     from taccorl.data.lerobot_format import check_path
 
     out, whole = config.out, config.out.resolve()

@@ -2,8 +2,8 @@
 taccorl lineage prune [--store=outputs/store] [--keep=DATASET ...] [--yes=true]
 
 explain  what a dataset or artefact was made from, down to the raw recordings, and what changed since (then it exits 1)
-prune    what no dataset was made from; deletes it only with --yes=true. Datasets that lie where they were written
-         count by themselves; name moved or copied ones with --keep
+prune    artefacts that no dataset needs; deletes them only with --yes=true. Datasets that are where they were written
+         are known; name moved or copied ones with --keep
 """
 
 import sys

@@ -1,7 +1,8 @@
 """``taccorl merge --real=outputs/recorded --sim=outputs/sources --sim=outputs/many --out=outputs/both``
 
-Datasets of the robot and of the twin into one for co-training: every row says where it is from (``observation.is_sim``), so that
-``lerobot-train --policy.type=tactile_pi05 --policy.sim_weight=0.5`` weighs them. Statistics are computed anew over all rows.
+Merge datasets of the robot and of the twin into one for co-training. Every row is marked with its domain
+(``observation.is_sim``), by which ``lerobot-train --policy.type=tactile_pi05 --policy.sim_weight=0.5`` weights it. Statistics
+are computed anew over all rows.
 """
 
 import os
@@ -14,7 +15,7 @@ from taccorl.errors import DatasetError
 
 @dataclass(kw_only=True)
 class MergeConfig:
-    """Datasets of both domains in one."""
+    """Merge datasets of both domains into one."""
 
     out: Path
     """The dataset's folder. It must not hold anything else."""
@@ -27,7 +28,7 @@ class MergeConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: merged."""
+    """Run ``taccorl merge``; returns the exit status 0."""
     config = parse(MergeConfig, argv, positional=None)
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
     from taccorl.lineage.store import Store

@@ -1,4 +1,4 @@
-"""Config dataclass from a command line, in the syntax of lerobot-train (draccus): ``--a.b=c`` or ``--a.b c``,
+"""Make a configuration dataclass from a command line, in the syntax of lerobot-train (draccus): ``--a.b=c`` or ``--a.b c``,
 ``--config_path=file.yaml``.
 
 Bare words fill one named field: ``taccorl view episode.mcap`` is ``taccorl view --path=episode.mcap``.
@@ -29,7 +29,7 @@ _NEGATIVE = re.compile(r"-\.?\d.*")
 def parse[ConfigT](
     config_class: type[ConfigT], argv: Sequence[str], *, positional: str | None = None, prog: str | None = None
 ) -> ConfigT:
-    """``argv`` as ``config_class``. Paths and texts are taken as they are typed; other values are YAML, as in LeRobot.
+    """Parse ``argv`` into a ``config_class``. Paths and texts are taken as typed; other values are YAML, as in LeRobot.
 
     Args:
         positional: field that bare words fill; a list field takes all of them.

@@ -5,7 +5,7 @@ PPO in the twin from a co-trained policy, held to real demonstrations by a super
     --anchor.weight=1         β; 0: no anchor
     --out=FOLDER              checkpoints/last/pretrained_model is a LeRobot policy; progress.jsonl has a line an iteration;
                               rollouts/*.rrd show an episode after each checkpoint (--rerun=false: none)
-    --out=FOLDER --resume=true   go on from the last checkpoint there, with the settings that the run was begun with;
+    --out=FOLDER --resume=true   continue from the last checkpoint there, with the settings of the run;
                               --iterations=N, --save_freq and --keep_checkpoints may be others
     --config_path=FILE        settings from a file, such as configs/post_train/small.yaml
 
@@ -22,11 +22,11 @@ from taccorl.rl.settings import PostTrainSettings
 
 @dataclass(kw_only=True)
 class PostTrainConfig(PostTrainSettings):
-    """Post-training of a policy in the twin."""
+    """Post-train a policy in the twin."""
 
 
 def main(argv: list[str]) -> int:
-    """0: all iterations are done."""
+    """Run ``taccorl post-train``; returns the exit status 0."""
     config = parse(PostTrainConfig, argv, positional=None, prog="taccorl post-train")
     if config.resume:
         from taccorl.rl import run_settings

@@ -1,4 +1,4 @@
-"""What the verbs print: tables and progress bars, readable in a narrow terminal and in a log file."""
+"""Output of the verbs: tables and progress bars, readable in a narrow terminal and in a log file."""
 
 import sys
 import time
@@ -25,7 +25,7 @@ SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
 def Text(text: str, style: str = "") -> RichText:
-    """Text whose control characters are escaped: names of topics and files come from other people."""
+    """Text with control characters escaped, for names of topics and files that taccorl did not choose."""
     return RichText(printable(text), style)
 
 
@@ -36,7 +36,7 @@ class _Console(Console):
 
 
 def console() -> Console:
-    """The terminal at its own width; anything else wide enough not to fold a topic's name."""
+    """Console with the terminal's width; without a terminal, wide enough not to fold a topic's name."""
     found = _Console()
     return found if found.is_terminal else _Console(width=WIDE)
 
@@ -126,7 +126,7 @@ def _name(r: dict[str, Any]) -> str:
 
 
 def findings_table(name: str, findings: list[Any]) -> None:
-    """What ``taccorl check`` found in one episode or dataset."""
+    """Table of the findings of ``taccorl check`` in one episode or dataset."""
     out = console()
     worst = "error" if any(f.severity == "error" for f in findings) else "warning"
     if not any(f.severity in ("error", "warning") for f in findings):

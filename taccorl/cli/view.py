@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class ViewConfig:
-    """An episode in Rerun."""
+    """Show an episode in Rerun."""
 
     path: Path
     """A LeRobot dataset's folder, a recording, or an attempt of `taccorl augment` in the store."""
@@ -53,7 +53,7 @@ class ViewConfig:
 
 
 def main(argv: list[str]) -> int:
-    """0: shown or written."""
+    """Run ``taccorl view``; returns the exit status 0."""
     config = parse(ViewConfig, argv, positional="path")
     _check_outputs(config)
     with _opened(config) as whole:

@@ -1,7 +1,7 @@
-"""A recording that no robot made: what a bimanual PiPER with FlexiTac pads would have written, faults included.
+"""Synthetic recording (stand-in): what a bimanual PiPER with FlexiTac pads would have written, with optional faults.
 
-Takes the MuJoCo twin's place until there is one: demo, tests and benchmarks need files that look and go wrong like real
-ones, and whose truth is known. Every file says ``surrogate``. The same configuration gives the same bytes.
+Tests and benchmarks need files that look and fail like real ones, and whose true signals are known. Every file says
+``surrogate``. The same configuration gives the same bytes.
 
     write_mcap(path, StandInConfig(duration_s=6.0))    as ROS 2 drivers and rosbag2 would
     write_cobot_magic_hdf5(path, StandInConfig())      as cobot_magic's collect_data.py would

@@ -1,4 +1,4 @@
-"""What never moves in the stand-in's pictures: table, cutting mat, wall, columns, and sensor noise. Colours are BGR."""
+"""Static background of the stand-in's pictures: table, cutting mat, wall, columns, and sensor noise. Colours are BGR."""
 
 import functools
 from collections.abc import Callable
@@ -51,7 +51,7 @@ def table_texture(rows: int) -> np.ndarray:
 
 
 def front_backdrop(rows: int, columns: int, pixel_from_table: np.ndarray, project: Project) -> np.ndarray:
-    """What the front camera sees without arms and parts."""
+    """Picture of the front camera without arms and parts."""
     rng = np.random.default_rng(8)
     wall = np.linspace(150, 196, rows, dtype=np.float32)[:, None, None] * np.array([1.0, 0.99, 0.96], np.float32)
     picture = np.clip(wall + rng.normal(0, 2.5, (rows, columns, 1)), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What a stand-in recording holds, how the drivers it imitates behave, and what can go wrong with it."""
+"""Settings of a stand-in recording: contents, behaviour of the imitated drivers, and faults."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ Gap = tuple[str, float, float]  # topic, from, to [s since the start]
 
 @dataclass(frozen=True, kw_only=True)
 class StandInConfig:
-    """What to record, how the drivers behave, and what goes wrong. Faults are absent by default."""
+    """Settings of a stand-in recording. Faults are absent by default."""
 
     duration_s: float = 6.0
     seed: int = 0

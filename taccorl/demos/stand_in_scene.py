@@ -29,7 +29,7 @@ _SUBPIXEL_BITS = 4
 
 
 class Scene:
-    """Draws what each camera sees of a story."""
+    """Draws the pictures of each camera for a story."""
 
     def __init__(self, story: Story, camera_size: tuple[int, int], seed: int) -> None:
         self.story = story

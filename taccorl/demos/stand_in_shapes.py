@@ -63,7 +63,7 @@ _NEAREST_M = 0.035  # what has a corner nearer than this is left out
 
 @dataclass(frozen=True)
 class View:
-    """Where a camera is in N pictures, and its lens."""
+    """Poses of a camera in N pictures, and its intrinsics."""
 
     camera_from_world: np.ndarray  # (N, 4, 4), z forward, x right, y down
     focal_px: float
@@ -81,7 +81,7 @@ class View:
         return pixels.reshape((*points_world.shape[:-1], 2)), depth_m.reshape(points_world.shape[:-1])
 
     def on_screen(self, outlines_px: np.ndarray) -> np.ndarray:
-        """Which outlines (..., C, 2) may touch the picture."""
+        """Whether outlines (..., C, 2) may overlap the picture."""
         low, high = outlines_px.min(axis=-2), outlines_px.max(axis=-2)
         sane = np.maximum(-low, high).max(axis=-1) < 2e4  # beyond this OpenCV's fixed-point coordinates overflow
         return np.all((high > 0) & (low < [self.columns, self.rows]), axis=-1) & sane

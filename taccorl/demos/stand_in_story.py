@@ -1,4 +1,4 @@
-"""What truly happens in a stand-in recording: the left arm holds a rack, the right arm puts a tube into it. No physics.
+"""True signals of a stand-in recording: the left arm holds a rack, the right arm puts a tube into it. No physics.
 
 command q*(t)   minimum-jerk between solved key poses, plus a hand's tremor
 state q(t)      q̇ = (q* − q) / τ with τ = ``command_lead_s``; a gripper stops where it meets its part
@@ -37,7 +37,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodePlan:
-    """What one episode sets out to do; times in seconds from the start of the recording."""
+    """Plan of one episode; times in seconds from the start of the recording."""
 
     start_s: float
     end_s: float
@@ -47,11 +47,11 @@ class EpisodePlan:
     place_world: np.ndarray
 
     def at(self, fraction: float) -> float:
-        """When this fraction of the episode is over."""
+        """Time at which this fraction of the episode is over."""
         return self.start_s + fraction * (self.end_s - self.start_s)
 
     def closing_s(self, arm: str) -> tuple[float, float]:
-        """When the gripper is told to close: from, to."""
+        """Start and end of the gripper's closing command."""
         begin = self.at(0.30 if arm == "left" else 0.35)
         return begin, begin + min(0.5, 0.06 * (self.end_s - self.start_s))
 
@@ -164,7 +164,7 @@ class Story:
         return self._sample(self._state, time_s)
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
-        """What the leader arms ask for, same order, (N, 14)."""
+        """Commands of the leader arms, same order, (N, 14)."""
         return self._sample(self._command, time_s)
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
@@ -172,7 +172,7 @@ class Story:
         return self._sample(self._velocity, time_s)
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """Efforts (N, 14) [N·m] that look right: gravity on the long links, tracking error, the grippers' squeeze."""
+        """Plausible efforts (N, 14) [N·m]: gravity on the long links, tracking error, the grippers' squeeze."""
         joints = self.state(time_s)
         effort = 6.0 * (self.command(time_s) - joints)
         for arm in ARMS:
@@ -184,7 +184,7 @@ class Story:
         return effort
 
     def grip(self, arm: str, time_s: np.ndarray) -> np.ndarray:
-        """Grip as the pads feel it, 0 to 1, any shape."""
+        """Grip at the pads, 0 to 1, any shape."""
         felt_m = self._sample(self._squeeze_m, np.asarray(time_s, float) - self.contact_delay_s)
         return felt_m[..., ARMS.index(arm)] / SQUEEZE_M
 
@@ -196,7 +196,7 @@ class Story:
         return [(float(a), float(b)) for a, b in zip(begins_s, ends_s, strict=True)]
 
     def contact_s(self, arm: str) -> list[tuple[float, float]]:
-        """From when to when the pads of an arm feel its part, one interval per episode."""
+        """Interval in which the pads of an arm are in contact with its part, one per episode."""
         return [(a + self.contact_delay_s, b + self.contact_delay_s) for a, b in self._holds[arm]]
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""From the stand-in's story to what its drivers publish: one lazy stream of messages per topic, in order of log time."""
+"""Messages of the stand-in's drivers: one lazy stream per topic, in order of log time."""
 
 import math
 import zlib
@@ -37,7 +37,7 @@ _SLICE_S = 1  # streams work in slices of this length, so memory does not grow w
 
 @dataclass(frozen=True, kw_only=True)
 class StandInTruth:
-    """What really happened. Times in seconds since the start, which is ``START_UNIX_NS``; left arm first."""
+    """True signals of a recording. Times in seconds since the start, which is ``START_UNIX_NS``; left arm first."""
 
     config: StandInConfig
     story: Story
@@ -70,7 +70,7 @@ class StandInTruth:
 
 
 class Told(Protocol):
-    """What truly happened at any time, in seconds since the recording began; N instants."""
+    """Interface of true signals at any time, in seconds since the start of the recording; N instants."""
 
     plans: list[EpisodePlan]
 
@@ -96,7 +96,7 @@ class Told(Protocol):
 
 
 class Seen(Protocol):
-    """What the cameras see."""
+    """Interface of the cameras' pictures."""
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
         """One uint8 picture (rows, columns, 3), blue first, per time."""
@@ -162,7 +162,7 @@ class Streams:
             self._log_s[event.topic].append(event.log_s)
 
     def truth(self, story: Story) -> StandInTruth:
-        """Everything known, once the file is written."""
+        """True signals, available once the file is written."""
         time_s, lag_s = np.arange(0, self.config.duration_s, 1 / JOINT_HZ), self.config.tactile_lag_s
         touched = {arm: [(a + lag_s, b + lag_s) for a, b in story.contact_s(arm)] for arm in ARMS}
         return StandInTruth(

@@ -1,8 +1,8 @@
-"""A person demonstrates in the twin, looking at MuJoCo's viewer: ``taccorl collect --source.type=keyboard | gamepad | leader``.
+"""Teleoperation in the twin with MuJoCo's viewer: ``taccorl collect --source.type=keyboard | gamepad | leader``.
 
-What the person asks for goes into an action file as it happens (teleop_actions.py). The episode is then made by re-executing
-that file: it is as exact as an expert's, and nothing is lost when rendering or encoding fails. The same command goes on where
-the last one ended: a finished demonstration of a scene is re-executed, not asked for again.
+The person's actions are written to an action file at once (teleop_actions.py). The episode is then made by executing that file
+again: it is as exact as an expert's, and nothing is lost when rendering or encoding fails. The same command continues where the
+last one ended: a finished demonstration of a scene is executed again, not requested again.
 """
 
 import abc
@@ -36,7 +36,7 @@ _LATE_S = 0.2  # a machine that is later than this is too slow for real time: it
 
 
 class Window(Protocol):
-    """What a person sees and types into."""
+    """Interface of the window: display and keyboard."""
 
     def tick(self, sim: Simulation, lines: Sequence[str], goals: Sequence[np.ndarray]) -> None:
         """Wait for the next control step, then show simulation 0, some lines of text, and a mark at each (4, 4) goal.
@@ -51,7 +51,7 @@ class Window(Protocol):
         ...
 
     def held(self, codes: Collection[int]) -> set[int]:
-        """Those of ``codes`` that are down now."""
+        """Keys of ``codes`` that are pressed now."""
         ...
 
     def locked(self) -> AbstractContextManager[Any]:
@@ -59,23 +59,23 @@ class Window(Protocol):
         ...
 
     def close(self) -> None:
-        """Take it away."""
+        """Close the window."""
         ...
 
 
 class Hands(Protocol):
-    """One attempt's demonstrator."""
+    """Interface of the controls of one attempt."""
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
         """The next control step's action (14,) [rad, m], and what the person said besides."""
         ...
 
     def lines(self) -> list[str]:
-        """What the person should know."""
+        """Lines of text to show to the person."""
         ...
 
     def goals(self) -> list[np.ndarray]:
-        """World-from-TCP (4, 4) to be marked."""
+        """Poses, world-from-TCP (4, 4), to be marked in the window."""
         ...
 
 
@@ -205,7 +205,7 @@ _sessions: weakref.WeakKeyDictionary[Simulation, _Session] = weakref.WeakKeyDict
 
 @dataclass(frozen=True, kw_only=True)
 class HumanSource(Source):
-    """A person. Subclasses say through what."""
+    """A person demonstrates. Base class; subclasses define the input device."""
 
     folder: str = "outputs/teleop"
     """Where action files go."""
@@ -356,7 +356,7 @@ class LeaderDevice(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of them."""
+        """Disconnect."""
         ...
 
 

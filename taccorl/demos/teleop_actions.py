@@ -1,4 +1,4 @@
-"""Action files: what a demonstrator asked for, step by step, written as it happens; re-executed, they give the same episode.
+"""Action files: the actions of a demonstration, written step by step; executed again they give the same episode.
 
 A file is one JSON value a line, so that a process killed at any moment leaves one that can be read:
 
@@ -88,7 +88,7 @@ class ActionLog:
             os.fsync(self._descriptor)
 
     def end(self, end: str, outcome: str) -> None:
-        """Nothing comes after this."""
+        """Write the last line: how the demonstration ended."""
         assert end in _ENDS, end
         self._write({"end": end, "outcome": outcome})
         self.close()
@@ -132,7 +132,7 @@ def _sync_folder(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class ActionFile:
-    """One file, read."""
+    """Content of one action file."""
 
     path: Path
     header: dict[str, Any]
@@ -148,7 +148,7 @@ class ActionFile:
 
     @classmethod
     def read(cls, path: Path) -> "ActionFile":
-        """A last line that was cut off is left out.
+        """Read a file. An incomplete last line is left out.
 
         Raises:
             TaccorlError: not an action file, or damaged; with file and line.
@@ -305,7 +305,7 @@ class ReplayPlan(Plan):
         return len(self.files)
 
     def attempt_seed(self, k: int) -> int:
-        """Of file ``k``.
+        """Scene seed of file ``k``.
 
         Raises:
             TaccorlError: there are fewer: too few of them end in success.

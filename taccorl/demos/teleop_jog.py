@@ -32,7 +32,7 @@ _DEAD_ZONE = 0.15  # of a stick's way: worn sticks do not rest at 0
 
 
 class StepSize(NamedTuple):
-    """How far one step goes."""
+    """Size of one step: translation [m], rotation [rad], opening [m]."""
 
     name: str
     move_m: float
@@ -43,7 +43,7 @@ STEP_SIZES = (StepSize("fine", 0.001, 0.01), StepSize("medium", 0.005, 0.05), St
 
 
 class Command(enum.Enum):
-    """What a person says besides moving a hand."""
+    """Commands of a person other than motion."""
 
     SWITCH_ARM = "other arm"
     STEP_SIZE = "next step size: fine, medium, coarse"
@@ -98,7 +98,7 @@ _REST = (0,) * 15, (0.0, 0.0, 0.0, 0.0, -1.0, -1.0)  # buttons, axes
 
 
 def label(command: Command) -> str:
-    """The key of a command."""
+    """Name of the key of a command."""
     return next(label for label, meant in COMMAND_KEYS.values() if meant is command)
 
 
@@ -172,7 +172,7 @@ def _beyond_dead_zone(value: float) -> float:
 
 @dataclass
 class JoggedHand:
-    """Where one arm is asked to be."""
+    """Target of one jogged arm."""
 
     goal: np.ndarray
     """World-from-TCP (4, 4) at which the hand is to arrive; always in reach."""
@@ -186,7 +186,7 @@ class JoggedHand:
 
 
 class Jogger:
-    """Both hands of simulation 0. Make one after each reset."""
+    """Moves the targets of both hands of simulation 0 in steps. Make a new one after each reset."""
 
     def __init__(self, sim: Simulation, kinematics: dict[str, ArmKinematics] | None = None) -> None:
         self.sim = sim
@@ -205,12 +205,12 @@ class Jogger:
             self.hands[arm] = JoggedHand(pose, pose, joints, bias, float(targets[ROBOT.gripper_index(arm)]))
 
     def switch_arm(self) -> None:
-        """The next wishes are the other hand's."""
+        """Select the other hand for the next steps."""
         self.arm = ROBOT.arms[1 - ROBOT.arms.index(self.arm)]
         self.notice = ""
 
     def next_size(self) -> None:
-        """Fine → medium → coarse → fine."""
+        """Select the next step size: fine → medium → coarse → fine."""
         self.size = STEP_SIZES[(STEP_SIZES.index(self.size) + 1) % len(STEP_SIZES)]
 
     def jog(self, wish: np.ndarray) -> None:

@@ -1,6 +1,7 @@
 """A demonstration in the twin as the robot's drivers would have recorded it: MCAP with their rates and jitter.
 
-The same streams as the stand-in's, told by a trajectory of the twin: joints at 200 Hz, pads at 100 Hz with their rolling scan,
+The same streams as the stand-in's, computed from a trajectory of the twin: joints at 200 Hz, pads at 100 Hz with their
+rolling scan,
 pictures at 30 Hz from the state at their own stamps. No picture is lost on the way: two lost in a row would split the episode.
 Lost pictures are a fault, which the stand-in's recordings show. Nothing here comes from a robot, and the file says so.
 """
@@ -27,7 +28,7 @@ LEAD_S = 1.0
 
 
 class TwinStory:
-    """What the trajectory says at any time of the recording; before and after it, everything rests."""
+    """Signals of the trajectory at any time of the recording. Before and after the trajectory everything is at rest."""
 
     def __init__(self, sim: Simulation, trajectory: Trajectory, outcome: str) -> None:
         self.sim, self.trajectory = sim, trajectory

@@ -71,7 +71,7 @@ class Actor(Protocol):
 
 @dataclass(frozen=True)
 class Rollout:
-    """One episode."""
+    """Result of one episode: its row, actions and states."""
 
     row: EpisodeRow
     actions: np.ndarray

@@ -190,7 +190,7 @@ class PPOSettings:
 
 @dataclass(kw_only=True)
 class PostTrainSettings:
-    """A run of post-training."""
+    """Settings of a run of post-training."""
 
     policy: PolicySettings = field(default_factory=PolicySettings)
     """Which policy, and what of it is trained."""

@@ -294,7 +294,7 @@ class TactilePI05Config(PI05Config):
 
     @property
     def robot_state_dim(self) -> int:
-        """Numbers of the robot's state and, where it is told, its hands' poses."""
+        """Size of the robot's state and, with ``hand_poses``, of the hands' poses."""
         assert self.input_features is not None, "the policy's __init__ has made sure of features"
         return self.input_features[OBS_STATE].shape[0] + NUM_HAND_POSES * self.knows_hands
 

@@ -66,7 +66,7 @@ class TorqueSpeedLimit(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Stall torques about the most that is asked for, no-load speeds about the fastest that was asked for."""
+        """Start values: stall torques near the largest commanded torque, no-load speeds near the largest commanded speed."""
         stall, speed = cls.parameters()
         peak_nm, fastest = seen.get("peak_motor_nm", seen["peak_torque_nm"]), seen["peak_speed_rad_per_s"]
         return [
