@@ -35,7 +35,7 @@ REFERENCE_STEPS = 20_000
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One figure."""
+    """One figure of a benchmark, with goal, rival, number of measurements and spread."""
 
     name: str
     value: float

@@ -1,8 +1,7 @@
 """Draft two specs from a recording: how recordings are read, and what their dataset holds.
 
 Filled in is what the recording states: topics, types, names of joints, rates, shapes. What it does not state (units, valid
-ranges,
-the instruction) is ``TODO`` with a comment that says what to write there.
+ranges, the instruction) is ``TODO`` with a comment that says what to write there.
 """
 
 import itertools

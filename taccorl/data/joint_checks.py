@@ -71,7 +71,7 @@ def outside(values: np.ndarray, limits: np.ndarray, tolerance: float = LIMIT_TOL
 
 
 def unit_hint(values: np.ndarray, limit: np.ndarray, unit: str) -> str | None:
-    """Which other unit would bring all of an element's values (T,) into its limits; None where none would."""
+    """Name of the unit that would bring all of an element's values (T,) into its limits; None if there is none."""
     if unit == "m" and values.min() >= -0.05 and values.max() <= 1.05:
         return "a normalised opening 0 to 1"
     candidates = {

@@ -96,7 +96,8 @@ def declare_pictures(root: Path, spec: DatasetSpec) -> None:
 
 
 def check_path(path: Path) -> None:
-    """
+    """Check that LeRobot can use this path for a dataset.
+
     Raises:
         DatasetError: LeRobot would misread this place, or worse, read another.
     """
@@ -368,7 +369,8 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
 
 
 def require_videos(root: Path) -> None:
-    """
+    """Check that the dataset contains its videos.
+
     Raises:
         DatasetError: pictures of the dataset are in the cache of training frames alone.
     """

@@ -65,7 +65,7 @@ class PictureWatch:
 
 
 def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
-    """Frozen cameras.
+    """Find frozen cameras in an episode.
 
     Args:
         decode: also look at the pictures themselves, which takes their decoding.

@@ -61,7 +61,7 @@ class WireSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineSpec:
-    """Which counts mean "no touch": per taxel, the median of the recording's first ``frames`` frames."""
+    """Rule for the counts without contact: per taxel, the median of the recording's first ``frames`` frames."""
 
     rule: Literal["median_of_first"]
     frames: int
@@ -133,7 +133,7 @@ class FeatureSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetSpec:
-    """What the dataset holds and the policy sees."""
+    """Contract of a dataset: its features, row rate and video codec."""
 
     spec_version: int
     name: str
@@ -150,7 +150,8 @@ class DatasetSpec:
     """Filled on loading: feature key → its sensor. Not a key of the file."""
 
     def require_action_time(self, name: str) -> None:
-        """
+        """Check that the spec states when an action is reached.
+
         Args:
             name: of the dataset or episode, for the message.
 
@@ -210,7 +211,7 @@ class ChannelSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class MappingSpec:
-    """How one feature is filled: these channels, one after the other, brought to the grid by ``align``."""
+    """Source of one feature: these channels, one after the other, aligned to the rows by ``align``."""
 
     channels: tuple[str, ...]
     align: Align
@@ -218,7 +219,7 @@ class MappingSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodesSpec:
-    """Where episodes begin and end."""
+    """Rule for the start and end of episodes in a recording."""
 
     by: Literal["whole_file", "markers", "metadata"]
     topic: str | None = None
@@ -242,7 +243,7 @@ class InstructionSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSpec:
-    """How recordings of one robot's drivers fill a dataset spec."""
+    """Recording spec: how recordings of one robot's drivers fill a dataset."""
 
     spec_version: int
     dataset: str

@@ -35,7 +35,7 @@ NATIVE = [480, 640, 3]
 
 @dataclass(frozen=True)
 class Cost:
-    """What one piece of work took."""
+    """Measured cost of one piece of work: CPU time and wall time."""
 
     cpu_s: float
     wall_s: float

@@ -222,7 +222,7 @@ def _check_out(plan: Plan, out: Path, store: Store) -> None:
 
 
 def in_the_way(out: Path, stage: Stage, task: str) -> InTheWayError:
-    """What lies at ``out``, where ``stage`` was to publish a dataset of ``task``."""
+    """The error that names what occupies ``out``, where ``stage`` was to publish a dataset of ``task``."""
     manifest = read_manifest(out)
     if manifest:
         held = (

@@ -126,7 +126,7 @@ class CorrectionPlan:
 
     @property
     def scene_seeds(self) -> list[int]:
-        """Of the episodes; independent of how many there are, and of the scenes of other commands."""
+        """Scene seeds of the episodes; independent of their number, and different from those of other commands."""
         return [self._scene_seed(k) for k in range(self.episodes)]
 
     def _scene_seed(self, k: int) -> int:

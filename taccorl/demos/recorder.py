@@ -124,7 +124,7 @@ class EpisodeRecorder:
         return self._dense.trajectory()
 
     def episode(self, name: str, simulation: dict[str, Any]) -> Episode:
-        """All rows so far; ``simulation`` says what made them, and is kept in the dataset's provenance."""
+        """All recorded rows as an episode; ``simulation`` is stored in its provenance."""
         arrays = {key: np.stack([row[key] for row in self.rows]) for key in self.rows[0]}
         outcome = self.sim.judge.outcome
         keys = tuple(key for key in self.spec.keys("video"))

@@ -15,7 +15,7 @@ from taccorl.sim.twin import CONTROL_HZ
 
 @dataclass
 class Score:
-    """Of a number of episodes of one task."""
+    """Success, cost and contact forces of a number of episodes of one task."""
 
     outcomes: list[str] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)

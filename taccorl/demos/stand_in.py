@@ -75,7 +75,7 @@ def _stand_in(config: StandInConfig) -> tuple[Streams, Story]:
 
 
 def publish(path: Path, streams: Streams, label: dict[str, str]) -> None:
-    """All messages into one MCAP file, as rosbag2 would; replaces the file if there is one.
+    """Write all messages into one MCAP file, as rosbag2 would; replaces the file if there is one.
 
     Args:
         label: the MCAP metadata record ``taccorl``: ``origin`` says what this is.

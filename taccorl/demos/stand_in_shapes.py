@@ -124,7 +124,7 @@ def box_polygons(frames: dict[str, np.ndarray], view: View) -> Polygons:
 
 
 def capsule_polygons(frames: dict[str, np.ndarray], view: View, hidden_arm: str | None) -> Polygons:
-    """All capsules, three outlines each from dark to light. A wrist camera looks past its own arm, ``hidden_arm``."""
+    """Polygons of all capsules, three outlines each from dark to light; without a wrist camera's own arm, ``hidden_arm``."""
     capsules = [c for c in _CAPSULES if not (hidden_arm and c[0].startswith(hidden_arm))]
     ends, radius_m = _capsule_ends(frames, capsules)
     pixels, depth_m = view.project(ends)  # (N, K, 2, 2), (N, K, 2)

@@ -79,7 +79,7 @@ class Told(Protocol):
         ...
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14)."""
+        """Commands (N, 14) [rad, m]."""
         ...
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:

@@ -215,14 +215,14 @@ class HumanSource(Source):
 
     @abc.abstractmethod
     def device(self, window: Window) -> Any:
-        """What is opened once and read at each control step; says how it is used on the terminal."""
+        """Open the input device, and print how it is used. Called once; the device is read at each control step."""
 
     @abc.abstractmethod
     def hands(self, sim: Simulation, window: Window, device: Any) -> Hands:
-        """For an attempt that begins now."""
+        """Controls of an attempt that begins now."""
 
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        """Those of the finished demonstration of this scene; if there is none, the person makes one now.
+        """Actions of the finished demonstration of this scene; if there is none, the person demonstrates now.
 
         Raises:
             TaccorlError: no display, no device, or the person has closed the window.
@@ -365,7 +365,7 @@ _drivers: list[OpenLeader] = []
 
 
 def use_leader_driver(driver: OpenLeader) -> None:
-    """From now on leader arms are opened by ``driver``: LeRobot's lies in a layer above, so the command line brings it."""
+    """Set the function that opens leader arms: LeRobot's is in a higher layer, so the command line passes it."""
     _drivers[:] = [driver]
 
 

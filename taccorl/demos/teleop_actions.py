@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 
 def scene_of(sim: Simulation) -> dict[str, Any]:
-    """What defines the scene that simulation 0 was reset to, as JSON."""
+    """Definition of the scene to which simulation 0 was reset, as JSON values."""
     return {
         "task": sim.task.name,
         "difficulty": sim.task.difficulty,
@@ -49,7 +49,7 @@ def scene_of(sim: Simulation) -> dict[str, Any]:
 
 
 def give_time(sim: Simulation, seconds: float) -> None:
-    """From now on an episode is out of time after ``seconds``, whatever the task says: a person is slower than an expert."""
+    """Set the time limit of an episode to ``seconds``: a person is slower than an expert."""
     sim.judge.limit_steps = round(seconds * CONTROL_HZ)
 
 
@@ -94,7 +94,7 @@ class ActionLog:
         self.close()
 
     def close(self) -> None:
-        """To the disk. A file that is closed without ``end`` counts as cut off."""
+        """Flush the file to the disk. A file that is closed without ``end`` counts as cut off."""
         if self._descriptor >= 0:
             os.fsync(self._descriptor)
             os.close(self._descriptor)
@@ -233,7 +233,7 @@ class ActionsSource(Source):
         return sorted(path.glob("*.jsonl")) if path.is_dir() else [path] * path.is_file()
 
     def files(self) -> list[ActionFile]:
-        """All of them, in the order in which they were made.
+        """All action files, in the order in which they were made.
 
         Raises:
             TaccorlError: there is none, or one is damaged.

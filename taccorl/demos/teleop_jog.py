@@ -121,7 +121,7 @@ class Keyboard:
         self._down: dict[int, int] = {}
 
     def wish(self, taps: Iterable[int], held: Collection[int]) -> tuple[np.ndarray, list[Command]]:
-        """Of one control step.
+        """Steps (7,) requested in this control step.
 
         Args:
             taps: codes of the keys pressed since the last control step, in order.
@@ -149,7 +149,7 @@ class Gamepad:
         self._before: Sequence[int] = _REST[0]
 
     def wish(self, buttons: Sequence[int] | None, axes: Sequence[float] | None) -> tuple[np.ndarray, list[Command]]:
-        """Of one control step.
+        """Steps (7,) requested in this control step.
 
         Args:
             buttons: (15,) 1 where down, in GLFW's order: A B X Y, bumpers, BACK START …; None: the gamepad does not answer.
@@ -268,7 +268,7 @@ class JogHands:
         return self.jogger.act(), commands
 
     def lines(self) -> list[str]:
-        """Which hand, which step, and why the newest wish was refused."""
+        """Status lines: selected hand, step size, and why the last step was refused."""
         jogger = self.jogger
         size, opening_mm = jogger.size, jogger.hands[jogger.arm].opening_m * 1e3
         step = f"step {size.name}: {size.move_m * 1e3:g} mm, {size.turn_rad:g} rad"
@@ -300,7 +300,7 @@ class GlfwGamepad:
         self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
 
     def wish(self) -> tuple[np.ndarray, list[Command]]:
-        """Of this control step; nothing if the gamepad does not answer."""
+        """Steps (7,) requested in this control step; zeros if the gamepad does not answer."""
         state = self._glfw.get_gamepad_state(self.jid)
         return self._gamepad.wish(list(state.buttons), list(state.axes)) if state else self._gamepad.wish(None, None)
 
@@ -310,5 +310,5 @@ def _text(name: str | bytes | None) -> str:
 
 
 def squeeze_m(robot: RobotConfig) -> float:
-    """How far the command must lie below the opening of the fingers for ``GRIP_N``: F / k of the gripper's controller."""
+    """Distance [m] of the command below the fingers' opening for the force ``GRIP_N``: F / k of the gripper's controller."""
     return GRIP_N / robot.grip_stiffness_n_per_m

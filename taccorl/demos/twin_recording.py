@@ -1,9 +1,8 @@
 """A demonstration in the twin as the robot's drivers would have recorded it: MCAP with their rates and jitter.
 
-The same streams as the stand-in's, computed from a trajectory of the twin: joints at 200 Hz, pads at 100 Hz with their
-rolling scan,
-pictures at 30 Hz from the state at their own stamps. No picture is lost on the way: two lost in a row would split the episode.
-Lost pictures are a fault, which the stand-in's recordings show. Nothing here comes from a robot, and the file says so.
+The same streams as the stand-in's, computed from a trajectory of the twin: joints at 200 Hz, pads at 100 Hz with their rolling
+scan, pictures at 30 Hz from the state at their own stamps. No picture is lost on the way: two lost in a row would split the
+episode. Lost pictures are a fault, which the stand-in's recordings show. Nothing here comes from a robot, and the file says so.
 """
 
 import json
@@ -53,15 +52,15 @@ class TwinStory:
         return self._at(self.trajectory.reported, time_s)
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14)."""
+        """Commands (N, 14) [rad, m]."""
         return self._at(self.trajectory.targets, time_s)
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14)."""
+        """Velocities (N, 14) [rad/s, m/s]."""
         return self._at(self._velocity, time_s)
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14)."""
+        """Efforts (N, 14) [N·m, N]."""
         return self._at(self.trajectory.effort, time_s)
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:

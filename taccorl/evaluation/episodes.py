@@ -54,7 +54,7 @@ class EpisodeRow:
         return 1.0 if self.success else self.partial / self.max_partial
 
     def to_json(self) -> dict[str, Any]:
-        """All fields, and ``success`` and ``partial_credit``."""
+        """The row as JSON values: all fields, ``success`` and ``partial_credit``."""
         return asdict(self) | {"success": self.success, "partial_credit": self.partial_credit}
 
 

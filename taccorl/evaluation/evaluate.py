@@ -65,7 +65,8 @@ class Scenes:
         return range(self.seed, self.seed + self.episodes)
 
     def twin_config(self) -> TwinConfig:
-        """
+        """Load the twin of these scenes.
+
         Raises:
             TaccorlError: the twin's file cannot be read.
         """
@@ -92,7 +93,7 @@ class Scenes:
 
 
 def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> list[Rollout]:
-    """All episodes of one policy, task by task, in the order of their seeds.
+    """Roll out all episodes of one policy, task by task, in the order of their seeds.
 
     Raises:
         TaccorlError: as ``roll_out`` and ``TaccorlVectorEnv``.
@@ -160,5 +161,5 @@ def read_stored(folder: Path, scenes: Scenes) -> Stored:
 
 
 def scenes_to_json(scenes: Scenes) -> dict[str, Any]:
-    """All fields."""
+    """The scenes as JSON values, all fields."""
     return dataclasses.asdict(scenes) | {"tasks": list(scenes.tasks), "twin": str(scenes.twin) if scenes.twin else None}

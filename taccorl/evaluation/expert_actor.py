@@ -15,7 +15,7 @@ EXPERT = "expert"
 
 
 class ExpertActor:
-    """As ``taccorl collect`` runs it, with the same random numbers in the same scene (see ``rollouts.Actor``)."""
+    """The scripted expert as ``taccorl collect`` runs it, with the same random numbers in the same scene (``rollouts.Actor``)."""
 
     name = EXPERT
     needs_images = False
@@ -35,7 +35,8 @@ class ExpertActor:
         """Does nothing: random numbers follow from the scene's seed."""
 
     def begin(self, envs: TaccorlVectorEnv) -> None:
-        """
+        """Start the expert's script in the new episode.
+
         Raises:
             TaccorlError: more than one environment, or a task without an expert.
         """

@@ -32,7 +32,7 @@ class FailedEpisode:
 
 
 def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
-    """At most ``num`` failures with at least one action: one of each category in turn, in the order of the rows."""
+    """Choose at most ``num`` failures with at least one action: one of each category in turn, in the order of the rows."""
     by_category: dict[tuple[str, str], list[Rollout]] = {}
     for rollout in rollouts:
         if not rollout.row.success and len(rollout.actions):

@@ -33,7 +33,8 @@ Processor = Callable[[Any], Any]
 
 
 def require_same_parts(config: Any, task: str, there: tuple[str, ...]) -> None:
-    """
+    """Check that the environment's part poses are those with which the policy was trained.
+
     Args:
         there: names of the poses of the task's parts.
 
@@ -241,7 +242,7 @@ class PolicyActor:
         self._instructions = [envs.task_description] * envs.num_envs
 
     def act(self, observation: Observation) -> Acted:
-        """As ``policy_actions``, in mixed precision where the checkpoint wants it."""
+        """Next actions, as ``policy_actions``; in mixed precision if the checkpoint wants it."""
         amp = bool(getattr(self._config, "use_amp", False))
         with torch.autocast(torch.device(self._config.device).type) if amp else contextlib.nullcontext():  # pyright: ignore[reportOptionalMemberAccess]
             return Acted(

@@ -70,7 +70,8 @@ def preflight(policy: PolicyFacts, twin: TwinConfig) -> list[Check]:
 
 
 def refuse_differences(checks: Sequence[Check], policy: str) -> None:
-    """
+    """Raise if any line of the preflight differs.
+
     Raises:
         TaccorlError: a line of the preflight differs; names each with both sides.
     """

@@ -34,7 +34,7 @@ class Actor(Protocol):
 
     @property
     def name(self) -> str:
-        """Label in rows."""
+        """Label of the actor in rows."""
         ...
 
     @property
@@ -61,7 +61,7 @@ class Actor(Protocol):
         ...
 
     def begin(self, envs: TaccorlVectorEnv) -> None:
-        """All environments were reset."""
+        """Called after the reset of all environments."""
         ...
 
     def act(self, observation: Observation) -> Acted:

@@ -87,7 +87,7 @@ class PairedComparison:
 
     @classmethod
     def of(cls, first: Sequence[bool], second: Sequence[bool]) -> "PairedComparison":
-        """Of the successes (n,) of both, scene by scene.
+        """Compare the successes (n,) of both policies, scene by scene.
 
         Raises:
             TaccorlError: not one pair a scene.
@@ -120,7 +120,7 @@ class PairedComparison:
 
     @property
     def p_value(self) -> float:
-        """As ``mcnemar_exact``."""
+        """Two-sided p-value of McNemar's exact test."""
         return mcnemar_exact(self.only_first, self.only_second)
 
     def to_json(self) -> dict[str, int | float | list[float]]:

@@ -106,7 +106,7 @@ def not_default(config: Any) -> dict[str, Any] | None:
 
 
 def differences(old: Any, new: Any) -> list[str]:
-    """What changed between two canonical configs, ``["timing.rate_hz: 30.0 → 20.0"]``."""
+    """Differences of two canonical configs, such as ``["timing.rate_hz: 30.0 → 20.0"]``."""
     flat_old, flat_new = flatten(old), flatten(new)
     changed = []
     for name in sorted(flat_old.keys() | flat_new.keys()):

@@ -99,7 +99,7 @@ class RankTask:
 
 
 def require_datatrove() -> Any:
-    """The module ``datatrove.executor``.
+    """Import the module ``datatrove.executor``.
 
     Raises:
         EngineError: it is not installed.

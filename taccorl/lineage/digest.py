@@ -57,7 +57,7 @@ class DigestCache:
             return None
 
     def put(self, path: Path, stamp: list[int], digest: str) -> None:
-        """Remember ``digest``."""
+        """Store ``digest`` for a path and its ``stamp``."""
         self._kept[self._entry(path)] = json.dumps({"path": os.fsdecode(path), "stamp": stamp, "digest": digest})
         if self.folder.parent.is_dir():
             self.write_kept()

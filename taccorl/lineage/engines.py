@@ -26,7 +26,7 @@ NAME_LENGTH = 160
 
 @dataclass(frozen=True, kw_only=True)
 class Engine(draccus.ChoiceRegistry, abc.ABC):
-    """Where items are worked on."""
+    """Base class of engines, which run a function on many items."""
 
     def map(
         self,
@@ -89,7 +89,7 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
 @Engine.register_subclass("local")
 @dataclass(frozen=True, kw_only=True)
 class LocalEngine(Engine):
-    """This machine."""
+    """Engine that runs items in processes of this machine."""
 
     workers: int = 1
     """Processes; 1 works in this process, one item after another, which is best for a debugger. An item that kills its

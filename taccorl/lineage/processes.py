@@ -32,7 +32,7 @@ GRACE_S = 5.0  # how long a worker may tidy up before it is killed
 
 @dataclass(frozen=True)
 class Done:
-    """What the function returned for one item."""
+    """Result of the function for one item."""
 
     result: Any
 

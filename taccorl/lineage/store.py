@@ -91,7 +91,7 @@ class Store:
         return Artefact(path, digest)
 
     def dataset(self, root: Path) -> Artefact:
-        """As ``source``, of a LeRobot dataset whose numbers and pictures are those that it was written with, as far as it says.
+        """As ``source``, for a LeRobot dataset; checks that its files are as they were written, if a manifest states that.
 
         Its ``meta`` may be another: LeRobot's commands compute statistics anew in place.
 

@@ -18,7 +18,7 @@ REPEATS = 5
 
 @benchmark("touch_cost")
 def touch_cost() -> Iterator[Row]:
-    """What touch adds to a training step and to a chunk of the small preset, all rows in contact."""
+    """Cost of touch in a training step and in a chunk of the small preset, all rows in contact."""
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"

@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 class Advantages(NamedTuple):
-    """Both (T, N)."""
+    """Advantages and returns of a rollout, each (T, N)."""
 
     advantage_TN: Tensor
     return_TN: Tensor
@@ -30,7 +30,8 @@ def estimate_advantages(
     gamma: float,
     gae_lambda: float,
 ) -> Advantages:
-    """
+    """Compute advantages and returns of a rollout.
+
     Args:
         next_value_TN: V'; 0 where the episode succeeded or failed.
         end_TN: bool, the episode ended in this decision, whichever way: no credit passes to the decision before a reset.

@@ -65,7 +65,8 @@ def link(folder: Path, name: str) -> None:
 
 
 def policy_folder(out: Path, name: str = LAST) -> Path:
-    """
+    """Policy folder of a checkpoint in a run's folder.
+
     Raises:
         TaccorlError: there is no such checkpoint.
     """

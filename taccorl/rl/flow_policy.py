@@ -102,7 +102,7 @@ class TactileFlowPolicy(FlowPolicy):
 
     @property
     def num_features(self) -> int:
-        """F."""
+        """F: size of the critic's features."""
         config = self.policy.config
         width = self.model.paligemma_with_expert.paligemma.model.language_model.config.hidden_size
         if config.has_discrete_state:

@@ -130,7 +130,7 @@ class FlowSDE:
         return torch.where(counted_BHD, densities, 0.0).sum(dim=(1, 2))
 
     def sample(self, velocity: Velocity, draws: Draws, scored_HD: Tensor) -> Sampled:
-        """Denoise ``draws.initial_BHD``."""
+        """Sample chunks: denoise ``draws.initial_BHD`` with the stochastic steps of ``draws``."""
         x, step_BS = draws.initial_BHD, draws.step_BS
         before, after = torch.zeros_like(draws.noise_BSHD), torch.zeros_like(draws.noise_BSHD)
         log_prob_B = x.new_zeros(len(x))

@@ -264,7 +264,7 @@ class PPO:
 
 
 def policy_loss(log_ratio_M: Tensor, advantage_M: Tensor, clip: float) -> Tensor:
-    """L_PPO, a scalar."""
+    """Clipped loss of PPO, L_PPO, a scalar."""
     ratio_M = log_ratio_M.exp()
     return -torch.minimum(ratio_M * advantage_M, ratio_M.clamp(1 - clip, 1 + clip) * advantage_M).mean()
 

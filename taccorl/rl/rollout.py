@@ -82,7 +82,7 @@ class World(Protocol):
 
     @property
     def num_envs(self) -> int:
-        """N."""
+        """N: number of environments."""
         ...
 
     def observe(self) -> Seen:

@@ -50,7 +50,8 @@ def _replaced[T](target: T, stored: dict[str, Any], prefix: str = "") -> T:
 
 
 def refuse_changes(settings: PostTrainSettings) -> None:
-    """
+    """Check that a run can be resumed with these settings.
+
     Raises:
         TaccorlError: there is no run in ``settings.out``, or it has other settings, or its twin is another now.
     """

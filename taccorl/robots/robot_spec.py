@@ -172,11 +172,11 @@ class RobotSpec:
 
     @cached_property
     def action_names(self) -> tuple[str, ...]:
-        """(A,) ``<arm>_<joint>`` and ``<arm>_gripper``."""
+        """(A,) names ``<arm>_<joint>`` and ``<arm>_gripper`` of the numbers of an action."""
         return tuple(f"{arm}_{name}" for arm in self.arms for name in (*self.joints, "gripper"))
 
     def arm_slice(self, arm: str) -> slice:
-        """Where the joints and the gripper of ``arm`` are in an action of A numbers.
+        """Slice of the joints and the gripper of ``arm`` in an action of A numbers.
 
         Raises:
             ValueError: no such arm.
@@ -185,7 +185,7 @@ class RobotSpec:
         return slice(first, first + self.num_per_arm)
 
     def joint_slice(self, arm: str) -> slice:
-        """Where the joints of ``arm`` are in an action of A numbers.
+        """Slice of the joints of ``arm`` in an action of A numbers.
 
         Raises:
             ValueError: no such arm.

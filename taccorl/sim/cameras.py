@@ -18,7 +18,7 @@ from taccorl.robots import ROBOT
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """Where a picture lies in its letterboxed frame [pixels]; black bars are all around it."""
+    """Area of a picture within its letterboxed frame [pixels]; black bars are all around it."""
 
     top: int
     left: int

@@ -90,7 +90,7 @@ class Canvas:
         mujoco.mjr_render(mujoco.MjrRect(0, 0, view.window.columns, view.window.rows), self._scene, self._mjr)
 
     def labels(self, model: mujoco.MjModel, data: mujoco.MjData, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """What each pixel of a view's window shows: number of the geom, −1 for none, and depth [m] along the optical axis."""
+        """Geom shown by each pixel of a view's window (−1 for none), and depth [m] along the optical axis."""
         flags, rows, columns = self._scene.flags.copy(), view.window.rows, view.window.columns
         self._scene.flags[[int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]] = 1
         try:

@@ -16,10 +16,10 @@ _BITS = 52  # a float64 holds so many exactly
 
 
 def scene_digest(task: "Task", config: "TwinConfig", scale: float) -> float:
-    """Of task, difficulty, twin and randomisation: k / 2⁵², 0 ≤ k < 2⁵², from SHA-256. Equal ones have the same bits.
+    """Digest of task, difficulty, twin and randomisation: k / 2⁵², 0 ≤ k < 2⁵², from SHA-256. Equal scenes have equal bits.
 
-    An effect's interval and evidence are not included: they do not change the motion.
-    A fraction, so that it stays within the range that a dataset declares for ``sim.state``.
+    An effect's interval and evidence are not included: they do not change the motion. A fraction, so that it stays within the
+    range that a dataset declares for ``sim.state``.
     """
     bare = [dataclasses.replace(effect, interval={}, evidence="") for effect in config.effects]
     config = dataclasses.replace(config, effects=bare)

@@ -199,7 +199,7 @@ class SeenScene:
         return self.arrays["sensordata"][:, self._touching[body]] > 0
 
     def contact(self, body: str, other: str) -> Contact:
-        """Of a pair in ``task.mating``: touching, deepest penetration and net normal force."""
+        """Contact of a pair in ``task.mating``: touching, deepest penetration and net normal force."""
         if (body, other) not in self._mating:
             raise TaccorlError(f"contact {body}–{other}: task {self.task.name} declares {list(self._mating)} as mating")
         data, at, force = self.arrays["sensordata"], *self._mating[body, other]

@@ -215,7 +215,7 @@ def _combined(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Polyhedron:
-    """One convex solid."""
+    """One convex solid: its faces and vertices."""
 
     normals: np.ndarray
     """(F, 3) outward."""

@@ -22,7 +22,7 @@ CONTROL_HZ = 30  # the dataset's fps: one action a row
 
 @dataclass(kw_only=True)
 class PhysicsConfig:
-    """How contacts are solved. Chosen by measurement: docs/benchmarks.md, penetration and creep."""
+    """Contact and solver settings, chosen by measurement: docs/benchmarks.md, penetration and creep."""
 
     steps_per_control_step: int = 40
     """Physics steps within 1/30 s; a multiple of 20, so that 200 Hz joints and 100 Hz pads fall on whole steps."""

@@ -180,7 +180,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, *, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin new episodes.
+        """Start new episodes in all environments, or in those of ``reset_mask``.
 
         Args:
             seed: root of all seeds, or one scene seed for each environment; None: the next episodes of the stream.

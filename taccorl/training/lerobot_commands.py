@@ -50,7 +50,8 @@ class Training:
         return int(json.loads(told.read_text(encoding="utf-8"))["step"]) if told.is_file() else 0
 
     def command(self) -> list[str]:
-        """What is left to be run; nothing if it is finished. A run that ended before its first checkpoint is cleared away."""
+        """Command that runs the rest of the training; empty if it is finished. A run that ended before its first checkpoint
+        is removed."""
         begun = self.policy / "train_config.json"
         if not begun.is_file():
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -80,13 +81,13 @@ class Scoring:
         self.folder = training.folder / f"scored_{key[:8]}"
 
     def command(self) -> list[str]:
-        """What is left to be run; nothing if it is finished."""
+        """Command that runs the evaluation; empty if it is finished."""
         if (self.folder / "eval_info.json").is_file():
             return []
         env = "--env.type=taccorl", "--eval.use_async_envs=false", f"--seed={FIRST_SEED}"
         return ["lerobot-eval", f"--policy.path={self._policy}", *env, *self._words, f"--output_dir={self.folder}"]
 
     def successes(self) -> list[bool]:
-        """Of each episode, in the order of their seeds."""
+        """Success of each episode, in the order of their seeds."""
         told = json.loads((self.folder / "eval_info.json").read_text(encoding="utf-8"))
         return [bool(success) for run in told["per_task"] for success in run["metrics"]["successes"]]

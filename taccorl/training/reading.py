@@ -239,7 +239,7 @@ class Column:
         return torch.from_numpy(np.ascontiguousarray(pieces[rows])).reshape(len(rows), *self.shape)
 
     def rows(self, rows: list[int]) -> Tensor:
-        """(len(rows), *shape)"""
+        """Values of these rows, (len(rows), *shape)."""
         found = []
         for row in rows:
             piece = bisect.bisect_right(self._starts, row) - 1

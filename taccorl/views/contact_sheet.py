@@ -321,7 +321,7 @@ def _draw_time_axis(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout)
 
 
 def nice_ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """At most ``most`` round numbers, the first at or below ``low``, the last at or above ``high``."""
+    """Round numbers for an axis, at most ``most``: the first at or below ``low``, the last at or above ``high``."""
     for exponent in range(math.floor(math.log10(high - low)) - 1, 300):
         for step in (1.0, 2.0, 5.0):
             size = step * 10.0**exponent

@@ -34,7 +34,7 @@ _SHOWN_PX = 176
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationPage:
-    """What the page shows."""
+    """Content of the page of ``taccorl evaluate``."""
 
     rows: Sequence[EpisodeRow]
     about: dict[str, str]

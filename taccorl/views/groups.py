@@ -33,7 +33,7 @@ class Group:
 
 
 def short_name(key: str) -> str:
-    """``observation.images.front`` → ``front``."""
+    """Last part of a feature's name: ``observation.images.front`` → ``front``."""
     return key.removeprefix("observation.images.").removeprefix("observation.").replace(".", "_")
 
 

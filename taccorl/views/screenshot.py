@@ -73,7 +73,7 @@ def screenshot(
 
 
 def best_time_s(episode: Episode) -> float:
-    """Where touch is strongest; the middle of an episode without touch."""
+    """Time at which touch is strongest; the middle of an episode without touch."""
     pads = pads_of(episode)
     row = peak_row(pads) if pads else episode.num_rows // 2
     return float(episode.time_s[row])

@@ -48,7 +48,7 @@ class Pad:
 
     @property
     def gate_count(self) -> float:
-        """λ_f in counts."""
+        """Contact threshold λ_f in counts."""
         return CONTACT_THRESHOLD / self.sensor.gain_per_count
 
     @property

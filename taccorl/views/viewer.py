@@ -25,7 +25,8 @@ class ViewerError(TaccorlError):
 
 
 def require_screen() -> None:
-    """
+    """Check that there is a screen for a window.
+
     Raises:
         ViewerError: there is no screen to open a window on; says what to do instead.
     """

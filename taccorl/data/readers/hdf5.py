@@ -41,7 +41,8 @@ class RowClock:
 
     @classmethod
     def of(cls, rate_hz: float, spec: RecordingSpec | None) -> "RowClock":
-        """
+        """Clock for the channels of a spec.
+
         Raises:
             RecordingError: two channels shift one topic differently, or a channel of ``action`` does not state its shift.
         """
@@ -75,7 +76,7 @@ class RowClock:
 
 @readers.register("hdf5")
 class Hdf5Reader(Reader):
-    """One HDF5 file."""
+    """Reader for HDF5 files, one recording per file."""
 
     suffixes = (".hdf5", ".h5")
 

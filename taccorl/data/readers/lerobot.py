@@ -56,7 +56,7 @@ class LerobotReader(Reader):
 
     @functools.cached_property
     def index(self) -> int:
-        """Which episode."""
+        """Index of the episode in its dataset."""
         found = re.fullmatch(r"episode_(\d+)", self.source.part or "")
         if found is None:
             raise RecordingError(f"{self.source.name}: names no episode; give the folder of a LeRobot dataset")

@@ -40,7 +40,7 @@ class ArmKinematics:
         self._limits = [mink.ConfigurationLimit(self.model)]
 
     def pose(self, joints_rad: np.ndarray) -> np.ndarray:
-        """World-from-TCP (4, 4)."""
+        """Forward kinematics: pose world-from-TCP (4, 4)."""
         self._data.qpos[self._joints] = joints_rad
         mujoco.mj_kinematics(self.model, self._data)
         pose = np.eye(4)

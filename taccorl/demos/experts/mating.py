@@ -85,7 +85,7 @@ class Aim:
 
 
 def deflection(wanted: np.ndarray, actual: np.ndarray) -> np.ndarray:
-    """(6,) [m, rad], world: from one pose (4, 4) to another, the rotation as a rotation vector."""
+    """Difference (6,) [m, rad] of two poses (4, 4) in the world frame; the rotation as a rotation vector."""
     off = np.empty(6)
     off[:3] = actual[:3, 3] - wanted[:3, 3]
     off[3:] = wanted[:3, :3] @ rotvec(wanted, actual)

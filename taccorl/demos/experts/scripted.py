@@ -1,9 +1,8 @@
 """The scripted expert: two hands that move like a person at leader arms, detect when a part is blocked, and correct their aim.
 
 Each arm is a generator of ``Wish``es (TCP pose, gripper opening), one a control step; ``act`` turns both into 14 joint targets.
-It sees the true poses, as a person sees the bench, but aims with an error: it detects a wrong aim only when
-the part is blocked, as a person does, backs off and has a smaller error in the next try. Those corrections are what a policy
-with touch is
+It sees the true poses, as a person sees the bench, but aims with an error: it detects a wrong aim only when the part is
+blocked, as a person does, backs off and has a smaller error in the next try. Those corrections are what a policy with touch is
 to learn. Figures of the human likeness: research notes on teleoperation in the issue, tuned to ~2 corrections per insertion.
 """
 
@@ -214,7 +213,7 @@ class ScriptedExpert(ABC):
         return cls.remaining is not ScriptedExpert.remaining
 
     def resume(self) -> None:
-        """Take over both arms in the simulation's present state, whatever another did since its reset.
+        """Take over both arms in the simulation's present state, whatever happened since its reset.
 
         The first action repeats the command in force, so that the arms do not jump.
 
@@ -482,7 +481,8 @@ class ScriptedExpert(ABC):
         return bool(self.sim.pads_touching(part.name)[0, first : first + len(ROBOT.fingers)].all())
 
     def require_lying(self, arm: str, part: Part) -> None:
-        """
+        """Check that a part lies on the table as it did at the reset.
+
         Raises:
             LostError: the part is in the other hand, lies on another side than at the reset, or does not lie on the table.
         """
@@ -495,7 +495,8 @@ class ScriptedExpert(ABC):
             raise LostError(f"{part.name} is in no hand and not where it can be gripped")
 
     def require_not_in_other_hand(self, arm: str, part: Part) -> None:
-        """
+        """Check that a part is not held by the other hand.
+
         Raises:
             LostError: it is.
         """

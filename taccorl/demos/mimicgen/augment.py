@@ -1,9 +1,8 @@
 """Generate a dataset of N new successes from sources: attempts in the store, on any engine; the first N successes by number.
 
 An attempt's key contains everything that it depends on: the spec, the sources' content, the twin, the seed, its number. So a
-run that was
-killed continues, another spec or other sources never mix with it, and any number of workers gives the same dataset.
-An attempt that kills its process twice (``crashed``) or does not end (``hung``) is counted like any other that failed.
+run that was killed continues, another spec or other sources never mix with it, and any number of workers gives the same
+dataset. An attempt that kills its process twice (``crashed``) or does not end (``hung``) is counted like any other that failed.
 Attempts are physics; rows of a success, with touch and pictures, are another artefact, which ``rows: actions`` leaves out.
 """
 

@@ -16,14 +16,14 @@ from taccorl.lineage.store import Store
 
 @dataclass(frozen=True, kw_only=True)
 class Share:
-    """Successes among attempts."""
+    """Number of successes among attempts."""
 
     successes: int
     attempts: int
 
     @property
     def rate(self) -> float:
-        """NaN of none."""
+        """Success rate, 0 … 1; NaN without attempts."""
         return self.successes / self.attempts if self.attempts else float("nan")
 
     @property

@@ -38,11 +38,11 @@ class SeenPoses(Protocol):
     """Interface of the present scene: poses of hands and bodies."""
 
     def tcp(self, arm: str) -> np.ndarray:
-        """World-from-TCP (4, 4)."""
+        """Pose of an arm's hand, world-from-TCP (4, 4)."""
         ...
 
     def body(self, name: str) -> np.ndarray:
-        """World-from-body (4, 4)."""
+        """Pose of a body, world-from-body (4, 4)."""
         ...
 
     def mated(self, name: str) -> bool:
@@ -54,7 +54,7 @@ class Kinematics(Protocol):
     """Interface of one arm's kinematics."""
 
     def pose(self, joints_rad: np.ndarray) -> np.ndarray:
-        """World-from-TCP (4, 4)."""
+        """Forward kinematics: pose world-from-TCP (4, 4)."""
         ...
 
     def solve(self, tcp_world: np.ndarray, start_rad: np.ndarray) -> tuple[np.ndarray, float]:

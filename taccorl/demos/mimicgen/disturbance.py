@@ -51,7 +51,8 @@ class Disturbance:
         return [arm for arm, strength in zip(ROBOT.arms, self.strength, strict=True) if strength > 0]
 
     def update(self, wishes: Mapping[str, Wish], ahead: Mapping[str, Ahead], is_exact: np.ndarray) -> None:
-        """
+        """Advance the disturbance by one control step, and compute its strength for each arm.
+
         Args:
             wishes: of the coming control step.
             ahead: of each arm, after these wishes.
@@ -80,8 +81,7 @@ class Disturbance:
 
 class Exact:
     """Decides when an arm may not be disturbed: it grips what something else holds fast, the table for one; or mating parts
-    have met
-    and a hand still holds one of them. Inside its play a plug does not touch all the time, so that they have met is
+    have met and a hand still holds one of them. Inside its play a plug does not touch all the time, so that they have met is
     remembered."""
 
     def __init__(self, sim: Simulation) -> None:
@@ -100,6 +100,6 @@ class Exact:
 
 
 def drifted(off_rad: np.ndarray, spec: DisturbanceSpec, rng: np.random.Generator) -> np.ndarray:
-    """(12,) [rad] an Ornstein–Uhlenbeck process of each joint, a control step after ``off_rad`` (12,)."""
+    """(12,) [rad] state of an Ornstein–Uhlenbeck process per joint, one control step after ``off_rad`` (12,)."""
     kept = math.exp(-1 / (CONTROL_HZ * spec.time_s))
     return kept * off_rad + math.sqrt(1 - kept**2) * spec.joint_rad * rng.normal(size=off_rad.shape)

@@ -1,9 +1,8 @@
 """Make a LeRobot dataset from stored actions where it is needed: each demonstration is executed once, on any engine.
 
 Demonstrations that do not succeed here, or do not meet the acceptance criteria, are left out and counted: another CPU may
-differ in the last
-bit (``execution.py``). The numbers are the same whatever becomes of the pictures: encoded as video, rendered later into the
-cache of training frames (``taccorl.training.rendered_frames``), or left out.
+differ in the last bit (``execution.py``). The numbers are the same whatever becomes of the pictures: encoded as video, rendered
+later into the cache of training frames (``taccorl.training.rendered_frames``), or left out.
 """
 
 import dataclasses
@@ -81,7 +80,7 @@ class ExecutePlan:
 
     @property
     def config(self) -> dict[str, Any]:
-        """What an execution depends on besides the stored actions."""
+        """Settings on which an execution depends, besides the stored actions; part of the store's key."""
         parts = {"part_poses": True} if self.part_poses else {}  # executions of before there was a choice remain valid
         return parts | {
             "videos": self.pictures == "video",

@@ -51,7 +51,8 @@ class Execution:
 
 
 def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, gates: GatesSpec) -> Execution:
-    """
+    """Execute a demonstration in ``sim`` and record its rows.
+
     Args:
         sim: of the task, difficulty, twin and randomisation that the demonstration was made in.
         rows: what a row holds (``with_simulator``).

@@ -98,7 +98,8 @@ class SourceReader:
         self._touching = Touching(sim)
 
     def read(self, episode: Episode) -> Source:
-        """
+        """Read one episode as a source.
+
         Raises:
             DatasetError: states of another scene than this simulation's.
         """

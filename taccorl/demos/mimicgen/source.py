@@ -42,7 +42,7 @@ class ArmTrack:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """One successful demonstration."""
+    """One successful demonstration: tracks of both arms, poses of objects, and signals that end subtasks."""
 
     name: str
     arms: Mapping[str, ArmTrack]
@@ -143,9 +143,8 @@ class SourcePool:
     def segment(self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]) -> Segment:
         """Rows of source ``i`` that are subtask ``k`` of ``arm``, each subtask's end moved by its offset.
 
-        A subtask that had to wait for another arm begins where that arm's subtask ended: before, the arm only waited.
-        Subtasks that are to
-        begin together begin at the later one's beginning.
+        A subtask that had to wait for another arm begins where that arm's subtask ended: before, the arm only waited. Subtasks
+        that are to begin together begin at the later one's beginning.
         """
         start, end = self._begin(i, arm, k, offsets), self._end(i, arm, k, offsets)
         coordination = self.spec.coordination(arm, k)

@@ -56,7 +56,7 @@ class StoredActions:
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """Of ``SIMULATION``."""
+        """Task, difficulty, twin and randomisation of the simulation (the keys ``SIMULATION``)."""
         return {key: self.meta[key] for key in SIMULATION}
 
 
@@ -68,7 +68,8 @@ def write_stored(
     demonstrations: Sequence[Demonstration],
     kind: str = MIMICGEN,
 ) -> None:
-    """
+    """Write a folder of stored actions.
+
     Args:
         simulation: what ``SIMULATION`` names.
         spec: of the generation, as JSON values; its ``gates`` are those that an execution must pass.
@@ -89,7 +90,8 @@ def write_stored(
 
 
 def read_stored(root: Path) -> StoredActions:
-    """
+    """Read a folder of stored actions.
+
     Raises:
         DatasetError: no such folder, another format or action-time convention, or files of other lengths than meta.json says.
     """

@@ -31,7 +31,6 @@ class Touching:
 
     def holds_fast(self, arm: str) -> bool:
         """Whether the arm touches a part that something else touches too. Such a hand cannot reach its target, so its offset
-        must not
-        be estimated: the command would push ever harder."""
+        must not be estimated: the command would push ever harder."""
         held = [part for part in self._parts if {arm, part} in self.pairs]
         return any(part in pair and arm not in pair for part in held for pair in self.pairs)

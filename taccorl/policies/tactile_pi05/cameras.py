@@ -78,7 +78,7 @@ class CameraEncoder(nn.Module):
         return torch.cat([(weights_BKRC.sum(2) * x_C).sum(-1), (weights_BKRC.sum(3) * y_R).sum(-1)], dim=1)
 
     def forward(self, images_B3RC: Tensor) -> Tensor:
-        """(B, 3, R, C), −1 … 1 → (B, M, D)."""
+        """Encode pictures (B, 3, R, C), −1 … 1, into tokens (B, M, D)."""
         features_BKRC = self.features(images_B3RC)
         points_BP = self.points(self.maps(features_BKRC))
         half_turns = math.pi * 2.0 ** torch.arange(_OCTAVES, device=points_BP.device)

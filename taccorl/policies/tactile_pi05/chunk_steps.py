@@ -34,7 +34,8 @@ class ChunkSteps(nn.Module):
 
     @classmethod
     def of_statistics(cls, statistics: Any, config: Any, num_actions: int) -> "ChunkSteps":
-        """
+        """Make the normalisation from a dataset's statistics.
+
         Args:
             statistics: LeRobot's of a dataset; None, or without those of steps: a checkpoint brings them, or nothing does.
             config: the policy's.
@@ -68,6 +69,6 @@ class ChunkSteps(nn.Module):
         return (actions_BHA - self.mean_HA[:steps]) / self.std_HA[:steps]
 
     def restored(self, actions_BHA: Tensor) -> Tensor:
-        """z → x."""
+        """Undo the normalisation: z → x."""
         steps = actions_BHA.shape[-2]
         return actions_BHA * self.std_HA[:steps] + self.mean_HA[:steps]

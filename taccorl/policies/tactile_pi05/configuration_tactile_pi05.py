@@ -57,7 +57,7 @@ class FusedAdamW(AdamWConfig):
 
 @dataclass(frozen=True)
 class TactileFormat:
-    """How a dataset stores touch: ``tactile`` of the feature in its ``meta/info.json``."""
+    """Format of touch in a dataset: ``tactile`` of the feature in its ``meta/info.json``."""
 
     sensor: str
     pads: tuple[str, ...]
@@ -73,12 +73,13 @@ class TactileFormat:
 
     @property
     def num_taxels(self) -> int:
-        """K."""
+        """K: number of taxels of all pads."""
         return math.prod(self.layout)
 
     @classmethod
     def of_feature(cls, feature: dict[str, Any], where: str) -> "TactileFormat":
-        """
+        """Read the format from a dataset's feature.
+
         Args:
             feature: its entry in LeRobot's features dict.
             where: the dataset, for errors.
@@ -304,7 +305,8 @@ class TactilePI05Config(PI05Config):
         return len(bodies_of(self.require_part_names()))
 
     def require_part_names(self) -> list[str]:
-        """
+        """Names of the numbers of the parts' poses, which must be known.
+
         Raises:
             TaccorlError: neither a dataset nor a checkpoint has them.
         """
@@ -347,7 +349,8 @@ class TactilePI05Config(PI05Config):
         self.input_features = kept
 
     def require_tactile_format(self) -> TactileFormat:
-        """
+        """Format of touch, which must be known.
+
         Raises:
             TaccorlError: neither a dataset nor a checkpoint has told it.
         """

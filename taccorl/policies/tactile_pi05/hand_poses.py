@@ -136,7 +136,8 @@ class HandPosesStep(ObservationProcessorStep):
         self._chains: dict[torch.device, Tensor] = {}
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """
+        """Add the hand poses to an observation.
+
         Raises:
             TaccorlError: the state has other joints than the arms.
         """

@@ -49,7 +49,8 @@ class Mixture:
 
     @classmethod
     def of_statistics(cls, stats: Mapping[str, Mapping[str, Any]] | None, sim_weight: float) -> "Mixture | None":
-        """
+        """Make the weights from a dataset's statistics.
+
         Args:
             stats: the dataset's statistics, as LeRobot keeps them; None or without ``observation.is_sim``: one domain.
 

@@ -46,12 +46,12 @@ def num_pairs(num_bodies: int) -> int:
 
 
 def num_part_numbers(num_bodies: int) -> int:
-    """How many numbers ``PART_POSES`` has for a task with ``num_bodies`` parts."""
+    """Size of ``PART_POSES`` for a task with ``num_bodies`` parts."""
     return (1 + _ARMS) * _POSE * num_bodies + _PAIR * num_pairs(num_bodies)
 
 
 def part_poses(poses_BN: Tensor, tcps: list[Tensor]) -> Tensor:
-    """(B, ``num_part_numbers``) float32.
+    """Input (B, ``num_part_numbers``) float32 of the policy from the parts' poses; see the module's table.
 
     Args:
         poses_BN: (B, 9 P) as ``taccorl.sim.part_poses`` gives them.
@@ -108,7 +108,8 @@ class PartPosesStep(ObservationProcessorStep):
         self._chains: dict[torch.device, Tensor] = {}
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """
+        """Add the parts' poses to an observation.
+
         Raises:
             TaccorlError: no poses of the parts, those of other parts, or another robot.
         """
@@ -163,7 +164,7 @@ class PoseHead(nn.Module):
         self.out = nn.Linear(_HIDDEN, 3 * self.num_vectors)
 
     def forward(self, cameras: list[Tensor], state_BS: Tensor) -> Tensor:
-        """(B, V, 3) [``PART_TO_PART_M``].
+        """Predict relative positions (B, V, 3), in units of ``PART_TO_PART_M``.
 
         Args:
             cameras: tokens (B, M, D) of each camera.

@@ -29,7 +29,7 @@ class ByteTokenizer:
         return _FIRST + 256
 
     def tokens(self, text: str) -> list[int]:
-        """Of one prompt, without filling."""
+        """Tokens of one prompt, without padding."""
         return [_BEGIN, *(_FIRST + byte for byte in text.encode())]
 
     def __call__(self, texts: list[str], **_: Any) -> dict[str, torch.Tensor]:
@@ -52,7 +52,7 @@ class WordTokenizer(ByteTokenizer):
         return _FIRST + _NUM_NUMBERS + _NUM_WORDS
 
     def tokens(self, text: str) -> list[int]:
-        """Of one prompt, without filling."""
+        """Tokens of one prompt, without padding."""
         return [_BEGIN, *(self._token(piece) for piece in _PIECES.findall(text))]
 
     @staticmethod

@@ -122,7 +122,7 @@ class AddedEffects:
         return sum(effect.picture_age_s() for effect in self.present if camera in effect.acts_on())
 
     def picture(self, pictures: np.ndarray, camera: CameraConfig) -> np.ndarray:
-        """What ``camera`` gives of pictures (n, rows, columns, 3) uint8 RGB as they are drawn, letterboxed."""
+        """Pictures of ``camera`` with effects, from rendered pictures (n, rows, columns, 3) uint8 RGB, letterboxed."""
         acting = [e for e in self.present if camera.name in e.acts_on() and type(e).picture is not Effect.picture]
         if not acting:
             return pictures

@@ -44,15 +44,15 @@ class LiveModel:
             values[:] = self._nominal[name]
 
     def dofs(self, joints: Sequence[str]) -> np.ndarray:
-        """Where the joints stand in ``qvel``, ``qfrc_bias``, ``dof_frictionloss``."""
+        """Indices of the joints in ``qvel``, ``qfrc_bias``, ``dof_frictionloss``."""
         return self._of(joints)[0]
 
     def angles(self, joints: Sequence[str]) -> np.ndarray:
-        """Where the joints stand in ``qpos``."""
+        """Indices of the joints in ``qpos``."""
         return self._of(joints)[1]
 
     def actuators(self, joints: Sequence[str]) -> np.ndarray:
-        """The joints' motors."""
+        """Indices of the joints' motors."""
         return self._of(joints)[2]
 
     def _of(self, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -68,7 +68,7 @@ class LiveModel:
         return self.model.actuator_gaintype[self.actuators(joints)] == mujoco.mjtGain.mjGAIN_PID
 
     def integrals(self, joints: Sequence[str]) -> np.ndarray:
-        """Where the motors that integrate keep their integrals in ``act``."""
+        """Indices in ``act`` of the integrals of motors that have one."""
         return self.model.actuator_actadr[self.actuators(joints)[self.integrates(joints)]]
 
     def error_rad(self, joints: Sequence[str]) -> np.ndarray:

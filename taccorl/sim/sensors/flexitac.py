@@ -140,7 +140,7 @@ def _convert(
 @sensors.register("flexitac")
 @dataclass(kw_only=True)
 class FlexiTacConfig(SensorConfig):
-    """FlexiTac-V2 pads."""
+    """Settings of simulated FlexiTac-V2 pads."""
 
     spec: str = "flexitac_v2"
     """Sensor file: taxels, wire, converter, scan. A name among data_specs/sensors, or a path."""

@@ -34,7 +34,7 @@ class ScanNoise(NamedTuple):
     """(N,) 0 … 2³² − 1."""
 
     def of(self, start: int, end: int) -> "ScanNoise":
-        """Of simulations ``start`` … ``end``."""
+        """Noise of simulations ``start`` … ``end``."""
         return ScanNoise(self.seeds[start:end], self.steps[start:end])
 
     def draw(self, shape: tuple[int, ...]) -> np.ndarray:

@@ -21,7 +21,7 @@ class Bench(Task):
     }
 
     def add_parts(self, spec: mujoco.MjSpec) -> None:
-        """None."""
+        """Adds nothing: the bench has no parts."""
 
     def reset(self, draw: dict[str, np.ndarray]) -> Reset:
         return Reset(poses={})
