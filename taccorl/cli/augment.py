@@ -32,23 +32,23 @@ class AugmentConfig:
     task: str
     """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's."""
     episodes: int = 200
-    """How many successful ones."""
+    """Number of successful demonstrations to generate."""
     out: Path | None = None
     """The dataset's folder; outputs/TASK_augmented if not given. It must not hold anything else."""
     store: Path = Path("outputs/store")
-    """Finished attempts are kept here, so that a second run goes on where the first ended."""
+    """Finished attempts are kept here, so that a second run continues where the first ended."""
     difficulty: str = "train"
     """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given. It need not be that of the sources."""
     spec: str | None = None
-    """How, as a file like those of data_specs/mimicgen/; the shipped one of the task if not given."""
+    """Settings of the generation: a file like those of data_specs/mimicgen/; by default the shipped one of the task."""
     images: bool = True
     """Render the three cameras (needs OpenGL)."""
     seed: int = 0
-    """Of all attempts, at least 0; another seed gives other scenes."""
+    """Seed of all attempts, at least 0; another seed gives other scenes."""
     stratify: bool = False
-    """After the first half, choose attempts that begin where episodes are few; the report says what that did."""
+    """After the first half, choose attempts that begin where episodes are few; the report shows the effect."""
     rows: str = "dataset"
     """dataset; or actions: seeds and actions alone, for taccorl execute."""
     engine: Engine = field(default_factory=LocalEngine)

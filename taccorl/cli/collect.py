@@ -24,15 +24,15 @@ class CollectConfig:
     """Collect demonstrations in the twin."""
 
     task: str | None = None
-    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's. Action files say it themselves."""
+    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's. Action files state it."""
     source: Source = field(default_factory=ExpertSource)
     """Who demonstrates: --source.type=expert, keyboard, gamepad, leader, actions."""
     episodes: int = 20
-    """How many successful ones, of a dataset and of recordings alike."""
+    """Number of successful demonstrations, in a dataset or as recordings."""
     out: Path | None = None
     """Folder of the dataset or the recordings; outputs/TASK if not given. It must not hold anything else."""
     store: Path = Path("outputs/store")
-    """Finished attempts are kept here, so that a second run goes on where the first ended."""
+    """Finished attempts are kept here, so that a second run continues where the first ended."""
     difficulty: str = "train"
     """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: Path | None = None
@@ -46,9 +46,9 @@ class CollectConfig:
     keep_failures: bool = False
     """Keep failed attempts as well."""
     seed: int = 0
-    """Of all attempts, at least 0; another seed gives other scenes."""
+    """Seed of all attempts, at least 0; another seed gives other scenes."""
     origin: str = ORIGIN
-    """Label in everything that is made; write "surrogate: …" where the twin plays the robot."""
+    """Label of the origin in all outputs; write "surrogate: …" where the twin plays the robot."""
 
 
 def main(argv: list[str]) -> int:

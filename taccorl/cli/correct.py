@@ -37,9 +37,9 @@ class CorrectConfig:
     num_envs: int = 64
     """Environments in which the policy acts at once."""
     seed: int = 0
-    """Of scenes, takeovers and the policy's random numbers."""
+    """Seed of scenes, takeovers and the policy's random numbers."""
     takeover: str = "failures"
-    """failures: of episodes in which the policy does not succeed by itself; all: of all."""
+    """failures: correct only episodes in which the policy does not succeed by itself; all: correct all episodes."""
     difficulty: str = "train"
     """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: Path | None = None

@@ -35,7 +35,8 @@ class ExecuteConfig:
     """Write the poses of the task's parts into every row (observation.environment_state), for
     --policy.part_poses and --policy.pose_loss."""
     resolution: str | None = None
-    """Of frames in the cache, rows x columns: 112x112, as --policy.image_resolution; the cameras' own 224x224 if not given."""
+    """Resolution of frames in the cache, rows x columns: 112x112, as --policy.image_resolution; the cameras' own 224x224 if
+    not given."""
     engine: Engine = field(default_factory=LocalEngine)
     """Where to work: --engine.type=local --engine.workers=16, slurm, ray."""
 

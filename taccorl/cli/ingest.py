@@ -34,7 +34,7 @@ class IngestConfig:
     out: Path = Path("outputs/dataset")
     """The dataset's folder. It must not hold anything else."""
     store: Path = Path("outputs/store")
-    """Finished recordings are kept here, so that a second run goes on where the first ended."""
+    """Finished recordings are kept here, so that a second run continues where the first ended."""
     dry_run: bool = False
     """Read, align and check, and write two rows into a scratch folder, but nothing that stays."""
     replace: bool = False

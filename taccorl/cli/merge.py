@@ -24,7 +24,7 @@ class MergeConfig:
     sim: list[Path] = field(default_factory=list)
     """Dataset of the twin: collected, augmented; once for each."""
     store: Path = Path("outputs/store")
-    """Remembers what was made from what."""
+    """Store for finished work and its lineage."""
 
 
 def main(argv: list[str]) -> int:

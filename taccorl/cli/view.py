@@ -35,7 +35,7 @@ class ViewConfig:
     path: Path
     """A LeRobot dataset's folder, a recording, or an attempt of `taccorl augment` in the store."""
     episode: int = 0
-    """Which one, counted from 0."""
+    """Number of the episode, counted from 0."""
     spec: str | None = None
     """Recording spec; needed for recordings."""
     start_s: float | None = None

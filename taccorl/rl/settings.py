@@ -47,11 +47,11 @@ class EnvSettings:
     """Groups of environments. With more than one, each runs in a process of its own: in one process about 10 of 32 CPUs were busy
     (docs/learning.md). Scenes do not depend on it, except with start_share: each group stores states of its own."""
     threads: int | None = None
-    """Of each shard; CPUs / shards if not given."""
+    """Threads of each shard; CPUs / shards if not given."""
     ray: bool = False
     """Shards are Ray actors: on this machine, or on those of the cluster that RAY_ADDRESS names. Needs the extra ray."""
     decisions: int = 36
-    """C: chunks of actions of each environment in an iteration. Episodes go on in the next one."""
+    """C: chunks of actions of each environment in an iteration. Episodes continue in the next one."""
     difficulty: str = "train"
     """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     randomization: float = 1.0
@@ -122,7 +122,7 @@ class AnchorSettings:
     dataset: Path | None = None
     """Folder of a LeRobot dataset with real demonstrations; of a co-training dataset only its real rows are used."""
     weight: float = 1.0
-    """β; 0: no anchor."""
+    """β: weight of the supervised loss; 0: no anchor."""
     batch_size: int = 32
     """B_real: rows of every optimiser step."""
     allow_simulated: bool = False
@@ -146,23 +146,23 @@ class PPOSettings:
     """PPO over decisions: one decision is one chunk of actions."""
 
     gamma: float = 0.99
-    """γ, for each decision."""
+    """γ: discount factor per decision."""
     gae_lambda: float = 0.95
-    """λ_GAE."""
+    """λ_GAE: decay of generalised advantage estimation."""
     clip: float = 0.2
-    """ε_clip."""
+    """ε_clip: clipping range of the probability ratio."""
     epochs: int = 1
-    """E_update."""
+    """E_update: epochs of updates per rollout."""
     batch_size: int = 512
     """B_RL: decisions of an optimiser step; the last one of an epoch may have fewer."""
     micro_batch: int = 128
     """Decisions in memory at once; results do not depend on it but for rounding."""
     actor_lr: float = 5e-6
-    """η_π."""
+    """η_π: learning rate of the actor."""
     critic_lr: float = 1e-4
-    """η_V."""
+    """η_V: learning rate of the critic."""
     weight_decay: float = 0.01
-    """Of both optimisers, AdamW with β = (0.9, 0.95) as in RLinf."""
+    """Weight decay of both optimisers, AdamW with β = (0.9, 0.95) as in RLinf."""
     max_grad_norm: float = 1.0
     """Gradients of actor and critic are clipped to this norm separately."""
     kl_stop: float = 0.05
@@ -193,7 +193,7 @@ class PostTrainSettings:
     """Settings of a run of post-training."""
 
     policy: PolicySettings = field(default_factory=PolicySettings)
-    """Which policy, and what of it is trained."""
+    """The policy, and which of its weights are trained."""
     env: EnvSettings = field(default_factory=EnvSettings)
     """Task, twin and number of environments."""
     noise: FlowSDESettings = field(default_factory=FlowSDESettings)
@@ -201,15 +201,15 @@ class PostTrainSettings:
     ppo: PPOSettings = field(default_factory=PPOSettings)
     """Advantages, updates, critic."""
     anchor: AnchorSettings = field(default_factory=AnchorSettings)
-    """Real data that the policy is held to."""
+    """Real data that keeps the policy near its demonstrations."""
     iterations: int = 100
     """Rollouts, each with its update; of the whole run, also after --resume=true."""
     seed: int = 0
-    """Of scenes, noise and order."""
+    """Seed of scenes, noise and order."""
     out: Path = Path("outputs/post_trained")
     """Folder of checkpoints and progress.jsonl. It must not exist, or be empty, unless --resume=true."""
     resume: bool = False
-    """Go on from the last checkpoint in --out."""
+    """Continue from the last checkpoint in --out."""
     save_freq: int = 10
     """Iterations between checkpoints."""
     keep_checkpoints: int = 3

@@ -24,9 +24,9 @@ class RobotConfig:
     inertias: str = "manufacturer"
     """Mass set: ``manufacturer`` (3.6 kg moving) or ``menagerie`` (2.2 kg moving)."""
     mount_height_m: float = 0.2
-    """Of the arms' bases above the table. Our choice: with it every task is reached within the joint limits."""
+    """Height of the arms' bases above the table. Our choice: with it every task is reached within the joint limits."""
     mount_spacing_m: float = 0.6
-    """Between the two bases, along y. Our choice."""
+    """Distance of the two bases along y. Our choice."""
     armature_kgm2: float = 0.01
     """Rotor inertia as seen by each joint. Not published; far below what the calibrated gains can tell."""
     gravity_compensation: float = 1.0
@@ -34,10 +34,11 @@ class RobotConfig:
     pads: Literal["sprung", "rigid"] = "sprung"
     """Sprung: each pad is a plate on a spring, so its depth follows the force and not the part's mass."""
     pad_stiffness_n_per_m: float = 2e4
-    """Of one whole pad; 10 N press it in by 0.5 mm. A choice, to be calibrated on a robot."""
+    """Stiffness of one whole pad; 10 N compress it by 0.5 mm. A choice, to be calibrated on a robot."""
     pad_damping_ns_per_m: float = 30.0
     pad_tilt_stiffness_nm_per_rad: tuple[float, float] = (40.0, 16.0)
-    """Of a pad that is pressed off its middle: along the finger, across it. Without it a load that twists the part would
+    """Tilt stiffness of a pad that is pressed off its middle: along the finger, and across it. Without it a load that twists
+    the part would
     leave no trace in the taxels. A plate on a uniform bed would have K L² / 12 = 6.8 and 1.0; a part that covers a part of
     the pad tilts it less. A choice, to be calibrated on a robot."""
     grip_stiffness_n_per_m: float = 2000.0

@@ -54,7 +54,7 @@ class TwinConfig:
     cameras: list[CameraConfig] = field(default_factory=lambda: list(bench_cameras()))
     sensor: SensorConfig = field(default_factory=FlexiTacConfig)
     effects: list[Effect] = field(default_factory=list)
-    """What the robot has beyond the above; in any order."""
+    """Physical effects of the twin, in any order."""
 
     def __post_init__(self) -> None:
         for arm in self.arm_controllers:

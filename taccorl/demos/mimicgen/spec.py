@@ -31,11 +31,11 @@ class SelectionSpec:
     """Parameters with which a strategy chooses among sources."""
 
     nn_k: int = 3
-    """One of so many nearest sources, each as likely."""
+    """Number of nearest sources from which one is drawn uniformly."""
     pos_weight: float = 1.0
-    """Of a metre."""
+    """Weight of one metre in the distance of poses."""
     rot_weight: float = 0.2
-    """Of a radian: a hand is some 0.2 m long. MimicGen's own is 1."""
+    """Weight of one radian in the distance of poses; a hand is about 0.2 m long. MimicGen's value is 1."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -151,14 +151,14 @@ class TactilePI05Config(PI05Config):
     fps: int | None = None
     """Rows a second that the window and the actions count in. None: read from the dataset likewise."""
     sim_weight: float = 0.5
-    """α: how much simulated rows count against real ones. Used where the dataset tells them apart (``observation.is_sim``)."""
+    """α: weight of the simulated loss against the real one. Used where the dataset tells them apart (``observation.is_sim``)."""
     sim_share: float | None = None
     """Of the rows that it was trained on, how many were simulated. Written by training."""
 
     image_randomization: bool = True
     """In training, crop, turn and recolour every image by chance: the image rows of the paper's domain randomisation."""
     image_rotation_deg: float = ImageRandomizationConfig.rotation_deg
-    """Of that: largest turn of an image about its middle [degrees]. 0: not turned."""
+    """Image randomisation: largest turn of an image about its middle [degrees]. 0: not turned."""
     image_noise_std: float = COTRAINING_NOISE_STD
     """σ_v: normal noise on training images in [0, 1], after that. 0: none."""
 
@@ -169,11 +169,11 @@ class TactilePI05Config(PI05Config):
     """On a GPU, train with compiled layers (see ``compiled``; ``compile_mode`` is not used). False: LeRobot's own forward."""
 
     chunk_size: int = 10
-    """H: actions that are predicted."""
+    """H: actions that are predicted at once."""
     n_action_steps: int = 10
-    """Actions of a chunk that are executed before the policy looks again."""
+    """Actions of a chunk that are executed before the next one is predicted."""
     num_inference_steps: int = 4
-    """K_denoise."""
+    """K_denoise: number of denoising steps."""
     normalize_steps: bool | None = None
     """Normalise each of the H × A numbers of a chunk of relative actions by its own mean and deviation, after LeRobot's
     normalisation of all steps together (see ``chunk_steps``). None: the backbone's own, False for full, whose weights know
@@ -182,9 +182,9 @@ class TactilePI05Config(PI05Config):
     """d: act with an exponential mean of the weights (see ``averaged``). 0: with the last ones. None: the backbone's own, 0.999
     for small and 0 for full and tiny."""
     optimizer_lr: float = 2.5e-5
-    """η_max."""
+    """η_max: largest learning rate."""
     scheduler_warmup_steps: int = 100
-    """T_warm."""
+    """T_warm: steps of the warm-up."""
     scheduler_decay_lr: float = 5e-6
     """η_min, reached at the last step of the training, whatever ``scheduler_decay_steps`` says."""
 
