@@ -1,1 +1,1 @@
-"""Making the twin match: measurements of a robot, how far they can be trusted, and what is fitted to them."""
+"""Alignment of the twin with a robot: measurements, their checks and noise floor, and identification of parameters."""

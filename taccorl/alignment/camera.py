@@ -1,9 +1,9 @@
-"""Where a camera really sits: the twin's camera moved until its arms lie on the pictures' (paper App. B.3).
+"""Camera calibration: move the twin's camera until its arms match those in the pictures (paper App. B.3).
 
 From the joints that were reported with some pictures, the arms' outlines are drawn at the pose that is believed now and laid over
 the edges of the pictures (``camera_edges``); what they are apart, across the edges, is brought down by least squares
-(``camera_fit``), and the outlines are drawn anew, from coarse pictures to fine ones. Nothing but arms is looked at: where the
-table ends and where parts lie, no joint says. It works for a fixed camera and for one on a wrist, whose pose is relative to the
+(``camera_fit``), and the outlines are drawn anew, from coarse pictures to fine ones. Only the arms are used: joint angles say
+nothing about the table and the parts. It works for a fixed camera and for one on a wrist, whose pose is relative to the
 link that carries it.
 
 The start is the twin's own mount, within about 3° and 30 mm along each axis; or points of the arms that somebody found in the
@@ -101,7 +101,8 @@ class KnownPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFit:
-    """What a calibration found. Poses (6,) are off the nominal mount, as ``CameraOffset``: rotation vector [rad], shift [m]."""
+    """Result of a calibration. Poses (6,) are relative to the nominal mount, as ``CameraOffset``: rotation vector [rad],
+    shift [m]."""
 
     camera: CameraConfig
     """The twin's camera with its new offset, for ``save_twin``; the old one where ``problems`` is not empty."""
@@ -139,12 +140,12 @@ class CameraFit:
 
     @property
     def change(self) -> tuple[float, float]:
-        """From where the twin had the camera: turned by [rad], shifted by [m]."""
+        """Change from the twin's camera: rotation [rad] and translation [m]."""
         start, end = (Rotation.from_rotvec(x[:3]) for x in (self.start, self.offset))
         return float((start.inv() * end).magnitude()), float(np.linalg.norm(self.offset[3:] - self.start[3:]))
 
     def twin(self, config: TwinConfig) -> TwinConfig:
-        """``config`` with this camera. The offset holds all, so effects that moved this camera alone are taken out.
+        """``config`` with this camera. The offset contains the whole change, so effects that moved only this camera are removed.
 
         Raises:
             TaccorlError: this is no calibration, or one effect moves this camera and others.
@@ -166,7 +167,7 @@ class CameraFit:
 def calibrate_camera(
     frames: CameraFrames, config: TwinConfig, camera: str, known: Sequence[KnownPoint] = ()
 ) -> CameraFit:
-    """The pose of the twin's ``camera`` at which its arms lie on those of the pictures.
+    """Fit the pose of the twin's ``camera`` so that its arms match those in the pictures.
 
     Every fourth frame and the stages are kept out of the fit, for the figures and overlays before and after.
 

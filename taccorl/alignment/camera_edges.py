@@ -1,4 +1,4 @@
-"""Edges that a camera calibration lays over each other: the twin's arms against their background, and a picture's.
+"""Edges that camera calibration compares: outlines of the twin's arms, and edges of a picture.
 
 The twin's are where the body that a pixel shows changes, or its depth jumps, with the place in space of the nearer one. A
 picture's are Canny's, refined to a fraction of a pixel along the gradient. The two are matched nearest to nearest among edges
@@ -99,7 +99,7 @@ def _unproject(pixels: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) 
 
 
 class PictureEdges:
-    """The edges of a picture (rows, columns, 3) uint8, ready to be asked for the nearest one of a direction."""
+    """Edges of a picture (rows, columns, 3) uint8, with a lookup of the nearest edge of a given direction."""
 
     def __init__(self, picture: np.ndarray) -> None:
         gray = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), _SMOOTH_PX)

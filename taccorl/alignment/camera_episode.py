@@ -1,6 +1,6 @@
-"""Frames of an episode that suit camera calibration: of a dataset, of a recording as ingest cuts it, of the twin.
+"""Select frames of an episode for camera calibration.
 
-Arms that stand still are where the joints say, whatever the latency; poses that differ are worth more than many.
+Frames in which the arms are at rest do not depend on the latency; different poses are worth more than many frames.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The least squares of camera calibration: outlines drawn, matched, laid over the pictures' edges, drawn again.
+"""Least squares of camera calibration: draw the outlines, match them with the pictures' edges, move the camera, repeat.
 
 Letters in shapes: F frames, P points.
 """
@@ -65,7 +65,7 @@ class Matches(NamedTuple):
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the least squares ended."""
+    """Result of the least squares: pose and misfit."""
 
     offset: np.ndarray
     """(6,) pose."""
@@ -102,7 +102,7 @@ def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrins
 
 
 def seen_from(view: TwinView, offset: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (P, 3) of the mount's frame in the camera's, at a pose (6,)."""
+    """Transform points (P, 3) from the mount's frame to the camera's, at a pose (6,)."""
     position, turn = view.pose(offset)
     return (points - position) @ turn
 
@@ -212,7 +212,7 @@ def _descend(
 
 
 def weights(apart: np.ndarray) -> np.ndarray:
-    """What soft L1 makes of residuals [px]: 1 for small ones."""
+    """Weights of residuals [px] under the soft L1 loss: 1 for small ones."""
     return 1 / np.sqrt(1 + (apart / _SOFT_PX) ** 2)
 
 

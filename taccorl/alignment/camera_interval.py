@@ -1,4 +1,4 @@
-"""How surely a camera pose is known: noise of the edges, and what the twin itself may have wrong.
+"""Uncertainty of a fitted camera pose, from noise of the edges and from errors of the twin's shapes and joint zeros.
 
 Noise: residuals of one body's outline in one frame go together, so these groups are what is independent (a sandwich estimate).
 Beyond it, however many pictures there are, each body may have another shape than the twin's, by ``SHAPE_M``, and each joint may
@@ -32,7 +32,7 @@ _SHARE = 0.35  # of the longest component: an axis that has less is not named
 
 @dataclass(frozen=True)
 class Covariance:
-    """Of a pose (6,), from what its least squares saw."""
+    """Covariance of a fitted pose (6,)."""
 
     noise: np.ndarray
     """(6, 6) from the scatter of the edges."""
@@ -46,7 +46,7 @@ class Covariance:
 
     @property
     def half_width(self) -> np.ndarray:
-        """(6,) of the 95 % intervals."""
+        """Half widths (6,) of the 95 % intervals."""
         return 1.96 * np.sqrt(np.diag(self.total))
 
     @property
@@ -56,7 +56,7 @@ class Covariance:
         return self.total / np.outer(deviation, deviation)
 
     def worst(self) -> tuple[float, str]:
-        """The direction that is known worst: half of its 95 % interval as a multiple of ``WANTED``, and its axes with theirs."""
+        """Least certain direction: half of its 95 % interval as a multiple of ``WANTED``, and its components."""
         values, vectors = np.linalg.eigh(self.total / np.outer(WANTED, WANTED))
         along = vectors[:, -1] / vectors[np.argmax(np.abs(vectors[:, -1])), -1]
         named = [k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= _SHARE]

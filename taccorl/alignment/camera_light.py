@@ -1,4 +1,4 @@
-"""How bright and how sharp a camera's pictures are beside the twin's: the numbers of the effect ``camera_exposure``.
+"""Brightness and sharpness of a camera's pictures relative to the twin's: parameters of the effect ``camera_exposure``.
 
 At a pose that has been fitted, pixels of picture and twin show the same thing. Tone: log y = γ (log g + log x), a straight line
 through the medians of the picture's grey values over those of the twin. Light, the colours of things and the camera's own

@@ -1,4 +1,4 @@
-"""Twin and picture laid over each other, as in the paper's figure of camera calibration (App. B.3)."""
+"""Overlay of twin and picture, as in the paper's figure of camera calibration (App. B.3)."""
 
 import cv2
 import numpy as np

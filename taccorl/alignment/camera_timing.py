@@ -1,4 +1,4 @@
-"""How late a camera's pictures are: how much changes from picture to picture, against how much would in the twin.
+"""Latency of a camera, from the change between consecutive pictures compared with that in the twin.
 
 The twin is drawn where the joints were at each picture's time; what changes between two of its pictures rises and falls with the
 arms' motion, without any delay. The measured pictures' change is the same curve, later: the shift at which the two agree best is
@@ -33,7 +33,7 @@ _FEWEST_S = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class LatencyFit:
-    """How late pictures are."""
+    """Estimated latency of a camera, with its interval."""
 
     latency_s: float
     """A picture shows what was that long before its time."""

@@ -1,4 +1,4 @@
-"""One camera of the twin with the arms placed where the joints say: what calibration holds against a picture.
+"""View of one camera of the twin with the arms at given joint angles, for comparison with a picture.
 
 Frames: *mount* is the body that carries the camera (``CameraConfig.body``: the world, or link 6 of an arm), *camera* is MuJoCo's
 (x right, y up, looking along −z). A pose is a vector (6,) = (ω, t) [rad, m] off the nominal mount, as ``CameraOffset``:
@@ -66,13 +66,13 @@ class TwinView:
         return position, Rotation.from_quat(quat, scalar_first=True).as_matrix()
 
     def offset_of(self, position: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """The pose (6,) that is at ``position`` (3,) [m] with mount-from-camera ``turn`` (3, 3)."""
+        """Pose (6,) of a camera at ``position`` (3,) [m] with the rotation mount-from-camera ``turn`` (3, 3)."""
         nominal = Rotation.from_quat(self._nominal[1], scalar_first=True).inv()
         turned = (nominal * Rotation.from_matrix(turn)).as_rotvec()
         return np.r_[turned, nominal.apply(position - self._nominal[0])]
 
     def place(self, joints: np.ndarray) -> None:
-        """Arms and fingers where ``joints`` (14,) [rad, m] are reported: effects on the encoders are taken off again."""
+        """Place arms and fingers for reported ``joints`` (14,) [rad, m], with the effects of encoders removed."""
         joints = joints - (self._encoder(joints[None])[0] - joints)
         self.data.qpos[self._joints] = joints[ROBOT.joint_indices]
         self.data.qpos[self._fingers] = joints[ROBOT.gripper_indices, None] / 2

@@ -1,4 +1,4 @@
-"""Are command and measurement on one clock, to less than a row? What can be known of it, and what cannot.
+"""Check that command and measurement are on one clock, to less than a row.
 
 * No joint moves before it is commanded: a measurement that **leads** its command has wrong time stamps, whatever the physics.
 * A measurement that comes **late** may have a late clock or a real delay. Positions alone do not tell the one from the other.
@@ -40,7 +40,7 @@ step · period / τ."""
 
 @dataclass(frozen=True)
 class CommandTiming:
-    """What is known of one joint's answer in time."""
+    """Timing of one joint's response to its command."""
 
     signal: str
     lag_s: float

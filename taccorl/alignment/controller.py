@@ -49,7 +49,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionError:
-    """How far the model is off on one recording, before (gains of the twin's config) and after."""
+    """Error of the model on one recording, before (gains of the twin's configuration) and after the fit."""
 
     name: str
     use: Literal["fit", "validation"]
@@ -63,7 +63,7 @@ class MotionError:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerFit:
-    """Gains of one joint, how well they are known, and what they are good for."""
+    """Fitted gains of one joint with intervals, and errors of the model before and after."""
 
     signal: str
     method: Method
@@ -86,7 +86,7 @@ class ControllerFit:
     cpu_s: float
 
     def record(self) -> dict[str, Any]:
-        """For a report."""
+        """The result as JSON values, for a report."""
         return asdict(self) | {"gains": self.gains._asdict()}
 
 

@@ -1,4 +1,4 @@
-"""What controller identification minimises: a joint's residuals as a function of its gains, with noise and intervals.
+"""Objective of controller identification: a joint's residuals as a function of its gains, with noise and intervals.
 
 Letters in shapes: R residuals, P parameters.
 """
@@ -62,7 +62,7 @@ class GainSearch:
         return Gains(float(kp), float(kd), float(torque_ff))
 
     def at(self, gains: Gains) -> np.ndarray:
-        """x of ``gains``, those within the bounds."""
+        """Coordinates x of ``gains``, clipped to the bounds."""
         kp = self._within("kp", gains.kp) if "kp" in self.free else self.given.kp
         every = {"kp": math.log(kp), "kd": math.log(self._within("kd", gains.kd) / kp)}
         every["torque_ff"] = self._within("torque_ff", gains.torque_ff) / kp
@@ -113,7 +113,7 @@ class GainSearch:
         return np.concatenate(self.parts(x, late_s))
 
     def jacobian(self, x: np.ndarray, late_s: float = 0.0) -> np.ndarray:
-        """(R, P) by central differences."""
+        """Derivatives (R, P) of the residuals by x, by central differences."""
         columns = []
         for name, unit in zip(self.free, np.eye(len(x)), strict=True):
             step = _STEPS[name]
@@ -154,7 +154,7 @@ class GainSearch:
         return late_s, math.sqrt(covariance(found.jac, found.fun, correlated)[-1, -1])
 
     def weigh(self, x: np.ndarray) -> None:
-        """From now on the noise of both channels is what is left of them at ``x``."""
+        """Set the noise of both channels to the residuals at ``x``."""
         left = [(self.simulate(motion, self.gains(x)), motion) for motion in self.motions]
         positions = np.concatenate([reported - motion.measured for (reported, _), motion in left])
         efforts = np.concatenate([effort - motion.effort for (_, effort), motion in left])
@@ -167,7 +167,7 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 
 def covariance(jacobian: np.ndarray, residual: np.ndarray, correlated: float) -> np.ndarray:
-    """(P, P) σ² (JᵀJ)⁻¹, with σ² times the correlation time of the residuals; huge where J tells nothing."""
+    """(P, P) σ² (JᵀJ)⁻¹, with σ² times the correlation time of the residuals; very large where J is singular."""
     norms = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-30)
     _, singular, right = np.linalg.svd(jacobian / norms, full_matrices=False)
     half = right / np.maximum(singular, 1e-12)[:, None] / norms

@@ -1,4 +1,4 @@
-"""Solids of an object as pads feel them, all in the object's frame instead of each in its own.
+"""Solids of an object for the pads' depth queries, all in the object's frame instead of each in its own.
 
 Letters in shapes: n pairs of pad and shape, G shapes.
 """
@@ -16,7 +16,7 @@ from taccorl.sim.signed_distance import Felt, Shapes
 
 
 def shapes_in_object(solids: Sequence[Solid]) -> tuple[list[Shapes], np.ndarray]:
-    """The solids as pads feel them, and the corners (8 G, 3) of their boxes, in the object's frame."""
+    """Solids for the pads' depth queries, and the corners (8 G, 3) of their bounding boxes, in the object's frame."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="pressed")
     for k, solid in enumerate(s for s in solids if s.touches):

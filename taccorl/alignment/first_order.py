@@ -1,4 +1,4 @@
-"""The simplest answer of a joint to its command, fitted: a first-order lag behind a pure delay.
+"""Fit of the simplest response of a joint to its command: a first-order lag behind a pure delay.
 
     y(t) = g · f(t − d) + b,   τ ḟ = q* − f
 
@@ -29,7 +29,7 @@ DELAY_ROWS, DELAY_S = 8.0, 0.15
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """The fit of one joint."""
+    """Fitted first-order lag and delay of one joint."""
 
     time_constant_s: float
     delay_s: float
@@ -84,7 +84,7 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
 
 @dataclass(frozen=True)
 class Shift:
-    """How much later one answer to a command comes than another, apart from other gains."""
+    """Delay of one response to a command relative to another, with differences of gains removed."""
 
     delay_s: float
     delay_sd_s: float

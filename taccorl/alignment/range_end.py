@@ -1,4 +1,4 @@
-"""Was a joint held by a mechanical stop, or did its encoder's range end there? When the reading changes again decides.
+"""Distinguish a joint at a mechanical stop from one whose encoder's range ended, by the time at which the reading changes again.
 
 Both leave a reading without change while the command lies beyond it. A joint whose *reading* ended moved on unseen: the reading
 changes when the joint's free answer to the command comes back, about a lag τ (0.1 s on a PiPER) after the command did. A joint
@@ -27,7 +27,7 @@ SETTLED_S = 0.3
 def stood_at_stop(
     target: np.ndarray, measured: np.ndarray, period_s: float, rows: tuple[int, int], sign: float, near: float
 ) -> bool:
-    """Whether the hold ended as that of a joint at a stop does; False where that is not clear.
+    """True if the hold ended as that of a joint at a stop; False if that is not clear.
 
     Args:
         target: (T,) commands.

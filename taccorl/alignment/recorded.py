@@ -37,7 +37,7 @@ names."""
 
 
 def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
-    """One recording as a measurement. Its episode markers do not matter; the instruction is the first one's.
+    """Read one recording as a measurement. Episode markers are ignored; the instruction is the first one's.
 
     Raises:
         RecordingError: not readable, a topic of the spec is missing, or commands and states do not overlap.

@@ -1,7 +1,7 @@
 """Simultaneous perturbation stochastic approximation (Spall 1992) with the constants of the paper's App. B.1.
 
 The two perturbed points of an iteration only estimate the gradient: at the first step they lie c = 0.08 from the iterate, so they
-say little about it. Loss, best point and patience are therefore those of the iterate x_k, which costs a third evaluation.
+say little about it. Loss, best point and stop rule therefore use the iterate x_k, which costs a third evaluation.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Does a measurement's time run forwards, evenly and without holes, and at the rate it should?"""
+"""Checks of a measurement's time stamps: increasing, even, without gaps, at the stated rate."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ RATE_SHARE = 0.8
 
 
 def check_time(m: Measurement) -> list[Finding]:
-    """Does time run forwards, evenly and without holes?"""
+    """Check that time stamps increase, evenly and without gaps."""
     steps = np.diff(m.time_s)
     if not np.isfinite(m.time_s).all() or (steps <= 0).any():
         row = int(np.argmax(~(steps > 0)))

@@ -1,8 +1,8 @@
 """Tactile calibration, paper App. B.2: λ_noise from readings without contact, then (k_n, k_d) on matched contact replays.
 
-The fit is least squares on the counts of all taxels that the object comes near. How well it matches is said, on recordings that
-were not fitted to, by what the paper aligns: masks of active taxels, their number, centroids, histograms, temporal differences.
-Twin and measurement go through the same threshold.
+The fit is least squares on the counts of all taxels that the object comes near. The match is measured, on recordings that were
+not used for the fit, by the quantities that the paper aligns: masks of active taxels, their number, centroids, histograms,
+temporal differences. Twin and measurement go through the same threshold.
 
 k_n and the sensor's gain (counts for a reading of 1) cannot be told apart by counts: the gain stays as configured.
 
@@ -38,7 +38,7 @@ _STEP = 1e-3  # of finite differences, in shares of the numbers to start from
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """What pads read that nothing touches."""
+    """Readings of pads without contact: mean, noise and threshold."""
 
     pads: tuple[str, ...]
     mean_count: np.ndarray
@@ -72,7 +72,7 @@ class Number:
 
 @dataclass(frozen=True)
 class TouchMatch:
-    """How alike measured and simulated touch are, over all frames of some recordings; 0 is perfect but for ``mask_iou``, 1."""
+    """Agreement of measured and simulated touch over all frames of some recordings. Perfect is 0, for ``mask_iou`` 1."""
 
     rms_count: float
     """Of counts, taxels that are ever active in either."""

@@ -1,4 +1,4 @@
-"""How deep each taxel was in a known object while a measurement was made: geometry alone, no dynamics (paper App. B.2).
+"""Depth of each taxel in a known object during a measurement, from geometry alone without dynamics (paper App. B.2).
 
 The fingers stand where their opening was measured, the object where it is known to be, so a taxel's depth δ and its rate δ̇
 follow, at the instants at which the board scanned it. Where the object is thicker than the opening, the difference is what the
@@ -43,7 +43,7 @@ _NEAR_M = 1e-3  # a pad that never comes so near to the object takes no part
 
 @dataclass(frozen=True, kw_only=True)
 class PressedObject:
-    """What the fingers of one arm press, and where it is. TCP frame: middle between the pads, z = approach, fingers close
+    """Object that the fingers of one arm press, and its pose. TCP frame: middle between the pads, z = approach, fingers close
     along y; finger a is on the side of +y."""
 
     solids: Sequence[Solid]
@@ -100,7 +100,8 @@ def indenter(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TouchMotion:
-    """Where the taxels were in the object, frame by frame, and what the pads sent. Made by ``touch_motion``."""
+    """Matched contact replay: poses of the taxels in the object, frame by frame, and the measured counts. Made by
+    ``touch_motion``."""
 
     measurement: Measurement = field(repr=False)
     """That it was made from."""
@@ -219,7 +220,7 @@ def _moved(matrices: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
-    """The matched contact replay of a measurement: rows with the gripper's opening, and frames of the pads.
+    """Make the matched contact replay of a measurement, from its gripper openings and its pad frames.
 
     Args:
         config: for the robot's mounts and the sensor's scan.

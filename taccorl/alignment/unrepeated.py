@@ -1,4 +1,4 @@
-"""What a robot does not repeat, per signal: how large, when, and whether dropped commands explain it.
+"""Differences between repeats of one motion, per signal: size, time, and whether dropped commands explain them.
 
     ratio       RMS of what repeats differ by, over the noise that rest, residue and rounding show
     bursts      the smallest share of half-second blocks that holds 80 % of the squared difference
@@ -37,7 +37,7 @@ MOST_TIMES = 5
 
 @dataclass(frozen=True, kw_only=True)
 class Burst:
-    """A stretch in which two recordings of one motion differ most."""
+    """Period in which two recordings of one motion differ most."""
 
     first: str
     second: str
@@ -74,7 +74,7 @@ class Dropped:
 
 @dataclass(frozen=True, kw_only=True)
 class Unrepeated:
-    """One signal."""
+    """Differences between repeats of one signal."""
 
     signal: str
     unit: str
@@ -101,7 +101,7 @@ class Unrepeated:
 
 
 def unrepeated(measurements: Sequence[Measurement]) -> list[Unrepeated]:
-    """Every signal that is commanded to move and was measured."""
+    """Analyse every signal that is commanded to move and was measured."""
     measurements = list(measurements)
     pairs = [(a, b, overlay(a, b)) for a, b in repeat_pairs(measurements)]
     floors = noise_floor(measurements)
@@ -176,7 +176,8 @@ def _dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
 
 
 def check_repeatability(measurements: Sequence[Measurement]) -> dict[str, list[Finding]]:
-    """Recording → findings ``dropped_commands`` (warning), ``does_not_repeat`` (warning) and ``not_judged`` (note)."""
+    """Check repeatability: recording → findings ``dropped_commands`` (warning), ``does_not_repeat`` (warning) and
+    ``not_judged`` (note)."""
     groups: dict[tuple[str, ...], list[Measurement]] = {}
     for m in measurements:
         groups.setdefault(m.signals, []).append(m)

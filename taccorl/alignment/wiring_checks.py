@@ -1,4 +1,4 @@
-"""Does every joint follow its own command, the right way round and in the right unit?
+"""Check that every joint follows its own command, with the right sign and unit.
 
     follows[i, j]   correlation of the velocity of measured i with that of command j behind a lag of 0.1 s
     gain[j]         how far measured j goes for each radian (metre) that command j goes, behind the same lag
@@ -44,7 +44,7 @@ _UNIT_WAY_OUT = "state the unit in the columns file (recordings: `scale` of the 
 
 
 def check_wiring(m: Measurement) -> list[Finding]:
-    """Swapped joints and arms, reversed signs, units."""
+    """Find swapped joints and arms, reversed signs, and wrong units."""
     found = _check_range(m)
     even = m.resampled(m.rate_hz)
     commanded = [

@@ -1,4 +1,4 @@
-"""The residual along the variables that physical effects depend on, with a band that knows that neighbouring rows are alike.
+"""Residual as a function of the variables on which physical effects depend, with a band that includes the correlation of rows.
 
 A curve that leaves zero says along what the twin is off; it does not say why.
 
@@ -24,7 +24,7 @@ Measure = Literal["mean", "RMS"]
 
 @dataclass(frozen=True)
 class Variable:
-    """Something that physical effects depend on."""
+    """A variable on which physical effects depend, such as speed or position."""
 
     name: str
     words: str
@@ -79,7 +79,7 @@ class Curve:
 
 
 def curves(comparison: Comparison, signal: str, kind: Kind = "position") -> list[Curve]:
-    """Along every variable that varies, all recordings of the signal together."""
+    """Curves along every variable that varies, from all recordings of the signal together."""
     motions = motions_of(comparison.of(signal, kind))
     found = [_curve(motions, signal, kind, variable) for variable in VARIABLES]
     return [c for c in found if c is not None]

@@ -1,4 +1,4 @@
-"""What a diagnosis costs. How often it is right is in docs/diagnosis.md (``python -m pipelines.diagnosis_study``)."""
+"""Cost of a diagnosis. Its accuracy is in docs/diagnosis.md (``python -m pipelines.diagnosis_study``)."""
 
 import time
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ HIDDEN_IN_PADS = ("taxel_saturation", "taxel_creep", "taxel_gain_spread", "pad_s
 
 @benchmark("diagnosis")
 def diagnosis() -> Iterator[Row]:
-    """One joint from the paper's 10 s chirp, and a whole arm on two cores; recordings of surrogate robots."""
+    """Cost of the diagnosis of one joint from the paper's 10 s chirp, and of a whole arm on two cores; surrogate recordings."""
     run(Job(study="warm-up", hidden=(), seed=0, design="chirp"))
     jobs = [Job(study="cost", hidden=(name,), seed=400 + k, design="chirp") for k, name in enumerate(HIDDEN)]
     costs = [float(run(job)["cpu_s"]) for job in jobs]

@@ -21,7 +21,7 @@ FEWEST = 10.0
 
 
 class Rows(NamedTuple):
-    """Which entries of one recording are in a stacked vector of residuals."""
+    """Entries of one recording in a stacked vector of residuals."""
 
     measured: np.ndarray
     """(T, C) bool."""

@@ -1,4 +1,4 @@
-"""How much better one model is than another on recordings that neither was fitted to: block by block, with its uncertainty."""
+"""Improvement of one model over another on recordings to which neither was fitted, block by block, with its uncertainty."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from taccorl.diagnosis.problem import Problem, Recording
 
 @dataclass(frozen=True)
 class Blocks:
-    """Squared residuals, block of time by block of time."""
+    """Squared residuals per block of time."""
 
     squares: np.ndarray
     """(B,) mean squared residual of each block, in floors²."""
@@ -53,7 +53,7 @@ def standard_score(blocks: Blocks) -> float:
 
 
 def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
-    """How far the Bayesian information criterion falls from ``parent`` to ``child``: 10 is strong evidence (Kass and
+    """Decrease of the Bayesian information criterion from ``parent`` to ``child``: 10 is strong evidence (Kass and
     Raftery 1995).
 
     The noise is known: residuals are in floors, and what ``child`` leaves above one floor counts as noise, too. Rows count as

@@ -1,4 +1,4 @@
-"""What a diagnosis says, in words: the same in the terminal and on the page."""
+"""Text of a diagnosis, the same in the terminal and on the page."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,8 @@ NO_GAIN = 0.01
 
 
 def evidence_words(e: Evidence) -> str:
-    """What speaks for an effect: ΔBIC on the recordings that it was fitted to, gain and standard errors on validation recordings.
+    """Evidence for an effect as text: ΔBIC on the recordings that it was fitted to, gain and standard errors on validation
+    recordings.
 
     ``weak`` is what the search would not add; ``none``: nothing goes away.
     """
@@ -28,7 +29,7 @@ def evidence_words(e: Evidence) -> str:
 
 
 def unjudged(d: Diagnosis) -> str:
-    """Where fit and validation recordings disagree after the fit; empty if they do not.
+    """Text on the regimes in which fit and validation recordings disagree after the fit; empty if there are none.
 
     What shows only in the recordings that were fitted can be neither confirmed nor refused; what shows only in those that
     validate was fitted to something else.
@@ -48,7 +49,7 @@ def unjudged(d: Diagnosis) -> str:
 
 
 def unit_words(unit: str) -> str:
-    """To be put behind a number; nothing for a pure one."""
+    """Unit to print behind a number; empty for a dimensionless one."""
     return "" if unit == "1" else f" {unit}"
 
 

@@ -1,4 +1,4 @@
-"""Which motion to record next: the one on which two rival explanations stay furthest apart, however the other is refitted.
+"""Choose the motion to record next: the one that separates rival explanations most after a refit (T-optimal design).
 Joints here; presses of the pads, by the same measure, in ``presses``.
 
 T-optimal design (Atkinson and Fedorov 1975): for rivals A and B and a motion, A predicts what would be measured; B with all its
@@ -38,19 +38,19 @@ STEPS = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """Something that could be recorded."""
+    """A recording that could be made, with its discrimination of rivals."""
 
     ways: dict[str, tuple[float, float]]
     """"a | b" → floors that stay between the two after a refit of b to a's truth, and of a to b's."""
 
     @property
     def discrimination(self) -> dict[str, float]:
-        """ "a | b" → the lesser of both: nobody knows which is true."""
+        """Pair "a | b" → discrimination in noise floors, the smaller of both directions."""
         return {pair: min(ways) for pair, ways in self.ways.items()}
 
     @property
     def worst(self) -> float:
-        """Over all pairs of rivals."""
+        """Smallest discrimination over all pairs of rivals."""
         return min(self.discrimination.values(), default=0.0)
 
     @property
@@ -71,7 +71,7 @@ class PlannedMotion(Planned):
 
 @dataclass(frozen=True, kw_only=True)
 class Plan[PlannedT: Planned]:
-    """What could be recorded of one part, best first."""
+    """Recordings that could be made of one part, best first."""
 
     part: str
     """``left_joint5``, ``left pads``."""
@@ -86,7 +86,7 @@ class Plan[PlannedT: Planned]:
 
     @property
     def hopeless(self) -> tuple[str, ...]:
-        """Pairs that nothing here tells apart for sure."""
+        """Pairs of rivals that none of these recordings separates reliably."""
         pairs = [f"{a} | {b}" for a, b in itertools.combinations(self.rivals, 2)]
         return tuple(pair for pair in pairs if self.best(pair) < TELLS)
 
@@ -172,7 +172,7 @@ def best_first[PlannedT: Planned](planned: Sequence[PlannedT]) -> tuple[PlannedT
 
 
 def room_of(config: TwinConfig, signal: str, pose: np.ndarray) -> Room:
-    """How far the joint may go about ``pose`` (7,)."""
+    """Range of motion of the joint about ``pose`` (7,)."""
     number = joint_number(signal)
     body = arm_bench.rigid(config, signal, pose, 0.0, [])
     middle = float(pose[number - 1])
@@ -181,7 +181,7 @@ def room_of(config: TwinConfig, signal: str, pose: np.ndarray) -> Room:
 
 
 def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
-    """(7,) where the arm stands while this joint is swept: as in the recordings that sweep it, else as ``motions.POSES``."""
+    """Pose (7,) of the arm while this joint is swept: as in the recordings that sweep it, else as in ``motions.POSES``."""
     arm, number = signal.split("_", 1)[0], joint_number(signal)
     swept = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
     pose = np.array([*POSES[number - 1], OPENING_M])
@@ -194,7 +194,7 @@ def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
 def imagined(
     config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray, floor_rad: float
 ) -> Measurement:
-    """What the twin itself would measure on a motion, with noise: a stand-in for a recording that is not made yet."""
+    """Simulated measurement of a motion by the twin, with noise, in place of a recording that is not made yet."""
     j = ROBOT.action_names.index(signal)
     arm = signal.split("_", 1)[0]
     targets = np.zeros((len(target), len(ROBOT.action_names)))
@@ -257,7 +257,7 @@ def _apart(
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """An effect with all numbers of the part, as if that were the truth."""
+    """A hypothesis: one effect with all fitted numbers of the part."""
 
     values: Values
     effect: Effect
@@ -285,7 +285,8 @@ def explanations(
 def floors_between(
     problem: Problem, present: Sequence[Effect], a: Explanation, b: Explanation, recordings: Sequence[Recording]
 ) -> tuple[float, float]:
-    """Floors that stay between two explanations on the last recording, b fitted to what a says of all of them, and a to b's.
+    """Residual RMS [noise floors] between two explanations on the last recording, after fitting b to data simulated from a,
+    and vice versa.
 
     Args:
         present: effects that the twin has in any case; their numbers are fitted, too.

@@ -1,4 +1,4 @@
-"""What all figures share: colours, units as people read them, where the data came from, and the PNG of a page.
+"""Common style of all figures: colours, readable units, label of the data's origin, and PNG encoding for a page.
 
 The measurement is black, the twin before a change orange, after it blue (Okabe and Ito's, apart for colour-blind eyes), the noise
 floor a grey band.
@@ -20,7 +20,7 @@ DOTS_PER_INCH = 110
 
 
 def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[str]) -> Figure:
-    """An empty one whose second title line says what made the data."""
+    """New empty figure with the origin of the data in its second title line."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained", dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)
     figure.suptitle(f"{title}\n", fontsize=11, fontweight="bold", x=0.01, ha="left")
@@ -37,7 +37,7 @@ def floor_band(axes: Axes, floor: float, unit: str) -> None:
 
 
 def tidy(axes: Axes) -> None:
-    """Faint grid, no box."""
+    """Draw a faint grid and remove the box."""
     axes.grid(True, color="#e5e7eb", lw=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
@@ -46,7 +46,7 @@ def tidy(axes: Axes) -> None:
 
 
 def legend(axes: Axes, columns: int = 4) -> None:
-    """Above the axes, on the right, in the way of no line."""
+    """Draw the legend above the axes on the right, where it covers no line."""
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, fontsize=7.5, frameon=False, borderpad=0.1)
 
 
@@ -57,11 +57,11 @@ def png(figure: Figure) -> bytes:
 
 
 def data_uri(picture: bytes) -> str:
-    """For a page that needs no other file."""
+    """A PNG as a data URI, for a page that needs no other file."""
     return f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
 
 
 def robust_limit(values: np.ndarray, least: float) -> float:
-    """Half height of an axis that shows all but the farthest 0.1 % of residuals, and the floor."""
+    """Limit of a symmetric axis that shows all but the largest 0.1 % of residuals, and the noise floor."""
     values = np.abs(values[np.isfinite(values)])
     return 1.15 * max(float(np.quantile(values, 0.999)) if len(values) else 0.0, least)

@@ -28,7 +28,7 @@ LANES = ("near zero speed", "after a reversal", "high speed", "high load", "in c
 
 
 def joint_response(before: Trace, after: Trace | None = None, names: tuple[str, str] = TWINS) -> Figure:
-    """Commanded, measured and replayed; the tracking error; the residual; and when the joint was in which regime.
+    """Figure of one joint over time: commanded, measured and replayed position, tracking error, residual, and regimes.
 
     Args:
         after: the same signal of the same recording, replayed by another twin.
@@ -88,7 +88,7 @@ def _residuals(axes: Axes, twins: Sequence[tuple[Trace, str, str]]) -> None:
 
 
 def heat_map_figure(cells: Sequence[Cell], origins: Sequence[str], title: str, most: float = 0.0) -> Figure:
-    """Signal × regime: RMSE over the noise floor. An empty cell: too few rows.
+    """Heat map, signal × regime, of RMSE over the noise floor. Empty cells have too few rows.
 
     Args:
         most: floors that the colours reach, at least.
@@ -131,7 +131,7 @@ def residual_along_variables(
     traces: Sequence[Trace],
     names: tuple[str, str] = TWINS,
 ) -> Figure:
-    """Mean or RMS residual along each variable, with its 95 % band.
+    """Figure of the mean or RMS residual along each variable, with its 95 % band.
 
     Args:
         traces: of the same signal, for its floor and units.

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: the error falling effect by effect, who was taken for whom, and how small an effect is still found."""
+"""Figures of a diagnosis: error after each effect, confusion of effects, and detection as a function of size."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from taccorl.diagnosis.search import SearchConfig
 
 @dataclass(frozen=True)
 class Step:
-    """The twin after one more effect."""
+    """One step of a waterfall: name of the added effect, and error after it."""
 
     label: str
     error: float
@@ -27,7 +27,7 @@ class Step:
 def waterfall(
     steps: Sequence[Step], origins: Sequence[str], title: str, goal: float = SearchConfig().stop_at
 ) -> Figure:
-    """Validation error after each added effect, down to the noise floor.
+    """Waterfall figure: validation error after each added effect, down to the noise floor.
 
     Args:
         steps: the twin as it was first, then one for each effect.
@@ -66,7 +66,7 @@ def waterfall(
 
 
 def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[str], title: str) -> Figure:
-    """Hidden effect × what was named. Rows add up to the number of seeds.
+    """Confusion matrix: hidden effect × named effect. Rows add up to the number of seeds.
 
     Args:
         counts: hidden → named → number of seeds; names that are not hidden ones ("nothing", "something else") come last.
@@ -124,7 +124,7 @@ def half_detected(signals: np.ndarray, found: np.ndarray, slope: float = SLOPE) 
 def detection_curves(
     points: Mapping[str, tuple[np.ndarray, np.ndarray]], origins: Sequence[str], title: str, edges: Sequence[float]
 ) -> Figure:
-    """A small panel an effect: share of seeds that found it over signal to noise, with 95 % Wilson intervals, and the curve.
+    """Detection curves, one panel per effect: share of seeds that found it over signal-to-noise, with 95 % Wilson intervals.
 
     Args:
         points: effect → signals (n,) and whether it was found (n,).

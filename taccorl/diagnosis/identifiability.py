@@ -1,6 +1,6 @@
-"""Before any effect is fitted: which effects these recordings would show at all, and which they cannot tell apart.
+"""Identifiability before any fit: which effects these recordings can show, and which they cannot separate.
 
-Every effect is probed at a typical strength, beside the always fitted numbers; what those can take up is no trace of it.
+Every effect is simulated at a typical strength; the part that the always fitted numbers can reproduce does not count.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ RIDGE = 0.999
 
 @dataclass(frozen=True, kw_only=True)
 class Identifiability:
-    """What a set of recordings can tell, whatever they will turn out to say."""
+    """Effects that a set of recordings can show and separate, independent of the measured values."""
 
     visible: dict[str, float]
     """Effect → RMS of what it would leave at a typical strength, in floors."""
@@ -40,7 +40,7 @@ class Identifiability:
 def identifiability(
     problem: Problem, recordings: Sequence[Recording], start: Values, present: Sequence[str] = ()
 ) -> Identifiability:
-    """Fit the numbers that are always fitted, from ``start``, with the effects ``present``, and look around."""
+    """Fit the always fitted numbers from ``start``, with the effects ``present``, and probe all candidates."""
     here = fit(problem, recordings, present, start)
     problem.learn(here.values)
     typical = [

@@ -1,4 +1,4 @@
-"""Which numbers of a fit the recordings identify, and what they leave open of the others.
+"""Numbers of a fit that the recordings identify, and the range of those that they do not.
 
 Positions identify ratios to K_p. All torques of a joint times one factor move it the same way but for its inertia:
 
@@ -71,7 +71,7 @@ class Identified:
 
 @dataclass(frozen=True, kw_only=True)
 class Known:
-    """What a fit knows about the numbers of one part."""
+    """Identified and absolute numbers of one part after a fit."""
 
     identifiable: tuple[Identified, ...]
     """The primary numbers: those that the recordings identify."""
@@ -82,7 +82,7 @@ class Known:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Of the absolute numbers."""
+        """95 % intervals of the absolute numbers."""
         return {n.name: (n.low, n.high) for n in self.absolute}
 
 

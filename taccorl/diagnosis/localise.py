@@ -1,4 +1,4 @@
-"""Where a twin is off: by regime, which is a stretch of the motion.
+"""Localise the error of a twin by regime, a part of the motion such as slow, fast or after a reversal.
 
 This says WHERE, never WHY: a delay, a payload, a wrong gain scale and missing inertia all light up "high speed" and "high load"
 (measured on surrogates). ``taccorl diagnose`` tells causes apart, by simulating each.
@@ -29,7 +29,7 @@ LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Regime:
-    """Rows of a kind."""
+    """A regime: a condition that selects rows of a motion."""
 
     name: str
     group: str
@@ -41,7 +41,7 @@ class Regime:
 
 @dataclass(frozen=True)
 class Motion:
-    """How a joint moved in one recording, from its own measurement (rows without one are bridged)."""
+    """Motion of a joint in one recording, from its own measurement (gaps are interpolated): velocity, acceleration, scales."""
 
     trace: Trace
     velocity: np.ndarray
@@ -72,7 +72,7 @@ class Motion:
 
 
 def motions_of(traces: Sequence[Trace]) -> list[Motion]:
-    """For all traces of one signal, with their scales in common."""
+    """Motions of all traces of one signal, with common scales."""
     velocities = [_slope(bridged(t.position), t.period_s) for t in traces]
     peak = float(np.quantile(np.abs(np.concatenate(velocities)), 0.99))
     positions = np.concatenate([t.position for t in traces])
@@ -164,7 +164,7 @@ def _has_contact(m: Motion) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One signal in one regime."""
+    """Error of one signal in one regime."""
 
     signal: str
     kind: Kind | Literal["touch"]
@@ -179,7 +179,7 @@ class Cell:
 
     @property
     def lift(self) -> float:
-        """How many times its share of the time its share of the error is."""
+        """Ratio of its share of the error to its share of the time."""
         return self.share_of_error / self.share_of_time
 
 
@@ -214,6 +214,6 @@ def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
 
 
 def worst_regime(cells: Sequence[Cell], signal: str, kind: str = "position") -> Cell | None:
-    """Where its RMSE is highest, of regimes that do not cover nearly all of its time."""
+    """Regime with the highest RMSE, among those that cover only a part of the time."""
     own = [c for c in cells if c.signal == signal and c.kind == kind and c.share_of_time < 0.9]
     return max(own, key=lambda c: c.ratio, default=None)

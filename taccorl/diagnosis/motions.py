@@ -1,4 +1,4 @@
-"""Motions to record of one joint: the paper's sweep and what else tells effects apart. 200 Hz, at rest at both ends.
+"""Library of motions to record for one joint: the paper's sweep and others that separate effects. 200 Hz, at rest at both ends.
 
     chirp            10 s as the paper's sweep (App. B.1), 0.1 to 2.5 Hz (a choice, the paper gives no frequencies)
     wide triangle    there and back over a wide range in 14 s: friction, weight, what hangs on the angle
@@ -56,7 +56,7 @@ WIDE_RAD = (1.1, 0.9, 0.9, 1.1, 0.95, 1.2)
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """One recording to be made."""
+    """One motion of a joint to be recorded."""
 
     name: str
     target: Callable[["Room"], np.ndarray]
@@ -69,7 +69,7 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """How far one joint may go, and how fast."""
+    """Range of motion of one joint: middle, widest reach and amplitude of the sweep [rad]."""
 
     middle_rad: float
     wide_rad: float

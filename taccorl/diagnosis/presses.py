@@ -1,4 +1,4 @@
-"""Which press to record next: what an arm's pads can be pressed with, and how far apart each press keeps rival explanations.
+"""Choose the press to record next: a library of presses of an arm's pads, scored by how well each separates rivals.
 
     press_hold_release   a ball to three depths at two speeds: k_n, k_d, the law
     deep_presses         to 1.6 mm: what saturates or bends
@@ -69,7 +69,7 @@ Knots = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class Press:
-    """One recording to be made: what is pressed where, and how deep over time."""
+    """One press to be recorded: object, place, and depth over time."""
 
     name: str
     knots: Knots
@@ -80,7 +80,7 @@ class Press:
     """Place of the object's middle in the TCP's frame, on no taxel's own middle; a rod lies across the pads, along x."""
 
     def pressed(self, arm: str) -> PressedNote:
-        """As measurements.yaml says it."""
+        """Entry ``pressed`` of measurements.yaml."""
         place = {"arm": arm, "radius_m": RADIUS_M[self.shape], "position_m": (self.x_m, 0.0, self.z_m)}
         if self.shape == "sphere":
             return PressedNote(shape="sphere", **place)
@@ -204,7 +204,7 @@ def grip(robot: RobotConfig, press: Press) -> tuple[np.ndarray, np.ndarray]:
 
 
 def travel_m(robot: RobotConfig) -> float:
-    """How deep a pad can be pressed: as far as the gripper's force goes, and never through its rubber."""
+    """Largest depth to which a pad can be pressed, limited by the gripper's force and the rubber's thickness."""
     return min(
         ROBOT.pad_thickness_m,
         robot.grip_force_max_n / robot.pad_stiffness_n_per_m if robot.pads == "sprung" else np.inf,
@@ -228,7 +228,7 @@ def _refusal(robot: RobotConfig, press: Press, target_m: np.ndarray) -> str:
 
 
 def imagined_press(config: TwinConfig, arm: str, press: Press) -> TouchMotion:
-    """What the twin itself would send in a press, with noise: a stand-in for a recording that is not made yet."""
+    """Simulated counts of the twin in a press, with noise, in place of a recording that is not made yet."""
     opening = press.opening_m()
     time_s = np.arange(len(opening)) / RATE_HZ
     target = np.tile([*REST_POSE, ROBOT.opening_max_m] * len(ROBOT.arms), (len(opening), 1))

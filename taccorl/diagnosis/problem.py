@@ -37,7 +37,7 @@ class Free:
     """Of a linear one: a change that matters."""
 
     def coordinate(self, value: float) -> float:
-        """Where the search stands: of order 1 for a change that matters."""
+        """Value of the number in the search's coordinate, scaled so that a relevant change is of order 1."""
         value = min(max(value, self.low), self.high)
         return math.log(value) if self.log else value / self.scale
 
@@ -47,7 +47,7 @@ class Free:
 
 
 def free(p: Parameter, effect: str) -> Free:
-    """How a parameter of an effect is searched: those that cannot change sign on a logarithmic scale."""
+    """Free number for a parameter of an effect; on a logarithmic scale if it cannot change sign."""
     one_sided = p.low > 0 or (p.low == 0 and p.absent in (None, 0.0))
     low = max(p.low, _SMALLEST * p.typical) if one_sided else p.low
     shift = abs(p.typical - p.absent) if p.absent is not None and math.isfinite(p.absent) else 0.0
@@ -93,7 +93,7 @@ def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) ->
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """One measurement as the search sees it."""
+    """One measurement in the form that the search takes."""
 
     name: str
     time_s: np.ndarray
@@ -128,7 +128,7 @@ class Problem(Protocol):
         ...
 
     def learn(self, values: Mapping[str, float]) -> None:
-        """The always fitted numbers have been fitted: where searches for effects start may hang on them."""
+        """Called after the first fit of the always fitted numbers; may update the start values of effects."""
         ...
 
     def prepare(

@@ -1,4 +1,4 @@
-"""Errors recording by recording and regime by regime, and where fit and validation recordings do not cover the same.
+"""Errors by recording and regime, and differences in coverage between fit and validation recordings.
 
 One pooled number hides a recording, a speed, a direction or a part of the range in which the twin is off.
 
@@ -53,7 +53,7 @@ class Coverage:
 
 @dataclass(frozen=True, kw_only=True)
 class RegimeErrors:
-    """One signal after the fit."""
+    """Errors of one signal after the fit, by recording and regime."""
 
     signal: str
     rows: tuple[RegimeError, ...]
@@ -69,7 +69,7 @@ class RegimeErrors:
 
 
 def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
-    """Of all recordings of one signal, replayed by the fitted twin."""
+    """Errors of all recordings of one signal, replayed by the fitted twin."""
     motions = motions_of(traces)
     regimes: list[tuple[str, Callable[[Motion], np.ndarray]]] = [(ALL, _every)]
     regimes += [(r.name, r.rows) for r in REGIMES if r.group in GROUPS]

@@ -1,4 +1,4 @@
-"""A comparison, and what was diagnosed from it, as one page that needs no other file, with the same in JSON beside it.
+"""Report of a comparison and a diagnosis: one HTML page without other files, and the same as JSON.
 
 ``report.html`` is for people, ``report.json`` holds every number of it. An earlier report of ours is replaced, and the caller is
 told so; any other file of that name is left alone.
@@ -65,20 +65,20 @@ class Report:
 
     @property
     def without_effects(self) -> Comparison:
-        """What effects are credited against: the refitted twin, or the twin as it was where nothing was refitted."""
+        """Reference for the improvement by effects: the refitted twin, or the original one where nothing was refitted."""
         return self.comparison if self.refitted is None else self.refitted
 
     def cells(self) -> list[Cell]:
-        """Where the twin without further effects is off: positions, efforts, pads."""
+        """Errors of the twin without further effects by regime: positions, efforts, pads."""
         return cells_of(self.without_effects)
 
     def regimes(self) -> dict[str, RegimeErrors]:
-        """Diagnosed joint → errors by recording and regime, of the twin as it ends."""
+        """Diagnosed joint → errors by recording and regime, of the final twin."""
         last = self.comparison if self.after is None else self.after
         return {part: regime_errors(traces) for part in self.diagnoses if (traces := last.of(part))}
 
     def verdicts(self) -> dict[str, Verdict]:
-        """Diagnosed part → the sentences that come first."""
+        """Diagnosed part → sentences of its verdict."""
         regimes = self.regimes()
         return {
             part: verdict(
@@ -94,7 +94,7 @@ class Report:
         }
 
     def unsettled(self) -> list[str]:
-        """What is wrong with the recordings: errors that the checks found in them.
+        """Errors that the checks found in the recordings.
 
         An offset of the clock counts if the fitted twin sees it: one that lacks an effect may see an offset that is not there.
         """
@@ -110,13 +110,13 @@ class Report:
 
 
 def cells_of(c: Comparison) -> list[Cell]:
-    """Positions, efforts, pads, regime by regime."""
+    """Errors of positions, efforts and pads by regime."""
     return [*heat_map(c, "position"), *heat_map(c, "effort"), *touch_heat_map(c.touches)]
 
 
 @dataclass(frozen=True)
 class Written:
-    """Files of a report."""
+    """Paths of the files of a report."""
 
     page: Path
     numbers: Path
@@ -125,7 +125,7 @@ class Written:
 
 
 def check_folder(folder: Path) -> str:
-    """May a report be written there? Returns when the one was made that it will replace; empty if there is none.
+    """Check that a report may be written there; returns the date of the report that it will replace, empty if there is none.
 
     Raises:
         TaccorlError: a file of its name that is not ours, or no folder can be there.
@@ -172,7 +172,7 @@ def write_report(report: Report, folder: Path) -> Written:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Every number of the page."""
+    """All numbers of the page as JSON values."""
     c, after, refitted = report.comparison, report.after, report.refitted
     drawn = report.without_effects
     return {

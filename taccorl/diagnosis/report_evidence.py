@@ -1,4 +1,4 @@
-"""The part of a page that says which effect is missing, with what evidence, and what cannot be told apart."""
+"""Section of a report on the missing effects: evidence, ties, and effects that cannot be separated."""
 
 import html
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from taccorl.sim.effects.effect import Effect
 
 
 def first_read(v: Verdict) -> str:
-    """What a reader needs first: verdict, confidence, what to record next with the command."""
+    """First section of a report: verdict, confidence, and what to record next, with the command."""
     lines = [
         f"<b>{html.escape(v.finding)}</b>",
         html.escape(v.confidence),
@@ -39,7 +39,8 @@ def diagnosis_section(
     known: Known | None = None,
     regimes: RegimeErrors | None = None,
 ) -> str:
-    """Errors, waterfall, numbers, errors by regime, evidence of each round, and the effects in words."""
+    """Section of one diagnosed part: errors, waterfall, numbers, errors by regime, evidence of each round, description of
+    effects."""
     found = [e for e in d.effects if e.name not in d.present]
     named = ", ".join(e.name for e in found) or "nothing was added"
     parts = [

@@ -1,4 +1,4 @@
-"""Pieces of a page."""
+"""HTML elements of a report."""
 
 import html
 from collections.abc import Container, Sequence

@@ -1,4 +1,4 @@
-"""Before any effect is fitted: what trace would each leave in these recordings that the fitted numbers cannot take up?
+"""Screening: the signature that each effect would leave in these recordings, beyond what the fitted numbers can reproduce.
 
 One probe simulation for each start of each effect. Its difference from the fitted model, less what a change of the fitted numbers
 would do as well (projection), is the effect's *signature* on these recordings. A score test (Rao) then says how much of the
@@ -27,7 +27,7 @@ WRONG_SIGN = 0.1
 
 @dataclass(frozen=True)
 class Probe:
-    """What one start of one effect would leave in the recordings."""
+    """Signature of one start of one effect in the recordings."""
 
     name: str
     start: Values
@@ -40,14 +40,14 @@ class Probe:
 
     @property
     def visible(self) -> float:
-        """RMS in floors: what of the effect these recordings show at all."""
+        """RMS of the signature in noise floors."""
         return float(np.sqrt(np.mean(np.square(self.signature))))
 
 
 def probe(
     problem: Problem, recordings: Sequence[Recording], parent: Fit, candidates: Sequence[Candidate]
 ) -> list[Probe]:
-    """Every start of every candidate, beside the effects that ``parent`` has.
+    """Probe every start of every candidate, in addition to the effects of ``parent``.
 
     Args:
         recordings: those that ``parent`` was fitted to.
@@ -117,7 +117,7 @@ def _strength(c: Candidate) -> Parameter:
 
 
 def can_fade(c: Candidate) -> bool:
-    """Whether there is ever less of it between its start and nothing."""
+    """Whether the effect can be weaker than at its start, down to its absent value."""
     absent = _strength(c).absent
     return bool(c.frees) and absent is not None and bool(np.isfinite(absent))
 

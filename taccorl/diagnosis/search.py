@@ -47,7 +47,7 @@ WORDS: dict[Status, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig:
-    """When an effect is believed. The values are choices, checked in docs/diagnosis.md."""
+    """Acceptance criteria of an effect. The values are choices, checked in docs/diagnosis.md."""
 
     stop_at: float = 1.3
     """Validation error in noise floors at which nothing more is looked for,"""
@@ -90,14 +90,14 @@ class SearchConfig:
     """Of the last refit of what was found, with finer slopes."""
 
     def refusal(self, gain: float, score: float, bic: float) -> str:
-        """Why an effect is not believed; empty if it is."""
+        """Reason why an effect is not accepted; empty if it is."""
         sure = gain >= self.sure_gain and score >= self.min_score
         if bic < (0.0 if sure else self.min_bic):
             return self.too_little(gain, score) or f"does not pay for its parameters: ΔBIC {bic:.0f}"
         return self.too_little(gain, score)
 
     def too_little(self, gain: float, score: float) -> str:
-        """Why an effect that takes away so much is not believed; empty if it is."""
+        """Reason why an effect with this gain is not accepted; empty if it is."""
         if gain < self.min_gain:
             return f"takes away {max(gain, 0.0):.0%} of what lies above the floor, less than {self.min_gain:.0%}"
         if score < self.min_score and gain < self.sure_gain:
@@ -107,7 +107,7 @@ class SearchConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """One effect in one round: what speaks for it."""
+    """Evidence for one effect in one round of the search."""
 
     name: str
     values: Values
@@ -147,7 +147,7 @@ class Round:
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """What is missing, how sure that is, and what cannot be told."""
+    """Result of a search: missing effects, evidence, ties and remarks."""
 
     status: Status
     effects: tuple[Effect, ...]

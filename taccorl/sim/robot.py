@@ -38,9 +38,8 @@ class RobotConfig:
     pad_damping_ns_per_m: float = 30.0
     pad_tilt_stiffness_nm_per_rad: tuple[float, float] = (40.0, 16.0)
     """Tilt stiffness of a pad that is pressed off its middle: along the finger, and across it. Without it a load that twists
-    the part would
-    leave no trace in the taxels. A plate on a uniform bed would have K L² / 12 = 6.8 and 1.0; a part that covers a part of
-    the pad tilts it less. A choice, to be calibrated on a robot."""
+    the part would leave no trace in the taxels. A plate on a uniform bed would have K L² / 12 = 6.8 and 1.0; a part that covers
+    a part of the pad tilts it less. A choice, to be calibrated on a robot."""
     grip_stiffness_n_per_m: float = 2000.0
     """Closing force of each finger for each metre that the command lies below the opening. A choice: with commands that end
     at 0 it takes 30 N to hold a part 18 mm wide."""
