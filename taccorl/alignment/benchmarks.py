@@ -34,7 +34,7 @@ RATE_HZ = 200.0
 
 
 def sweep(signal: str, config: TwinConfig) -> tuple[JointMotion, np.ndarray]:
-    """The sweep of ``sweep_range``, answered by MuJoCo with the gains of ``config``, as its joint sees it.
+    """Simulated recording of the sweep of ``sweep_range`` by MuJoCo, with the gains of ``config``.
 
     Returns:
         the motion, and (T,) what MuJoCo says without noise.

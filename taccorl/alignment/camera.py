@@ -223,7 +223,7 @@ def calibrate_camera(
 
 
 def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.ndarray:
-    """The pose (6,) that sees known points where they were found (OpenCV: SQPNP, then Levenberg–Marquardt).
+    """Pose (6,) from known points and their pixels (OpenCV: SQPNP, then Levenberg–Marquardt).
 
     Raises:
         TaccorlError: too few of them, or no pose explains them.

@@ -21,7 +21,7 @@ _GRIPPER_RAD = 0.5 / ROBOT.opening_max_m  # a gripper from end to end counts as 
 
 
 def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s: float = 0.0) -> CameraFrames:
-    """Rows of an episode in which the arms hardly move and stand differently, with the stages of the paper's figure.
+    """Select rows of an episode at which the arms are at rest in different poses, and the stages of the paper's figure.
 
     Args:
         latency_s: what a picture shows is that much older than its row; 0 where ingest has taken it off already.

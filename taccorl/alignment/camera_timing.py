@@ -48,7 +48,7 @@ class LatencyFit:
 def camera_latency(
     pictures: Iterable[np.ndarray], time_s: np.ndarray, joints: np.ndarray, config: TwinConfig, camera: str
 ) -> LatencyFit:
-    """Latency of ``camera`` from pictures T × (rows, columns, 3) uint8 taken, as they say, at ``time_s`` (T,).
+    """Estimate the latency of ``camera`` from pictures T × (rows, columns, 3) uint8 with time stamps ``time_s`` (T,).
 
     Args:
         joints: (T, 14) rad, m, as reported at the same times.

@@ -87,7 +87,7 @@ class TwinView:
         return np.where(self.robot[bodies], bodies, 0), depth_m
 
     def picture(self, joints: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        """What the twin's camera sees, without bars, (rows, columns, 3) uint8 RGB."""
+        """Picture of the twin's camera without bars, (rows, columns, 3) uint8 RGB."""
         self._turn(joints, offset)
         return self._renderer(self.window.rows, self.window.columns).render([self.data])[0, 0]
 

@@ -69,7 +69,7 @@ class HeldCommands:
 
 
 def find_held_commands(target: np.ndarray, measured: np.ndarray, period_s: float) -> HeldCommands | None:
-    """Search one signal of one recording; None where too little is measured or the target rests.
+    """Find dropped commands of one signal of one recording; None if too little is measured or the target does not move.
 
     Args:
         target: (T,) as commanded, in force from row k on.

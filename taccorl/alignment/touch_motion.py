@@ -148,7 +148,7 @@ class TouchMotion:
         return self._known[offsets_m]
 
     def cut(self, frames: np.ndarray, window: tuple[slice, slice]) -> "TouchMotion":
-        """Some frames of some rows and columns of the pads: what a fit simulates again and again, without the rest.
+        """Copy with some frames, rows and columns only, to make the repeated simulations of a fit cheaper.
 
         Args:
             frames: (T,) bool.

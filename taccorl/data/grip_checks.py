@@ -331,7 +331,7 @@ def rest_change(counts: np.ndarray, rest: np.ndarray, fps: int) -> tuple[float, 
 
 
 def rest_level(counts: np.ndarray, rest: np.ndarray, fps: int) -> float | None:
-    """Counts: median resting level of (T, R, C) at the episode's first rest; None without one."""
+    """Median resting level [counts] of (T, R, C) in the episode's first rest; None without one."""
     found = [r for r in runs(rest) if r[1] - r[0] >= REST_MIN_S * fps]
     return float(np.median(counts[slice(*found[0])].mean(axis=0))) if found else None
 

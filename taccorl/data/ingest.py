@@ -198,7 +198,7 @@ def _moved_aside(out: Path) -> Iterator[Path]:
 
 
 def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
-    """One recording to a shard in the store. Never raises for a fault of the recording: the entry says what happened."""
+    """Ingest one recording into a shard in the store. Never raises for a fault of the recording: the entry states the outcome."""
     digests: list[str] = []
     try:
         entry = _dry(job, progress) if job.dry_run else _stored(job, progress, digests)

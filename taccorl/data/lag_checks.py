@@ -73,7 +73,7 @@ def _correlation_at(v_action: np.ndarray, v_state: np.ndarray, lag: int) -> floa
 
 
 def arm_lags(episode: Episode) -> dict[str, Lag]:
-    """Arm name → lag of the arm behind its command, for the arms that move enough to tell."""
+    """Lag of each arm behind its command, by arm name; only arms that move enough."""
     if episode.num_rows < LAG_MIN_S * episode.spec.fps:
         return {}
     state, action = episode.arrays.get(STATE), episode.arrays.get(ACTION)
@@ -138,7 +138,7 @@ def check_lag(episode: Episode) -> list[Finding]:
 
 
 def arms_swapped(state: np.ndarray, action: np.ndarray, left: Arm, right: Arm, fps: int) -> bool | None:
-    """Does each arm's state follow the other arm's command? None where the arms move too little to tell."""
+    """True if each arm's state follows the other arm's command; None if the arms move too little to decide."""
     pairs = [(left, right), (right, left)]
     if any(len(a.joints) != len(b.joints) or not len(a.joints) for a, b in pairs):
         return None

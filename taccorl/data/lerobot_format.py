@@ -382,7 +382,7 @@ def require_videos(root: Path) -> None:
 
 
 def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> None:
-    """Replace what ``meta/stats.json`` says of features that are numbers: over all rows, quantiles too.
+    """Replace the statistics of numeric features in ``meta/stats.json`` by exact ones over all rows, quantiles included.
 
     Args:
         root: a dataset.

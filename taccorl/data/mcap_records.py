@@ -124,7 +124,7 @@ class McapFile:
         self.chunked = self.summary.has_chunks
 
     def record(self, offset: int) -> Record | None:
-        """The whole record at ``offset``, or None if what stands there cannot be one."""
+        """The whole record at ``offset``, or None if the bytes there cannot be one."""
         record = self._header(offset)
         if record is None or record.end > self.end:
             return None

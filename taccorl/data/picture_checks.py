@@ -31,7 +31,7 @@ def thumbnail(picture: np.ndarray) -> np.ndarray:
 
 
 def same_picture_runs(thumbs: np.ndarray) -> list[tuple[int, int]]:
-    """[first, last + 1) of stretches whose pictures all look like their first; thumbs (T, h, w).
+    """Runs [first, last + 1) of pictures that all resemble the first of the run; thumbs (T, h, w).
 
     Compared with the first one, not the one before: a slow change adds up and ends the stretch.
     """

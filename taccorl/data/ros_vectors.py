@@ -46,6 +46,6 @@ def vector_type(kind: str) -> str | None:
 
 
 def unit_of(name: str, kind: str) -> str:
-    """Unit of the value ``name`` of a message of type ``kind``; empty where the type does not say."""
+    """Unit of the value ``name`` of a message of type ``kind``; empty if the type does not determine it."""
     field, own = name.rpartition(".")[0], vector_type(kind) or ""
     return (UNITS_OF_ACCEL if own == "Accel" else UNITS).get(field, "") if field else UNITS_OF_TYPE.get(own, "")

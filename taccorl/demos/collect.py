@@ -146,7 +146,7 @@ class Attempt(EpisodeRecorder):
 
 
 def attempt(plan: Plan, sim: Simulation, spec: DatasetSpec, k: int, *, dense: bool = False) -> Attempt:
-    """Run attempt ``k`` to its end: success, failure, time limit, the demonstrator has finished, or cannot go on."""
+    """Run attempt ``k`` up to success, failure, the time limit, or the end of the demonstrator's actions."""
     seed = plan.attempt_seed(k)
     sim.reset([seed])
     recorder = Attempt(sim, spec, np.random.default_rng([seed, 2]), dense=dense)

@@ -207,7 +207,8 @@ class Correction:
 
 
 def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, episode: PolicyEpisode) -> Correction:
-    """Execute the policy's episode up to the takeover and let the expert complete the task; it gets the task's full time."""
+    """Execute the policy's episode up to the takeover, then let the expert complete the task within the task's full time
+    limit."""
     if episode.outcome == "success" and plan.takeover == "failures":
         return Correction(KEPT_OUT)
     limit_steps = sim.judge.limit_steps

@@ -1,4 +1,4 @@
-"""The stand-in's message types as ROS 2, JSON and protobuf channels of an MCAP file: the same content three ways.
+"""Message types of the stand-in as ROS 2, JSON and protobuf channels of an MCAP file, with the same content.
 
 A message is a plain dict shaped like its ROS type. ``ros2`` serialises it as CDR; ``json`` keeps its shape; ``protobuf``
 uses messages of the same fields, described at run time. Pictures in JSON and protobuf are ``foxglove.CompressedImage``:

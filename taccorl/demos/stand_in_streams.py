@@ -83,11 +83,11 @@ class Told(Protocol):
         ...
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14) rad/s, m/s."""
+        """Velocities (N, 14) [rad/s, m/s]."""
         ...
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14) N·m, N."""
+        """Efforts (N, 14) [N·m, N]."""
         ...
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
@@ -258,7 +258,7 @@ class Streams:
                 yield Event(log_s, stamp, topic, messages.COMPRESSED_IMAGE, message)
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray) -> Iterator[np.ndarray]:
-        """The pictures of a camera without loss or jitter, at tick times; for formats that know no other."""
+        """Pictures of a camera without loss or jitter, at tick times; for formats without time stamps."""
         last, still = self._last_picture(camera), None
         for ticks in np.array_split(np.arange(len(time_s)), math.ceil(len(time_s) / CAMERA_HZ)):
             moving = ticks[ticks <= last]

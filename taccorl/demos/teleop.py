@@ -67,7 +67,7 @@ class Hands(Protocol):
     """Interface of the controls of one attempt."""
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
-        """The next control step's action (14,) [rad, m], and what the person said besides."""
+        """Action (14,) [rad, m] for the next control step, and the person's commands."""
         ...
 
     def lines(self) -> list[str]:
@@ -372,7 +372,7 @@ def use_leader_driver(driver: OpenLeader) -> None:
 @Source.register_subclass("leader")
 @dataclass(frozen=True, kw_only=True)
 class LeaderSource(HumanSource):
-    """Leader arms: any LeRobot teleoperator that gives 14 values, or that is told which of its values are the 14."""
+    """Leader arms: any LeRobot teleoperator with 14 values, or with a mapping of its values to the 14."""
 
     teleop: str = ""
     """LeRobot's name of it: bi_rebot_102_leader, bi_openarm_leader, …"""

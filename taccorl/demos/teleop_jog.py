@@ -103,19 +103,19 @@ def label(command: Command) -> str:
 
 
 def key_map() -> str:
-    """The keys as a person reads them."""
+    """Readable list of the keys and their functions."""
     rows = [(axis.labels, axis.meaning) for axis in AXES]
     rows += [(label, command.value) for label, command in COMMAND_KEYS.values()]
     return "\n".join(f"  {keys:16}{meaning}" for keys, meaning in rows)
 
 
 def gamepad_map() -> str:
-    """The gamepad's sticks and buttons as a person reads them."""
+    """Readable list of the gamepad's sticks and buttons and their functions."""
     return "\n".join(f"  {what:21}{meaning}" for what, meaning in _GAMEPAD_MAP)
 
 
 class Keyboard:
-    """Keys → wishes: a tap is one step, a held key goes on."""
+    """Keyboard as a source of steps (7,): a tap is one step, a held key repeats."""
 
     def __init__(self) -> None:
         self._down: dict[int, int] = {}
@@ -143,7 +143,7 @@ class Keyboard:
 
 
 class Gamepad:
-    """GLFW's gamepad state (an XBox layout, whatever the maker) → wishes."""
+    """GLFW's gamepad state (an XBox layout) as a source of steps (7,)."""
 
     def __init__(self) -> None:
         self._before: Sequence[int] = _REST[0]
@@ -214,7 +214,7 @@ class Jogger:
         self.size = STEP_SIZES[(STEP_SIZES.index(self.size) + 1) % len(STEP_SIZES)]
 
     def jog(self, wish: np.ndarray) -> None:
-        """Move the goal of the chosen hand by ``wish`` (7,) steps; not if the new one is out of reach."""
+        """Move the target of the selected hand by ``wish`` (7,) steps, unless the new target is out of reach."""
         if not wish.any():
             return
         hand, self.notice = self.hands[self.arm], ""
@@ -251,13 +251,13 @@ class Jogger:
 
 
 class JogHands:
-    """A person's two hands for one attempt: wishes and commands, read by ``read`` from the keys tapped, into actions."""
+    """Controls of one attempt: converts steps and commands, read by ``read`` from the tapped keys, into actions."""
 
     def __init__(self, sim: Simulation, read: Callable[[Sequence[int]], tuple[np.ndarray, list[Command]]]) -> None:
         self.jogger, self._read = Jogger(sim), read
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
-        """The next control step's action (14,) [rad, m], and what the person said besides."""
+        """Action (14,) [rad, m] for the next control step, and the person's commands."""
         wish, commands = self._read(taps)
         for command in commands:
             if command is Command.SWITCH_ARM:
@@ -280,7 +280,7 @@ class JogHands:
 
 
 class GlfwGamepad:
-    """The first gamepad that GLFW (its Python module) knows.
+    """The first gamepad that GLFW (its Python module) finds.
 
     Raises:
         TaccorlError: there is none; names the joysticks that are there.

@@ -1,1 +1,1 @@
-"""Where the twin fails and why: compare, localise, find the missing effect, say what to record next."""
+"""Diagnosis: where the twin fails, which effect it lacks, and what to record next."""

@@ -54,13 +54,13 @@ def unit_words(unit: str) -> str:
 
 
 def excite_command(part: str, names: Sequence[str]) -> str:
-    """The command that plans a recording which tells effects of a joint or of pads apart; empty for any other part."""
+    """Command that plans a recording which separates effects of a joint or of pads; empty for any other part."""
     where = part if "_joint" in part else f"--pads={part.removesuffix(' pads')}" if part.endswith(" pads") else ""
     return f"taccorl excite {where} --effects={','.join(names)}" if where else ""
 
 
 def to_record(part: str, name: str, rivals: Sequence[str]) -> list[str]:
-    """What would tell an effect from its rivals: a command that plans it for a joint or for pads, in words for anything else."""
+    """Recording that would separate an effect from its rivals: a command for a joint or pads, a description for other parts."""
     command = excite_command(part, (name, *rivals))
     if command:
         return [command]

@@ -221,7 +221,7 @@ def imagined(
 
 
 def peak_torque_nm(config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray) -> float:
-    """Largest torque of the motor on a motion, what it needs to carry its load's weight included."""
+    """Largest torque of the motor on a motion, including gravity compensation."""
     m = imagined(config, signal, pose, motion, target, 0.0)
     model, seen = JointModel(config, signal), joint_motion(m, config, signal)
     answer = model.simulate(seen, model.gains)

@@ -1,4 +1,4 @@
-"""What the search works on: a part of the robot with numbers that are always fitted, recordings of it, and effects it may have.
+"""Problem of the search: a part of the robot with always fitted numbers, its recordings, and candidate effects.
 
 Letters in shapes: T rows, C channels of a recording (position and effort of a joint; taxels of a pad).
 """

@@ -1,4 +1,4 @@
-"""Which physical effect is missing: fit, screen, refit, judge on validation recordings, accept or say that it is something else.
+"""Search for missing effects: fit, screen, refit, judge on validation recordings, accept or report "something else".
 
     1. The numbers that are always fitted are fitted to the fit recordings.
     2. While the validation error is above ``stop_at`` noise floors, or the fit error above ``stop_fit_at``:

@@ -189,7 +189,7 @@ def _short(value: float) -> float:
 
 
 def told(found: Diagnosis) -> dict[str, Any]:
-    """What a diagnosis says, in plain numbers."""
+    """Result of a diagnosis as plain numbers."""
     ties = {r.added: list(r.ties) for r in found.rounds if r.added}
     return {
         "status": found.status,
@@ -329,7 +329,7 @@ def loop(design: str, seeds: Sequence[int]) -> list[Job]:
 
 
 def removed(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
-    """One hidden effect that the search does not know."""
+    """One hidden effect that was removed from the search's registry."""
     return [
         Job(study="removed", hidden=(n,), seed=s, design=design, without=(n,) if n in registry else ())
         for s in seeds

@@ -1,4 +1,4 @@
-"""The same function on a Slurm or Ray cluster: datatrove's executors start the tasks, files carry items and results.
+"""Run the same function on a Slurm or Ray cluster: datatrove's executors start the tasks; items and results are files.
 
 A job is a folder that all nodes see: ``job.pkl`` (function, items, retry policy), ``results/<index>.pkl`` (renamed into place),
 ``logs/``. Task r of n works on the items r, r+n, r+2n, … in a process of its own, so that an item that kills it, or hangs,

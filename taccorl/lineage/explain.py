@@ -21,7 +21,7 @@ SHOWN_LETTERS = 400  # of a config: a spec or a twin goes with it whole
 
 @dataclass
 class Origin:
-    """One artefact or raw source, what is wrong with it, and what it was made from."""
+    """Node of the lineage tree: one artefact or raw source, its differences from the record, and its inputs."""
 
     title: str
     lines: list[str] = field(default_factory=list)
@@ -204,7 +204,7 @@ def _digest(digest: str) -> str:
 
 
 def render(origin: Origin) -> str:
-    """The tree as text, one line per fact, and a last line that says whether all is as it was made."""
+    """Render the tree as text, one line per fact, with a summary in the last line."""
     wrong = origin.num_problems()
     verdict = (
         f"✗ differs from the record in {wrong} place{'s' * (wrong > 1)}"

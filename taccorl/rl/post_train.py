@@ -1,4 +1,4 @@
-"""Post-training: rollouts in the twin and updates by turns, with checkpoints that go on bit for bit on a CPU.
+"""Post-training: alternate rollouts in the twin and updates; checkpoints continue bit for bit on a CPU.
 
 ``progress.jsonl`` in the run's folder has one line an iteration: success and outcomes of the episodes that ended in it, losses,
 KL divergence, undone steps, learning rate, gradient norms, explained variance, seconds of each part.

@@ -148,7 +148,7 @@ def _serve(pipe: Connection, envs: dict[str, Any], shard: dict[str, Any], starts
 
 
 def start_ray() -> Any:
-    """The module, connected: to the cluster that RAY_ADDRESS names, else to one on this machine.
+    """Start Ray and return its module: connected to the cluster of RAY_ADDRESS, else to one on this machine.
 
     Raises:
         TaccorlError: it is not installed.

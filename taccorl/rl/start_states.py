@@ -41,7 +41,7 @@ class StartStates:
         return len(self._kept)
 
     def see(self, sim: Simulation, window_NLK: np.ndarray, over_N: np.ndarray) -> None:
-        """Keep states of some environments whose episodes go on. None in which the goal holds: they would be won by waiting."""
+        """Store states of environments whose episodes continue, except those in which the goal holds already."""
         if not self._share:
             return
         subtask, counts = sim.judge.subtask, [len(subtasks) for subtasks in sim.task.subtasks().values()]

@@ -1,4 +1,4 @@
-"""The twin's environments for rollouts: a policy's own processors, its history of touch, pictures only where it looks.
+"""The twin's environments for rollouts: the policy's own processors, its window of touch, pictures only when they are used.
 
 Several groups of environments (shards) compute at the same time. One thread for each of them waits for its results.
 

@@ -145,7 +145,7 @@ class CameraOffset:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraConfig:
-    """One colour camera: where its optical centre sits on which body, and what it records."""
+    """Settings of one colour camera: mount, model, recorded size and intrinsics."""
 
     name: str
     """Dataset name: ``observation.images.<name>``."""
@@ -198,7 +198,7 @@ def bench_cameras() -> tuple[CameraConfig, ...]:
 
 
 def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Quaternion wxyz (4,) of a camera at ``position_m`` that sees ``target_m`` in its middle; all in one frame.
+    """Quaternion wxyz (4,) of a camera at ``position_m`` with ``target_m`` in the middle of its picture; all in one frame.
 
     Raises:
         TaccorlError: the target is the position, or lies straight along ``up``.

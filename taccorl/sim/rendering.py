@@ -166,7 +166,7 @@ TABLE = "table"  # geom that carries the working surface, and the material that 
 
 
 def style(spec: mujoco.MjSpec) -> None:
-    """Light, background and table for pictures that tell parts apart. Physics does not change.
+    """Set light, background and table so that parts are easy to distinguish. Physics does not change.
 
     Call it when table and parts are in. Two directional lights (no shadows) from unlike sides give each face of a box its
     own brightness; the table, if a geom of that name is there, gets a faint grain in its own colour, so that motion over

@@ -207,7 +207,7 @@ def box_between(low_m: Sequence[float], high_m: Sequence[float], color: str = "g
 
 
 def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey") -> list[Solid]:
-    """``region`` drawn up from z_low to z_high: exact boxes for axis-parallel rectangles, prisms for the rest."""
+    """Extrude ``region`` from z_low to z_high: exact boxes for axis-parallel rectangles, prisms for the rest."""
     pose = np.eye(4)
     pose[2, 3] = (z_low_m + z_high_m) / 2
     solids: list[Solid] = []

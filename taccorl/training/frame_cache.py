@@ -1,4 +1,4 @@
-"""Pictures of a dataset, decoded once: uint8 at the resolution that the policy sees, in the store, on the GPU or in memory.
+"""Cache of decoded pictures of a dataset: uint8 at the policy's resolution, in the store, on the GPU or in memory.
 
 Decoding a video for every row that is drawn limits training to some hundred rows a second and core. Here each frame is decoded
 once, by the stage ``frames``, into one file a camera that is memory-mapped. Its key is made of the dataset's content, the

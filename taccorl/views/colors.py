@@ -1,4 +1,4 @@
-"""Colours that every view shares, RGB: a joint, a pad or a line looks the same in plots, heatmaps, figure and sheet.
+"""Colours of all views, RGB: a joint, a pad or a line has the same colour in plots, heatmaps, figure and sheet.
 
 Lines stay apart on dark ground and for colour-blind eyes (Okabe and Ito's set, lightened).
 """

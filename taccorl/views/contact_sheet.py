@@ -79,7 +79,7 @@ def choose_instants(episode: Episode, num: int = NUM_INSTANTS) -> tuple[int, ...
 
 
 def draw_sheet(episode: Episode) -> tuple[Image.Image, Layout]:
-    """The picture, and where everything stands in it."""
+    """Draw the sheet; returns the picture and the positions of its elements."""
     pads, plots = pads_of(episode), _plots(episode)
     layout = _arrange(episode, pads, list(plots))
     image = Image.new("RGB", layout.size, PAPER)

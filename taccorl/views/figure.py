@@ -80,7 +80,7 @@ def tool_paths(episode: Episode) -> dict[str, np.ndarray]:
 
 
 def floor_z_m(episode: Episode) -> float:
-    """World height of the drawn floor: just below the lowest finger, for nobody records how high the arms stand."""
+    """World height of the drawn floor: just below the lowest finger, because the arms' height is not recorded."""
     lowest = min(path[:, 2].min() for path in tool_paths(episode).values())
     return min(0.0, float(lowest) - ROBOT.pad.length_m / 2 - 0.01)
 
@@ -111,7 +111,7 @@ def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], index
 
 
 def pad_colors(pad: Pad) -> np.ndarray:
-    """(T,) RGBA as uint32: the heatmaps' colours, 0 at no active taxel, full as ``Pad.full_sum_count`` says."""
+    """(T,) RGBA as uint32: colour of a pad, from 0 without active taxels up to ``Pad.full_sum_count``."""
     rgb = heat(pad.sum_count / pad.full_sum_count).astype(np.uint32)
     return (rgb[:, 0] << 24) | (rgb[:, 1] << 16) | (rgb[:, 2] << 8) | 255
 

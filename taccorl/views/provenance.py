@@ -12,7 +12,7 @@ NO_ORIGIN = "not stated by the recording"
 
 
 def outcome(episode: Episode) -> str:
-    """``success``, ``failure``, or that nobody said."""
+    """``success``, ``failure``, or a text that the outcome is not stated."""
     return {True: "success", False: "failure", None: "not stated"}[episode.success]
 
 

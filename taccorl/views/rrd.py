@@ -1,4 +1,4 @@
-"""An .rrd file that we write ourselves: Rerun's own writer goes on when the disk is full, and only logs it."""
+"""Write .rrd files with errors raised: Rerun's own writer continues when the disk is full, and only logs it."""
 
 import contextlib
 from collections.abc import Iterator

@@ -26,7 +26,7 @@ _LONGEST_REGAIN_S = 1.0
 
 
 class AirAssembly(ScriptedExpert):
-    """Both hands lift; the left one waits where they meet, the right one inserts and lets go."""
+    """Base of both assembly experts: both hands lift a part, the left one holds its part in the air, the right one inserts."""
 
     enough_m: float
     """Depth from which the plug stays in its place."""
@@ -176,7 +176,7 @@ class AirAssembly(ScriptedExpert):
 
 @experts.register("assembly_1")
 class Assembly1Expert(AirAssembly):
-    """The mortise is 38 mm deep; the plug counts as in from 34 mm on."""
+    """Expert of assembly_1. The mortise is 38 mm deep; the plug counts as inserted from 34 mm on."""
 
     task = "assembly_1"
     enough_m = 0.0352

@@ -13,7 +13,7 @@ _LET_DOWN_M, _LET_DOWN_MPS = 0.001, 0.01  # so that the cradle, not the hand, ca
 
 @experts.register("assembly_2")
 class Assembly2Expert(AirAssembly):
-    """The cradle is 34 mm deep; its stop is felt, and the centre of mass is then 15 mm inside."""
+    """Expert of assembly_2. The cradle is 34 mm deep; at its stop the plug's centre of mass is 15 mm inside."""
 
     task = "assembly_2"
     enough_m = 0.032

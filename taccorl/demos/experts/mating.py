@@ -46,7 +46,8 @@ class Mating:
         return scene.body(self.holder)[:3, :3] @ self.holder_from_hole[:3, 2]
 
     def turned(self, scene: Seen) -> np.ndarray:
-        """(4, 4) the turn about the hole's axis, among those that look the same, that is nearest to how it is held."""
+        """Rotation (4, 4) about the hole's axis, among the symmetric ones, that is nearest to the held part's present
+        rotation."""
         hole, mate = self._relative(scene)
         angle = measure_fit(hole, mate, 1).turn_rad
         wrong = measure_fit(hole, mate, self.num_turns).turn_rad

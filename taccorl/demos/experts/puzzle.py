@@ -32,7 +32,7 @@ _HAND = {"triangle": "right", "circle": "left", "heart": "right"}
 
 @experts.register("puzzle")
 class PuzzleExpert(ScriptedExpert):
-    """The right hand places triangle and heart, the left one the circle in between; each waits for the other at the tray."""
+    """Expert of the puzzle: the right hand places triangle and heart, the left one the circle in between; one at a time."""
 
     task = "puzzle"
 

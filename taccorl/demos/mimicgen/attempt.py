@@ -118,7 +118,7 @@ class Hands:
             self._rest[arm] = RestOffset(joints, command[ROBOT.joint_slice(arm)].copy(), lag_s)
 
     def action(self, wishes: Mapping[str, Wish], pushed: Collection[str] = ()) -> np.ndarray:
-        """(14,) float32 joint targets [rad] and openings [m]. Of arms that are ``pushed`` off their way no rest is learnt."""
+        """(14,) float32 joint targets [rad] and openings [m]. For ``pushed`` (disturbed) arms the offset is not estimated."""
         action, qpos = np.empty(ROBOT.num_actions), self.sim.arrays["qpos"][0]
         may_learn = [arm for arm in ROBOT.arms if self.learn and arm not in pushed and not wishes[arm].contact]
         still = [arm for arm in may_learn if self._rest[arm].is_still]

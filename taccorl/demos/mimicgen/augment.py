@@ -167,7 +167,7 @@ class AugmentPlan:
 def augment(
     plan: AugmentPlan, source: Path, out: Path, store: Store, engine: Engine | None = None, progress: Progress = print
 ) -> dict[str, Any]:
-    """``plan.episodes`` successes made of those at ``source``, as ``plan.rows`` says, at ``out``; returns the report.
+    """Generate ``plan.episodes`` successes from those at ``source`` into ``out``, as ``plan.rows`` states; returns the report.
 
     Raises:
         TaccorlError: sources that do not fit or are not as written, something else at ``out``, or hardly any attempt succeeds.

@@ -46,7 +46,7 @@ class SeenPoses(Protocol):
         ...
 
     def mated(self, name: str) -> bool:
-        """Whether a body touches what it goes into, or what goes into it."""
+        """Whether a body touches the body that it is to be mated with."""
         ...
 
 

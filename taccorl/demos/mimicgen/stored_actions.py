@@ -47,7 +47,7 @@ class StoredActions:
 
     @property
     def kind(self) -> str:
-        """``MIMICGEN`` or ``CORRECTION``: where an episode's provenance says how it was made."""
+        """Kind of the stored episodes: ``MIMICGEN`` or ``CORRECTION``."""
         return self.meta.get("kind", MIMICGEN)
 
     @property

@@ -147,7 +147,7 @@ class Run(NamedTuple):
 
 @numba.njit(cache=True)
 def encoder(d: Drive, angle):
-    """What the encoder of the joint under test says."""
+    """Reading of the encoder of the joint under test."""
     return d.encoder_scale * angle + d.encoder_bias + d.encoder_wave * np.sin(d.encoder_waves * angle + d.encoder_phase)
 
 

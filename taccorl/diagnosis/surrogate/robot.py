@@ -1,4 +1,4 @@
-"""The surrogate robot: the plant with its sensors, at rest before a motion, and disturbed as robots are.
+"""Surrogate robot: the plant with sensors and disturbances, at rest before a motion.
 
 Letters in shapes: T rows (200 Hz), M milliseconds.
 """
@@ -142,7 +142,7 @@ class Robot:
         return np.interp(run.angle[:, self.joint], coarse, weight)
 
     def reported(self, run: Run) -> np.ndarray:
-        """(T, 6) rad as the encoders say it at each row, without noise."""
+        """(T, 6) rad reported by the encoders at each row, without noise."""
         late_ms = 1e3 * sum(c.report_delay_s for c in self._changes)
         ms = np.arange(len(run.angle), dtype=float)
         rows = ms[::COMMAND_MS] - late_ms

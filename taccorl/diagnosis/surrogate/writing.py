@@ -244,7 +244,7 @@ def _check_is_surrogate(folder: Path) -> None:
 
 
 def seal(folder: Path, truth: dict[str, object]) -> None:
-    """The truth into its file, so that nobody reads it by mistake."""
+    """Write the truth into its file in encoded form, so that nobody reads it by mistake."""
     text = base64.b64encode(json.dumps(truth, ensure_ascii=False).encode()).decode()
     (folder / TRUTH).write_text(json.dumps({"note": _NOTE, "sealed": text}, indent=1), encoding="utf-8")
 

@@ -290,7 +290,7 @@ class TactilePI05Config(PI05Config):
 
     @property
     def state_dim(self) -> int:
-        """S: numbers that the state's token is made of: the robot's state and, where they are told, poses of hands and parts."""
+        """S: size of the state token's input: the robot's state and, by option, poses of hands and parts."""
         return self.robot_state_dim + (num_part_numbers(self.num_bodies) if self.part_poses else 0)
 
     @property

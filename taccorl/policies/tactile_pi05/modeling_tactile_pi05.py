@@ -339,7 +339,7 @@ class TactilePI05Policy(PI05Policy):
         self.train(was_training)
 
     def prepare_action(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, H, 32) of what is learnt: normalised, each step by itself where that is wanted, and filled up."""
+        """(B, H, 32) training target: normalised actions, by option each step by itself, padded to π0.5's 32."""
         if self.steps is None:
             return super().prepare_action(batch)
         return super().prepare_action({**batch, ACTION: self.steps.normalized(batch[ACTION])})

@@ -23,7 +23,7 @@ _PIECES = re.compile(r"-?\d+|[^\W\d]+|[^\w\s]")  # numbers, words, signs
 
 
 class ByteTokenizer:
-    """UTF-8 bytes, behind a token that says where the prompt begins: 258 tokens in all."""
+    """Tokenizer of UTF-8 bytes with a token for the start of the prompt: 258 tokens in all."""
 
     def __len__(self) -> int:
         return _FIRST + 256

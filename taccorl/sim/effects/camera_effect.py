@@ -1,4 +1,4 @@
-"""What effects of cameras have in common."""
+"""Base of effects of cameras."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar

@@ -1,4 +1,4 @@
-"""Contact friction: parts are more slippery, or less, than the model says."""
+"""Contact friction: sliding friction of parts differs from the model's."""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""Depth offset: a pad's surface stands further out, or further back, than the model says."""
+"""Depth offset: a pad is thicker or thinner than in the model."""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""What effects of dry friction and of passive torques share."""
+"""Shared code of effects of dry friction and of passive torques."""
 
 import mujoco
 

@@ -192,7 +192,7 @@ class Effect:
 
     @property
     def is_absent(self) -> bool:
-        """Whether every parameter that has an absent value stands at it."""
+        """Whether all parameters that have an absent value have it."""
         return all(getattr(self, p.name) == p.absent for p in self.parameters() if p.absent is not None)
 
     @classmethod

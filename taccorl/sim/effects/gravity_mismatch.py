@@ -1,4 +1,4 @@
-"""Gravity mismatch: the controller carries a share of the arm’s weight that is not the configured one."""
+"""Gravity mismatch: the controller compensates a share of the arm’s weight that is not the configured one."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar

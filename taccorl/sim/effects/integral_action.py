@@ -1,4 +1,4 @@
-"""Integral action: the controller adds up its error until nothing of it remains."""
+"""Integral action: the controller integrates its error until it vanishes."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar

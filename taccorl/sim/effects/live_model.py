@@ -83,7 +83,7 @@ class LiveModel:
         return np.divide(left, kp, out=np.zeros_like(left), where=kp > 0)
 
     def motor_torque_nm(self, joints: Sequence[str]) -> np.ndarray:
-        """(N, number of joints) what the motors give, with what carries the weight."""
+        """(N, number of joints) torque of the motors, including gravity compensation."""
         dofs = self.dofs(joints)
         torque = self.seen("qfrc_actuator")[:, dofs] + self.seen("qfrc_applied")[:, dofs]
         apart = self.model.jnt_actgravcomp[self.model.dof_jntid[dofs]] == 0  # else it is in qfrc_actuator already

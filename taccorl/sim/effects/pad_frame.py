@@ -1,4 +1,4 @@
-"""A pad that sits elsewhere on its finger than the model says: what moves the taxels' frame."""
+"""Base of effects that move the frame of a pad's taxels: a pad that is mounted elsewhere than in the model."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar

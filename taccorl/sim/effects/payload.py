@@ -1,4 +1,4 @@
-"""Payload: a mass on the hand that the controller does not know of."""
+"""Payload: a mass on the hand that the controller does not compensate."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar

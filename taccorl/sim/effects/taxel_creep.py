@@ -1,4 +1,4 @@
-"""Creep: under a load that stays, a taxel’s reading goes on changing."""
+"""Creep: under a constant load, a taxel’s reading continues to change."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Touch lag: the electronics smooth what the taxels say."""
+"""Touch lag: the electronics low-pass the taxels' readings."""
 
 from dataclasses import dataclass
 from typing import ClassVar

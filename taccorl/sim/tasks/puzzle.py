@@ -113,7 +113,7 @@ class Puzzle(Task):
         )
 
     def placed(self, scene: Scene, shape: str) -> np.ndarray:
-        """(N,) whether a piece is in its hole and let go."""
+        """(N,) whether a piece is in its hole and released."""
         inside = self.inside(self.fits(scene, [PIECES.index(shape)]))[:, 0]
         return inside & ~scene.pads_touching(shape).any(axis=1)
 
