@@ -1,19 +1,23 @@
 """``taccorl ingest recordings/ --spec=piper_flexitac_mcap --out=outputs/my_dataset``
 
 Recordings (MCAP, ROS 2 and ROS 1 bags, HDF5, LeRobot datasets) into one LeRobot v3 dataset with touch.
+``--watch=true`` ingests what arrives in a folder until Ctrl-C.
 ``taccorl ingest inspect FILE`` prints the contents of a recording and drafts its specs.
 """
 
+import contextlib
 import ctypes
 import json
 import os
 import shlex
+import signal
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import parse
-from taccorl.errors import DatasetError, InTheWayError, TaccorlError, printable
+from taccorl.errors import DatasetError, InTheWayError, RecordingError, TaccorlError, printable
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 
@@ -21,6 +25,7 @@ if TYPE_CHECKING:
     from taccorl.data.ingest import Job
     from taccorl.data.inspection import Inventory
     from taccorl.data.recording import Source
+    from taccorl.data.spec import RecordingSpec
 
 
 @dataclass(kw_only=True)
@@ -37,6 +42,9 @@ class IngestConfig:
     """Finished recordings are kept here, so that a second run continues where the first ended."""
     dry_run: bool = False
     """Read, align and check, and write two rows into a scratch folder, but nothing that stays."""
+    watch: bool = False
+    """Ingest what arrives in the folders, one line a recording, until Ctrl-C or SIGTERM; then publish the dataset of all that
+    are complete. A recording is complete when its files have not changed for 5 s."""
     replace: bool = False
     """If `out` holds another dataset, move that aside (out.old-1, …) and publish this one."""
     engine: Engine = field(default_factory=LocalEngine)
@@ -87,7 +95,13 @@ def _ingest(config: IngestConfig) -> int:
 
     spec = load_recording_spec(config.spec)
     skipped: list[str] = []
-    jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped)
+    if config.watch:
+        jobs = _watch(config, spec, skipped)
+        if not jobs:
+            print("no recording arrived; nothing was written")
+            return 0
+    else:
+        jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped)
     for line in skipped:
         print(f"not read: {printable(line)}")
     _check_out(config, jobs)
@@ -109,6 +123,70 @@ def _ingest(config: IngestConfig) -> int:
     return (
         1 if report["episodes_quarantined"] + report["outcomes"]["quarantined"] + report["outcomes"]["refused"] else 0
     )
+
+
+def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "list[Job]":
+    """Ingest what arrives until the user stops it; returns all that are complete then.
+
+    Args:
+        skipped: is told what else lies in the folders then and why it is not read.
+    """
+    from taccorl.cli.tables import Bars
+    from taccorl.data.arrivals import SETTLED_S, Arrivals
+    from taccorl.data.ingest import Job, find_jobs, ingest_each
+    from taccorl.lineage.store import Store
+
+    if config.dry_run:
+        raise TaccorlError("--watch=true keeps each recording's rows in the store; leave --dry_run out")
+    for path in config.paths:
+        if not path.is_dir():
+            raise TaccorlError(f"{path}: no folder to watch; make it, or leave --watch out")
+        for name, place in (("out", config.out), ("store", config.store)):
+            if place.resolve().is_relative_to(path.resolve()):
+                raise TaccorlError(f"--{name}={place} lies in {path}, which is watched: choose another")
+    _check_out(config, [])
+    if not is_free(config.out) and not config.replace:
+        raise InTheWayError(f"{config.out} exists: give another --out, or --replace=true to move it aside at the end.")
+    Store(config.store).make()
+
+    def find() -> "list[Job]":
+        skipped.clear()
+        jobs: dict[str, Job] = {}
+        for path in config.paths:
+            with contextlib.suppress(RecordingError):  # nothing there yet
+                found = find_jobs([path], spec, config.spec, config.store, False, skipped)
+                jobs |= {job.source.name: job for job in found}
+        return list(jobs.values())
+
+    arrivals = Arrivals(find)
+    print(f"watching {', '.join(map(str, config.paths))}; Ctrl-C ends it and writes {config.out}", flush=True)
+    stopping = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        while True:
+            for job in arrivals.look(time.monotonic()):
+                begin_s = time.monotonic()
+                with Bars(1) as bars:
+                    [entry] = ingest_each([job], progress=bars.update)
+                print(_arrived(entry, time.monotonic() - begin_s), flush=True)
+            time.sleep(1.0)
+    except KeyboardInterrupt:
+        print()
+    finally:
+        signal.signal(signal.SIGTERM, stopping)
+    for job in arrivals.growing:
+        print(f"left out, changed in the last {SETTLED_S:.0f} s: {printable(job.source.name)}")
+    return arrivals.complete
+
+
+def _arrived(entry: dict[str, Any], seconds: float) -> str:
+    """One line about a recording."""
+    written = [e for e in entry["episodes"] if e["outcome"] == "written"]
+    name = entry["recording"] + (f"#{entry['part']}" if entry["part"] else "")
+    line = f"{time.strftime('%H:%M:%S')} {name}: {entry['outcome']}"
+    if written:
+        line += f", {len(written)} episodes, {sum(e['rows'] for e in written)} rows"
+    line += f" ({seconds:.1f} s)"
+    return printable(line + (f": {entry['reason']}" if entry["reason"] else ""))
 
 
 def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
@@ -134,7 +212,7 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
             raise DatasetError(f"{place}: {folder} is no folder")
         if not os.access(folder, os.W_OK | os.X_OK):
             raise DatasetError(f"{place}: nothing may be written in {folder}")
-    if not is_free(out) and not config.replace:
+    if jobs and not is_free(out) and not config.replace:
         _check_same(out, jobs)
 
 

@@ -111,16 +111,7 @@ def ingest(
         InTheWayError: ``out`` holds something else.
         TaccorlError: the machine failed (disk full); what was finished is kept and not done again.
     """
-    if engine is None or (isinstance(engine, LocalEngine) and engine.workers <= 1):
-        entries = [ingest_one(job, progress) for job in jobs]
-    else:
-        done = iter(range(1, len(jobs) + 1))
-        entries = engine.map(
-            ingest_one,
-            jobs,
-            name=lambda job: job.source.name,
-            on_done=lambda job, _: progress(job.source.name, next(done), len(jobs)) if progress else None,
-        )
+    entries = ingest_each(jobs, engine, progress)
     _leave_out_twins(jobs, entries)
     report = _report(jobs, entries)
     shards = [(entry, Path(entry["artefact"])) for entry in entries if entry.get("artefact")]
@@ -159,6 +150,21 @@ def ingest(
             raise _stopped(fault, out) from error
         raise
     return report
+
+
+def ingest_each(
+    jobs: Sequence[Job], engine: Engine | None = None, progress: Progress | None = None
+) -> list[dict[str, Any]]:
+    """Report entries of ``ingest_one`` for each job, in order."""
+    if engine is None or (isinstance(engine, LocalEngine) and engine.workers <= 1):
+        return [ingest_one(job, progress) for job in jobs]
+    done = iter(range(1, len(jobs) + 1))
+    return engine.map(
+        ingest_one,
+        jobs,
+        name=lambda job: job.source.name,
+        on_done=lambda job, _: progress(job.source.name, next(done), len(jobs)) if progress else None,
+    )
 
 
 def _leave_out_twins(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> None:
