@@ -10,8 +10,8 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help demo test test-slow lint bench pictures notebooks lock clean
 
-demo: .venv/.ready  ## twin → recordings → dataset → checks → Rerun file, and a hidden effect found; into outputs/demo (the default)
-	@echo "demo: the twin demonstrates → recordings → dataset → checks → Rerun; a hidden effect is found. Nothing here comes from a robot."
+demo: .venv/.ready  ## simulated demonstrations → recordings → dataset → checks → Rerun file; a hidden effect is found (the default)
+	@echo "demo: simulated demonstrations → recordings → dataset → checks → Rerun; then a hidden effect is found. Nothing here comes from a robot."
 	$(BIN)/python -m pipelines.demo
 
 # Only the targets that have a description.

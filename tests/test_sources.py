@@ -23,6 +23,25 @@ def test_every_document_of_the_project_that_is_cited_exists() -> None:
     assert missing == []
 
 
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings as GitHub makes them: lower case, without signs, hyphens for spaces."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_every_link_of_a_page_leads_somewhere() -> None:
+    broken = []
+    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
+            path, _, anchor = target.partition("#")
+            place = (page.parent / path).resolve() if path else page
+            if not target.startswith("http") and not (
+                place.exists() and (not anchor or (place.suffix == ".md" and anchor in anchors(place)))
+            ):
+                broken.append(f"{page.name}: {target}")
+    assert broken == []
+
+
 def test_every_package_that_is_imported_is_declared() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     stated = [*project["dependencies"], *(d for group in project["optional-dependencies"].values() for d in group)]

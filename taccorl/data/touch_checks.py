@@ -149,7 +149,7 @@ def noise_visible(counts: np.ndarray) -> bool:
 def find_stuck(
     counts: np.ndarray, baseline: np.ndarray | None, noise_count: float, max_count: int, fps: int
 ) -> np.ndarray:
-    """(R, C) bool: constant far from its baseline, shorted from the start, or alone in feeling touch at all times."""
+    """(R, C) bool: constant far from its baseline, shorted from the start, or the only taxel with contact at all times."""
     length, value = constant_runs(counts)
     long = length >= min(STUCK_S * fps, len(counts))
     stuck = np.zeros(counts.shape[1:], dtype=bool)
