@@ -69,7 +69,7 @@ def surrogate_pictures(
     joint_zero_rad: float = 0.0,
     shape_m: float = 0.0,
 ) -> np.ndarray:
-    """What a camera that sits at ``offset`` (6,) off its mount gives at joints (F, 14): (F, rows, columns, 3) uint8.
+    """Surrogate pictures (F, rows, columns, 3) uint8 of a camera ``offset`` (6,) off its mount, at joints (F, 14).
 
     Args:
         plain: as the twin draws it, without the gap in light, colours and sensor.
@@ -221,7 +221,7 @@ def _twin_is_off(camera: str) -> Iterator[Row]:
 
 
 def moving_joints(rng: np.random.Generator, time_s: np.ndarray) -> np.ndarray:
-    """(T, 14) of both arms going to and fro, each joint with frequencies of its own."""
+    """Joint angles (T, 14) of both arms in motion, each joint with its own frequencies."""
     home = tasks.get("assembly_1").home_rad
     middle = np.concatenate([[*home[arm], 0.04] for arm in ROBOT.arms])
     swing = np.tile(np.r_[_AMPLITUDE_RAD * 0.8, 0.0], len(ROBOT.arms)) / 2

@@ -87,7 +87,8 @@ def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level
 
 
 def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrinsics) -> Outlines:
-    """Of the twin's arms for joints (F, 14), drawn at a pose (6,) in pictures like ``at``. At most ``_POINTS`` a frame."""
+    """Outlines of the twin's arms at joints (F, 14), drawn at a pose (6,) in pictures like ``at``. At most ``_POINTS`` a
+    frame."""
     rng = np.random.default_rng(0)
     position, turn = view.pose(offset)
     parts = []
@@ -108,7 +109,7 @@ def seen_from(view: TwinView, offset: np.ndarray, points: np.ndarray) -> np.ndar
 
 
 def pixels_of(seen: np.ndarray, at: Intrinsics) -> np.ndarray:
-    """(P, 2) as (u, v) of points (P, 3) in the camera's frame; not-a-number behind it."""
+    """Project points (P, 3) of the camera's frame to pixels (P, 2) as (u, v); not-a-number behind the camera."""
     depth = np.where(seen[:, 2] < 0, -seen[:, 2], np.nan)
     return np.stack([at.cx_px + at.fx_px * seen[:, 0] / depth, at.cy_px - at.fy_px * seen[:, 1] / depth], axis=1)
 
@@ -131,7 +132,7 @@ def distances(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
 
 
 def space_slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
-    """(M, 3) of ``distances`` by where the points are in the camera's frame [px/m]."""
+    """Derivatives (M, 3) of ``distances`` by the points' positions in the camera's frame [px/m]."""
     x, y, z = seen[matches.found].T
     across = matches.across[matches.found] * [at.fx_px, at.fy_px]
     return np.stack(
@@ -141,7 +142,7 @@ def space_slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarr
 
 
 def slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
-    """(M, 6) of ``distances`` by a small turn and shift of the camera in its own frame."""
+    """Derivatives (M, 6) of ``distances`` by a small rotation and translation of the camera in its own frame."""
     by_point = space_slopes(seen, matches, at)
     # The camera turned by ω and shifted by t sees a point at x − ω × x − t.
     return np.concatenate([np.cross(by_point, seen[matches.found]), -by_point], axis=1)
@@ -179,7 +180,7 @@ def _distinct(tried: list[Solution]) -> list[Solution]:
 
 
 def misfit(view: TwinView, offset: np.ndarray, drawn: Outlines, level: Level) -> float:
-    """How badly outlines lie at a pose (6,): mean distance as a share of ``_FAR_PX``; points without an edge there count 1."""
+    """Misfit of outlines at a pose (6,): mean distance as a share of ``_FAR_PX``; points without an edge count 1."""
     seen = seen_from(view, offset, drawn.points)
     matches = match(drawn, seen, level, _FAR_PX)
     apart = np.abs(distances(seen, matches, level.intrinsics))

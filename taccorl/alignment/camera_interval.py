@@ -41,7 +41,7 @@ class Covariance:
 
     @property
     def total(self) -> np.ndarray:
-        """(6, 6)."""
+        """Total covariance (6, 6)."""
         return self.noise + self.twin
 
     @property
@@ -51,7 +51,7 @@ class Covariance:
 
     @property
     def correlation(self) -> np.ndarray:
-        """(6, 6)."""
+        """Correlation matrix (6, 6)."""
         deviation = np.sqrt(np.diag(self.total))
         return self.total / np.outer(deviation, deviation)
 
@@ -69,7 +69,7 @@ def _in_words(value: float, axis: int) -> str:
 
 
 def covariance(view: TwinView, joints: np.ndarray, level: Level, solution: Solution) -> Covariance | None:
-    """Of ``solution`` from the frames with joints (F, 14); None where the edges do not fix all six numbers at all."""
+    """Covariance of ``solution`` from the frames with joints (F, 14); None if the edges do not determine all six numbers."""
     seen = seen_from(view, solution.offset, solution.outlines.points)
     found = solution.matches.found
     apart = distances(seen, solution.matches, level.intrinsics)

@@ -109,7 +109,7 @@ class GainSearch:
         return parts
 
     def residual(self, x: np.ndarray, late_s: float = 0.0) -> np.ndarray:
-        """(R,)."""
+        """Residuals (R,) of all recordings and channels, in units of their noise."""
         return np.concatenate(self.parts(x, late_s))
 
     def jacobian(self, x: np.ndarray, late_s: float = 0.0) -> np.ndarray:
@@ -135,7 +135,7 @@ class GainSearch:
         )
 
     def lateness(self, start: np.ndarray) -> tuple[float, float]:
-        """How late [s] the measured rows would be if that were fitted as well, and its standard error."""
+        """Delay [s] of the measured rows if it is fitted as well, and its standard error."""
 
         def residual(y: np.ndarray) -> np.ndarray:
             return self.residual(y[:-1], float(y[-1]))

@@ -55,7 +55,7 @@ class HeldCommand:
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """What was found in one recording of one signal."""
+    """Dropped commands found in one recording of one signal."""
 
     events: tuple[HeldCommand, ...]
     mirrored: tuple[HeldCommand, ...]

@@ -1,1 +1,1 @@
-"""From recording to dataset: spec, readers, timing, checks, LeRobot format."""
+"""Recordings to datasets: spec, readers, timing, checks, LeRobot format."""

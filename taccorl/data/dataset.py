@@ -140,7 +140,7 @@ class Dataset:
         )
 
     def tasks(self, index: int) -> list[tuple[int, str]]:
-        """(first row, text) of every stretch of rows with one task; mostly there is one."""
+        """Instructions of an episode as (first row, text) for each run of rows with one instruction; usually one."""
         numbers = self.values(index, ["task_index"])["task_index"].ravel()
         starts = [0, *(np.flatnonzero(np.diff(numbers)) + 1)] if len(numbers) else []
         unknown = sorted({int(numbers[row]) for row in starts} - set(self._tasks))

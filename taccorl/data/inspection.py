@@ -1,4 +1,4 @@
-"""What a recording holds: channels, rates, gaps, clock skew, names of joints, damage, and which shipped spec fits it."""
+"""Inspect a recording: channels, rates, gaps, clock skew, names of joints, damage, and which shipped spec fits it."""
 
 import contextlib
 import math

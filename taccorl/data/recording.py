@@ -149,7 +149,7 @@ DEEPEST = 4
 def find_sources(
     path: Path, *, reader: str | None = None, split_bag: bool = False, skipped: list[str] | None = None
 ) -> list[tuple[str, Source]]:
-    """(reader name, source) of every recording that ``path`` holds: a file, a bag folder, a dataset, or a folder of those.
+    """Find all recordings at ``path`` (a file, bag folder, dataset, or folder of those) as (reader name, source).
 
     Args:
         skipped: if given, what a folder holds besides and why it is not read is added here, and no entry of a folder

@@ -1,4 +1,4 @@
-"""Which picture is this: a 16-bit frame id in the upper left corner, 2 × 8 blocks of 8 × 8 pixels, first bit first."""
+"""Frame id in a picture: 16 bits in the upper left corner, 2 × 8 blocks of 8 × 8 pixels, first bit first."""
 
 import numpy as np
 

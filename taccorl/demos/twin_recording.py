@@ -48,7 +48,7 @@ class TwinStory:
         self._counts = self.sim.sensor.clean_counts(trajectory.reading).swapaxes(2, 3)
 
     def state(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14) as the encoders report them."""
+        """State (N, 14) [rad, m] as the encoders report it."""
         return self._at(self.trajectory.reported, time_s)
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ class TwinStory:
         return self._at(self.trajectory.effort, time_s)
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
-        """(N, 12, 32) in wire order: the pad's columns are the wire's rows."""
+        """Counts (N, 12, 32) above baseline in wire order: the pad's columns are the wire's rows."""
         counts = self._counts[:, PADS.index(pad)]
         rows = np.broadcast_to(np.asarray(time_s, float).reshape(len(time_s), -1), (len(time_s), 12))
         before, share = self._place(rows)

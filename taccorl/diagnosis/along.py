@@ -46,7 +46,7 @@ VARIABLES: tuple[Variable, ...] = (
 
 
 def variable_unit(variable: str, position_unit: str) -> str:
-    """Of its axis, for a signal whose position is in ``position_unit``."""
+    """Unit of the variable's axis, for a signal whose position is in ``position_unit``."""
     speed, effort = UNITS[position_unit]
     units = {"velocity": speed, "position": position_unit, "commanded acceleration": f"{speed}²", "time": "s"}
     return units.get(variable, effort if variable == "modelled torque" else speed)

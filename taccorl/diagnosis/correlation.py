@@ -48,7 +48,7 @@ def block_of_rows(num_rows: int, rate_hz: float) -> np.ndarray:
 
 
 def unstacked(values: np.ndarray, layout: Sequence[Rows]) -> Iterator[np.ndarray]:
-    """(T, C) of each recording from the stacked ``values`` (n,); NaN where nothing was measured."""
+    """Values (T, C) of each recording from the stacked ``values`` (n,); NaN where nothing was measured."""
     at = 0
     for rows in layout:
         count = int(rows.measured.sum())

@@ -78,7 +78,7 @@ class Room:
 
     @classmethod
     def of(cls, joint: int, middle_rad: float, inertia_kgm2: float, weight_nm: float) -> "Room":
-        """Of joint 1 to 6 with this inertia and weight."""
+        """Range of motion of joint 1 to 6 with this inertia and weight."""
         low, high = ROBOT.links[joint - 1].range_rad
         wide = min(WIDE_RAD[joint - 1], middle_rad - low - MARGIN_RAD, high - middle_rad - MARGIN_RAD)
         left_nm = max(TORQUE_NM[joint - 1] - abs(weight_nm), 0.2 * TORQUE_NM[joint - 1])
@@ -87,7 +87,7 @@ class Room:
 
 
 def chirp(seconds: float, low_hz: float, high_hz: float, amplitude_rad: float) -> np.ndarray:
-    """(T,) from 0 to 0; where it would be too fast it is smaller."""
+    """Chirp (T,) [rad] from 0 to 0, with a smaller amplitude where it would be too fast."""
     time_s = _time(seconds)
     hz = low_hz + (high_hz - low_hz) * time_s / seconds
     angle = 2 * np.pi * (low_hz * time_s + (high_hz - low_hz) * time_s**2 / (2 * seconds))
@@ -96,13 +96,13 @@ def chirp(seconds: float, low_hz: float, high_hz: float, amplitude_rad: float) -
 
 
 def triangle(seconds: float, amplitude_rad: float, turns: int = 1) -> np.ndarray:
-    """(T,) from 0 up, down and back."""
+    """Triangle (T,) [rad] from 0 up, down and back."""
     time_s = _time(seconds)
     return amplitude_rad * np.interp(time_s * turns / seconds % 1.0, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0])
 
 
 def steps(levels_rad: np.ndarray, hold_s: float = 1.0) -> np.ndarray:
-    """(T,) from one level to the next at the highest speed."""
+    """Steps (T,) [rad] from one level to the next at the highest speed."""
     most = SPEED_RAD_PER_S / RATE_HZ
     at, out = 0.0, []
     for level in levels_rad:
@@ -113,7 +113,7 @@ def steps(levels_rad: np.ndarray, hold_s: float = 1.0) -> np.ndarray:
 
 
 def multisine(seconds: float, amplitude_rad: float, seed: int) -> np.ndarray:
-    """(T,) of four sines with random phases, from 0 to 0."""
+    """Multisine (T,) [rad]: four sines with random phases, from 0 to 0."""
     rng = np.random.default_rng(seed)
     time_s = _time(seconds)
     hz = np.array([0.15, 0.4, 0.9, 1.7])

@@ -87,7 +87,7 @@ class Press:
         return PressedNote(shape="rod", length_m=ROD_LENGTH_M, rpy_rad=(0.0, round(math.pi / 2, 4), 0.0), **place)
 
     def penetration_m(self) -> np.ndarray:
-        """(T,) at 200 Hz; below 0 is air."""
+        """Penetration (T,) at 200 Hz; negative values are distances to the pad."""
         time_s, depth_m = np.array(self.knots).T
         rows = np.arange(-(SMOOTH_ROWS // 2), round(time_s[-1] * RATE_HZ) + SMOOTH_ROWS // 2) / RATE_HZ
         return np.convolve(np.interp(rows, time_s, depth_m), np.ones(SMOOTH_ROWS) / SMOOTH_ROWS, mode="valid")

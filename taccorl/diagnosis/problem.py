@@ -124,7 +124,7 @@ class Problem(Protocol):
     candidates: dict[str, Candidate]
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) what the twin would have measured, in the units of ``recording.measured``."""
+        """Simulated measurement (T, C) in the units of ``recording.measured``."""
         ...
 
     def learn(self, values: Mapping[str, float]) -> None:
@@ -139,7 +139,7 @@ class Problem(Protocol):
 
 
 def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[list[Recording], list[Recording]]:
-    """Where no recording is marked for validation: the first ``share`` of the rows of each for fitting, the others for judging.
+    """Split recordings without validation marks: the first ``share`` of the rows of each for fitting, the others for validation.
 
     Both are simulated from the beginning, where the robot was at rest.
     """

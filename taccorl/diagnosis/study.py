@@ -1,4 +1,4 @@
-"""How often the search is right, on surrogate robots whose hidden effects are known: one case at a time, as a row of numbers.
+"""Accuracy of the search on surrogate robots with known hidden effects: one case at a time, as a row of numbers.
 
 Under which conditions a robot is recorded (sampled loop, efforts, weighed mass, coloured noise) hangs on its seed and on what is
 hidden in it. Rows of any number of machines and sessions add up in one file; ``pipelines/diagnosis_study.py`` makes them,
@@ -54,14 +54,14 @@ class Job:
 
     @property
     def key(self) -> str:
-        """The same for the same job, whenever it is run."""
+        """Key of the job, the same for equal jobs."""
         strength = "" if self.strength is None else f" at {self.strength:g}"
         return f"{self.study} {self.design} {'+'.join(self.hidden) or 'none'}{strength} seed {self.seed}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """How a robot is recorded, beside what is hidden in it."""
+    """Conditions of the recordings of a robot, besides the hidden effects."""
 
     effort: bool
     """The search uses the motor's efforts, too."""
@@ -143,7 +143,7 @@ def run(job: Job) -> dict[str, Any]:
 
 
 def run_touch(job: Job) -> dict[str, Any]:
-    """The same for pads of one arm that press known objects."""
+    """As ``run``, for pads of one arm that press known objects."""
     began = time.process_time()
     case = draw_touch_case(job.hidden, job.seed, strength=job.strength)
     motions = touch_recordings(case).motions(case.twin)
@@ -231,7 +231,7 @@ def _identified(
 
 
 def findings(measurements: Sequence[Measurement], signal: str) -> list[str]:
-    """What the recordings by themselves show: ``dropped_commands``, ``does_not_repeat``; nothing without that module."""
+    """Findings of the recordings alone: ``dropped_commands``, ``does_not_repeat``."""
     module = "taccorl.alignment.unrepeated"
     if find_spec(module) is None:
         return []
@@ -263,7 +263,7 @@ def named(row: dict[str, Any]) -> bool:
 
 
 def exact_but_for_algebra(row: dict[str, Any]) -> bool:
-    """As ``exact``, but that of effects which no position can ever tell apart either one will do."""
+    """As ``exact``, with effects counted as one that no position measurement can separate."""
     found = row["found"] if len(row["hidden"]) > 1 else row["found"][:1]
     return all(any(h == f or any({h, f} <= group for group in IDENTICAL) for f in found) for h in row["hidden"])
 
@@ -273,7 +273,7 @@ AT_FLOOR = ("at_floor", "gains_moved")
 
 
 def silently_wrong(row: dict[str, Any]) -> bool:
-    """At the floor with effects none of which is hidden, and without a word of those that are."""
+    """True if the search ends at the floor without having found or named any hidden effect."""
     return row["status"] in AT_FLOOR and not set(row["found"]) & set(row["hidden"]) and not named(row)
 
 
@@ -283,7 +283,7 @@ def drop_said(row: dict[str, Any]) -> bool:
 
 
 def inside(row: dict[str, Any], *, hidden_only: bool = False) -> list[bool]:
-    """Of each identifiable number that has a truth, whether its 95 % interval holds it.
+    """For each identifiable number with a known true value: whether its 95 % interval contains it.
 
     Args:
         hidden_only: numbers of the hidden effects, and not those that are always fitted.

@@ -1,4 +1,4 @@
-"""What a reader needs first: what is missing, how sure that is, and what to record next. One sentence each.
+"""Verdict of a diagnosis: what is missing, how certain that is, and what to record next. One sentence each.
 
 A pure function of what was found; the terminal and the page show the same sentences.
 """
@@ -49,7 +49,7 @@ def verdict(
     doubts: Sequence[str] = (),
     options: Sequence[str] = (),
 ) -> Verdict:
-    """What was found out about one part.
+    """Verdict on one part.
 
     Args:
         can_tell: what its recordings can show at all.

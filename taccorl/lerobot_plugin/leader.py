@@ -196,7 +196,7 @@ def _check_units(source: LeaderSource) -> None:
 
 
 def to_twin(values: np.ndarray, joint_unit: str, gripper_unit: str) -> np.ndarray:
-    """(A,) in a leader's units → rad and m.
+    """Convert values (A,) from a leader's units to rad and m.
 
     rad, m: as they are. deg: π / 180. range_m100_100: −100 is our joint's lower limit, 100 its upper. range_0_100: 0 is closed,
     100 is 70 mm open.

@@ -1,4 +1,4 @@
-"""What an artefact was made from, down to the raw recordings, and whether anything changed since: a tree as text.
+"""Explain an artefact: a tree, as text, of its inputs down to the raw recordings, with everything that changed since.
 
 ``✗`` marks what no longer matches its record: a changed, missing or added file, or a raw source that is gone. An
 artefact that was removed from the store is no fault: the dataset contains its record.

@@ -56,7 +56,7 @@ class StartStates:
             self._next = (self._next + 1) % self._size
 
     def draw(self, over_N: np.ndarray) -> tuple[np.ndarray, list[int]]:
-        """(N,) which of the environments ``over_N`` begin in a kept state, and the numbers of these states."""
+        """Draw which of the environments ``over_N`` start in a stored state, (N,) bool, and the indices of these states."""
         if not self._share:
             return np.zeros_like(over_N), []
         chosen_N = over_N & (self._rng.random(len(over_N)) < self._share) & bool(self._kept)

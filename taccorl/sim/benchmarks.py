@@ -171,7 +171,7 @@ def rollout_speed() -> Iterator[Row]:
 
 @benchmark("grip")
 def grip() -> Iterator[Row]:
-    """How a part stays in the hand, and what its mass does to the pads' reading."""
+    """Creep and slip of a held part, and influence of its mass on the pads' reading."""
     model, data = gripped(0.04, 10.0)
     creeps = []
     for _ in range(3):
@@ -259,7 +259,7 @@ def tiled_pictures() -> Iterator[Row]:
 
 @benchmark("physics_step")
 def physics_step() -> Iterator[Row]:
-    """What the choice of the physics step costs; penetration is measured in ``make bench ONLY=experts``."""
+    """Cost of the physics step; penetration is measured in ``make bench ONLY=experts``."""
     for steps in (20, 40):
         config = TwinConfig()
         config.physics = dataclasses.replace(config.physics, steps_per_control_step=steps)

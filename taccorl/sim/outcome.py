@@ -1,4 +1,4 @@
-"""From predicates at one instant to the outcome of an episode: success that held for half a second, failure, or time limit."""
+"""Outcome of an episode from predicates at single instants: success that held for half a second, failure, or time limit."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

@@ -27,7 +27,7 @@ class Row:
 
 
 def symmetric(name: str, half: float | Sequence[float], unit: str) -> Row:
-    """U(−half, half), one value a component."""
+    """Row with a uniform distribution U(−half, half) for each component."""
     halves = tuple(np.atleast_1d(half).tolist())
     return Row(name=name, low=tuple(-h for h in halves), high=halves, unit=unit)
 

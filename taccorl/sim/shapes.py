@@ -222,7 +222,7 @@ def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey
 
 
 def moved[S: Solid](solid: S, part_from_frame: np.ndarray) -> S:
-    """The same solid, given in another frame of the part."""
+    """Transform a solid into another frame of the part."""
     return replace(solid, part_from_solid=part_from_frame @ solid.part_from_solid)
 
 

@@ -39,7 +39,7 @@ class AirAssembly(ScriptedExpert):
 
     @abstractmethod
     def world_from_level(self) -> np.ndarray:
-        """(3, 3) how the hole is held: its axis along +y."""
+        """Rotation (3, 3) in which the hole is held: its axis along +y."""
 
     @abstractmethod
     def plug(self) -> tuple[Part, str]:

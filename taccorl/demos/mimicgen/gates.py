@@ -30,7 +30,7 @@ class Measured:
         return asdict(self)
 
     def refused(self, gates: GatesSpec) -> tuple[str, str] | None:
-        """(gate, reason) of the first gate that is not passed."""
+        """First gate that is not passed, as (gate, reason); None if all are passed."""
         checks = (
             ("force", self.force_n, gates.max_force_n, 1.0, "N between mating parts"),
             ("penetration", self.penetration_m, gates.max_penetration_m, 1e3, "mm overlap of mating parts"),

@@ -21,7 +21,7 @@ _STILL_RAD = 0.001  # of a joint in a control step: what a tremor makes; 12 mm/s
 
 
 def joint_addresses(model: mujoco.MjModel, arm: str) -> np.ndarray:
-    """(6,) where an arm's joints are in ``qpos``."""
+    """Indices (6,) of an arm's joints in ``qpos``."""
     return np.array([model.joint(f"{arm}_{joint}").qposadr[0] for joint in ROBOT.joints])
 
 

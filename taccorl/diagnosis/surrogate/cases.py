@@ -129,7 +129,8 @@ class Case:
         return numbers | {f"{h.name}.{name}": value for h in self.hidden for name, value in h.values.items()}
 
     def ratios(self) -> dict[str, float]:
-        """What angles alone can show: every torque, stiffness, damping, inertia and mass over K_p, all else as it is."""
+        """True values of what angles alone identify: torques, stiffnesses, dampings, inertias and masses over K_p; others
+        unchanged."""
         own = {n: v for n, v in self.values().items() if n != "kp"}
         return {f"{n}/kp" if _is_torque(n) else n: v / self.gains[0] if _is_torque(n) else v for n, v in own.items()}
 

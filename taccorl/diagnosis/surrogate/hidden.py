@@ -1,4 +1,4 @@
-"""What may be hidden in the surrogate robot: effects of the registry, by its names and numbers, and some that it lacks.
+"""Effects that can be hidden in the surrogate robot: those of the registry by name and parameters, and some outside of it.
 
 Each kind says how large it may be (``severity``, from subtle to absurd), what numbers a severity stands for in the registry's
 terms, and what they are in the surrogate's own plant. The registry's classes (``taccorl.sim.effects``) define what the names
@@ -23,7 +23,7 @@ Values = dict[str, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """What counts as much on the joint under test."""
+    """Reference values of the joint under test (gains, inertia, torque, speed, centre), by which effects are sized."""
 
     kp: float
     kd: float
@@ -43,7 +43,7 @@ class Scale:
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """What a hidden effect changes in the plant."""
+    """Change of the plant by a hidden effect."""
 
     drive: Values = field(default_factory=dict)
     """Fields of ``Drive``. Torques, inertias, delays add up, ``torque_scale`` multiplies, the others replace."""
@@ -113,7 +113,7 @@ class Hidden:
         return KINDS[self.name].plant(self.values)
 
     def effect(self) -> Effect:
-        """As the registry would write it.
+        """The hidden effect as an effect of the registry.
 
         Raises:
             TaccorlError: it lies outside the registry.
@@ -133,7 +133,7 @@ def kind(name: str) -> Kind:
 
 
 def selectors(name: str, signal: str) -> dict[str, Any]:
-    """How the registry's effect ``name`` is told to act on ``signal``; nothing for those outside of it."""
+    """Selectors with which the registry's effect ``name`` acts on ``signal``; empty for effects outside of it."""
     if not KINDS[name].registered:
         return {}
     arm, _, joint = signal.partition("_")

@@ -32,7 +32,7 @@ COMMAND_MS = 5
 
 
 class Drive(NamedTuple):
-    """What the drive, gear and friction of the joint under test do. Absent values by default; rad, N·m, s."""
+    """Parameters of drive, gear and friction of the joint under test. Absent values by default; rad, N·m, s."""
 
     kp: float
     kd: float

@@ -213,7 +213,7 @@ _USES = {"fit": FIT, "validation": VALIDATION, "test": TEST}
 
 
 def pressed_object(case: TouchCase, press: Press) -> PressedObject:
-    """As the user knows it."""
+    """The pressed object as a user would state it."""
     position, rod = (press.x_m, 0.0, press.z_m), press.shape == "rod"
     shape, turn = ("rod", (0.0, math.pi / 2, 0.0)) if rod else ("sphere", (0.0, 0.0, 0.0))
     return indenter(shape, RADIUS_M[press.shape], case.arm, length_m=0.04, position_m=position, rpy_rad=turn)

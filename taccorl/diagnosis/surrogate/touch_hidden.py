@@ -1,4 +1,4 @@
-"""What may be hidden in the surrogate's pads: the registry's effects by its names and numbers, computed here in other ways.
+"""Effects that can be hidden in the surrogate's pads: the registry's, by name and parameters, with independent code.
 
 Letters in shapes: M milliseconds, K taxels that the object comes near, T frames, R × C taxels of a pad.
 """

@@ -250,7 +250,7 @@ def seal(folder: Path, truth: dict[str, object]) -> None:
 
 
 def reveal(folder: Path) -> dict[str, object]:
-    """What was sealed in ``folder``.
+    """Read the sealed truth of ``folder``.
 
     Raises:
         TaccorlError: there is no sealed truth, or it is damaged.

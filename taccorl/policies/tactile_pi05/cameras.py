@@ -70,7 +70,7 @@ class CameraEncoder(nn.Module):
         self.out = nn.Linear(width, num_tokens * width)
 
     def points(self, maps_BKRC: Tensor) -> Tensor:
-        """(B, 2K) where each map is large: all x, to the right, then all y, downwards; −1 … 1 from edge cell to edge cell."""
+        """Positions (B, 2K) of the maps' maxima by spatial softmax: all x, to the right, then all y, downwards; −1 … 1."""
         maps_BKRC = maps_BKRC.to(torch.float32)
         weights_BKN = (maps_BKRC.flatten(2) * (_SHARPNESS * self.sharpness)[:, None]).softmax(-1)
         weights_BKRC = weights_BKN.view_as(maps_BKRC)
@@ -88,7 +88,7 @@ class CameraEncoder(nn.Module):
 
 
 def encode_pictures(camera: nn.Module, images_B3RC: Tensor) -> Tensor:
-    """(B, M, D) of one camera's pictures."""
+    """Tokens (B, M, D) of one camera's pictures."""
     return camera(images_B3RC)
 
 
@@ -104,7 +104,7 @@ class CameraTower(nn.Module):
     def forward(
         self, images: list[Tensor], encode: Callable[[nn.Module, Tensor], Tensor] = encode_pictures
     ) -> list[Tensor]:
-        """(B, M, D) of each camera's (B, 3, R, C), in the order of the policy's features.
+        """Tokens (B, M, D) of each camera's pictures (B, 3, R, C), in the order of the policy's features.
 
         Args:
             encode: ``encode_pictures``, or what it is compiled to.

@@ -80,7 +80,7 @@ class TouchIntoContext(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, context_BTD: torch.Tensor, touch_BMD: torch.Tensor) -> torch.Tensor:
-        """(B, T, D) to be added to the context."""
+        """Contribution (B, T, D) of touch, to be added to the context."""
         context = self.norm_context(context_BTD)
         touch = self.norm_touch(touch_BMD)
         q, k, v = (

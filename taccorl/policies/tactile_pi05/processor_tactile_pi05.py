@@ -79,7 +79,7 @@ class _KeepsFeatures(ProcessorStep):
 
 @dataclass
 class RawStateStep(_KeepsFeatures):
-    """At inference, also passes the state without normalisation to the policy: its relative actions refer to it.
+    """Step that, at inference, also passes the unnormalised state to the policy: its relative actions refer to it.
 
     LeRobot 0.6.1 adds the state of now to every action that comes out of a chunk, but all of them are relative to the state for
     which the chunk was predicted: an arm that has moved since would be sent twice as far. So the policy says with each action how

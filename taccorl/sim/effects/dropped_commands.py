@@ -85,7 +85,7 @@ class DroppedCommands(JointEffect):
 
 
 def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """(…) in [0, 1) for each bus, episode and command, all whole numbers below 2³²: the same ones on every machine."""
+    """Random numbers (…) in [0, 1) for each bus, episode and command, all whole numbers below 2³²: equal on every machine."""
     # Arrays of at least one number: they wrap around, scalars warn.
     key = (np.atleast_1d(seed).astype(np.uint64) << np.uint64(32)) + np.asarray(episode, dtype=np.uint64)
     bits = mixed(mixed(key) + (np.asarray(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(STRIDE))

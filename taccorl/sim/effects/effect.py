@@ -1,4 +1,4 @@
-"""What an effect is: a physical mechanism with parameters, each with unit, bounds and the value at which nothing happens.
+"""Base classes of effects: a physical mechanism with parameters, each with unit, bounds and the value at which it is absent.
 
 An effect acts through as few of eight hooks as it needs:
 

@@ -54,7 +54,7 @@ class TactileFrames:
         return above.reshape(len(above), -1)
 
     def wire_frame(self, pad: str) -> np.ndarray:
-        """(N, wire rows, wire columns) as the board of ``pad`` sends them, row after row.
+        """Frame (N, wire rows, wire columns) as the board of ``pad`` sends it, row after row.
 
         Raises:
             TaccorlError: there is no such pad; names the nearest.
@@ -65,7 +65,7 @@ class TactileFrames:
 
 
 def as_wire(frames: np.ndarray, spec: SensorSpec) -> np.ndarray:
-    """(..., R, C) in the pad's layout → (..., wire rows, wire columns); a view."""
+    """Reorder (..., R, C) in the pad's layout to (..., wire rows, wire columns); a view."""
     return frames.swapaxes(-1, -2) if spec.wire.transpose else frames
 
 

@@ -31,7 +31,7 @@ def normal_reading(
 
 
 def scan_instants_s(spec: SensorSpec) -> np.ndarray:
-    """(wire rows,) when each row of the wire is read, before the stamp: the middles of equal shares of the scan."""
+    """Times (wire rows,) before the stamp at which each row of the wire is read: the middles of equal parts of the scan."""
     share = (np.arange(spec.wire.rows) + 0.5) / spec.wire.rows
     return (share - 1) * spec.scan_time_s
 
