@@ -10,7 +10,7 @@ Letters in shapes: T rows, J signals (of the robot: in the order of actions), N 
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -55,6 +55,7 @@ class Measurement:
         TaccorlError: shapes that do not fit each other.
     """
 
+    known_units: ClassVar[tuple[str, ...]] = tuple(UNITS)
     name: str
     time_s: np.ndarray
     """(T,) since the first row. Even for recordings; a table keeps its own times, which the checks judge."""
@@ -115,9 +116,9 @@ class Measurement:
                 raise TaccorlError(f"measurement {self.name}: {name} is {found}, times and signals say {shape}")
         if len(self.units) != shape[1] or self.quantum.shape != shape[1:] or len(set(self.signals)) != shape[1]:
             raise TaccorlError(f"measurement {self.name}: units, quantum and names do not fit signals {self.signals}")
-        wrong = [u for u in self.units if u not in UNITS]
+        wrong = [u for u in self.units if u not in self.known_units]
         if wrong:
-            raise TaccorlError(f"measurement {self.name}: positions are in rad or m, not in {wrong[0]!r}")
+            raise TaccorlError(f"measurement {self.name}: units are {' or '.join(self.known_units)}, not {wrong[0]!r}")
 
     @property
     def num_rows(self) -> int:
@@ -147,7 +148,7 @@ class Measurement:
         """(J,) bool: recorded, and not only zeros."""
         return np.isfinite(self.effort).any(axis=0) & (np.nan_to_num(self.effort) != 0).any(axis=0)
 
-    def resampled(self, rate_hz: float) -> "Measurement":
+    def resampled(self, rate_hz: float) -> Self:
         """The same at an even ``rate_hz``, in straight lines between rows: keeps the mean time of every command and position.
 
         Raises:

@@ -21,10 +21,10 @@ flange, z along the hand towards the fingers, y the direction in which they clos
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -41,6 +41,8 @@ from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 INDEX = "measurements.yaml"
+TableReader = Callable[[Path, Any], Measurement]
+"""Reads a table: its path, and its columns file if there is one."""
 FARTHEST_PAYLOAD_M = 1.0
 """Of a payload's centre of mass from the flange: the arm itself reaches 0.63 m (PiPER manual)."""
 Use = Literal["fit", "validation", "test"]
@@ -138,6 +140,7 @@ def read_measurements(
     test: Sequence[str] = (),
     validation_every: int | None = None,
     units: Mapping[str, str] | None = None,
+    table: "TableReader | None" = None,
 ) -> Measurements:
     """A recording, a table, a dataset, or a folder of those, divided.
 
@@ -147,6 +150,8 @@ def read_measurements(
         validation, test: names of measurements; with those the index's ``use`` is not looked at.
         validation_every: every k-th motion that is not named is for validation; else the index's.
         units: signal of the machine → unit of its position, for tables without a columns file; the PiPER's if not given.
+        table: reads a table, by its path and that of the columns file, of a machine whose tables are not of joints; ``columns``
+            is then a path.
 
     Raises:
         TaccorlError: nothing to read, unknown names, or a motion and its repeat on both sides.
@@ -156,9 +161,9 @@ def read_measurements(
     index = _load_index(folder)
     spec = spec if spec is not None or index.spec is None else _beside(folder, index.spec)
     columns = columns if columns is not None or index.columns is None else folder / index.columns
-    table_spec = columns if isinstance(columns, TableSpec) or columns is None else load_table_spec(columns)
+    table = table or _joint_tables(columns, units)
     skipped: list[str] = []
-    found = sorted(_read(path, spec, table_spec, units, skipped), key=lambda m: natural_key(m.name))
+    found = sorted(_read(path, spec, lambda one: table(one, columns), skipped), key=lambda m: natural_key(m.name))
     found = _noted(found, index, folder, whole=path.is_dir())
     whole = path.is_dir()
     if validation or test or not whole:  # who asks for one file wants to fit it
@@ -167,6 +172,11 @@ def read_measurements(
         named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "validation", "test")}
     every = index.validation_every * whole if validation_every is None else validation_every
     return dataclasses.replace(split(found, **named, validation_every=every), skipped=tuple(skipped))
+
+
+def _joint_tables(columns: Path | TableSpec | None, units: Mapping[str, str] | None) -> TableReader:
+    spec = columns if isinstance(columns, TableSpec) or columns is None else load_table_spec(columns)
+    return lambda path, _: read_table(path, spec, units)
 
 
 def split(
@@ -350,11 +360,7 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
 
 
 def _read(
-    path: Path,
-    spec: str | Path | RecordingSpec | None,
-    columns: TableSpec | None,
-    units: Mapping[str, str] | None,
-    skipped: list[str],
+    path: Path, spec: str | Path | RecordingSpec | None, table: Callable[[Path], Measurement], skipped: list[str]
 ) -> list[Measurement]:
     if not path.exists():
         siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
@@ -363,12 +369,12 @@ def _read(
         return read_dataset(path)
     if path.is_file():
         if path.suffix in SUFFIXES:
-            return [read_table(path, columns, units)]
+            return [table(path)]
         return _read_recordings(path, spec, skipped)
     children = sorted(path.iterdir(), key=lambda p: natural_key(p.name))
     datasets = [p for p in children if (p / "meta" / "info.json").is_file()]
     tables = [p for p in children if p.is_file() and p.suffix in SUFFIXES]
-    found = [m for p in datasets for m in read_dataset(p)] + [read_table(p, columns, units) for p in tables]
+    found = [m for p in datasets for m in read_dataset(p)] + [table(p) for p in tables]
     left: list[str] = []
     try:
         found += _read_recordings(path, spec, left)

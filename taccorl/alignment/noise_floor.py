@@ -143,10 +143,10 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
     return floors
 
 
-def repeat_pairs(measurements: Iterable[Measurement]) -> list[tuple[Measurement, Measurement]]:
+def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]:
     """(first, repeat) for every further recording of a motion."""
     by_name = {m.name: m for m in measurements}
-    firsts: dict[str, Measurement] = {}
+    firsts: dict[str, M] = {}
     pairs = []
     roots = motions(by_name.values())
     for name, root in sorted(roots.items(), key=lambda item: item[0] != item[1]):  # the original first, if it is here
@@ -159,18 +159,23 @@ def repeat_pairs(measurements: Iterable[Measurement]) -> list[tuple[Measurement,
 def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
     """(K,) counts: noise of every taxel from the residue at the pads' own rate, at least 1 / √12; None without
     touch."""
-    found = []
-    for m in measurements:
-        if m.touch is None:
-            continue
-        rate_hz = 1.0 / float(np.median(np.diff(m.touch.time_s[:, 0])))
-        found.append(_smooth_blocks(m.touch.counts.astype(np.float32), rate_hz))
-    found = [b for b in found if len(b.mean_squares)]
+    touched = [m.touch for m in measurements if m.touch is not None]
+    frames = [(t.counts.astype(np.float32), 1.0 / float(np.median(np.diff(t.time_s[:, 0])))) for t in touched]
+    values = residue_floor(frames) if frames else np.zeros(0)
+    return np.maximum(values, 1.0 / math.sqrt(12)) if values.size and np.isfinite(values).all() else None
+
+
+def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+    """(K,) noise of each column of (values (T, K), rate [Hz]) by the residue method; NaN where all are too short.
+
+    In the median over blocks: contact comes and goes in few of them. Blocks with NaN do not count.
+    """
+    found = [b for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels) if len(b.mean_squares)]
     if not found:
-        return None
-    # In the median: contact comes and goes in few blocks.
-    values = np.sqrt(_median(np.concatenate([b.mean_squares for b in found]), found[0].freedom))
-    return np.maximum(values, 1.0 / math.sqrt(12))
+        return np.full(channels[0][0].shape[1], np.nan)
+    squares = np.concatenate([b.mean_squares for b in found])
+    own = [column[np.isfinite(column)] for column in squares.T]
+    return np.sqrt([float(_median(c, found[0].freedom)) if len(c) else np.nan for c in own])
 
 
 def _chosen(found: list[Estimate]) -> Estimate | None:

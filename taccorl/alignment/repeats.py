@@ -38,8 +38,12 @@ class Overlay:
     row."""
 
 
-def overlay(first: Measurement, second: Measurement) -> Overlay:
+def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SHARE) -> Overlay:
     """Lay ``second`` over ``first``: the shift is where their commands agree best, to a fraction of a row.
+
+    Args:
+        same_share: by which share of the motion commands may differ once they lie over each other; more for loads, which are
+            measured and not commanded.
 
     Raises:
         TaccorlError: other signals, or other commands.
@@ -65,7 +69,7 @@ def overlay(first: Measurement, second: Measurement) -> Overlay:
     whole = _moving(a.target, 0).sum()
     rms = float(np.sqrt(np.mean(target[moving] ** 2))) if moving.any() else 0.0
     motion = float(np.sqrt(np.mean(np.var(a.target, axis=0))))
-    if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > max(SAME_SHARE * motion, SAME_QUANTA):
+    if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > max(same_share * motion, SAME_QUANTA):
         raise TaccorlError(
             f"{second.name} does not repeat {first.name}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
             f"over {moving.sum() / rate_hz:.1f} s in common; mend repeat_of, or record the same command file twice"

@@ -15,7 +15,7 @@ units are written down in a columns file; no unit is ever guessed::
 
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -210,8 +210,9 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         RecordingError: a column is missing, a cell is empty or no number; names file, line and column.
     """
     path = Path(path)
-    read = _read_parquet if path.suffix == ".parquet" else _read_csv
-    header, columns = read(path, spec, signal_units)
+    header, columns = read_columns(
+        path, lambda header: _wanted(spec or own_spec(path, header, signal_units)), spec.separator if spec else "comma"
+    )
     spec = spec or own_spec(path, header, signal_units)
     time_s = columns[spec.time.column] * TIME_S[spec.time.unit]
     if len(time_s) < 2:
@@ -250,14 +251,25 @@ def _wanted(spec: TableSpec) -> list[str]:
     return [spec.time.column, *(c.column for s in spec.signals.values() for _, c in _columns_of(s))]
 
 
-def _check_header(
-    path: Path, header: list[str], spec: TableSpec | None, signal_units: Mapping[str, str] | None
-) -> list[str]:
-    """Columns to read: all of the spec's, or all."""
+def read_columns(
+    path: Path, choose: Callable[[list[str]], list[str]], separator: str = "comma"
+) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Columns of a CSV or parquet file as numbers: the header, and name → (T,).
+
+    Args:
+        choose: names of the columns to read, from the header; may raise.
+        separator: a key of ``SEPARATORS``, for CSV.
+
+    Raises:
+        RecordingError: a column is missing or there twice, a cell is empty or no number; names file, line and column.
+    """
+    return _read_parquet(path, choose) if path.suffix == ".parquet" else _read_csv(path, choose, separator)
+
+
+def _chosen(path: Path, header: list[str], choose: Callable[[list[str]], list[str]]) -> list[str]:
+    """Columns to read, each of which must be there once."""
     twice = sorted({h for h in header if header.count(h) > 1})
-    wanted = header if spec is None else _wanted(spec)
-    if spec is None:
-        own_spec(path, header, signal_units)
+    wanted = choose(header)
     for name in wanted:
         if name not in header:
             raise RecordingError(f"{path}: no column {name!r}; {nearest(name, header)}")
@@ -267,12 +279,11 @@ def _check_header(
 
 
 def _read_csv(
-    path: Path, spec: TableSpec | None, signal_units: Mapping[str, str] | None
+    path: Path, choose: Callable[[list[str]], list[str]], separator: str
 ) -> tuple[list[str], dict[str, np.ndarray]]:
-    separator = SEPARATORS[spec.separator if spec else "comma"]
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.reader(file, delimiter=separator, strict=True)
+            rows = csv.reader(file, delimiter=SEPARATORS[separator], strict=True)
             header = [cell.strip() for cell in next(rows, [])]
             if not header:
                 raise RecordingError(f"{path}: is empty")
@@ -281,7 +292,7 @@ def _read_csv(
                 raise RecordingError(
                     f"{path}: its columns are parted by {other}; write `separator: {other}` in a columns file"
                 )
-            wanted = _check_header(path, header, spec, signal_units)
+            wanted = _chosen(path, header, choose)
             at = [header.index(name) for name in wanted]
             found: list[list[float]] = []
             for row in rows:
@@ -311,12 +322,10 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
     return value
 
 
-def _read_parquet(
-    path: Path, spec: TableSpec | None, signal_units: Mapping[str, str] | None
-) -> tuple[list[str], dict[str, np.ndarray]]:
+def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[list[str], dict[str, np.ndarray]]:
     try:
         header = list(pq.read_schema(path).names)
-        wanted = _check_header(path, header, spec, signal_units)
+        wanted = _chosen(path, header, choose)
         table = pq.read_table(path, columns=wanted)
     except (pa.ArrowException, OSError) as error:
         raise RecordingError(f"{path}: cannot be read as parquet: {' '.join(str(error).split())}") from error

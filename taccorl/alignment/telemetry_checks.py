@@ -18,6 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from taccorl.alignment.cell_checks import ERRORS as CELL_ERRORS
 from taccorl.alignment.clock_checks import check_clock
 from taccorl.alignment.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurement import Measurement
@@ -62,6 +63,7 @@ DIFFERENT = 3.0
 ERRORS = (
     "time_backwards", "time_unit", "not_finite", "lost_samples", "too_short", "no_motion", "dead_channel", "frozen_channel",
     "saturated_channel", "unit", "reversed", "swapped_joints", "swapped_arms", "measured_before_command", "shifted_from_twin",
+    *CELL_ERRORS,
 )  # fmt: skip
 """Checks that can end in an error, and so be accepted."""
 _NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")

@@ -81,7 +81,7 @@ class TouchModel:
             reading = np.zeros((len(law), len(ROBOT.pads), *shape), np.float32)
             reading[:, slots] = law
             for effect, memory in zip(acting, memories, strict=True):
-                reading = _through(effect, reading, memory, time_s[some], dt_s[some])
+                reading = through(effect, reading, memory, time_s[some], dt_s[some])
             seen[some] = reading[:, slots]
         return seen
 
@@ -135,8 +135,13 @@ def _offsets(effects: Sequence[Effect], pads: Sequence[str]) -> tuple[tuple[floa
     return tuple((float(x), float(y), float(z)) for x, y, z in total)
 
 
-def _through(effect: Effect, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-    """Frames (B, P, R, C) of all pads as they come out of an effect; its memory goes on."""
+def through(effect: Effect, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+    """Frames (B, P, R, C) of all pads as they come out of an effect; its memory goes on.
+
+    Args:
+        memory: as after the frames before; {} for an effect without memory. Changed in place.
+        time_s, dt_s: (B,) since the first scan, and since the scan before.
+    """
     if not memory:
         return effect.reading(reading, memory, time_s, dt_s)
     if isinstance(effect, RememberingEffect):

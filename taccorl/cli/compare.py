@@ -76,7 +76,6 @@ def main(argv: list[str]) -> int:
     """0: compared; 1: the measurements have errors, nothing was compared."""
     config = parse(CompareConfig, argv, positional="measurements")
     _check_outputs(config)
-    from taccorl.alignment.measurements import read_measurements
     from taccorl.alignment.telemetry_checks import accepted, check_names
     from taccorl.cli.measured import checked, clock_is_off, print_findings, unused_accepts
     from taccorl.diagnosis.machine import load_machine
@@ -84,12 +83,8 @@ def main(argv: list[str]) -> int:
     check_names(config.accept)
 
     twins = [load_machine(path) for path in (config.twin, config.against)[: 1 + (config.against is not None)]]
-    measurements = read_measurements(
-        config.measurements,
-        spec=config.spec,
-        columns=config.columns,
-        validation_every=config.validation_every,
-        units=twins[0].units,
+    measurements = twins[0].read(
+        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
     )
     findings = checked(twins[0], measurements, "not compared", config.accept)
     if findings is None:

@@ -75,7 +75,6 @@ def main(argv: list[str]) -> int:
     from taccorl.diagnosis.report import check_folder
 
     check_folder(config.out)
-    from taccorl.alignment.measurements import read_measurements
     from taccorl.alignment.telemetry_checks import accepted, check_names
     from taccorl.cli.measured import checked, clock_is_off, print_findings, unused_accepts
     from taccorl.diagnosis.machine import load_machine
@@ -85,12 +84,8 @@ def main(argv: list[str]) -> int:
     machine = load_machine(config.twin)
     for name in config.without:
         effects.get(name)
-    measurements = read_measurements(
-        config.measurements,
-        spec=config.spec,
-        columns=config.columns,
-        validation_every=config.validation_every,
-        units=machine.units,
+    measurements = machine.read(
+        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
     )
     findings = checked(machine, measurements, "not diagnosed", config.accept)
     if findings is None:

@@ -32,7 +32,8 @@ def checked(
     """
     from taccorl.alignment.telemetry_checks import accepted, check_measurements
 
-    found, own = check_measurements(measurements.all, accept=accept), machine.check(measurements)
+    found = check_measurements(measurements.all, accept=accept) if machine.of_joints else {}
+    own = machine.check(measurements)
     found = {
         m.name: [*_judged(m, found.get(m.name, [])), *accepted(own.get(m.name, []), accept)] for m in measurements.all
     }

@@ -88,6 +88,13 @@ class TouchTrace:
     origin: str
     touched: np.ndarray | None = None
     """(N, P) bool: what is pressed is in the pad, by where both are; None where that is not known."""
+    unit: str = "counts"
+    """Of the readings."""
+    thirds: tuple[str, ...] = ("palm third", "middle third", "tip third")
+    """Names of parts of the rows with about as many rows each; () where the rows are too few."""
+    load: np.ndarray | None = None
+    """(N, P, R, C) what pressed each cell, in ``load_unit``; None where only its shape and place are known."""
+    load_unit: str = ""
 
     @property
     def residual(self) -> np.ndarray:
@@ -174,14 +181,16 @@ class Comparison:
         return _score(traces) if traces else None
 
     def scores(self) -> list[Score]:
-        """Every signal and use, and all pads together."""
+        """Every signal and use, and all pads together where there are several."""
         found = [self.score(signal, kind, use) for signal, kind in self.signals for use in self.uses]
-        found += [_touch_score([t for t in self.touches if t.use == use]) for use in self.uses]
+        if len({pad for t in self.touches for pad in t.pads}) > 1:
+            found += [_touch_score([t for t in self.touches if t.use == use]) for use in self.uses]
         return [s for s in found if s is not None]
 
     def pad_scores(self) -> list[Score]:
         """Every pad and use."""
-        pads = [pad for pad in ROBOT.pads if any(pad in t.pads for t in self.touches)]
+        there = dict.fromkeys(pad for t in self.touches for pad in t.pads)
+        pads = sorted(there, key=lambda pad: ROBOT.pads.index(pad) if pad in ROBOT.pads else len(ROBOT.pads))
         found = [_touch_score([t for t in self.touches if t.use == use], pad) for pad in pads for use in self.uses]
         return [s for s in found if s is not None]
 
@@ -242,12 +251,12 @@ def _touch_score(traces: Sequence[TouchTrace], pad: str | None = None) -> Score 
         signal="touch" if pad is None else pad,
         kind="touch",
         use=traces[0].use,
-        unit="counts",
+        unit=traces[0].unit,
         rmse=rmse,
         interval=_rms_interval(total, number),
         nrmse=rmse / spread if spread > 0 else math.inf,
         floor=level,
-        floor_words=f"{level:.3g} counts (residue of each taxel; a lower bound)",
+        floor_words=f"{level:.3g} {traces[0].unit} (residue of each taxel; a lower bound)",
         lower_bound=True,
         n=int(number.sum()),
         recordings=len(traces),

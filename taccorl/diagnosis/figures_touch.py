@@ -10,7 +10,7 @@ from taccorl.diagnosis.comparison import FELT_FLOORS, TouchTrace
 from taccorl.diagnosis.figure_style import AFTER, BEFORE, FLOOR, MEASURED, legend, new_figure, tidy
 from taccorl.diagnosis.figures import TWINS, ratio_map
 from taccorl.diagnosis.localise import Cell
-from taccorl.diagnosis.localise_touch import REGIMES
+from taccorl.diagnosis.localise_touch import EVERYWHERE
 
 BINS = 48
 
@@ -26,16 +26,18 @@ def touch_histogram(
     series += [(np.concatenate([t.replayed.ravel() for t in before]), BEFORE, names[0])]
     series += [(np.concatenate([t.replayed.ravel() for t in after]), AFTER, names[1])] if after else []
     top = max(float(values.max()) for values, _, _ in series)
-    edges = np.linspace(least, max(top, least + 1), BINS).tolist()
-    axes.axvspan(0, least, color=FLOOR, alpha=0.45, lw=0, label=f"{FELT_FLOORS:g} × noise floor ({least:.2g} counts)")
+    edges = np.linspace(least, max(top, 2 * least), BINS).tolist()
+    axes.axvspan(
+        0, least, color=FLOOR, alpha=0.45, lw=0, label=f"{FELT_FLOORS:g} × noise floor ({least:.2g} {before[0].unit})"
+    )
     for values, color, name in series:
         active = values[values > least]
         label = f"{name}: n = {len(active)}, mean {active.mean() if len(active) else 0:.3g}"
         axes.hist(active, edges, histtype="step", color=color, lw=1.4, label=label)
     axes.set_yscale("log")
     axes.set_xlim(0, edges[-1])
-    axes.set_xlabel("counts above baseline", fontsize=8)
-    axes.set_ylabel("taxel readings", fontsize=8)
+    axes.set_xlabel(f"{before[0].unit} above baseline", fontsize=8)
+    axes.set_ylabel("readings", fontsize=8)
     tidy(axes)
     legend(axes, 2)
     return figure
@@ -56,11 +58,11 @@ def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple
     tops = [max(float(v.max()) for _, v in part) for part in (maps[: len(rows)], maps[len(rows) :])]
     where = f"{before.recording} ({before.use.replace('_', '-')}), strongest touch at {before.time_s[frame, 0]:.2f} s"
     size_in = (1.7 * len(maps) + 0.8, 1.2 + 2.6 * len(before.pads))
-    figure = new_figure(*size_in, f"counts above baseline: {where}", [before.origin])
+    figure = new_figure(*size_in, f"{before.unit} above baseline: {where}", [before.origin])
     axes = figure.subplots(len(before.pads), len(maps), squeeze=False)
     for j, (name, values) in enumerate(maps):
         residual = j >= len(rows)
-        top = max(tops[residual], 1.0)
+        top = tops[residual] or 1.0
         for p, pad in enumerate(before.pads):
             axis = axes[p, j]
             cmap = "magma" if residual else "turbo"
@@ -70,12 +72,12 @@ def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple
             if p == 0:
                 axis.set_title(name, fontsize=7.5)
             if j == 0:
-                axis.set_ylabel(f"{pad} (palm above, tip below)", fontsize=8)
+                axis.set_ylabel(f"{pad} ({before.thirds[0]} above)" if before.thirds else pad, fontsize=8)
         if j in (len(rows) - 1, len(maps) - 1):
             bar = figure.colorbar(image, ax=axes[:, j].tolist(), shrink=0.5, pad=0.02)
             bar.ax.tick_params(labelsize=7)
             noise = f"noise floor {np.median(before.floor):.2g}"
-            bar.set_label("counts" if not residual else f"counts, RMS ({noise})", fontsize=7.5)
+            bar.set_label(before.unit if not residual else f"{before.unit}, RMS ({noise})", fontsize=7.5)
     return figure
 
 
@@ -95,10 +97,35 @@ def touch_over_time(before: TouchTrace, after: TouchTrace | None = None, names: 
         axes[p].axhspan(-floor, floor, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor ± {floor:.3g}")
         for values, color, name in sums:
             axes[p].plot(before.time_s[:, p], values[:, p].sum(axis=(1, 2)), color=color, lw=1.1, label=name)
-        axes[p].set_ylabel(f"{pad}, sum\n[counts]", fontsize=8)
+        axes[p].set_ylabel(f"{pad}, sum\n[{before.unit}]", fontsize=8)
         tidy(axes[p])
     legend(axes[0])
     below[-1].set_xlabel("time [s]", fontsize=8)
+    return figure
+
+
+def reading_over_load(
+    before: Sequence[TouchTrace], after: Sequence[TouchTrace] = (), names: tuple[str, str] = TWINS
+) -> Figure:
+    """Reading of the most loaded cell over its load, measured and simulated: a bend is a law, a loop is memory."""
+    first = before[0]
+    assert first.load is not None
+    strongest = np.max([np.max(t.load, axis=0) for t in before if t.load is not None], axis=0)
+    cell = np.unravel_index(int(np.argmax(strongest)), strongest.shape)
+    where = f"{first.pads[cell[0]]}" + (f"[{cell[1]}, {cell[2]}]" if strongest.size > 1 else "")
+    figure = new_figure(8.0, 4.6, f"reading over load of {where}, {len(before)} recordings", _origins(before))
+    axes = figure.subplots()
+    series = [("measured", MEASURED, before, "measured"), ("replayed", BEFORE, before, names[0])]
+    series += [("replayed", AFTER, after, names[1])] if after else []
+    for field, color, traces, name in series:
+        for k, t in enumerate(traces):
+            assert t.load is not None
+            load, reading = t.load[:, *cell], getattr(t, field)[:, *cell]
+            axes.plot(load, reading, color=color, lw=0.8, alpha=0.7, label=name if k == 0 else None)
+    axes.set_xlabel(f"load [{first.load_unit}]", fontsize=8)
+    axes.set_ylabel(f"{first.unit} above baseline", fontsize=8)
+    tidy(axes)
+    legend(axes)
     return figure
 
 
@@ -112,7 +139,7 @@ def _error_over_time(axes: Axes, before: TouchTrace, after: TouchTrace | None, p
             error = np.sqrt(np.mean(trace.residual[:, pad][:, felt] ** 2, axis=1))
             axes.plot(trace.time_s[:, pad], error, color=color, lw=0.9)
     axes.set_ylim(bottom=0)
-    axes.set_ylabel(f"RMS error of\n{felt.sum()} taxels [counts]", fontsize=8)
+    axes.set_ylabel(f"RMS error of\n{felt.sum()} cells [{before.unit}]", fontsize=8)
     tidy(axes)
 
 
@@ -123,7 +150,9 @@ def touch_heat_map_figure(
     most: float = 0.0,
 ) -> Figure:
     """Pad × regime: RMSE over the noise floor. An empty cell: too few readings."""
-    return ratio_map(cells, [name for name in REGIMES if any(c.regime == name for c in cells)], origins, title, most)
+    there = dict.fromkeys(c.regime for c in cells)
+    regimes = [*(name for name in EVERYWHERE if name in there), *(name for name in there if name not in EVERYWHERE)]
+    return ratio_map(cells, regimes, origins, title, most)
 
 
 def _origins(traces: Sequence[TouchTrace]) -> list[str]:

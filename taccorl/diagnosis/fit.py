@@ -193,7 +193,7 @@ def fit(
     inside = 1e-6 * (high - low)
     first = np.clip(first, low + inside, high - inside)
     evaluations = 0
-    newest: tuple[bytes, np.ndarray] = b"", first
+    newest: tuple[bytes | None, np.ndarray] = None, first
 
     def at(coordinates: np.ndarray) -> tuple[Values, list[Effect]]:
         values = {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}

@@ -22,9 +22,8 @@ PHASES = {
     "just released": "the first second after a touch",
     "untouched": "the rest",
 }
-THIRDS = ("palm third", "middle third", "tip third")
-"""Of a pad's rows."""
-REGIMES = ("in contact", "no contact", *PHASES, *THIRDS)
+EVERYWHERE = ("in contact", "no contact", *PHASES)
+"""Regimes of all cells; those of parts of the rows follow (``TouchTrace.thirds``)."""
 RELEASED_S = 1.0
 CHANGE_PER_S = 0.25
 """Of the touch's strongest sum: faster is loading or unloading, slower is a hold."""
@@ -58,12 +57,12 @@ def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarr
     always = np.ones(len(trace.measured), dtype=bool)
     found = phases(trace, pad)
     quiet = found["just released"] | found["untouched"]
-    third = np.arange(rows)[:, None] * len(THIRDS) // rows
+    third = np.arange(rows)[:, None] * len(trace.thirds) // rows
     return {
         "in contact": (~quiet, everywhere),
         "no contact": (quiet, everywhere),
         **{name: (frames, everywhere) for name, frames in found.items()},
-        **{name: (always, everywhere & (third == k)) for k, name in enumerate(THIRDS)},
+        **{name: (always, everywhere & (third == k)) for k, name in enumerate(trace.thirds)},
     }
 
 
@@ -71,9 +70,10 @@ def touch_heat_map(traces: Sequence[TouchTrace]) -> list[Cell]:
     """Every pad in every regime, over the taxels that feel something at some time."""
     cells = []
     for pad in dict.fromkeys(pad for t in traces for pad in t.pads):
-        squares: dict[str, list[np.ndarray]] = {name: [] for name in REGIMES}
+        own_traces = [t for t in traces if pad in t.pads]
+        squares: dict[str, list[np.ndarray]] = {name: [] for name in (*EVERYWHERE, *own_traces[0].thirds)}
         floor_squares = []
-        for t in (t for t in traces if pad in t.pads):
+        for t in own_traces:
             p = t.pads.index(pad)
             felt = t.felt(p)
             floor_squares.append(t.floor[p][felt] ** 2)

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
 import numpy as np
 import yaml
 
-from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.measurements import Measurements, read_measurements
 from taccorl.alignment.touch_motion import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison import Comparison
@@ -167,7 +167,16 @@ class Machine(ABC):
     def units(self) -> Mapping[str, str]:
         """Signal → unit of its position (rad, m), for tables without a columns file."""
 
+    def read(
+        self, path: Path, *, spec: str | None = None, columns: Path | None = None, validation_every: int | None = None
+    ) -> Measurements:
+        """Recordings of it, as ``read_measurements`` reads them."""
+        return read_measurements(path, spec=spec, columns=columns, validation_every=validation_every, units=self.units)
+
     # measurements ----------------------------------------------------------------------------------------------------
+
+    of_joints: ClassVar[bool] = True
+    """Whether its recordings are of joints, which the checks of telemetry judge."""
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
         """Recording → findings that only this machine can make, such as positions beyond its limits."""
@@ -229,34 +238,7 @@ class Machine(ABC):
         Args:
             without: effects that are not considered.
         """
-        problem = self.problem(part, measurements, gains)
-        fit_to, validation = (problem.fit, problem.validation) if problem.validation else split_rows(problem.fit)
-        if not any(np.isfinite(r.measured).any() for r in validation):
-            raise TaccorlError(
-                f"{part}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so no effect "
-                "can be judged; record a motion that is measured to its end, or mark another one with use: validation"
-            )
-        can_tell = identifiability(problem, fit_to, problem.start, problem.present)
-        found = diagnose(
-            problem,
-            fit_to,
-            validation,
-            problem.test,
-            start=problem.start,
-            present=problem.present,
-            without=without,
-            config=search,
-        )
-        return PartFinding(
-            part=part,
-            diagnosis=found,
-            can_tell=can_tell,
-            noise=problem.noise,
-            numbers=problem.numbers,
-            measured=problem.measured,
-            recordings={use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")},
-            rows_split=not problem.validation,
-        )
+        return solved(part, self.problem(part, measurements, gains), search, without)
 
     # effects ---------------------------------------------------------------------------------------------------------
 
@@ -313,6 +295,46 @@ class Machine(ABC):
     def option_of(self, part: str) -> list[str]:
         """Options with which ``taccorl add-effect`` must name this part although it was diagnosed."""
         return []
+
+
+def solved(
+    part: str, problem: PartProblem, search: SearchConfig | None = None, without: Sequence[str] = ()
+) -> PartFinding:
+    """Search for the effect that is missing in one part's problem.
+
+    Args:
+        without: effects that are not considered.
+
+    Raises:
+        TaccorlError: nothing was measured in the validation rows.
+    """
+    fit_to, validation = (problem.fit, problem.validation) if problem.validation else split_rows(problem.fit)
+    if not any(np.isfinite(r.measured).any() for r in validation):
+        raise TaccorlError(
+            f"{part}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so no effect "
+            "can be judged; record a motion that is measured to its end, or mark another one with use: validation"
+        )
+    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
+    found = diagnose(
+        problem,
+        fit_to,
+        validation,
+        problem.test,
+        start=problem.start,
+        present=problem.present,
+        without=without,
+        config=search,
+    )
+    return PartFinding(
+        part=part,
+        diagnosis=found,
+        can_tell=can_tell,
+        noise=problem.noise,
+        numbers=problem.numbers,
+        measured=problem.measured,
+        recordings={use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")},
+        rows_split=not problem.validation,
+    )
 
 
 machines: Registry[type[Machine]] = Registry("kind of machine", "taccorl.diagnosis.machines")

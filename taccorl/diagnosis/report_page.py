@@ -8,7 +8,13 @@ from taccorl.diagnosis.along import curves
 from taccorl.diagnosis.comparison import Comparison, Kind, Score, Trace, origin_words, shown, shown_unit
 from taccorl.diagnosis.figure_style import data_uri, png
 from taccorl.diagnosis.figures import heat_map_figure, joint_response, residual_along_variables
-from taccorl.diagnosis.figures_touch import touch_heat_map_figure, touch_histogram, touch_maps, touch_over_time
+from taccorl.diagnosis.figures_touch import (
+    reading_over_load,
+    touch_heat_map_figure,
+    touch_histogram,
+    touch_maps,
+    touch_over_time,
+)
 from taccorl.diagnosis.localise import WHERE_NOT_WHY, Cell, worst_regime
 from taccorl.diagnosis.report import GENERATOR, Report, cells_of
 from taccorl.diagnosis.report_evidence import diagnosis_section, first_read
@@ -222,6 +228,9 @@ def _touch(c: Comparison, after: Comparison | None) -> Iterable[str]:
     names = (c.twin, after.twin if after is not None else "")
     later = after.touches if after is not None else ()
     parts = ["<h2>Touch</h2>", figure(data_uri(png(touch_histogram(c.touches, later, names))), "all recordings")]
+    if all(t.load is not None for t in c.touches):
+        drawn = reading_over_load(c.touches, later, names)
+        parts.append(figure(data_uri(png(drawn)), "reading over load: a bend is a law, a loop is memory"))
     for pads in dict.fromkeys(t.pads for t in c.touches):
         own = [t for t in c.touches if t.pads == pads]
         shown_one = next(t for use in ("validation", "test", "fit") for t in own if t.use == use)

@@ -166,13 +166,8 @@ class TouchProblem:
         """To start a search from: the twin's own numbers."""
 
     def _candidate(self, cls: type[Effect]) -> Candidate:
-        found = candidate(cls, self.seen, pads=list(self.pads), **_FIXED.get(cls.name, {}))
-        fixed = {f"{cls.name}.{p}" for p in _FIXED.get(cls.name, {})}
-        frees = tuple(f for f in found.frees if f.name not in fixed)
-        starts = tuple({k: v for k, v in start.items() if k not in fixed} for start in found.starts) if frees else ({},)
-        return dataclasses.replace(
-            found, frees=frees, starts=starts, num_maps=self._num_gains if cls is TaxelGainMap else 0
-        )
+        found = touch_candidate(cls, self.seen, list(self.pads))
+        return dataclasses.replace(found, num_maps=self._num_gains) if cls is TaxelGainMap else found
 
     def recordings(
         self, fit: Sequence[TouchMotion], validation: Sequence[TouchMotion], test: Sequence[TouchMotion] = ()
@@ -337,9 +332,18 @@ class TouchProblem:
         )
 
 
+def touch_candidate(cls: type[Effect], seen: Mapping[str, float], pads: list[str]) -> Candidate:
+    """An effect on readings as a candidate, without parameters that others take up (``_FIXED``)."""
+    found = candidate(cls, seen, pads=pads, **_FIXED.get(cls.name, {}))
+    fixed = {f"{cls.name}.{p}" for p in _FIXED.get(cls.name, {})}
+    frees = tuple(f for f in found.frees if f.name not in fixed)
+    starts = tuple({k: v for k, v in start.items() if k not in fixed} for start in found.starts) if frees else ({},)
+    return dataclasses.replace(found, frees=frees, starts=starts)
+
+
 def _shows(cls: type[Effect]) -> bool:
     """Whether an effect changes what pads read in a matched replay, by numbers that can be fitted."""
-    if not issubclass(cls, TouchEffect) or issubclass(cls, BoardEffect):
+    if not issubclass(cls, TouchEffect) or issubclass(cls, BoardEffect) or "pads" not in cls.kinds():
         return False
     return issubclass(cls, PadFrameEffect) or cls.reading is not Effect.reading
 

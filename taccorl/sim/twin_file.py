@@ -51,7 +51,7 @@ def load_twin(path: Path) -> TwinConfig:
     path = Path(path)
     if _says_nothing(path):
         return TwinConfig()
-    document = _TwinDocument(TwinConfig, path)
+    document = EffectsDocument(TwinConfig, path)
     try:
         present(document.value.effects)
     except TaccorlError as error:
@@ -79,7 +79,7 @@ def twin_text(config: TwinConfig) -> str:
         content["cameras"] = _camera_differences(config.cameras, nominal.cameras)
     if config.sensor != nominal.sensor:
         content["sensor"] = _plugin_differences("type", sensors, config.sensor, type(nominal.sensor))
-    content["effects"] = [_plugin_differences("effect", effects, effect) for effect in config.effects]
+    content["effects"] = [effect_entry(effect) for effect in config.effects]
     return _HEADER + yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
 
 
@@ -94,7 +94,21 @@ def save_twin(config: TwinConfig, path: Path) -> None:
     Raises:
         TaccorlError: the folder cannot be written to, or a number is not finite.
     """
-    path, text = Path(path), twin_text(config)
+    write_whole(path, twin_text(config))
+
+
+def effect_entry(effect: Effect) -> dict[str, Any]:
+    """An effect as an entry of a file's ``effects``: its name, and what is not as in its class."""
+    return _plugin_differences("effect", effects, effect)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file; it is replaced as a whole or not at all.
+
+    Raises:
+        TaccorlError: the folder cannot be written to.
+    """
+    path = Path(path)
     new = path.with_name(f".{path.name}.new")
     try:
         new.write_text(text, encoding="utf-8")
@@ -107,8 +121,8 @@ def save_twin(config: TwinConfig, path: Path) -> None:
 # reading ---------------------------------------------------------------------------------------------------------------
 
 
-class _TwinDocument(Document[TwinConfig]):
-    """Lists, plug-ins and cameras on top of what every strict file knows."""
+class EffectsDocument[T](Document[T]):
+    """A strict file with effects: lists, plug-ins and cameras on top of what every strict file knows."""
 
     def _build(self, kind: Any, node: yaml.Node, key: str) -> Any:
         self._lines.setdefault(key, node.start_mark.line + 1)
@@ -148,7 +162,7 @@ class _TwinDocument(Document[TwinConfig]):
             raise
         except TaccorlError as error:
             named = sorted((str(error).index(name), name) for name in values if name in str(error))
-            raise self.error(f"{key}/{named[0][1]}" if named else key, str(error)) from error
+            raise self.error(f"{key}/{named[0][1]}".lstrip("/") if named else key, str(error)) from error
 
     def _plugin(self, tag: str, registry: Registry[Any], default: type | None, node: yaml.Node, key: str) -> Any:
         """A plug-in named by the key ``tag``, with its settings."""

@@ -206,7 +206,7 @@ def test_shapes_and_units_are_checked():
     (m,) = made("a")
     with pytest.raises(TaccorlError, match=r"measured is \(3, 14\), times and signals say \(4, 14\)"):
         dataclasses.replace(m, measured=np.zeros((3, 14)))
-    with pytest.raises(TaccorlError, match="not in 'deg'"):
+    with pytest.raises(TaccorlError, match="rad or m, not 'deg'"):
         dataclasses.replace(m, units=("deg",) * 14)
     with pytest.raises(TaccorlError, match="did you mean 'left_joint5'"):
         m.column("left_joint_5")

@@ -11,7 +11,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.cameras import CameraConfig, letterbox_window
 from taccorl.sim.effects.camera_past import PastScene
-from taccorl.sim.effects.effect import LAYERS, Effect, Memory
+from taccorl.sim.effects.effect import CELLS, LAYERS, Effect, Memory
 from taccorl.sim.effects.live_model import LiveModel
 
 if TYPE_CHECKING:
@@ -207,4 +207,8 @@ def present(effects: Sequence[Effect]) -> list[Effect]:
 def edit_model(spec: mujoco.MjSpec, config: "TwinConfig") -> None:
     """Build the effects of ``config`` into a model that is otherwise complete."""
     for effect in present(config.effects):
+        if CELLS in effect.acts_on():
+            raise TaccorlError(
+                f"effects: {effect.name}: pads: a robot's twin has no cells; name pads: {', '.join(ROBOT.pads)}"
+            )
         effect.edit(spec, config)

@@ -28,6 +28,9 @@ class BaselineDrift(TouchEffect):
     at_a_policy: ClassVar = "After minutes it feels contact that is not there, or misses the one that is."
     to_record: ClassVar = "5 s without contact at the beginning and at the end of a long recording."
     near_twins: ClassVar = {
+        "taxel_temperature": (
+            "A sensor that warms up steadily drifts in time, too; record the temperature, and let it go up and down."
+        ),
         "taxel_creep": (
             "In one long hold both rise slowly; drift goes on without contact. Record 5 s of nothing before and after."
         ),

@@ -68,6 +68,8 @@ NEEDS = {
 """Word in ``Effect.needs`` → what a model must know so that the effect can be computed."""
 Memory = dict[str, np.ndarray]
 """Name → array (N, …), changed in place."""
+CELLS = "cells"
+"""What ``TouchEffect.pads`` names instead of pads where the effect is of a sensor of cells, which a cells file describes."""
 LAYERS = ("robot", "material", "spread", "taxel", "baseline", "camera")
 """From the mechanics outwards; a pad's rubber comes before its wiring, and the wiring before the zero that is taken off."""
 
@@ -368,7 +370,7 @@ class TouchEffect(Effect):
     windows: ClassVar[bool] = False
     """Whether ``reading`` and ``memory`` also hold for a rectangle of each pad's taxels, where nothing touches beyond its rim."""
     pads: list[str] = field(default_factory=lambda: list(ROBOT.pads))
-    """``left_a`` … ``right_b``."""
+    """``left_a`` … ``right_b``; or ``CELLS`` alone."""
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
@@ -377,15 +379,16 @@ class TouchEffect(Effect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_chosen(self.name, "pad", self.pads, ROBOT.pads)
+        if self.pads != [CELLS]:
+            _check_chosen(self.name, "pad", self.pads, ROBOT.pads)
 
     def acts_on(self) -> list[str]:
         return list(self.pads)
 
     @property
     def slots(self) -> list[int]:
-        """Indices of the chosen pads in the reading."""
-        return [ROBOT.pads.index(pad) for pad in self.pads]
+        """Indices of the chosen pads in the reading; a sensor of cells is the only one in its own."""
+        return [0] if self.pads == [CELLS] else [ROBOT.pads.index(pad) for pad in self.pads]
 
     def within(self, window: tuple[slice, slice]) -> "TouchEffect | None":
         """The effect for readings of these rows and columns only; None if it must have whole pads (``windows``)."""

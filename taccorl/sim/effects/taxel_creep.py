@@ -32,6 +32,9 @@ class TaxelCreep(RememberingEffect):
     at_a_policy: ClassVar = "A grasp that is held feels as if it tightened or slipped, and the policy answers to that."
     to_record: ClassVar = "A press that is held for 4 s or longer, and 5 s of nothing after its release."
     near_twins: ClassVar = {
+        "taxel_log_creep": (
+            "Over a few seconds both bend alike; logarithmic creep goes on for minutes. Record a hold of 30 s or longer."
+        ),
         "taxel_hysteresis": (
             "Both read more on the way out; creep goes on in a hold and fades after. Record a hold of 4 s."
         ),

@@ -26,6 +26,7 @@ UNITS = {
     "_rad_per_s": "rad/s",
     "_per_s": "1/s",
     "_per_min": "1/min",
+    "_per_k": "1/K",
     "_kgm2": "kg·m²",
     "_nm": "N·m",
     "_kg": "kg",
@@ -63,6 +64,11 @@ ONE_OF_FOUR = [pytest.param(name, marks=[pytest.mark.slow] * (k % 4 > 0)) for k,
 """All effects; three of four are slow."""
 
 
+def shows_in_a_run(name: str) -> bool:
+    cls = effects.get(name)
+    return cls.layer != "camera" and "temperature" not in cls.needs
+
+
 def check_fades_out(cls: type[Effect]) -> None:
     """It does something at typical values, and at most a tenth of that a hundredth of the way from its absent values."""
     there = difference(perform(start(cls(**typical(cls)))), nominal())
@@ -87,8 +93,8 @@ def test_an_absent_effect_leaves_the_run_bit_identical(name: str) -> None:
             np.testing.assert_array_equal(seen[kind], values, err_msg=f"{name} {variant}: {kind}")
 
 
-# What cameras show fades out in test_camera_effects.py.
-@pytest.mark.parametrize("name", [p for p in ONE_OF_FOUR if effects.get(str(p.values[0])).layer != "camera"])
+# What cameras show fades out in test_camera_effects.py; a run has no temperature: tests/diagnosis/test_cells_problem.py.
+@pytest.mark.parametrize("name", [p for p in ONE_OF_FOUR if shows_in_a_run(str(p.values[0]))])
 def test_an_effect_fades_out_towards_its_absent_value(name: str) -> None:
     check_fades_out(effects.get(name))
 

@@ -1,0 +1,228 @@
+"""A sensor of cells as a machine, described by a cells file (``taccorl.alignment.cells``). It is its own only part."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from taccorl.alignment.cell_checks import LOADED, check_cells
+from taccorl.alignment.cell_model import calibrated, of_file, readings, responses, thinned
+from taccorl.alignment.cell_tables import CellMeasurement, load_cell_columns, read_cell_table
+from taccorl.alignment.cells import (
+    CellsConfig,
+    cells_digest,
+    load_cells,
+    make_cells_effect,
+    save_cells,
+)
+from taccorl.alignment.measurements import Measurements, read_measurements
+from taccorl.alignment.touch_motion import PressedObject
+from taccorl.data.finding import Finding as DataFinding
+from taccorl.diagnosis.cells_problem import CellsProblem, prepared_all, reading_floor
+from taccorl.diagnosis.comparison import USES, Comparison, TouchTrace
+from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine, machines, solved
+from taccorl.diagnosis.problem import chosen
+from taccorl.diagnosis.search import Diagnosis, Evidence, SearchConfig
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects import effects as registry
+from taccorl.sim.effects.effect import Effect
+
+THIRDS = ("first rows", "middle rows", "last rows")
+"""Of a grid of three rows or more."""
+
+
+@machines.register("cells")
+@dataclass(frozen=True)
+class CellsMachine(Machine):
+    """A sensor of cells."""
+
+    config: CellsConfig
+    name: str = "cells"
+    file_name: str = "cells.yaml"
+    part_word: ClassVar[str] = "sensor"
+    of_joints: ClassVar[bool] = False
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        return cls(load_cells(path), path.stem)
+
+    def save(self, path: Path) -> None:
+        save_cells(self.config, path)
+
+    def digest(self) -> str:
+        return cells_digest(self.config)
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.config.effects if not e.is_absent)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """It has no positions."""
+        return {}
+
+    def read(
+        self, path: Path, *, spec: str | None = None, columns: Path | None = None, validation_every: int | None = None
+    ) -> Measurements:
+        if spec is not None:
+            raise TaccorlError(f"--spec={spec}: a sensor of cells is read from tables (CSV, parquet); leave --spec out")
+
+        def table(one: Path, beside: Path | None) -> CellMeasurement:
+            return read_cell_table(one, self.config, None if beside is None else load_cell_columns(beside, self.config))
+
+        return read_measurements(path, columns=columns, validation_every=validation_every, table=table)
+
+    def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
+        return check_cells(self.config, _cells(measurements.all), [m.name for m in measurements.fit])
+
+    def parts(self, measurements: Measurements) -> tuple[str, ...]:
+        return (self.config.name,)
+
+    def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
+        if joints or pads:
+            option = "joints" if joints else "pads"
+            raise TaccorlError(
+                f"--{option}: {self.name} is a sensor of cells and has no {option}; leave --{option} out"
+            )
+        return tuple(parts)
+
+    def compare(
+        self,
+        measurements: Measurements,
+        *,
+        name: str = "",
+        pressed: PressedObject | None = None,
+        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
+    ) -> Comparison:
+        """With gain and offset of the file; where it has none, those fitted to the fit recordings."""
+        config = self.config
+        fit_to = prepared_all(config, measurements.fit)
+        calibration = of_file(config) or calibrated(config, [(responses(config, m), m.measured) for m in fit_to])
+        floor = reading_floor(config, prepared_all(config, measurements.all))
+        touches = []
+        total = len(measurements.all)
+        for use in USES:
+            for m in map(thinned, _cells(getattr(measurements, use))):
+                progress(m.name, len(touches), total)
+                shape = (m.num_rows, 1, *config.shape)
+                zero = calibration.offset
+                simulated = readings(config, responses(config, m), calibration)
+                loaded = np.asarray((m.target > LOADED * config.load.rated).any(axis=1, keepdims=True))
+                touches.append(
+                    TouchTrace(
+                        recording=m.name,
+                        use=use,
+                        pads=(config.name,),
+                        time_s=m.time_s[:, None],
+                        measured=(config.sign * (m.measured - zero)).reshape(shape),
+                        replayed=(config.sign * (simulated - zero)).reshape(shape),
+                        floor=floor.reshape(1, *config.shape),
+                        origin=m.origin,
+                        touched=loaded,
+                        unit=config.reading.unit,
+                        thirds=THIRDS if config.shape[0] >= len(THIRDS) else (),
+                        load=m.target.reshape(shape),
+                        load_unit=config.load.unit,
+                    )
+                )
+        return Comparison(
+            twin=name or self.name,
+            effects=self.effects,
+            traces=(),
+            touches=tuple(touches),
+            split=measurements.record(),
+            left_out=tuple(_cut_words(config, measurements)),
+        )
+
+    def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> CellsProblem:
+        return CellsProblem(self.config, measurements)
+
+    def diagnose(
+        self,
+        part: str,
+        measurements: Measurements,
+        *,
+        gains: GainsAre = "auto",
+        search: SearchConfig | None = None,
+        without: Sequence[str] = (),
+    ) -> Finding:
+        problem = self.problem(part, measurements, gains)
+        found = solved(part, problem, search, without)
+        unit, load = self.config.load.unit, self.config.load_of_reading
+        remark = f"1 in the unit reading is {load:g} {unit}, a tenth of the rated load"
+        return dataclasses.replace(found, diagnosis=_with_numbers(problem, found.diagnosis), remark=remark)
+
+    def effect(
+        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
+    ) -> Effect | None:
+        if name in registry and "cells" not in registry.get(name).kinds():
+            return None
+        return make_cells_effect(name, **{k: v for k, v in values.items() if k != "pads"})
+
+    def by_hand(
+        self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
+    ) -> list[Addition]:
+        """Gain and offset stay as they are."""
+        (part,) = self.select((self.config.name,), joints, pads)
+        made = self.effect(name, part, {**values, "evidence": "by hand"})
+        if made is None:
+            raise TaccorlError(f"{name} is no effect of a sensor of cells; {nearest(name, _cells_effects())}")
+        known = {key: getattr(self.config, key) for key in ("gain", "offset") if getattr(self.config, key)}
+        numbers = {f"{key}_{cell}": x for key in known for cell, x in zip(self.config.names, known[key], strict=True)}
+        return [Addition(part, [made], numbers, {})]
+
+    def with_additions(self, additions: Sequence[Addition]) -> "CellsMachine":
+        """Gain and offset are those that were fitted beside the effects; without any they are left out, and fitted by who loads
+        the file."""
+        config = self.config
+        for addition in additions:
+            names = {e.name for e in addition.effects}
+            kept = [e for e in config.effects if e.name not in names]
+            numbers = {
+                key: [addition.base[f"{key}_{cell}"] for cell in config.names if f"{key}_{cell}" in addition.base]
+                for key in ("gain", "offset")
+            }
+            config = dataclasses.replace(config, effects=[*kept, *addition.effects], **numbers)
+        return CellsMachine(config, self.name)
+
+
+def _cells(measurements: Sequence[Any]) -> list[CellMeasurement]:
+    return [m for m in measurements if isinstance(m, CellMeasurement)]
+
+
+def _cells_effects() -> list[str]:
+    return [name for name in registry if "cells" in registry.get(name).kinds()]
+
+
+def _cut_words(config: CellsConfig, measurements: Measurements) -> list[str]:
+    """How many readings were at an end of the converter, recording by recording."""
+    words = []
+    for m, kept in zip(measurements.all, prepared_all(config, measurements.all), strict=True):
+        share = float(np.mean(~np.isfinite(kept.measured)))
+        if share > 0:
+            words.append(f"{m.name}: {share:.1%} of the readings are at an end of the converter; they say nothing")
+    return words
+
+
+def _with_numbers(problem: CellsProblem, d: Diagnosis) -> Diagnosis:
+    """With gain and offset of each cell, which the search fits in closed form, among the fitted numbers."""
+    present = {k: v for k, v in d.before.values.items() if "." in k}
+    rounds = [
+        dataclasses.replace(r, evidence=tuple(_of_evidence(problem, d.present, e) for e in r.evidence)) if k == 0 else r
+        for k, r in enumerate(d.rounds)
+    ]
+    return dataclasses.replace(
+        d,
+        base=problem.file_numbers(d.effects),
+        before=dataclasses.replace(d.before, values=present | problem.file_numbers(d.before.effects)),
+        rounds=tuple(rounds),
+    )
+
+
+def _of_evidence(problem: CellsProblem, present: Sequence[str], e: Evidence) -> Evidence:
+    values = e.base | e.values
+    effects = [c.make(values) for c in chosen(problem, [*present, e.name])]
+    return dataclasses.replace(e, base=e.base | problem.file_numbers(effects))
