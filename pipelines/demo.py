@@ -1,4 +1,4 @@
-"""``make demo``: the twin demonstrates → recordings as the robot's drivers would write them → dataset → checks → Rerun; then a
+"""``make demo``: simulated demonstrations → recordings as the robot's drivers would write them → dataset → checks → Rerun; then a
 surrogate robot with a hidden effect → compare → diagnose → add it → the error has fallen.
 
 There is no robot here: simulations stand in for it, and everything made from them says so.
