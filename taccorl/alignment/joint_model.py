@@ -98,13 +98,19 @@ class JointModel:
         self._rigid: dict[tuple, Rigid] = {}
 
     def simulate(
-        self, motion: JointMotion, gains: Gains, effects: Sequence[Effect] = (), lever: PayloadLever = AT_ITS_PLACE
+        self,
+        motion: JointMotion,
+        gains: Gains,
+        effects: Sequence[Effect] = (),
+        lever: PayloadLever = AT_ITS_PLACE,
+        age_s: float = 0.0,
     ) -> JointResponse:
         """Its answer to the recording's targets, from rest at ``motion.start``.
 
         Args:
             gains: those of a recording with ``kp_scale`` = 1.
             effects: besides the machine's; one of the same name takes the place of the machine's.
+            age_s: of the measured position when the drive's torque acts, besides the joint's own.
             lever: left out where effects have no ``drive`` and MuJoCo runs.
 
         Raises:
@@ -113,13 +119,18 @@ class JointModel:
         sent, parts, hold, step_s = self._sent(motion)
         present = self.joint.effects(effects)
         kp, kd = gains.kp * motion.kp_scale, gains.kd * motion.kd_scale
-        scaled = Gains(kp, kd, gains.torque_ff)
+        early_s = 0.5 * step_s if self.joint.exact_timing else 0.0
+        # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
+        scaled = Gains(kp, kd - kp * (self.joint.position_age_s + age_s + early_s), gains.torque_ff)
+        speed_late_s = self.joint.speed_delay_s + early_s
         drives = [(effect.name, effect.drive()) for effect in present]
-        numbers = _combined([(name, drive) for name, drive in drives if drive is not None])
+        timing = [("the drive", {"speed_delay": speed_late_s})] if speed_late_s > 0.0 else []
+        numbers = _combined([*timing, *((name, drive) for name, drive in drives if drive is not None)])
         if numbers is None or any(drive is None for _, drive in drives):
             return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
-        drive = Drive(*scaled, **self._body(motion, bodies)._asdict())._replace(**numbers)
+        drive = Drive(*scaled, **self._body(motion, bodies)._asdict(), torque_max=self.joint.torque_max)
+        drive = drive._replace(**numbers)
         weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
         drive = drive._replace(
             gravity_sin=drive.gravity_sin + weight * lever.sin_m,

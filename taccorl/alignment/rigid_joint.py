@@ -79,6 +79,15 @@ class RigidJoint(ABC):
     effort_holds_weight: ClassVar[bool] = False
     """Whether the reported effort holds the torque by which the controller carries the weight."""
 
+    torque_max: float = math.inf
+    """N·m: a limit that is known."""
+    position_age_s: float = 0.0
+    """How old the measured position is, on average, when the drive's torque acts; with ``speed_delay_s`` of a velocity."""
+    speed_delay_s: float = 0.0
+    exact_timing: ClassVar[bool] = False
+    """Whether the half step by which the integrator is early is taken off, and the age of the position is fitted where gains are
+    commanded: half a millisecond is 18 noise floors of 0.1 mrad at 3.7 rad/s."""
+
     def timestep_s(self, rate_hz: float) -> float:
         """Physics step for rows at ``rate_hz``."""
         raise NotImplementedError

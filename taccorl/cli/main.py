@@ -15,6 +15,7 @@ VERBS = {
         "execute": "stored actions (augment --rows=actions) → LeRobot dataset, or frames for training without any video",
         "evaluate": "how good a policy is in the twin: success with its interval, failures, two policies on the same scenes",
         "post-train": "a policy → a better one: PPO in the twin, held to real demonstrations",
+        "init-robot": "MJCF or URDF of your own robot → a robot file for compare, diagnose and add-effect",
         "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
         "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",
         "add-effect": "the twin with one effect more, with the fitted values",

@@ -59,7 +59,7 @@ def compare(
     levels = {signal: floor.value for signal, floor in floors["position"].items()}
     responses = replay_all(config, every, progress)
     for (use, m), response in zip(uses, responses, strict=True):
-        traces += _traces(m, use, response, floors)
+        traces += traces_of(m, use, response, floors)
         if np.isfinite(response.reported).any():
             clock[m.name] = tuple(check_against_twin(response.measurement, response.reported, levels))
     for signal in GRIPPERS:
@@ -120,13 +120,13 @@ def held_up(m: Measurement) -> list[str]:
     return [signal for signal, held, said in zip(GRIPPERS, touched, stated, strict=True) if held or said]
 
 
-def _traces(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
+def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
     """One for each signal that is compared and was measured, and one for its effort where that was recorded."""
     touched = in_contact(response.measurement)
     found = []
     even = response.measurement
     for signal in compared(m):
-        j = even.column(signal)
+        j, arm = even.column(signal), signal.split("_", 1)[0]
         columns: dict[Kind, tuple[np.ndarray, np.ndarray]] = {
             "position": (even.measured[:, j], response.reported[:, j]),
             "effort": (even.effort[:, j], response.effort[:, j]),
@@ -150,7 +150,9 @@ def _traces(m: Measurement, use: Use, response: Response, floors: dict[Kind, dic
                     measured=measured,
                     replayed=replayed,
                     torque=response.effort[:, j],
-                    touched=touched[:, ROBOT.arms.index(signal.split("_", 1)[0])],
+                    touched=touched[:, ROBOT.arms.index(arm)]
+                    if arm in ROBOT.arms
+                    else np.zeros(even.num_rows, dtype=bool),
                     floor=floors[kind][signal],
                     origin=m.origin,
                 )

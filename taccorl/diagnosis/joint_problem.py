@@ -46,6 +46,9 @@ EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0
 SPEED_DELAY = Free(name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3)
 """τ of the effect speed_delay: what a sampled loop does to the inertia. Fitted where something besides the inertia
 says something about the scale of the torques: else K_p takes it up (``taccorl.diagnosis.identifiable``)."""
+POSITION_AGE = Free(name="position_age_s", unit="s", start=0.0, low=-1e-3, high=TIMING_S, scale=1e-4)
+"""Age of the measured position when the drive's torque acts, besides what is known of the loop. Fitted beside commanded gains
+where the machine says so (``RigidJoint.exact_timing``): fitted ones take it up, K_d − K_p a."""
 PAYLOAD_PLACE = tuple(
     Free(name=name, unit="m", start=0.0, low=-0.05, high=0.05, scale=5e-3)
     for name in ("payload_sin_m", "payload_cos_m")
@@ -151,7 +154,8 @@ class JointProblem:
                 *effects,
                 SpeedDelay(**self.model.joint.selectors(SpeedDelay) or {}, delay_s=float(base[SPEED_DELAY.name])),
             ]
-        answer = self.model.simulate(recording.data, self._gains(base), effects, lever)
+        age_s = float(base.get(POSITION_AGE.name, 0.0))
+        answer = self.model.simulate(recording.data, self._gains(base), effects, lever, age_s=age_s)
         if not self.effort:
             return answer.reported[:, None]
         return np.column_stack([answer.reported, base.get("effort_scale", 1.0) * answer.effort])
@@ -182,9 +186,9 @@ class JointProblem:
             SPEED_DELAY, high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9))
         )
         if self.commanded:
-            found += [EFFORT_SCALE] * self.effort + [delay]
+            found += [EFFORT_SCALE] * self.effort + [delay] + [POSITION_AGE] * self.model.joint.exact_timing
         else:
-            gains = [dataclasses.replace(f, start=v, low=f.low / WIDER) for f, v in ((KP, kp), (KD, kd))]
+            gains = [_around(f, v) for f, v in ((KP, kp), (KD, max(kd, KD.low / WIDER)))]
             found = gains + found + [delay] * (self.effort or self._weight_shows(1.0))
         payloads: list[JointMotion] = [
             r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known
@@ -228,6 +232,12 @@ class JointProblem:
             "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
             "duration_s": max(float(m.time_s[-1]) for m in motions),
         }
+
+
+def _around(gain: Free, start: float) -> Free:
+    """A gain with wider bounds, which hold its start."""
+    low, high = min(gain.low / WIDER, 0.1 * start), gain.high if start < gain.high else 10.0 * start
+    return dataclasses.replace(gain, start=start, low=low, high=high)
 
 
 def floors_of(measurements: Sequence[Measurement], signal: str, *, effort: bool) -> list[SignalFloor]:

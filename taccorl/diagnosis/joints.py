@@ -10,6 +10,7 @@ from multiprocessing import get_context
 
 import numpy as np
 
+from taccorl.alignment.arm_joint import HasJoints
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.noise_floor import SignalFloor
@@ -84,7 +85,7 @@ def moves(m: Measurement, signal: str) -> bool:
 
 
 def diagnose_joint(
-    config: TwinConfig,
+    machine: TwinConfig | HasJoints,
     signal: str,
     measurements: Measurements,
     *,
@@ -104,7 +105,7 @@ def diagnose_joint(
     if not sides[0]:
         raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
     own = dataclasses.replace(measurements, fit=sides[0], validation=sides[1], test=sides[2])
-    problem = JointProblem(config, signal, own, gains=gains)
+    problem = JointProblem(machine, signal, own, gains=gains)
     fit_to, validation = (problem.fit, problem.validation) if problem.validation else split_rows(problem.fit)
     if not any(np.isfinite(r.measured).any() for r in validation):
         raise TaccorlError(

@@ -13,7 +13,9 @@ import numpy as np
 
 from taccorl.alignment.arm_bench import held_payload
 from taccorl.alignment.arm_joint import BENCH_REST as BENCH_REST
-from taccorl.alignment.joint_model import JointModel, joint_motion
+from taccorl.alignment.arm_joint import HasJoints
+from taccorl.alignment.joint_model import JointModel
+from taccorl.alignment.joint_motion import motion_of
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.rigid_joint import AT_TCP
 from taccorl.alignment.touch_motion import PressedObject, TouchMotion, touch_motion
@@ -40,18 +42,18 @@ class Response:
     """The recording as it was replayed: all signals, resampled at a rate whose period is a whole number of physics steps."""
     way: Literal["joint", "twin"]
     reported: np.ndarray
-    """(T, 14) rad, m; NaN for signals that were not replayed."""
+    """(T, J) rad, m, J signals of the machine; NaN for those that were not replayed."""
     effort: np.ndarray
-    """(T, 14) N·m, N that the motors give at the time of each row; NaN where not known."""
+    """(T, J) N·m, N that the motors give at the time of each row; NaN where not known."""
 
 
-def replay_joints(config: TwinConfig, m: Measurement, signals: Sequence[str]) -> Response:
+def replay_joints(machine: TwinConfig | HasJoints, m: Measurement, signals: Sequence[str]) -> Response:
     """Each of ``signals`` alone, the others as they were measured; gains and payloads as the recording knows them."""
-    m = evened(m, config)
-    reported, effort = np.full((2, m.num_rows, len(ROBOT.action_names)), np.nan)
+    m = evened(m, machine) if isinstance(machine, TwinConfig) else m
+    reported, effort = np.full((2, m.num_rows, len(m.signals)), np.nan)
     for signal in signals:
-        model, j = JointModel(config, signal), m.column(signal)
-        done = model.simulate(joint_motion(m, config, signal), model.gains)
+        model, j = JointModel(machine, signal), m.column(signal)
+        done = model.simulate(motion_of(m, signal, model.joint), model.gains)
         reported[:, j], effort[:, j] = done.reported, done.effort
     return Response(m, "joint", reported, effort)
 

@@ -1,0 +1,289 @@
+"""Any robot of an MJCF or URDF file as rigid bodies: the kinematic tree, masses and inertias, gravity, and what else it says of
+its joints.
+
+Meshes are not needed: mesh, texture and material entries are removed before the model is compiled, and a file of them need not
+be there. So a moving link needs its inertia in the file (``<inertial>``), or, in MJCF, geoms that are primitives. A floating base
+is held fixed, and so are ball joints. Joints that a closed chain ties together are refused: inverse dynamics of a tree would be
+wrong for them.
+
+Passive forces of the file (damping, dry friction, springs) and its actuators are no part of the rigid bodies; ``joint_facts``
+returns them, and ``taccorl init-robot`` writes them into the robot file, where they can be seen, fitted and removed.
+"""
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from taccorl.data.finding import listed
+from taccorl.errors import TaccorlError
+
+_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_MOST_BYTES = 1 << 24
+"""Largest model file that is read."""
+_CLOSING = {mujoco.mjtEq.mjEQ_CONNECT: "connect", mujoco.mjtEq.mjEQ_WELD: "weld"}
+_REMOVED = ("sensors", "keys", "equalities", "tendons", "pairs", "excludes", "skins", "lights", "cameras")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorFacts:
+    """One actuator of a joint, as MJCF has it: τ = gear · (gain · ctrl + bias0 + bias1 · gear q + bias2 · gear q̇)."""
+
+    name: str
+    kp: float
+    """N·m/rad or N/m at the joint; 0 for a motor."""
+    kd: float
+    """N·m·s/rad or N·s/m at the joint."""
+    effort_limit: float | None
+    """N·m or N at the joint."""
+    gear: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFacts:
+    """What a model file says of one joint."""
+
+    name: str
+    unit: Literal["rad", "m"]
+    limits: tuple[float, float] | None
+    """rad or m; None where it has none."""
+    inertia: float
+    """kg·m² or kg of all that it moves, others at the model's zero pose; without armature."""
+    armature: float
+    """kg·m² or kg: rotor inertia as it acts at the joint."""
+    effort_limit: float | None
+    """N·m or N."""
+    damping: float
+    """N·m·s/rad or N·s/m."""
+    friction: float
+    """N·m or N."""
+    stiffness: float
+    """N·m/rad or N/m of a spring."""
+    spring_rest: float
+    """rad or m."""
+    actuators: tuple[ActuatorFacts, ...]
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """A compiled tree of rigid bodies without contact, passive forces and armature."""
+
+    path: Path
+    model: mujoco.MjModel
+    joints: dict[str, JointFacts]
+    """Hinge and slide joints, in the order of the tree."""
+    remarks: tuple[str, ...]
+    """What of the file was left out, and why that is no harm."""
+
+
+def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotModel:
+    """Read an MJCF or URDF file.
+
+    Args:
+        gravity_compensation: share of the weight that the controller carries.
+
+    Raises:
+        TaccorlError: the file cannot be read; a moving link has no inertia, or one that needs a mesh; a closed chain; joints
+            without a name, or none at all.
+    """
+    path = Path(path)
+    spec, remarks = _spec(path)
+    _refuse_closed_chains(path, spec)
+    remarks += _without_meshes(path, spec)
+    remarks += _held_base(spec)
+    for body in spec.bodies:
+        body.gravcomp = gravity_compensation
+    model = _compiled(path, spec)
+    joints = {name: _facts(model, name, k) for k, name in enumerate(_joint_names(path, model))}
+    joints = {name: facts for name, facts in joints.items() if facts is not None}
+    if not joints:
+        raise TaccorlError(f"{path}: no hinge and no slide joint; is it the whole robot?")
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    for field in ("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness"):
+        getattr(model, field)[:] = 0.0
+    return RobotModel(path, model, joints, tuple(remarks))
+
+
+# reading ---------------------------------------------------------------------------------------------------------------
+
+
+def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise TaccorlError(f"{path}: is larger than {_MOST_BYTES:,} bytes; is it a model file?")
+        root = ET.fromstring(path.read_bytes())
+    except OSError as error:
+        raise TaccorlError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ET.ParseError as error:
+        raise TaccorlError(f"{path}:{error.position[0]}: is not XML: {error}; give an MJCF or URDF file") from error
+    if root.tag not in ("mujoco", "robot"):
+        hint = "; expand it first: xacro robot.urdf.xacro > robot.urdf" if "xacro" in path.name else ""
+        raise TaccorlError(f"{path}: <{root.tag}> is neither MJCF (<mujoco>) nor URDF (<robot>){hint}")
+    if root.tag == "robot" and any("xacro" in element.tag for element in root.iter()):
+        raise TaccorlError(f"{path}: holds xacro macros; expand it first: xacro {path.name} > robot.urdf")
+    try:
+        if root.tag == "mujoco":
+            return mujoco.MjSpec.from_file(str(path)), []
+        shapes = 0
+        for link in root.iter("link"):
+            for kind in ("visual", "collision"):
+                for shape in link.findall(kind):
+                    link.remove(shape)
+                    shapes += 1
+        remarks = [f"{shapes} visual and collision shapes of the URDF are not used"] * bool(shapes)
+        return mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode")), remarks
+    except (ValueError, mujoco.FatalError) as error:
+        raise TaccorlError(f"{path}: MuJoCo cannot read it: {_one_line(error)}") from error
+
+
+def _refuse_closed_chains(path: Path, spec: mujoco.MjSpec) -> None:
+    closing = [e for e in spec.equalities if e.type in _CLOSING and e.active]
+    if closing:
+        names = listed(
+            [f"{_CLOSING[e.type]} {e.name or '(no name)'} between {e.name1} and {e.name2 or 'world'}" for e in closing]
+        )
+        raise TaccorlError(
+            f"{path}: closed chain: {names}. Only trees are known: remove <{_CLOSING[closing[0].type]}> and the links that close "
+            "the loop, and give the joints that remain the inertia of what they move"
+        )
+
+
+def _without_meshes(path: Path, spec: mujoco.MjSpec) -> list[str]:
+    """Remove meshes and all that refers to them.
+
+    Raises:
+        TaccorlError: a moving body has its inertia from a mesh.
+    """
+    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    groups = spec.compiler.inertiagrouprange
+    from_mesh: dict[str, str] = {}
+    moving = _moving(spec)
+    meshes = 0
+    for geom in list(spec.geoms):
+        geom.material = ""
+        if not geom.meshname and geom.type not in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD):
+            continue
+        body = geom.parent
+        weightless = geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0)
+        counts = groups[0] <= geom.group <= groups[1] and not weightless
+        if body.name in moving and counts and (always or not body.explicitinertial):
+            from_mesh.setdefault(body.name or "(no name)", geom.meshname)
+        spec.delete(geom)
+        meshes += 1
+    if from_mesh:
+        body, mesh = next(iter(from_mesh.items()))
+        others = f" So it is for {listed(list(from_mesh)[1:])}." if len(from_mesh) > 1 else ""
+        why = ' (the file says inertiafromgeom="true")' if always else ""
+        raise TaccorlError(
+            f"{path}: body {body} has its inertia from mesh {mesh!r}{why}, and meshes are not read. Write it down: <inertial "
+            f'pos="x y z" mass="kg" diaginertia="Ixx Iyy Izz"/> in <body name="{body}">.{others} A model that MuJoCo '
+            "has compiled once has them: save it with mj_saveLastXML"
+        )
+    for actuator in list(spec.actuators):
+        if actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
+            spec.delete(actuator)
+    for kind in (*_REMOVED, "materials", "textures", "meshes", "hfields"):
+        for thing in list(getattr(spec, kind)):
+            spec.delete(thing)
+    return [f"{meshes} mesh geoms are not used; inertias are those of the file"] * bool(meshes)
+
+
+def _moving(spec: mujoco.MjSpec) -> set[str]:
+    """Bodies that a hinge, slide or ball joint moves."""
+    moving: set[str] = set()
+
+    def visit(body: mujoco.MjsBody, moved: bool) -> None:
+        moved = moved or any(j.type != mujoco.mjtJoint.mjJNT_FREE for j in body.joints)
+        if moved:
+            moving.add(body.name)
+        for child in body.bodies:
+            visit(child, moved)
+
+    visit(spec.worldbody, False)
+    return moving
+
+
+def _held_base(spec: mujoco.MjSpec) -> list[str]:
+    """Remove free and ball joints: what they move is held where the file has it."""
+    remarks = []
+    for joint in list(spec.joints):
+        if joint.type not in (_HINGE, _SLIDE):
+            what = "free" if joint.type == mujoco.mjtJoint.mjJNT_FREE else "ball"
+            remarks.append(f"{what} joint {joint.name or 'of ' + joint.parent.name}: held fixed")
+            spec.delete(joint)
+    return remarks
+
+
+def _compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        text = _one_line(error)
+        if "mass and inertia of moving bodies" in text:
+            named = text.partition("Element name '")[2].partition("'")[0]
+            inertial = (
+                '<inertial><origin xyz="x y z"/><mass value="kg"/><inertia ixx="" iyy="" izz="" ixy="0" ixz="0" iyz="0"/>'
+                f'</inertial> in <link name="{named}">'
+                if path.suffix == ".urdf"
+                else f'<inertial pos="x y z" mass="kg" diaginertia="Ixx Iyy Izz"/> in <body name="{named}">'
+            )
+            raise TaccorlError(
+                f"{path}: link {named} moves and has no mass or inertia; write {inertial}, from CAD or the data sheet"
+            ) from error
+        raise TaccorlError(f"{path}: MuJoCo cannot compile it: {text}") from error
+
+
+def _joint_names(path: Path, model: mujoco.MjModel) -> Iterator[str]:
+    for k in range(model.njnt):
+        name = model.joint(k).name
+        if not name:
+            raise TaccorlError(
+                f"{path}: a joint of body {model.body(model.jnt_bodyid[k]).name} has no name; give it one"
+            )
+        yield name
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+# what it says of joints ------------------------------------------------------------------------------------------------
+
+
+def _facts(model: mujoco.MjModel, name: str, k: int) -> JointFacts | None:
+    dof = model.jnt_dofadr[k]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mass = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    own = [a for a in range(model.nu) if model.actuator_trnid[a, 0] == k]
+    effort = model.jnt_actfrcrange[k] if model.jnt_actfrclimited[k] else None
+    return JointFacts(
+        name=name,
+        unit="m" if model.jnt_type[k] == _SLIDE else "rad",
+        limits=(float(model.jnt_range[k, 0]), float(model.jnt_range[k, 1])) if model.jnt_limited[k] else None,
+        inertia=float(mass[dof, dof] - model.dof_armature[dof]),
+        armature=float(model.dof_armature[dof]),
+        effort_limit=None if effort is None else float(np.abs(effort).max()),
+        damping=float(model.dof_damping[dof]),
+        friction=float(model.dof_frictionloss[dof]),
+        stiffness=float(np.ravel(model.jnt_stiffness[k])[0]),
+        spring_rest=float(model.qpos_spring[model.jnt_qposadr[k]]),
+        actuators=tuple(_actuator(model, a) for a in own),
+    )
+
+
+def _actuator(model: mujoco.MjModel, a: int) -> ActuatorFacts:
+    gear = float(model.actuator_gear[a, 0])
+    affine = model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE
+    kp, kd = (-(gear**2) * float(model.actuator_biasprm[a, p]) if affine else 0.0 for p in (1, 2))
+    limit = abs(gear) * float(np.abs(model.actuator_forcerange[a]).max()) if model.actuator_forcelimited[a] else None
+    if limit is None and not affine and model.actuator_ctrllimited[a]:
+        limit = abs(gear * float(model.actuator_gainprm[a, 0])) * float(np.abs(model.actuator_ctrlrange[a]).max())
+    name = model.actuator(a).name or f"actuator {a}"
+    return ActuatorFacts(name=name, kp=kp + 0.0, kd=kd + 0.0, effort_limit=limit, gear=gear)

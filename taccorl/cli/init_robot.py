@@ -1,0 +1,48 @@
+"""``taccorl init-robot my_arm.xml --out=my_robot.yaml``: a robot file for compare, diagnose and add-effect.
+
+MODEL is an MJCF or URDF file of any kinematic tree; its meshes need not be there. The file that is written names its joints with
+limits, inertias, actuators, damping and friction as the model has them, and TODO where only you know: gains of the drives, and
+whether they carry the weight.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from taccorl.cli.parse import parse
+from taccorl.errors import TaccorlError
+
+
+@dataclass(kw_only=True)
+class InitRobotConfig:
+    """A robot file from an MJCF or URDF file."""
+
+    model: Path
+    """MJCF or URDF file."""
+    out: Path | None = None
+    """File to write; beside the model, with _robot.yaml in its name, if not given. A file that is there is left alone."""
+
+
+def main(argv: list[str]) -> int:
+    """0: written."""
+    config = parse(InitRobotConfig, argv, positional="model", prog="taccorl init-robot")
+    out = config.out or config.model.with_name(f"{config.model.stem}_robot.yaml")
+    if out.exists():
+        raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
+    from taccorl.alignment.robot_draft import robot_draft
+    from taccorl.alignment.robot_file import TODO
+
+    text, robot = robot_draft(config.model, out)
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise TaccorlError(f"{out}: cannot be written: {error.strerror or error}") from error
+    for remark in robot.remarks:
+        print(f"note: {remark}")
+    print(f"wrote {out}: {len(robot.joints)} joints ({', '.join(robot.joints)})")
+    left = [number for number, line in enumerate(text.splitlines(), 1) if f": {TODO}" in line]
+    print(f"write {len(left)} values where it says {TODO}: lines {', '.join(map(str, left))}")
+    name = next(iter(robot.joints))
+    print(f"record each joint: tables with columns t, {name}.q, {name}.q_target, and where you have them .qd and .tau")
+    print(f"next: taccorl compare YOUR_SWEEPS --twin={out}")
+    return 0

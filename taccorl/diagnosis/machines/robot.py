@@ -1,0 +1,173 @@
+"""Any robot as a machine: ``kind: robot`` (``taccorl.alignment.robot_file``). Its parts are its joints, by the model's names."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from taccorl.alignment.clock_checks import check_against_twin
+from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.measurements import Measurements, Use
+from taccorl.alignment.noise_floor import SignalFloor, noise_floor
+from taccorl.alignment.robot_checks import check_robot
+from taccorl.alignment.robot_file import Robot, load_robot
+from taccorl.alignment.touch_motion import PressedObject
+from taccorl.data.finding import Finding as DataFinding
+from taccorl.data.finding import listed
+from taccorl.diagnosis.compare import moving, traces_of
+from taccorl.diagnosis.comparison import USES, Comparison, Kind
+from taccorl.diagnosis.joints import diagnose_joint, moves
+from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine, machines
+from taccorl.diagnosis.replays import replay_joints
+from taccorl.diagnosis.search import SearchConfig
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.twin_file import write_whole
+
+
+@machines.register("robot")
+@dataclass(frozen=True)
+class RobotMachine(Machine):
+    """A robot of an MJCF or URDF file."""
+
+    robot: Robot
+    name: str
+    part_word: ClassVar[str] = "joint"
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        return cls(load_robot(path), Path(path).stem)
+
+    def save(self, path: Path) -> None:
+        write_whole(path, self.robot.text(path))
+
+    def digest(self) -> str:
+        return self.robot.digest()
+
+    @property
+    def file_name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return f"{self.name}.yaml"
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(e.name for joint in self.robot.config.joints.values() for e in joint.effects))
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        return self.robot.units
+
+    # measurements ----------------------------------------------------------------------------------------------------
+
+    def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
+        """Positions beyond limits, efforts beyond theirs, an inertia that cannot be right, columns that are missing."""
+        found: dict[str, list[DataFinding]] = {}
+        for m in measurements.all:
+            moved = [name for name in self.robot.config.joints if moves(m, name)]
+            found[m.name] = check_robot(self.robot, m, self._whole(m), moved)
+        return found
+
+    def parts(self, measurements: Measurements) -> tuple[str, ...]:
+        for m in measurements.all:
+            self._whole(m)
+        found = tuple(s for s in self.robot.config.joints if any(moves(m, s) for m in measurements.fit))
+        if not found:
+            raise TaccorlError(
+                f"no fit recording moves a joint of {self.robot.path} by 2 mrad (2 mm) or more; record a sweep of each: "
+                "± 0.3 rad, 0.1 to 2 Hz, 10 s, twice"
+            )
+        return found
+
+    def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
+        if pads:
+            raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; leave --pads out")
+        for name in joints:
+            if name not in self.robot.config.joints:
+                raise TaccorlError(f"--joints={name}: no such joint; {nearest(name, self.robot.config.joints)}")
+            if name not in parts:
+                raise TaccorlError(
+                    f"--joints={name}: no fit recording moves it; those that are moved: {listed(list(parts))}"
+                )
+        return tuple(p for p in parts if not joints or p in joints)
+
+    def compare(
+        self,
+        measurements: Measurements,
+        *,
+        name: str = "",
+        pressed: PressedObject | None = None,
+        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
+    ) -> Comparison:
+        if pressed is not None:
+            raise TaccorlError(f"--pressed: {self.name} has no pads; leave it out")
+        uses: list[tuple[Use, Measurement]] = [
+            (use, self._whole(m)) for use in USES for m in getattr(measurements, use)
+        ]
+        every = [m for _, m in uses]
+        floors: dict[Kind, dict[str, SignalFloor]] = {kind: noise_floor(every, kind) for kind in ("position", "effort")}
+        levels = {signal: floor.value for signal, floor in floors["position"].items()}
+        traces, clock, held = [], {}, set()
+        for k, (use, m) in enumerate(uses):
+            progress(m.name, k, len(uses))
+            known = [s for s in moving(m) if s in self.robot.config.joints]
+            held |= {s for s in moving(m) if s not in self.robot.config.joints}
+            response = replay_joints(self.robot, m, known)
+            traces += [t for t in traces_of(m, use, response, floors) if t.signal in known]
+            if known:
+                clock[m.name] = tuple(check_against_twin(m, response.reported, levels))
+        progress("", len(uses), len(uses))
+        if not traces:
+            raise TaccorlError(
+                f"{', '.join(m.name for m in every)}: nothing to compare: no joint of the robot file moved"
+            )
+        left_out = [f"{s}: {self.robot.path.name} does not name it under joints" for s in sorted(held)]
+        return Comparison(
+            twin=name or self.name,
+            effects=self.effects,
+            traces=tuple(traces),
+            split=measurements.record(),
+            clock=clock,
+            left_out=tuple(left_out),
+        )
+
+    def diagnose(
+        self,
+        part: str,
+        measurements: Measurements,
+        *,
+        gains: GainsAre = "auto",
+        search: SearchConfig | None = None,
+        without: Sequence[str] = (),
+    ) -> Finding:
+        return diagnose_joint(self.robot, part, measurements, gains=gains, search=search, without=without)
+
+    # effects ---------------------------------------------------------------------------------------------------------
+
+    def effect(
+        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
+    ) -> Effect | None:
+        joint = self.robot.joint(part)
+        if joint.selectors(effects.get(name)) is None:
+            return None
+        return make_effect(name, **{key: value for key, value in values.items() if key not in ("arm", "joints")})
+
+    def with_additions(self, additions: Sequence[Addition]) -> "RobotMachine":
+        robot = self.robot
+        for a in additions:
+            config = robot.config.joints[a.part]
+            numbers = {key: float(a.base[key]) for key in ("kp", "kd", "torque_ff") if key in a.base}
+            new = list(a.effects)
+            if "position_age_s" in a.base:
+                numbers["position_age_s"] = config.position_age_s + float(a.base["position_age_s"])
+            if "speed_delay_s" in a.base:
+                sure = a.intervals["speed_delay_s"][0] > 0.0
+                new.append(make_effect("speed_delay", delay_s=float(a.base["speed_delay_s"]) * sure))
+            names = {e.name for e in new}
+            kept = [e for e in config.effects if e.name not in names]
+            effects_ = [*kept, *(e for e in new if not e.is_absent)]
+            robot = robot.with_joint(a.part, dataclasses.replace(config, **numbers, effects=effects_))
+        return dataclasses.replace(self, robot=robot)
+
+    def _whole(self, m: Measurement) -> Measurement:
+        return self.robot.joint(next(iter(self.robot.config.joints))).whole(m)
