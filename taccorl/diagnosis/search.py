@@ -8,7 +8,8 @@
           parameters explain (BIC), and if it was not fitted to nothing. The best of those is added. Those that do as
           well are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else;
        d. if none is accepted, the search ends with "something else".
-    3. Effects that others have made superfluous go; each is tried against its ties once more, now that the others are in. An
+    3. Where that ends above the floor, it is done again from the ties of the first effect. Effects that others have made
+       superfluous go; each is tried against its ties once more, now that the others are in. An
        effect that contains a simpler one (Stribeck contains Coulomb friction) must do better than the simpler one and another.
     4. The test recordings, which no choice has seen, give the final figures.
 
@@ -30,6 +31,8 @@ from taccorl.diagnosis.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
 
 Status = Literal["nothing_missing", "gains_moved", "at_floor", "something_else", "too_many", "not_converged"]
+MOST_TIES = 3
+"""Of one round, from which the search is done again where it ended above the floor."""
 BESIDE = (0.9, 0.97, 1.03, 1.1)
 """Factors to an effect's numbers from which it is fitted once more."""
 GAINS_MOVED = 2.0
@@ -73,6 +76,9 @@ class SearchConfig:
     """up to this share, those whose blocks do not differ by ``min_score``."""
     simpler: float = 1.1
     """Of ties the one with the fewest parameters is taken if what it leaves, squared, is at most so many times the least."""
+    from_tie: float = 0.25
+    """Where the search ended above the floor, a search from a tie of an added effect replaces it if what that leaves, squared, is
+    below this share: half of the error."""
     max_effects: int = 4
     num_refitted: int = 12
     """Effects that are refitted after the screening: the true one was among the first 12 in every case (research §4.4)."""
@@ -242,6 +248,7 @@ class _Search:
         self.problem.learn(first.values)
         names = [name for name in self.problem.candidates if name not in without]
         model, rounds = self._search(first, names, c.max_effects)
+        model, rounds = self._from_ties(model, rounds, names)
         model, rounds, contained = self._with_simpler(model, rounds, names)
         steps = [("", self.error(first)), *((r.added, r.validation_error) for r in rounds if r.added)]
         model = self._without_superfluous(model)
@@ -418,6 +425,37 @@ class _Search:
         )
 
     # are they all needed, and are they the right ones? ---------------------------------------------------------------
+
+    def _from_ties(self, model: Fit, rounds: list[Round], names: Sequence[str]) -> tuple[Fit, list[Round]]:
+        """What is found from a tie of the first added effect that has any, if the search ended above the floor.
+
+        Effects that explain as much alone need not do so together with what else is missing. Of a sensor with creep and a voltage
+        divider, logarithmic creep explained as much as creep; beside it, only hysteresis was accepted.
+        """
+        k = next((k for k, r in enumerate(rounds) if r.added and r.ties), None)
+        if self._at_floor(model) or k is None or k + 1 >= self.config.max_effects:
+            return model, rounds
+        before = tuple(n for r in rounds[:k] if (n := r.added))
+        here = above_floor(block_squares(self.problem, model, self.validation))
+        for tie in rounds[k].ties[:MOST_TIES]:
+            self.progress(f"looking for more with {tie} in place of {rounds[k].added}")
+            ended = [e for e in rounds[k].evidence if e.name == tie]
+            parent = self._fitted((*self.present, *before, tie), [e.base | e.values for e in ended], self.config.steps)
+            other, more = self._search(parent, names, self.config.max_effects - k - 1)
+            there = above_floor(block_squares(self.problem, other, self.validation))
+            if there < self.config.from_tie * here:
+                retold = self._taken_instead(rounds[k], tie, parent)
+                return other, [*rounds[:k], retold, *more]
+        return model, rounds
+
+    def _taken_instead(self, found: Round, tie: str, model: Fit) -> Round:
+        """The round with one of its ties added."""
+        ties = tuple(found.added if name == tie else name for name in found.ties if found.added)
+        verdicts = {tie: "added"} | dict.fromkeys(ties, f"tied with {tie}")
+        evidence = tuple(dataclasses.replace(e, verdict=verdicts.get(e.name, e.verdict)) for e in found.evidence)
+        return dataclasses.replace(
+            found, evidence=evidence, added=tie, ties=ties, validation_error=self.error(model), fit_error=model.error
+        )
 
     def _without_superfluous(self, model: Fit) -> Fit:
         """Effects that would not be accepted if they were to be added now go again."""

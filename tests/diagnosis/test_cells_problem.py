@@ -9,9 +9,11 @@ import pytest
 from taccorl.alignment.cell_model import Calibration, calibrated, readings, responses, thinned, within_ends
 from taccorl.alignment.cell_tables import CellMeasurement
 from taccorl.alignment.cells import CellsConfig, Load, Reading, make_cells_effect
+from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.cells_problem import CellsProblem, reading_floor
 from taccorl.diagnosis.machines.cells import CellsMachine
-from taccorl.diagnosis.search import Diagnosis, diagnose
+from taccorl.diagnosis.problem import split_rows
+from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
 from taccorl.diagnosis.surrogate.cells import HIDDEN, CellsCase, draw_cells, record, simulated
 
 RATE_HZ = 100.0
@@ -25,12 +27,14 @@ def config(**changes) -> CellsConfig:
     )
 
 
-def press(load_n: np.ndarray, reading: np.ndarray | None = None, cells: int = 1, **changes) -> CellMeasurement:
+def press(
+    load_n: np.ndarray, reading: np.ndarray | None = None, cells: int = 1, name: str = "press", **changes
+) -> CellMeasurement:
     """A recording at 100 Hz of a load (T,) that all cells bear."""
     load = np.repeat(np.asarray(load_n, float)[:, None], cells, axis=1)
     names = ("thumb",) if cells == 1 else tuple(f"r{i}c{j}" for i, j in itertools.product(range(2), range(cells // 2)))
     return CellMeasurement(
-        name="press",
+        name=name,
         time_s=np.arange(len(load)) / RATE_HZ,
         target=load,
         measured=np.zeros_like(load) if reading is None else np.asarray(reading, float).reshape(load.shape),
@@ -188,3 +192,38 @@ def test_the_machine_keeps_gain_and_offset_of_the_refit_and_its_comparison_falls
     for one, other in zip(before, after, strict=True):
         assert one.ratio > 2.5
         assert other.ratio < 1.2
+
+
+def test_creep_with_a_voltage_divider_is_found_although_logarithmic_creep_explains_as_much_alone():
+    rng = np.random.default_rng(3)
+    share, time_constant_s, half_n = 0.25, 1.5, 12.0
+
+    def one(peak_n: float, name: str) -> CellMeasurement:
+        t = np.arange(3000) / RATE_HZ
+        load = np.where(t > 2, np.maximum(peak_n * np.sin(2 * np.pi * t / 7), 0), 0)
+        load[(t > 15) & (t < 22)] = 6.0
+        crept, creep = np.zeros_like(t), 0.0
+        for k, force in enumerate(load):  # explicit Euler at 100 Hz
+            creep += (share * force - creep) / RATE_HZ / time_constant_s
+            crept[k] = force + creep
+        counts = np.round(20 + 1000 * crept / (crept + half_n) + rng.normal(0, 1, len(t)))
+        return press(load + rng.normal(0, 0.02, len(t)), counts, name=name)
+
+    sensor = config(load=Load(unit="N", rated=10.0))  # 1 in the unit reading is 1 N
+    recorded = tuple(one(peak, f"press {peak}") for peak in (4.0, 5.0, 6.0, 7.0))
+    problem = CellsProblem(sensor, Measurements(fit=recorded, validation=(), test=()))
+    sides = split_rows(problem.fit)
+    alone = diagnose(problem, *sides, start=problem.start, config=SearchConfig(from_tie=0.0))
+    assert alone.status == "something_else" and "taxel_saturation" not in alone.names
+    result = diagnose(problem, *sides, start=problem.start)
+    assert result.status == "at_floor"
+    assert set(result.names) == {"taxel_creep", "taxel_saturation"}
+    numbers = {f"{e.name}.{p.name}": getattr(e, p.name) for e in result.effects for p in e.parameters()}
+    assert numbers["taxel_creep.share"] == pytest.approx(share, rel=0.03)
+    assert numbers["taxel_creep.time_constant_s"] == pytest.approx(time_constant_s, rel=0.05)
+    assert numbers["taxel_saturation.limit"] == pytest.approx(half_n, rel=0.03)
+    first = result.rounds[0]
+    verdicts = {e.name: e.verdict for e in first.evidence}
+    assert first.added == alone.rounds[0].ties[0] == "taxel_creep"
+    assert first.ties == (alone.rounds[0].added,) == ("taxel_log_creep",)
+    assert verdicts["taxel_creep"] == "added" and verdicts["taxel_log_creep"] == "tied with taxel_creep"
