@@ -2,7 +2,8 @@
 
 Recordings of a robot that is not there, with effects hidden in it that the seed draws, for ``taccorl compare`` and ``diagnose``.
 It is a simulation of its own, apart from the twin: other equations, finer steps, friction of bristles, a sampled controller.
-With --pads its fingers press known objects, and what is hidden is in the pads.
+With --pads its fingers press known objects, and what is hidden is in the pads. With --cells=true it is a sensor of force cells,
+simulated, for a cells file (``taxel.yaml``).
 What is hidden lies in a sealed file; ``taccorl surrogate --reveal=outputs/surrogate_7`` prints it.
 """
 
@@ -28,6 +29,8 @@ class SurrogateConfig:
     """What is hidden, instead of what the seed draws; [] for nothing."""
     pads: Literal["no", "left", "right", "drawn"] = "no"
     """Presses of known objects by the pads of this arm, instead of sweeps of a joint; ``drawn``: of either."""
+    cells: bool = False
+    """Presses of a sensor of force cells, instead of a robot."""
     signal: str | None = None
     """Joint under test, as left_joint5; drawn if not given."""
     strength: float | None = None
@@ -53,10 +56,32 @@ def main(argv: list[str]) -> int:
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
     if not is_free(out):
         raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
+    if config.cells:
+        return _cells(config, config.secret, out)
     made = _sweeps(config, config.secret, out) if config.pads == "no" else _presses(config, config.secret, out)
     print(f"{made} in {out / SWEEPS}: a simulated robot, not a real one")
     print(f"next: taccorl compare --twin={out / TWIN} --measurements={out / SWEEPS}")
     print(f"then: taccorl diagnose --twin={out / TWIN} --measurements={out / SWEEPS}")
+    print(f"last: taccorl surrogate --reveal={out}")
+    return 0
+
+
+def _cells(config: SurrogateConfig, secret: int, out: Path) -> int:
+    from taccorl.diagnosis.surrogate.cells import HIDDEN, PRESSES, SENSOR, draw_cells, write_cells
+
+    plain = SurrogateConfig()
+    others = [
+        n for n in ("pads", "signal", "strength", "gains_known", "design") if getattr(config, n) != getattr(plain, n)
+    ]
+    if others:
+        raise TaccorlError(f"--{others[0]} is of robots; leave it out with --cells=true")
+    hidden = [list(HIDDEN)[secret % len(HIDDEN)]] if config.effects is None else config.effects
+    if len(hidden) > 1:
+        raise TaccorlError(f"--effects: {len(hidden)} effects; a simulated sensor of cells hides one or none")
+    count = write_cells(draw_cells("".join(hidden), secret), out)
+    print(f"{count} recordings of a sensor of cells in {out / PRESSES}: simulated, not a real one")
+    print(f"next: taccorl compare {out / PRESSES} --twin={out / SENSOR}")
+    print(f"then: taccorl diagnose {out / PRESSES} --twin={out / SENSOR}")
     print(f"last: taccorl surrogate --reveal={out}")
     return 0
 

@@ -7,6 +7,7 @@ from multiprocessing import get_context
 from statistics import median
 
 from taccorl.benchmark import Row, against_reference, benchmark, spread
+from taccorl.diagnosis.cells_study import ASKED, FIRST_SEED, run_cells
 from taccorl.diagnosis.study import Job, run, run_touch
 from taccorl.diagnosis.surrogate.cases import draw_case
 from taccorl.diagnosis.surrogate.recordings import recordings
@@ -49,6 +50,37 @@ def diagnosis() -> Iterator[Row]:
         "one arm's pads, four fit and two validation recordings, 13 candidates, surrogate",
         [float(run_touch(job)["cpu_s"]) for job in pads],
         goal="≤ 3.3e6",
+    )
+
+
+@benchmark("cells")
+def cells() -> Iterator[Row]:
+    """Sensors of cells with one of eight hidden effects, and clean ones; all simulated (``python -m pipelines.cells_study``)."""
+    run_cells("", FIRST_SEED - 1)
+    rows = [run_cells(name, FIRST_SEED + k) for name in ASKED for k in range(5)]
+    seen = [r for r in rows if r.material]
+    clean = [run_cells("", FIRST_SEED + 100 + k) for k in range(20)]
+    exact, silent = sum(r.exact for r in seen) / len(seen), sum(r.exact for r in clean) / len(clean)
+    yield Row(
+        name="hidden effect of a force cell: exact, simulated",
+        value=exact,
+        unit="1",
+        goal="≥ 0.85",
+        n=len(seen),
+        spread=0.0,
+    )
+    yield Row(
+        name="nothing hidden in a force cell: silent, simulated",
+        value=silent,
+        unit="1",
+        goal="≥ 0.98",
+        n=20,
+        spread=0.0,
+    )
+    yield against_reference(
+        "one force cell, six recordings at 100 Hz, 10 candidates, simulated",
+        [r.cpu_s for r in rows],
+        goal="≤ 1,500,000",
     )
 
 

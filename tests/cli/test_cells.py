@@ -23,8 +23,8 @@ LOAD_N = np.interp(T_S, [0, 3, 4, 8, 9, 12, 13, 16, 17, 20], [0, 0, 10, 10, 0, 0
 @pytest.fixture(scope="module")
 def creeping(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recordings of a simulated cell that creeps, and ``taxel.yaml``, which does not know it."""
-    folder = tmp_path_factory.mktemp("cells")
-    write_cells(draw_cells("taxel_creep", 11), folder / "presses")
+    folder = tmp_path_factory.mktemp("cells") / "simulated"
+    write_cells(draw_cells("taxel_creep", 11), folder)
     return folder
 
 
@@ -73,6 +73,18 @@ def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping: Path, said
     before, after = ({s["use"]: s["ratio"] for s in report[key]} for key in ("scores", "scores_after"))
     for use in ("fit", "validation", "test"):
         assert before[use] > 2.5 and after[use] < 1.2, (use, before, after)
+
+
+def test_a_simulated_sensor_is_written_with_its_truth_sealed(tmp_path: Path, said) -> None:
+    code, shown = said("surrogate", "--secret=3", "--cells=true", "--effects=[taxel_threshold]", "--out=made")
+    assert code == 0
+    assert "simulated, not a real one" in shown
+    assert "taxel_threshold" not in (tmp_path / "made" / "sealed_truth.json").read_text()
+    assert "taxel_threshold" in said("surrogate", "--reveal=made")[1]
+    assert load_cells(tmp_path / "made" / "taxel.yaml").names == ("thumb",)
+    assert said("compare", "made/presses", "--twin=made/taxel.yaml")[0] == 0
+    assert "no hidden effect 'creep'" in said("surrogate", "--secret=3", "--cells=true", "--effects=[creep]")[1]
+    assert "--pads is of robots" in said("surrogate", "--secret=3", "--cells=true", "--pads=left")[1]
 
 
 def test_an_effect_can_be_added_by_hand_and_a_wrong_one_is_refused(tmp_path: Path, said) -> None:

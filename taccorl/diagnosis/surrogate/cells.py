@@ -20,10 +20,13 @@ import numpy as np
 
 from taccorl.alignment.cell_tables import CellMeasurement
 from taccorl.alignment.cells import CellsConfig, Load, Reading, save_cells
-from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.measurements import INDEX, Measurements
 from taccorl.diagnosis.surrogate.touch_hidden import MILLISECOND, Values, material, spread
+from taccorl.diagnosis.surrogate.writing import seal
+from taccorl.errors import TaccorlError, nearest
 
 ORIGIN = "simulated force cells"
+PRESSES, SENSOR = "presses", "taxel.yaml"
 RATE_HZ = 100.0
 RATED_N = 20.0
 HIGHEST_COUNT = 1023
@@ -31,7 +34,7 @@ LOAD_NOISE = 5e-4
 """Share of the rated load: the noise of the load cell."""
 HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
     "taxel_saturation": lambda rng: {"limit": _between(rng, 8, 60)},
-    "taxel_power_law": lambda rng: {"exponent": _between(rng, 1.1, 1.6) ** rng.choice([-1.0, 1.0])},
+    "taxel_power_law": lambda rng: {"exponent": float(_between(rng, 1.1, 1.6) ** rng.choice([-1.0, 1.0]))},
     "taxel_threshold": lambda rng: {"threshold": _between(rng, 0.15, 1.0)},
     "taxel_hysteresis": lambda rng: {"half_width": _between(rng, 0.02, 0.15)},
     "taxel_creep": lambda rng: {
@@ -109,7 +112,13 @@ class CellsCase:
 
 
 def draw_cells(hidden: str, seed: int) -> CellsCase:
-    """A sensor with ``hidden`` in it (empty: with nothing); a grid of 3 × 4 cells where only neighbours show it."""
+    """A sensor with ``hidden`` in it (empty: with nothing); a grid of 3 × 4 cells where only neighbours show it.
+
+    Raises:
+        TaccorlError: nothing of that name can be hidden.
+    """
+    if hidden and hidden not in HIDDEN:
+        raise TaccorlError(f"simulated cells: no hidden effect {hidden!r}; {nearest(hidden, HIDDEN)}")
     rng = np.random.default_rng([seed, 77])
     shape = (3, 4) if hidden in OF_GRIDS else (1, 1)
     return CellsCase(seed=seed, shape=shape, hidden=hidden, values=HIDDEN[hidden](rng) if hidden else {})
@@ -169,20 +178,27 @@ def record(case: CellsCase, name: str) -> CellMeasurement:
     return dataclasses.replace(even, temperature_c=np.interp(even.time_s, measured.time_s, measured.temperature_c))
 
 
-def write_cells(case: CellsCase, folder: Path) -> None:
-    """The recordings as CSV files with ``measurements.yaml`` and ``columns.yaml``, and beside the folder the sensor as its user
-    knows it, ``taxel.yaml``.
+def write_cells(case: CellsCase, folder: Path) -> int:
+    """Write a sensor as files, and what is hidden sealed beside them, as ``taccorl.diagnosis.surrogate.writing`` does robots.
+
+    FOLDER/presses/*.csv, measurements.yaml, columns.yaml    for ``taccorl compare`` and ``diagnose``
+    FOLDER/taxel.yaml                                        the sensor as its user knows it
+
+    Returns:
+        How many recordings there are.
 
     Raises:
         FileExistsError: the folder is there already.
     """
     config = case.config()
+    presses = folder / PRESSES
     folder.mkdir(parents=True)
+    presses.mkdir()
     load = ["force_n"] if config.load.shared else [f"{name}.force_n" for name in config.names]
     for name in RECORDINGS:
         m = record(case, name)
         columns = [m.time_s, *m.target.T[: len(load)], *m.measured.T, m.temperature_c]
-        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+        with (presses / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(["t", *load, *(f"{cell}.reading" for cell in config.names), "temperature_c"])
             writer.writerows([[f"{x:.6g}" for x in row] for row in zip(*columns, strict=True)])
@@ -194,10 +210,12 @@ def write_cells(case: CellsCase, folder: Path) -> None:
     for cell in config.names:
         own = "" if config.load.shared else f", load: {{column: {cell}.force_n, unit: N}}"
         columns.append(f"  {cell}: {{reading: {{column: {cell}.reading, unit: count}}{own}}}")
-    (folder / "columns.yaml").write_text("\n".join(columns) + "\n", encoding="utf-8")
+    (presses / "columns.yaml").write_text("\n".join(columns) + "\n", encoding="utf-8")
     text = ["columns: columns.yaml", "recordings:", *uses]
-    (folder / "measurements.yaml").write_text("\n".join(text) + "\n", encoding="utf-8")
-    save_cells(config, folder.parent / "taxel.yaml")
+    (presses / INDEX).write_text("\n".join(text) + "\n", encoding="utf-8")
+    save_cells(config, folder / SENSOR)
+    seal(folder, {"data": ORIGIN, "seed": case.seed, "hidden": case.hidden, "values": case.values})
+    return len(RECORDINGS)
 
 
 def _hidden(case: CellsCase, pressed: np.ndarray, time_s: np.ndarray, warm_k: np.ndarray) -> np.ndarray:
