@@ -28,8 +28,8 @@ from taccorl.data.finding import Finding
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
 
-EVEN, LONGEST_GAP_S = 0.1, 0.25
-"""Steps within this share of the period are even; a gap longer than that is not bridged."""
+EVEN, LONGEST_GAP_S, LONGEST_GAP_ROWS = 0.1, 0.25, 5
+"""Steps within this share of the period are even; a gap longer than that, and than so many periods, is not bridged."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,13 +211,13 @@ def _even(m: CellMeasurement) -> CellMeasurement:
     """At even times, by straight lines between rows.
 
     Raises:
-        RecordingError: a gap of more than ``LONGEST_GAP_S``.
+        RecordingError: a gap of more than ``LONGEST_GAP_S`` and ``LONGEST_GAP_ROWS``.
     """
     steps, period = np.diff(m.time_s), m.period_s
     if (np.abs(steps - period) < EVEN * period).all():
         return m
     gap = int(np.argmax(steps))
-    if steps[gap] > max(LONGEST_GAP_S, 1.5 * period):
+    if steps[gap] > max(LONGEST_GAP_S, LONGEST_GAP_ROWS * period):
         raise RecordingError(
             f"{m.source}: no row for {steps[gap]:.2f} s after {m.time_s[gap]:.2f} s; cut the table there into two files"
         )

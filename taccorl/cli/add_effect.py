@@ -27,7 +27,7 @@ class AddEffectConfig:
     effect: str
     """Name of the effect; docs/effects.md lists them."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file with kind: axis. The PiPER's nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """left_joint5; joint5 or J4 (the paper's name of it) for both arms. All that were diagnosed with it if not given."""
     pads: list[str] = field(default_factory=list)

@@ -51,7 +51,7 @@ class CompareConfig:
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file with kind: axis. The PiPER's nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     against: Path | None = None
     """Another such file, shown beside the first."""
     joints: list[str] = field(default_factory=list)

@@ -43,7 +43,7 @@ class DiagnoseConfig:
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file with kind: axis. The PiPER's nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """Only these: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If neither joints
     nor pads are given, all that are swept and all that press something known."""

@@ -167,10 +167,7 @@ def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) 
     """(K,) noise floor of each cell in the unit of the reading: its own noise and, times its gain, that of the load; where a
     press was repeated, at least what the cell does not repeat under the same load."""
     step = np.max([m.quantum for m in measurements], axis=0) / math.sqrt(12)
-    own, load = (
-        np.nan_to_num(residue_floor([(getattr(m, kind), m.rate_hz) for m in measurements]))
-        for kind in ("measured", "target")
-    )
+    own, load = (_own_noise([(getattr(m, kind), m.rate_hz) for m in measurements]) for kind in ("measured", "target"))
     gain = np.abs(calibrated(config, [(m.target, m.measured) for m in measurements]).gain)
     floor = np.hypot(np.maximum(own, step), gain * load)
     squares, rows = np.zeros(len(floor)), np.zeros(len(floor))
@@ -192,3 +189,14 @@ def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) 
     repeated = np.sqrt(squares / np.maximum(rows, 1))
     spread = np.array([np.nanstd(np.concatenate([m.measured[:, k] for m in measurements])) for k in range(len(floor))])
     return np.maximum(np.maximum(floor, repeated), 1e-6 * spread + 1e-12)
+
+
+def _own_noise(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+    """(K,) noise of each column by ``residue_floor``; where recordings are too short for it, from second differences of rows,
+    whose variance is 6 times the noise's."""
+    noise = residue_floor(channels)
+    for k in np.flatnonzero(~np.isfinite(noise)):
+        second = np.concatenate([np.diff(values[:, k], n=2) for values, _ in channels])
+        second = np.abs(second[np.isfinite(second)])
+        noise[k] = 1.4826 * np.median(second) / math.sqrt(6) if len(second) else 0.0
+    return noise

@@ -125,6 +125,13 @@ def test_the_noise_floor_is_that_of_reading_and_load_together():
     assert floor[0] == pytest.approx(np.hypot(2.0, 20.0 * 0.05), rel=0.08)
 
 
+def test_recordings_of_a_second_have_a_noise_floor_too():
+    rng = np.random.default_rng(4)
+    load = np.interp(np.arange(20) / RATE_HZ, [0, 0.05, 0.1, 0.2], [0, 0, 10, 10])
+    short = [press(load, 20.0 * load + rng.normal(0, 2.0, 20)) for _ in range(40)]
+    assert reading_floor(config(), short)[0] == pytest.approx(2.0, rel=0.25)
+
+
 def test_nothing_is_found_in_a_clean_sensor_and_its_gain_and_offset_are_those_that_were_set():
     case, d = found("", 7)
     assert d.status == "nothing_missing"
