@@ -160,6 +160,30 @@ def test_every_hidden_effect_is_found_in_one_sensor(hidden):
     assert d.names[:1] == (hidden,)
 
 
+def test_a_divider_whose_reading_falls_is_the_saturation_law_with_a_negative_gain():
+    """y = 5 V R / (R + R_s) of a cell with R = R_0 / (1 + F / F_0) falls as 1 / (1 + F / F_s): F_s = F_0 (1 + R_0 / R_s)."""
+    case = draw_cells("", 15)
+    resistance, series, f0_n = 30.0, 10.0, 4.0
+    falling = Reading(unit="V", lowest=0.0, highest=5.0, falls=True)
+
+    def divided(m: CellMeasurement, seed: int) -> CellMeasurement:
+        cell = resistance / (1 + np.maximum(m.target, 0) / f0_n)
+        volts = 5.0 * cell / (cell + series) + np.random.default_rng(seed).normal(0, 0.003, m.target.shape)
+        return dataclasses.replace(m, measured=volts, units=("V",), quantum=np.zeros(1), repeat_of=None)
+
+    made = simulated(case)
+    sides = [
+        tuple(divided(m, 10 * k + n) for n, m in enumerate(side)) for k, side in enumerate((made.fit, made.validation))
+    ]
+    measurements = dataclasses.replace(made, fit=sides[0], validation=sides[1], test=())
+    problem = CellsProblem(dataclasses.replace(case.config(), reading=falling), measurements)
+    d = diagnose(problem, problem.fit, problem.validation, (), start=problem.start)
+    assert d.names == ("taxel_saturation",)
+    limit_n = 2.0 * d.effects[0].limit  # pyright: ignore[reportAttributeAccessIssue]
+    assert limit_n == pytest.approx(f0_n * (1 + resistance / series), rel=0.03)
+    assert problem.file_numbers(d.effects)["gain_thumb"] < 0
+
+
 def test_an_effect_of_the_file_is_fitted_anew_and_stays():
     case = draw_cells("taxel_saturation", 13)
     rough = make_cells_effect("taxel_saturation", limit=1.3 * case.values["limit"])
