@@ -167,7 +167,7 @@ class Comparison:
 
     @property
     def signals(self) -> tuple[tuple[str, Kind], ...]:
-        """(signal, kind), positions first, in the order of actions."""
+        """(signal, kind), positions first, in the order of the PiPER's actions, or else as they come."""
         found: dict[tuple[str, Kind], None] = dict.fromkeys((t.signal, t.kind) for t in self.traces)
         return tuple(sorted(found, key=lambda s: (s[1] != "position", _order(s[0]))))
 
@@ -301,7 +301,7 @@ def shown(value: float, unit: str) -> str:
 
 
 def _order(signal: str) -> int:
-    return ROBOT.action_names.index(signal)
+    return ROBOT.action_names.index(signal) if signal in ROBOT.action_names else len(ROBOT.action_names)
 
 
 def only(comparison: Comparison, signals: Iterable[str]) -> Comparison:

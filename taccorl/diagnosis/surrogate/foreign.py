@@ -9,6 +9,7 @@ Letters in shapes: T rows at 200 Hz, J joints.
 """
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.robot_file import Robot, load_robot
+from taccorl.errors import TaccorlError
 
 ORIGIN = "simulated robot (taccorl.diagnosis.surrogate.foreign)"
 RATE_HZ, LOOP_HZ, STEP_S = 200, 1000, 0.25e-3
@@ -90,8 +92,18 @@ _SCARA2 = (
     Link("scara_2", (0, 0, 1), (0.25, 0, 0), 2.5, 0.04, -0.6),
 )
 ROBOTS: Mapping[str, tuple[Link, ...]] = {"arm of 7 joints": _ARM7, "leg": _LEG3, "SCARA": _SCARA2}
+EXAMPLE = "arm of 6 joints"
+"""Of docs/your_robot.md."""
+_ARM6 = (
+    Link("shoulder_pan", (0, 0, 1), (0, 0, 0.12), 2.5, 0.10, 0.3),
+    Link("shoulder_lift", (0, 1, 0), (0.30, 0, 0.02), 2.8, 0.10, -0.5),
+    Link("elbow", (0, 1, 0), (0.28, 0, 0), 1.8, 0.06, 1.0),
+    Link("wrist_1", (0, 1, 0), (0, 0, 0.09), 0.7, 0.02, 0.4),
+    Link("wrist_2", (0, 0, 1), (0.08, 0, 0), 0.6, 0.02, -0.3),
+    Link("wrist_3", (1, 0, 0), (0.10, 0, 0), 0.6, 0.01, 0.0),
+)
 MOVE_TOGETHER = ("leg",)
-CARRIES_WEIGHT = ("arm of 7 joints",)
+CARRIES_WEIGHT = ("arm of 7 joints", EXAMPLE)
 
 
 def mjcf(links: Sequence[Link], gear: Mapping[str, str] = {}) -> str:
@@ -140,7 +152,7 @@ class Case:
 
     @property
     def links(self) -> tuple[Link, ...]:
-        return ROBOTS[self.robot]
+        return _ARM6 if self.robot == EXAMPLE else ROBOTS[self.robot]
 
     @property
     def name(self) -> str:
@@ -388,3 +400,54 @@ def _weight(model: mujoco.MjModel, data: mujoco.MjData, angles: np.ndarray) -> n
     mujoco.mj_fwdPosition(model, data)
     mujoco.mj_fwdVelocity(model, data)
     return data.qfrc_bias.copy()
+
+
+# the example -----------------------------------------------------------------------------------------------------------
+
+
+def write_example(folder: Path) -> Plant:
+    """An arm of six joints as its user has it: ``arm.xml``, and ``sweeps/`` of its elbow as tables. Dry friction is hidden.
+
+    Raises:
+        TaccorlError: the folder is there already.
+    """
+    case = Case(robot=EXAMPLE, joint="elbow", hidden="coulomb_friction", strength=0.02, seed=6, effort=True)
+    plant = Plant(case)
+    if folder.exists():
+        raise TaccorlError(f"{folder}: is there already; name a new folder")
+    (folder / "sweeps").mkdir(parents=True)
+    (folder / "SIMULATED.txt").write_text(
+        f"Everything here is simulated: {ORIGIN}. No robot was near.\n", encoding="utf-8"
+    )
+    (folder / "arm.xml").write_text(mjcf(case.links), encoding="utf-8")
+    made = recordings(plant)
+    lines = ["recordings:"]
+    for use, side in (("fit", made.fit), ("validation", made.validation)):
+        for m in side:
+            lines.append(f"  {m.name}.csv: {{use: {use}{f', repeat_of: {m.repeat_of}.csv' * bool(m.repeat_of)}}}")
+            keys = {"q": m.measured, "q_target": m.target, "tau": m.effort}
+            header = ["t", *(f"{name}.{key}" for name in m.signals for key in keys)]
+            rows = [m.time_s, *(values[:, j] for j in range(len(m.signals)) for values in keys.values())]
+            np.savetxt(
+                folder / "sweeps" / f"{m.name}.csv",
+                np.column_stack(rows),
+                fmt="%.7g",
+                delimiter=",",
+                header=",".join(header),
+                comments="",
+            )
+    (folder / "sweeps" / "measurements.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return plant
+
+
+def main(argv: Sequence[str]) -> int:
+    """``python -m taccorl.diagnosis.surrogate.foreign my_arm``: writes the example, and prints the gains of its drives."""
+    plant = write_example(Path(argv[0]))
+    print(f"wrote {argv[0]}: arm.xml and sweeps/ of its elbow; simulated, no robot was near. Its drives run:")
+    for link, kp, kd in zip(plant.case.links, plant.kp, plant.kd, strict=True):
+        print(f"  {link.joint}: kp: {kp}, kd: {kd}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
