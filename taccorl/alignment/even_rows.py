@@ -52,6 +52,8 @@ def even_rows(m: Measurement) -> Measurement:
     grid = start_s + np.arange(round((m.time_s[-1] - start_s) / period) + 1) * period
     columns = {name: _between(grid, m.time_s, getattr(m, name), period) for name in ("measured", "velocity", "effort")}
     target = _commands(grid, m.time_s, m.target, period)
+    if m.load.size:
+        columns["load"] = _commands(grid, m.time_s, m.load, period)
     masked = int((~np.isfinite(columns["measured"]).any(axis=1)).sum())
     where = ""
     if gaps.any():

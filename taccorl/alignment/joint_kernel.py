@@ -36,6 +36,10 @@ _mixed = numba.njit(dropped_commands.mixed)
 _STRIDE = dropped_commands.STRIDE
 
 
+POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
+"""What a command is."""
+
+
 class Drive(NamedTuple):
     """One joint with its drive: numbers in SI, N·m and rad (of a sliding axis N and m). The defaults do nothing."""
 
@@ -107,6 +111,12 @@ class Drive(NamedTuple):
     torque_scale: float = 1.0
     fade_rate: float = 0.0
     """1/s: torque × (1 − rate · t)."""
+    command: float = POSITION
+    """What a command is: a position, a velocity (τ = K_d (q̇* − q̇) + T_ref) or a torque (τ = τ* + T_ref)."""
+    duty_torque: float = math.inf
+    """Torque of the whole supply voltage at rest, V k_t / R: what the controller asks for is clipped to it …"""
+    back_emf: float = 0.0
+    """… before k_t k_e / R times the speed is lost."""
     # Gear.
     backlash: float = 0.0
     """Whole play."""
@@ -178,6 +188,10 @@ def _limit(p: Drive, torque: float, v: float) -> float:
 def _asked(p: Drive, command: float, before: float, q: float, v: float, integral: float) -> tuple[float, float, float]:
     """The controller's torque, and how far it counts as a spring and a damper. ``before`` is the command until now: whether the
     error lies within the dead band is known from it."""
+    if p.command == TORQUE:
+        return command + p.torque_ff, 0.0, 0.0
+    if p.command == VELOCITY:
+        return p.kd * (command - v) + p.torque_ff, 0.0, p.kd
     seen = q + p.encoder_bias
     slope = p.encoder_scale * (1.0 + p.encoder_wave * math.cos(seen + p.encoder_wave_phase))
     angle = p.encoder_scale * (seen + p.encoder_wave * math.sin(seen + p.encoder_wave_phase))
@@ -188,7 +202,12 @@ def _asked(p: Drive, command: float, before: float, q: float, v: float, integral
             error, stiffness = 0.0, 0.0
         else:
             error -= math.copysign(p.deadband, before - angle)
-    return p.kp * (error + p.integral_rate * integral) - damping * v + p.torque_ff, stiffness, damping
+    asked = p.kp * (error + p.integral_rate * integral) - damping * v + p.torque_ff
+    if abs(asked) > p.duty_torque:
+        asked, stiffness, damping = math.copysign(p.duty_torque, asked), 0.0, 0.0
+    if p.back_emf != 0.0:
+        asked, damping = asked - p.back_emf * v, damping + p.back_emf
+    return asked, stiffness, damping
 
 
 @numba.njit(cache=True)

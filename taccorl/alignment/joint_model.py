@@ -125,7 +125,9 @@ class JointModel:
         speed_late_s = self.joint.speed_delay_s + early_s
         drives = [(effect.name, effect.drive()) for effect in present]
         timing = [("the drive", {"speed_delay": speed_late_s})] if speed_late_s > 0.0 else []
-        numbers = _combined([*timing, *((name, drive) for name, drive in drives if drive is not None)])
+        of_effects = [(name, drive) for name, drive in drives if drive is not None]
+        facts = {k: v for k, v in self.joint.facts.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
+        numbers = _combined([*timing, ("the drive", facts), *of_effects])
         if numbers is None or any(drive is None for _, drive in drives):
             return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]

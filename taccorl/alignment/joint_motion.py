@@ -13,6 +13,8 @@ from taccorl.alignment.rigid_joint import AT_TCP, Position, RigidJoint, Surround
 from taccorl.errors import TaccorlError
 from taccorl.sim.twin import TwinConfig
 
+_TARGET_COLUMNS = {"position": "q_target", "velocity": "qd_target", "torque": "tau_target"}
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointMotion:
@@ -68,6 +70,12 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
     target, measured = m.target[:, j].astype(float), m.measured[:, j].astype(float)
     if m.num_rows < 10:
         raise TaccorlError(f"{m.name}: {m.num_rows} rows are too short for a motion of {signal}; record some seconds")
+    wanted = "position" if joint is None else joint.target_kind
+    if m.target_kind(signal) != wanted:
+        raise TaccorlError(
+            f"{m.name}: {signal} is commanded by {m.target_kind(signal)}, its law takes a {wanted}; mend the law in its file, or "
+            f"give the column {_TARGET_COLUMNS[wanted]}"
+        )
     if not np.isfinite(target).all():
         row = int(np.flatnonzero(~np.isfinite(target))[0])
         raise TaccorlError(f"{m.name}: {signal} has no target at {m.time_s[row]:.3f} s; cut the recording there")

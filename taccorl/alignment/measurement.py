@@ -10,7 +10,7 @@ Letters in shapes: T rows, J signals (of the robot: in the order of actions), N 
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -31,6 +31,7 @@ def unit_of(name: str) -> str:
     return "m" if name.endswith("gripper") else "rad"
 
 
+TargetKind = Literal["position", "velocity", "torque"]
 ROBOT_UNITS = tuple(unit_of(name) for name in ROBOT.action_names)
 
 
@@ -67,9 +68,13 @@ class Measurement:
     """(T, J) rad/s, m/s as the driver reports it; NaN where it does not."""
     effort: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) N·m, N as the driver reports it; NaN where it does not. PiPER firmware may report another scale."""
+    load: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) N·m, N: external torque that is known to push the joint, positive where it drives it forwards; empty if none is."""
     signals: tuple[str, ...] = ROBOT.action_names
     units: tuple[str, ...] = ROBOT_UNITS
     """Of positions, one per signal: rad or m."""
+    target_kinds: tuple[TargetKind, ...] = ()
+    """What ``target`` commands, one per signal; positions if not given."""
     quantum: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(J,) step between neighbouring encoder readings [rad, m], found before any interpolation; 0 where none shows."""
     touch: Touch | None = None
@@ -110,11 +115,16 @@ class Measurement:
                 object.__setattr__(self, name, np.full(shape, np.nan))
         if self.quantum.size == 0:
             object.__setattr__(self, "quantum", np.zeros(shape[1]))
-        for name in ("target", "measured", "velocity", "effort"):
+        for name in ("target", "measured", "velocity", "effort", *(["load"] if self.load.size else [])):
             found = getattr(self, name).shape
             if found != shape:
                 raise TaccorlError(f"measurement {self.name}: {name} is {found}, times and signals say {shape}")
-        if len(self.units) != shape[1] or self.quantum.shape != shape[1:] or len(set(self.signals)) != shape[1]:
+        if (
+            len(self.units) != shape[1]
+            or len(self.target_kinds) not in (0, shape[1])
+            or self.quantum.shape != shape[1:]
+            or len(set(self.signals)) != shape[1]
+        ):
             raise TaccorlError(f"measurement {self.name}: units, quantum and names do not fit signals {self.signals}")
         wrong = [u for u in self.units if u not in self.known_units]
         if wrong:
@@ -144,6 +154,14 @@ class Measurement:
             raise TaccorlError(f"{self.name} has no signal {signal!r}; {nearest(signal, self.signals)}")
         return self.signals.index(signal)
 
+    def target_kind(self, signal: str) -> TargetKind:
+        """What the target of a signal commands."""
+        return self.target_kinds[self.column(signal)] if self.target_kinds else "position"
+
+    def known_load(self, signal: str) -> np.ndarray:
+        """(T,) external torque on a signal; 0 where none is known."""
+        return self.load[:, self.column(signal)] if self.load.size else np.zeros(self.num_rows)
+
     def has_effort(self) -> np.ndarray:
         """(J,) bool: recorded, and not only zeros."""
         return np.isfinite(self.effort).any(axis=0) & (np.nan_to_num(self.effort) != 0).any(axis=0)
@@ -160,7 +178,7 @@ class Measurement:
         time_s = self.time_s[0] + np.arange(steps) / rate_hz
         columns = {
             name: np.column_stack([np.interp(time_s, self.time_s, c) for c in getattr(self, name).T])
-            for name in ("target", "measured", "velocity", "effort")
+            for name in ("target", "measured", "velocity", "effort", *(["load"] if self.load.size else []))
         }
         return dataclasses.replace(self, time_s=time_s, **columns)
 
@@ -178,6 +196,12 @@ class Measurement:
                 )
             if unit != unit_of(name):
                 raise TaccorlError(f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}")
+            if (kind := self.target_kind(name)) != "position":
+                raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
+            if self.known_load(name).any():
+                raise TaccorlError(
+                    f"{self.name}: {name} has a known load, which the robot's twin cannot take; remove the column"
+                )
         at = [ROBOT.action_names.index(name) for name in self.signals]
         arrays: dict[str, np.ndarray] = {
             name: np.full((self.num_rows, ROBOT.num_actions), np.nan) for name in ("measured", "velocity", "effort")
@@ -187,7 +211,15 @@ class Measurement:
             values[:, at] = getattr(self, name)
         quantum = np.zeros(ROBOT.num_actions)
         quantum[at] = self.quantum
-        return dataclasses.replace(self, **arrays, quantum=quantum, signals=ROBOT.action_names, units=ROBOT_UNITS)
+        return dataclasses.replace(
+            self,
+            **arrays,
+            quantum=quantum,
+            load=np.empty(0),
+            signals=ROBOT.action_names,
+            units=ROBOT_UNITS,
+            target_kinds=(),
+        )
 
 
 def other_arm(signal: str) -> str:

@@ -89,7 +89,7 @@ class RecordingNote:
     gain_scale: dict[str, float] = field(default_factory=dict)
     """Signal → factor of both gains over the other recordings', where no more than that is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
-    """Arm → mass held."""
+    """Arm, or an axis of its own file → mass held."""
     payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Arm → centre of mass of what is held, in link 6's frame (flange, z along the hand); the TCP, [0, 0, 0.168], by default."""
     effort_scale: dict[str, float] = field(default_factory=dict)
@@ -158,7 +158,7 @@ def read_measurements(
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
-    index = _load_index(folder)
+    index = _load_index(folder, ROBOT.arms if units is None else (*ROBOT.arms, *units))
     spec = spec if spec is not None or index.spec is None else _beside(folder, index.spec)
     columns = columns if columns is not None or index.columns is None else folder / index.columns
     table = table or _joint_tables(columns, units)
@@ -249,7 +249,7 @@ def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
     return roots
 
 
-def _load_index(folder: Path) -> MeasurementIndex:
+def _load_index(folder: Path, holders: Sequence[str]) -> MeasurementIndex:
     path = folder / INDEX
     if not path.is_file():
         return MeasurementIndex()
@@ -261,9 +261,11 @@ def _load_index(folder: Path) -> MeasurementIndex:
             if bad:
                 raise document.error(f"recordings/{name}/{key}/{bad}", f"{getattr(note, key)[bad]:g} is below 0")
         for key in ("payload_kg", "payload_position_m"):
-            arm = next((a for a in getattr(note, key) if a not in ROBOT.arms), None)
+            known = holders if key == "payload_kg" else ROBOT.arms
+            arm = next((a for a in getattr(note, key) if a not in known), None)
             if arm:
-                raise document.error(f"recordings/{name}/{key}/{arm}", f"no arm {arm!r}; left, right")
+                others = [h for h in known if h not in ROBOT.action_names]
+                raise document.error(f"recordings/{name}/{key}/{arm}", f"no arm {arm!r}; {', '.join(others)}")
         _check_payload_positions(document, f"recordings/{name}/payload_position_m", note)
         if note.pressed is not None:
             _check_pressed(document, f"recordings/{name}/pressed", note.pressed)

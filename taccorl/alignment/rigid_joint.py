@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import Effect
@@ -79,6 +79,10 @@ class RigidJoint(ABC):
     effort_holds_weight: ClassVar[bool] = False
     """Whether the reported effort holds the torque by which the controller carries the weight."""
 
+    target_kind: TargetKind = "position"
+    """What its controller takes as a target."""
+    facts: Mapping[str, float] = {}
+    """Numbers of ``joint_kernel.Drive`` that are known of the drive; those of effects are added or take their place."""
     torque_max: float = math.inf
     """N·m: a limit that is known."""
     position_age_s: float = 0.0

@@ -1,8 +1,9 @@
-"""Measurements from CSV and parquet files: one row an instant, one column a quantity.
+"""Measurements from CSV, parquet and MATLAB files: one row an instant, one column (of a .mat file: one variable) a quantity.
 
 Without a columns file the table speaks our own language: ``t`` [s], and for every signal ``left_joint5.q`` [rad, m],
-``left_joint5.q_target``, and where recorded ``left_joint5.qd`` [rad/s, m/s] and ``left_joint5.tau`` [N·m, N]. Other names and
-units are written down in a columns file; no unit is ever guessed::
+``left_joint5.q_target``, and where recorded ``left_joint5.qd`` [rad/s, m/s], ``left_joint5.tau`` [N·m, N] and
+``left_joint5.load`` [N·m, N], an external torque that is known to push the joint, positive forwards. Other names and units are
+written down in a columns file; no unit is ever guessed::
 
     time: {column: stamp, unit: ms}
     signals:
@@ -10,7 +11,7 @@ units are written down in a columns file; no unit is ever guessed::
         q:        {column: pos_5, unit: deg}
         q_target: {column: cmd_5, unit: deg}
         qd:       {column: speed_5, unit: rpm}
-        tau:      {column: torque_5, unit: Nmm}
+        tau:      {column: current_5, unit: Nm, factor: 0.000082}    # mA, 0.082 Nm/A; a factor of -1 mends a sign
 """
 
 import csv
@@ -22,15 +23,16 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import scipy.io
 
 from taccorl.alignment.even_rows import even_rows
-from taccorl.alignment.measurement import Measurement, unit_of
+from taccorl.alignment.measurement import Measurement, TargetKind, unit_of
 from taccorl.alignment.quantisation import find_quantum
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
 from taccorl.robots import ROBOT
 
-SUFFIXES = (".csv", ".parquet")
+SUFFIXES = (".csv", ".parquet", ".mat")
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
 
 _TURN, _DEG = 2 * math.pi, math.pi / 180
@@ -53,7 +55,11 @@ EFFORT = {"Nm": ("rad", 1.0), "N·m": ("rad", 1.0), "Ncm": ("rad", 1e-2), "Nmm":
 EFFORT |= {"kgcm": ("rad", 0.0980665), "N": ("m", 1.0), "kN": ("m", 1e3), "mN": ("m", 1e-3)}
 """Unit of an effort → the position's unit that it goes with, and the factor to N·m or N. Amperes are no effort: a torque
 constant is somebody's guess until it is written down as a column in N·m."""
-_CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT}
+_CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT, "load": EFFORT}
+_CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
+TARGETS = ("q_target", "qd_target", "tau_target")
+"""Exactly one of them commands a signal."""
+_KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +68,8 @@ class Column:
 
     column: str
     unit: str
+    factor: float = 1.0
+    """The column's numbers times this are in ``unit``: turns of a tick, N·m of a mA, −1 for a sign."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +78,18 @@ class SignalColumns:
 
     q: Column
     """Measured position."""
-    q_target: Column
-    """Commanded position."""
+    q_target: Column | None = None
+    """Commanded position; or else one of:"""
+    qd_target: Column | None = None
+    """Commanded velocity."""
+    tau_target: Column | None = None
+    """Commanded torque; 0 while the motor is off."""
     qd: Column | None = None
     """Measured velocity."""
     tau: Column | None = None
     """Effort of the motor."""
+    load: Column | None = None
+    """Known external torque, positive where it drives the joint forwards."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,15 +125,26 @@ def load_table_spec(path: Path) -> TableSpec:
         raise document.error("signals", "names no signal")
     for name, signal in spec.signals.items():
         kinds: dict[str, str] = {}
+        if (num := sum(getattr(signal, key) is not None for key in TARGETS)) != 1:
+            raise document.error(
+                f"signals/{name}",
+                "key 'q_target' is missing; or qd_target, tau_target"
+                if num == 0
+                else f"has {num} targets; one of {', '.join(TARGETS)} commands it",
+            )
         for key, column in _columns_of(signal):
             known, where = _CONVERSIONS[key], f"signals/{name}/{key}/unit"
             if column.unit not in known:
                 hint = (
-                    "; a current needs its motor's torque constant: write a column in Nm"
+                    "; a current needs its motor's torque constant: write `unit: Nm` with `factor:` in Nm a unit of the column"
                     if column.unit in ("A", "mA")
                     else ""
                 )
+                if column.unit in ("ticks", "tick", "counts", "count"):
+                    hint = "; write `unit: rad` with `factor:` in rad a tick"
                 raise document.error(where, f"{column.unit!r} is no unit of {key}; {nearest(column.unit, known)}{hint}")
+            if not math.isfinite(column.factor) or column.factor == 0.0:
+                raise document.error(where, f"factor {column.factor:g}; give a finite number other than 0")
             kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
         if len(kinds) > 1:
             raise document.error(f"signals/{name}", f"{' and '.join(kinds.values())}: does it turn or slide?")
@@ -170,7 +195,8 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
         if key not in _CONVERSIONS or not name:
             own = [f"{n}.{key}" for n in known for key in _CONVERSIONS]
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r} is not NAME.q, .q_target, .qd or .tau; {nearest(column, own)}"
+                f"{path}: column {k + 1} {column!r} is not NAME.q, .qd, .tau, .load, .q_target, .qd_target or .tau_target; "
+                + nearest(column, own)
             )
         if name not in known:
             raise RecordingError(
@@ -179,14 +205,27 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
             )
         parts.setdefault(name, set()).add(key)
     for name, keys in parts.items():
-        for needed in ("q", "q_target"):
+        targets = [key for key in TARGETS if key in keys]
+        if len(targets) > 1:
+            raise RecordingError(
+                f"{path}: {name} has {' and '.join(targets)}; one of them commands it: remove the others"
+            )
+        for needed in ("q", *(["q_target"] if not targets else [])):
             if needed not in keys:
                 raise RecordingError(
                     f"{path}: column '{name}.{needed}' is missing; {name} has {', '.join(sorted(keys))}"
                 )
     units = {
-        "rad": {"q": "rad", "q_target": "rad", "qd": "rad/s", "tau": "Nm"},
-        "m": {"q": "m", "q_target": "m", "qd": "m/s", "tau": "N"},
+        "rad": {
+            "q": "rad",
+            "q_target": "rad",
+            "qd": "rad/s",
+            "tau": "Nm",
+            "load": "Nm",
+            "qd_target": "rad/s",
+            "tau_target": "Nm",
+        },
+        "m": {"q": "m", "q_target": "m", "qd": "m/s", "tau": "N", "load": "N", "qd_target": "m/s", "tau_target": "N"},
     }
     signals = {
         name: SignalColumns(
@@ -214,16 +253,21 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         path, lambda header: _wanted(spec or own_spec(path, header, signal_units)), spec.separator if spec else "comma"
     )
     spec = spec or own_spec(path, header, signal_units)
-    time_s = columns[spec.time.column] * TIME_S[spec.time.unit]
+    time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
     if len(time_s) < 2:
         raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
     shape = (len(time_s), len(spec.signals))
-    values = {key: np.full(shape, np.nan) for key in _CONVERSIONS}
+    values = {key: np.full(shape, 0.0 if key == "load" else np.nan) for key in _CONVERSIONS}
     units = []
+    kinds: list[TargetKind] = []
     for j, signal in enumerate(spec.signals.values()):
         units.append(POSITION[signal.q.unit][0])
         for key, column in _columns_of(signal):
-            values[key][:, j] = columns[column.column] * _CONVERSIONS[key][column.unit][1]
+            if key in TARGETS:
+                kinds.append(_KINDS[key])
+            values["q_target" if key in TARGETS else key][:, j] = (
+                columns[column.column] * column.factor * _CONVERSIONS[key][column.unit][1]
+            )
     late = spec.target_rows_late
     if abs(late) >= len(time_s) - 1:
         raise RecordingError(f"{path}: target_rows_late {late} leaves nothing of {len(time_s)} rows")
@@ -236,8 +280,10 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         measured=values["q"][rows],
         velocity=values["qd"][rows],
         effort=values["tau"][rows],
+        load=values["load"][rows] if any(s.load for s in spec.signals.values()) else np.empty(0),
         signals=tuple(spec.signals),
         units=tuple(units),
+        target_kinds=tuple(kinds),
         quantum=np.array([find_quantum(column) for column in values["q"].T]),
         source=path,
         origin=spec.origin,
@@ -263,6 +309,8 @@ def read_columns(
     Raises:
         RecordingError: a column is missing or there twice, a cell is empty or no number; names file, line and column.
     """
+    if path.suffix == ".mat":
+        return _read_mat(path, choose)
     return _read_parquet(path, choose) if path.suffix == ".parquet" else _read_csv(path, choose, separator)
 
 
@@ -340,3 +388,27 @@ def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple
             raise RecordingError(f"{path}: column {name!r}: row {bad[0]} is empty or not finite; leave the row out")
         columns[name] = values
     return header, columns
+
+
+def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Variables of a MATLAB file up to version 7 that are vectors of numbers."""
+    try:
+        content = scipy.io.loadmat(path)
+    except (OSError, ValueError, NotImplementedError) as error:
+        raise RecordingError(
+            f"{path}: cannot be read as a MATLAB file up to version 7: {' '.join(str(error).split())}"
+        ) from error
+    vectors = {
+        name: np.asarray(value, dtype=float).ravel()
+        for name, value in content.items()
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.size == max(value.shape, default=0) > 1
+    }
+    wanted = _chosen(path, list(vectors), choose)
+    lengths = {name: len(vectors[name]) for name in wanted}
+    if len(set(lengths.values())) > 1:
+        raise RecordingError(f"{path}: its variables differ in length: {lengths}")
+    for name in wanted:
+        bad = np.flatnonzero(~np.isfinite(vectors[name]))
+        if len(bad):
+            raise RecordingError(f"{path}: variable {name!r}: row {bad[0]} is not finite; leave the row out")
+    return list(vectors), {name: vectors[name] for name in wanted}

@@ -1,154 +1,95 @@
-"""A driven axis that is not one of the robot's joints, as a problem for the search: a slide on a bench, a motor with a mass.
+"""A driven axis by itself as a problem for the search: a slide on a bench, a motor with a mass, a servo with a pendulum.
 
-It is described in a file of its own (``configs/diagnose/emps.yaml`` is one)::
-
-    name: drive                # the signal in the measurements
-    unit: m                    # of its position: rad or m
-    inertia: 100.0             # kg, or kg·m²: where the fit starts
-    kp: 1.37e6                 # of the commanded law τ = kp (q* − q) − kd q̇ + torque_ff, N/m or N·m/rad
-    kd: 8560.0
-    force_unit_n: 10.0         # effects know their bounds for a small arm in N·m and rad; the axis is searched in
-    length_unit_m: 0.25        # these units, in which its forces and ways are of that size, and told in its own
-
-Angle and torque stand for position and force where the unit is m. Inertia is fitted; so are the gains, within ``GAINS_WITHIN`` of
-those commanded, where the effort was recorded, which tells them. A few per cent of them outweigh the friction of a fast drive.
+Inertia and a constant torque are fitted, and the weight where the file states one. So are the gains, within ``GAINS_WITHIN`` of
+those commanded, where the effort was recorded, which identifies them: a few per cent of them outweigh the friction of a fast
+drive. Of law ``pwm`` the stall torque and the back-EMF are, within ``WINDING_WITHIN``: data sheets are no better.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from taccorl.alignment.joint_model import Gains, JointModel, JointMotion, joint_motion
+from taccorl.alignment.axis_file import AxisConfig, DrivenAxis
+from taccorl.alignment.joint_model import JointModel, JointMotion, JointResponse
+from taccorl.alignment.joint_motion import motion_of
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.noise_floor import noise_floor
-from taccorl.data.strict_yaml import Document
 from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
-from taccorl.sim.effects.effect import Effect, JointEffect
-from taccorl.sim.settings import check_numbers
+from taccorl.sim.effects.effect import Effect
 
-_POWERS = {  # of force unit and length unit in each unit of a parameter
-    "N·m": (1, 0),
-    "rad": (0, 1),
-    "rad/s": (0, 1),
-    "N·m/rad": (1, -1),
-    "N·m·s/rad": (1, -1),
-    "N·m·s²/rad²": (1, -2),
-    "kg·m²": (1, -1),
-    "rad/(N·m)": (-1, 1),
-}
-"""Units that are not here (1, s, 1/s …) are the same on every axis."""
-_SLIDE = {"N·m": "N", "rad": "m", "kg·m²": "kg"}
 GAINS_WITHIN = 1.25
 """Factor to both sides."""
-
-
-@dataclass(kw_only=True)
-class AxisConfig:
-    """One driven axis."""
-
-    name: str
-    unit: Literal["rad", "m"]
-    inertia: float
-    """kg·m² or kg."""
-    kp: float
-    """N·m/rad or N/m."""
-    kd: float
-    """N·m·s/rad or N·s/m."""
-    torque_ff: float = 0.0
-    """N·m or N."""
-    force_unit_n: float = 1.0
-    """N·m or N that are one unit of force in the search."""
-    length_unit_m: float = 1.0
-    """rad or m that are one unit of length in the search."""
-    timestep_s: float = 1.0 / 1200.0
-
-    def __post_init__(self) -> None:
-        positive = ("inertia", "kp", "force_unit_n", "length_unit_m", "timestep_s")
-        check_numbers("axis", self, positive=positive, not_negative=("kd",), finite=("torque_ff",))
-
-    def factor(self, unit: str) -> float:
-        """Number in the axis's units / number in the search's."""
-        force, length = _POWERS.get(unit, (0, 0))
-        return self.force_unit_n**force * self.length_unit_m**length
-
-    def unit_of(self, unit: str) -> str:
-        """How a parameter's unit is called on this axis: of a slide N for N·m, m for rad."""
-        if self.unit == "m":
-            for angular, linear in _SLIDE.items():
-                unit = unit.replace(angular, linear)
-        return unit.replace("(N)", "N")
-
-
-def load_axis(path: Path) -> AxisConfig:
-    """An axis's file.
-
-    Raises:
-        TaccorlError: with file and line.
-    """
-    return Document(AxisConfig, path).value
+WINDING_WITHIN = 3.0
+"""Factor to both sides."""
+WEIGHT_WITHIN = 3.0
+"""Times the weight's torque that the file states, of both signs."""
+MOST_TORQUE = 20.0
+"""Of a constant torque, in force units of the axis."""
+_NO_CANDIDATES = ("armature", "gravity_mismatch")
+"""More inertia is the inertia, which is fitted; an axis carries no weight by itself."""
+_OF_POSITION_LOOPS = ("integral_action", "error_deadband", "velocity_feedforward")
 
 
 class AxisProblem:
-    """An axis and recordings of it. Channels: position, and effort where it was recorded.
+    """An axis and recordings of it. Channels: position, and effort where every recording has it; in the units of the axis.
 
     Raises:
-        TaccorlError: the recordings lack the axis, or have it in another unit.
+        TaccorlError: the recordings lack the axis, have it in another unit, or command what its law does not take.
     """
 
     def __init__(self, axis: AxisConfig, measurements: Measurements) -> None:
         self.axis, self.signal = axis, axis.name
-        force, length = axis.force_unit_n, axis.length_unit_m
-        stiffness = length / force
-        self.gains = Gains(axis.kp * stiffness, axis.kd * stiffness, axis.torque_ff / force)
-        sides = [
-            [self._scaled(m) for m in side] for side in (measurements.fit, measurements.validation, measurements.test)
-        ]
-        everything = [m for side in sides for m in side]
+        own = axis.made()
+        self.present = tuple(e.name for e in own)
+        self._bare = dataclasses.replace(axis, effects=())
+        everything = measurements.all
         self.effort = all(m.has_effort()[m.column(axis.name)] for m in everything)
         kinds = ("position", "effort") if self.effort else ("position",)
-        own = measurements.all
-        self.floors = [noise_floor(own, kind)[axis.name] for kind in kinds]
-        """In the axis's units."""
-        inertia = axis.inertia * stiffness
-        self.base = (
-            Free(name="inertia", unit="kg·m²", start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True),
-            Free(name="torque_ff", unit="N·m", start=self.gains.torque_ff, low=-20.0, high=20.0),
+        self.floors = [noise_floor(everything, kind)[axis.name] for kind in kinds]
+        self.fit, self.validation, self.test = (
+            [self._recording(m) for m in side]
+            for side in (measurements.fit, measurements.validation, measurements.test)
         )
-        if self.effort:
-            self.base += tuple(
-                Free(name=name, unit=unit, start=at, low=at / GAINS_WITHIN, high=at * GAINS_WITHIN, log=True)
-                for name, unit, at in (("kp", "N·m/rad", self.gains.kp), ("kd", "N·m·s/rad", self.gains.kd))
-            )
-        self.fit, self.validation, self.test = ([self._recording(m) for m in side] for side in sides)
-        self.candidates: dict[str, Candidate] = {}
-        self.learn(self.gains._asdict() | {"inertia": inertia})
+        self.base = self._base()
         self.start: Values = {f.name: f.start for f in self.base}
-        self.present: tuple[str, ...] = ()
+        self.start |= {f"{e.name}.{p.name}": getattr(e, p.name) for e in own for p in e.parameters()}
+        self.candidates: dict[str, Candidate] = {}
+        self.learn(self.start)
+
+    @property
+    def noise(self) -> str:
+        return "; effort ".join(f.words() for f in self.floors)
+
+    @property
+    def numbers(self) -> str:
+        """Where the always fitted numbers are from."""
+        return f"fitted: {', '.join(f.name for f in self.base)}; other numbers as the file states them"
+
+    @property
+    def measured(self) -> str:
+        """What the errors are of."""
+        return "positions and efforts together" if self.effort else "positions"
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) position, and effort, in the search's units."""
-        model = JointModel.axis(self.signal, base["inertia"], gains=self.gains, timestep_s=self.axis.timestep_s)
-        answer = model.simulate(recording.data, self._gains(base), effects)
+        """(T, C) position, and effort."""
+        answer = simulated(self._bare.with_numbers(base), recording.data, effects)
         return np.column_stack([answer.reported, answer.effort][: 1 + self.effort])
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Starts of searches hang on the forces that the motor would give."""
         seen = self._seen(values)
         for name in registry:
-            cls = registry.get(name)
-            if not cls.fitted:
+            if not registry.get(name).fitted or name in _NO_CANDIDATES:
                 continue
-            found = candidate(cls, seen)
-            knows = issubclass(cls, JointEffect) and found.make({f.name: f.start for f in found.frees}).drive()
-            if knows and name != "armature":  # more inertia is the inertia, which is fitted
-                self.candidates[name] = found
+            if self.axis.law in ("velocity", "torque") and name in _OF_POSITION_LOOPS:
+                continue
+            cls = self.axis.effect_class(name)
+            if cls is not None:
+                self.candidates[name] = candidate(cls, seen)
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
@@ -156,47 +97,106 @@ class AxisProblem:
         """An axis has no maps."""
         return list(effects)
 
-    def _gains(self, values: Mapping[str, float]) -> Gains:
-        return self.gains._replace(**{name: values[name] for name in Gains._fields if name in values})
-
-    def _scaled(self, m: Measurement) -> Measurement:
-        j = m.column(self.signal)
-        if m.units[j] != self.axis.unit:
-            raise TaccorlError(f"{m.name}: {self.signal} is in {m.units[j]}, the axis's file says {self.axis.unit}")
-        length, force = self.axis.length_unit_m, self.axis.force_unit_n
-        return dataclasses.replace(
-            m,
-            target=m.target / length,
-            measured=m.measured / length,
-            velocity=m.velocity / length,
-            effort=m.effort / force,
-            quantum=m.quantum / length,
-        )
+    def _base(self) -> tuple[Free, ...]:
+        axis, unit = self.axis, self.axis.scale.unit_of
+        force, inertia = axis.scale.force, axis.inertia
+        most = max(MOST_TORQUE * force, 10.0 * abs(axis.torque_ff))
+        found = [
+            Free(name="inertia", unit=unit("kg·m²"), start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True),
+            Free(name="torque_ff", unit=unit("N·m"), start=axis.torque_ff, low=-most, high=most, scale=force),
+        ]
+        weight = float(np.hypot(axis.weight_sin, axis.weight_cos))
+        if weight > 0.0:
+            for name in ("weight_sin", "weight_cos"):
+                most = WEIGHT_WITHIN * weight
+                found.append(
+                    Free(name=name, unit="N·m", start=getattr(axis, name), low=-most, high=most, scale=0.1 * weight)
+                )
+        if axis.law == "pwm":
+            within, numbers = WINDING_WITHIN, {"stall_nm": axis.stall_nm, "back_emf": axis.back_emf}
+        elif self.effort:
+            within, numbers = GAINS_WITHIN, {"kp": axis.gains.kp, "kd": axis.gains.kd}
+        else:
+            within, numbers = 1.0, {}
+        units = {"stall_nm": "N·m", "kp": "N·m/rad"}
+        found += [
+            Free(
+                name=name,
+                unit=unit(units.get(name, "N·m·s/rad")),
+                start=at,
+                low=at / within,
+                high=at * within,
+                log=True,
+            )
+            for name, at in numbers.items()
+            if at > 0.0
+        ]
+        return tuple(found)
 
     def _recording(self, m: Measurement) -> Recording:
-        motion = joint_motion(m, None, self.signal)
+        motion = axis_motion(self.axis, m)
         columns = [motion.measured, motion.effort][: 1 + self.effort]
-        channels = (f"{self.signal} [{self.axis.unit}]", f"{self.signal} effort [{self.axis.unit_of('N·m')}]")
+        channels = (f"{self.signal} [{self.axis.unit}]", f"{self.signal} effort [{self.axis.scale.unit_of('N·m')}]")
         return Recording(
             name=m.name,
             time_s=motion.time_s,
             measured=np.column_stack(columns),
-            floor=np.array([f.value for f in self.floors])
-            / [self.axis.length_unit_m, self.axis.force_unit_n][: 1 + self.effort],
+            floor=np.array([f.value for f in self.floors]),
             channels=channels[: 1 + self.effort],
             data=motion,
         )
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         motions: list[JointMotion] = [r.data for r in self.fit]
-        model = JointModel.axis(self.signal, values["inertia"], gains=self.gains, timestep_s=self.axis.timestep_s)
-        efforts = [np.abs(model.simulate(m, self._gains(values)).effort).max() for m in motions]
-        speeds = np.concatenate([np.abs(np.gradient(m.target, 1.0 / m.rate_hz)) for m in motions])
+        bare = self._bare.with_numbers(values)
+        answers = [simulated(bare, m, []) for m in motions]
+        asked = [
+            m.target if self.axis.law in ("impedance", "cascade", "pwm") else a.reported
+            for m, a in zip(motions, answers, strict=True)
+        ]
+        speeds = np.concatenate([np.abs(np.gradient(q, 1.0 / m.rate_hz)) for q, m in zip(asked, motions, strict=True)])
         return {
-            "peak_torque_nm": float(max(efforts)),
+            "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
             "peak_speed_rad_per_s": float(speeds.max()),
-            "span_rad": float(max(np.ptp(m.target) for m in motions)),
+            "span_rad": max(float(np.ptp(q)) for q in asked),
             "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
             "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
-            "duration_s": float(max(m.time_s[-1] for m in motions)),
+            "duration_s": max(float(m.time_s[-1]) for m in motions),
         }
+
+
+def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
+    """A recording of an axis, with the gains that it states.
+
+    Raises:
+        TaccorlError: it lacks the axis, has it in another unit, or commands what its law does not take.
+    """
+    j = m.column(axis.name)
+    if m.units[j] != axis.unit:
+        raise TaccorlError(f"{m.name}: {axis.name} is in {m.units[j]}, the axis's file says {axis.unit}")
+    motion = motion_of(m, axis.name, DrivenAxis(axis))
+    if motion.payload_kg > 0.0 and axis.unit == "rad" and axis.lever_m == 0.0:
+        raise TaccorlError(
+            f"{m.name}: payload_kg of {axis.name} is stated, and its file does not say where it is held; write `lever_m: …`"
+        )
+    for name in ("kp", "kd"):
+        stated = getattr(m, name).get(axis.name)
+        if stated is not None and not getattr(axis, name):
+            raise TaccorlError(
+                f"{m.name}: {name} of {axis.name} is stated, and its file has no {name} with law {axis.law}; remove it from "
+                "measurements.yaml, or write it into the file"
+            )
+    kd_scale = m.kd[axis.name] / axis.kd if axis.name in m.kd else motion.kd_scale
+    kp_scale = m.kp[axis.name] / axis.kp if axis.name in m.kp else motion.kp_scale
+    # Of a cascade K_p is the product of both gains.
+    return dataclasses.replace(
+        motion,
+        kp_scale=kp_scale * (kd_scale if axis.law == "cascade" and axis.name in m.kd else 1.0),
+        kd_scale=kd_scale,
+    )
+
+
+def simulated(axis: AxisConfig, motion: JointMotion, effects: Sequence[Effect]) -> JointResponse:
+    """Answer of the axis to a recording's targets, with the effects of its file and ``effects``."""
+    model = JointModel.of(DrivenAxis(axis))
+    return model.simulate(motion, model.gains, effects)

@@ -152,7 +152,7 @@ def test_the_index_names_the_columns_file(tmp_path):
 def test_nothing_to_read_is_an_error_with_a_way_out(tmp_path):
     with pytest.raises(RecordingError, match="no such file or folder"):
         read_measurements(tmp_path / "sweps")
-    with pytest.raises(RecordingError, match=r"no recording here.*tables \(.csv, .parquet\)"):
+    with pytest.raises(RecordingError, match=r"no recording here.*tables \(.csv, .parquet, .mat\)"):
         read_measurements(tmp_path)
 
 

@@ -1,26 +1,28 @@
 """Driven axes that are no joint of the robot: a slide whose friction is known here, and a real one (EMPS benchmark)."""
 
 import dataclasses
+import math
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
 
+from taccorl.alignment.axis_file import AxisConfig, axis_text, load_axis
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
-from taccorl.diagnosis.axis_problem import GAINS_WITHIN, AxisConfig, AxisProblem, load_axis
+from taccorl.diagnosis.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
 from taccorl.diagnosis.problem import split_rows
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.search import SearchConfig, diagnose
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects.scaled import scaled
 
 ROOT = Path(__file__).parents[2]
 EMPS = ROOT.parent / "shared" / "data" / "emps"
 MASS_KG, FRICTION_N, KP, KD = 100.0, 20.0, 4e4, 2800.0
 NOISE_M, NOISE_N = 2e-5, 2.0
-AXIS = AxisConfig(
-    name="drive", unit="m", inertia=80.0, kp=KP, kd=KD, force_unit_n=10.0, length_unit_m=0.25, timestep_s=1e-3
-)
+AXIS = AxisConfig(name="drive", unit="m", inertia=80.0, kp=KP, kd=KD, force_unit_n=10.0, length_unit_m=0.25)
 
 
 def simulated(name: str, amplitude_m: float, hz: float, seed: int, repeat_of: str | None = None) -> Measurement:
@@ -65,10 +67,6 @@ def problem(slide: Measurements) -> AxisProblem:
     return AxisProblem(AXIS, slide)
 
 
-def own_units(axis: AxisConfig, found: Diagnosis, name: str, unit: str) -> float:
-    return found.after.values[name] * axis.factor(unit)
-
-
 @pytest.mark.slow
 def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
     found = diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
@@ -77,14 +75,13 @@ def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
     assert found.errors["fitted"]["validation"] > 5.0
     assert found.errors["after"]["validation"] < 0.4 * found.errors["fitted"]["validation"]
     best = next(e for e in first.evidence if e.name == "coulomb_friction")
-    friction_n = best.values["coulomb_friction.torque_nm"] * AXIS.factor("N·m")
-    assert friction_n == pytest.approx(FRICTION_N, rel=0.2)  # the model's steps of 1 ms cost some
-    assert best.base["inertia"] * AXIS.factor("kg·m²") == pytest.approx(MASS_KG, rel=0.1)
+    assert best.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.2)  # steps of 1 ms cost some
+    assert best.base["inertia"] == pytest.approx(MASS_KG, rel=0.1)
 
 
-def test_floors_are_those_of_the_noise_in_the_search_s_units(problem: AxisProblem):
+def test_floors_are_those_of_the_noise(problem: AxisProblem):
     assert problem.effort
-    assert problem.fit[0].floor * [0.25, 10.0] == pytest.approx([NOISE_M, NOISE_N], rel=0.1)
+    assert problem.fit[0].floor == pytest.approx([NOISE_M, NOISE_N], rel=0.1)
     assert problem.fit[0].channels == ("drive [m]", "drive effort [N]")
 
 
@@ -93,26 +90,54 @@ def test_words_of_a_floor_are_in_the_axis_s_units(problem: AxisProblem):
     assert float(problem.floors[0].words().split()[0]) == pytest.approx(1e3 * NOISE_M, rel=0.1)
 
 
-def test_units_of_the_search_and_of_the_axis():
+def test_effects_have_the_size_and_the_units_of_the_axis():
     """10 N and 0.25 m are 1: stiffness 40 N/m, damping 40 N·s/m, mass 40 kg."""
     factors = {"N·m": 10.0, "rad": 0.25, "rad/s": 0.25, "N·m/rad": 40.0, "N·m·s/rad": 40.0, "kg·m²": 40.0}
     factors |= {"N·m·s²/rad²": 160.0, "rad/(N·m)": 0.025, "s": 1.0, "1": 1.0, "1/s": 1.0}
-    assert {unit: AXIS.factor(unit) for unit in factors} == pytest.approx(factors)
+    scale = AXIS.scale
+    assert {unit: scale.factor(unit) for unit in factors} == pytest.approx(factors)
     words = {"N·m": "N", "rad": "m", "rad/s": "m/s", "N·m/rad": "N/m", "N·m·s/rad": "N·s/m", "kg·m²": "kg"}
     words |= {"rad/(N·m)": "m/N", "s": "s"}
-    assert {unit: AXIS.unit_of(unit) for unit in words} == words
-    turning = dataclasses.replace(AXIS, unit="rad")
-    assert turning.unit_of("N·m/rad") == "N·m/rad"
+    assert {unit: scale.unit_of(unit) for unit in words} == words
+    assert dataclasses.replace(scale, unit="rad").unit_of("N·m/rad") == "N·m/rad"
+    (friction,) = scaled("coulomb_friction", scale).parameters()
+    assert (friction.unit, friction.absent, friction.high, friction.typical) == ("N", 0.0, 200.0, 4.0)
+    (limit,) = scaled("torque_saturation", scale).parameters()
+    assert limit.absent == math.inf
 
 
-def test_an_answer_does_not_hang_on_the_search_s_units(slide: Measurements, problem: AxisProblem):
-    plain = AxisProblem(dataclasses.replace(AXIS, force_unit_n=1.0, length_unit_m=1.0), slide)
-    answers = []
-    for p in (problem, plain):
-        units = np.array([p.axis.length_unit_m, p.axis.force_unit_n])
-        answers.append(p.simulate(p.start, [], p.fit[0]) * units)
-    np.testing.assert_allclose(answers[0], answers[1], rtol=1e-9, atol=1e-9)
-    assert np.ptp(answers[0][:, 0]) == pytest.approx(0.2, rel=0.05)  # ± 0.1 m
+def test_an_effect_of_another_size_survives_a_process_and_refuses_what_is_beyond_its_bounds():
+    effect = scaled("coulomb_friction", AXIS.scale)(torque_nm=150.0, interval={"torque_nm": (149.0, 151.0)})
+    back = pickle.loads(pickle.dumps(effect))
+    assert back == effect and back.drive() == {"coulomb": 150.0}
+    with pytest.raises(TaccorlError, match=r"250 N, outside of 0 … 200 N"):
+        scaled("coulomb_friction", AXIS.scale)(torque_nm=250.0)
+
+
+def test_searches_start_at_the_same_effects_whatever_the_size(slide: Measurements, problem: AxisProblem):
+    """Starts of an arm's effects at a tenth of the force, times ten."""
+    (first, *_) = problem.candidates["slew_limit"].starts
+    peak = np.abs(np.gradient(slide.fit[0].target[:, 0], 1e-3)).max()
+    assert first["slew_limit.speed_rad_per_s"] == pytest.approx(0.35 * peak, rel=1e-6)
+
+
+def test_a_known_external_force_moves_the_axis_by_force_over_stiffness(slide: Measurements, problem: AxisProblem):
+    pushed = dataclasses.replace(slide.fit[0], load=np.full_like(slide.fit[0].target, 40.0))
+    recording = AxisProblem(AXIS, Measurements((pushed,))).fit[0]
+    before = problem.simulate(problem.start, [], problem.fit[0])
+    moved = (problem.simulate(problem.start, [], recording) - before)[-1]
+    assert moved == pytest.approx([40.0 / KP, -40.0], rel=1e-3)
+
+
+def test_gains_that_a_recording_states_are_those_it_is_simulated_with(slide: Measurements):
+    twice = dataclasses.replace(slide.fit[0], kp={"drive": 2 * KP}, kd={"drive": 0.5 * KD})
+    motion = axis_motion(AXIS, twice)
+    assert (motion.kp_scale, motion.kd_scale) == pytest.approx((2.0, 0.5))
+    cascade = dataclasses.replace(AXIS, law="cascade", kp=KP / KD)
+    assert cascade.gains == pytest.approx(AXIS.gains)
+    stated = dataclasses.replace(slide.fit[0], kp={"drive": 2 * KP / KD}, kd={"drive": 0.5 * KD})
+    motion = axis_motion(cascade, stated)
+    assert (motion.kp_scale, motion.kd_scale) == pytest.approx((1.0, 0.5)), "K_p is the product of both"
 
 
 def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(
@@ -139,20 +164,35 @@ def test_recordings_in_another_unit_or_of_another_axis_are_refused(slide: Measur
 
 
 def test_a_file_of_an_axis_is_strict(tmp_path: Path):
-    good = (ROOT / "configs" / "diagnose" / "emps.yaml").read_text()
+    good = (ROOT / "configs" / "diagnose" / "emps.yaml").read_text() + (
+        "effects:\n- {effect: coulomb_friction, torque_nm: 20.0, interval: {torque_nm: [19.0, 21.0]}, evidence: by hand}\n"
+    )
     path = tmp_path / "axis.yaml"
     for old, new, message in (
-        ("inertia: 80.0", "inertia: -1.0", "inertia"),
+        ("inertia: 80.0", "inertia: -1.0", r"axis\.yaml:6: inertia: -1.0"),
         ("unit: m", "unit: feet", "feet"),
         ("inertia: 80.0", "mass: 80.0", "mass"),
+        ("law: cascade", "law: pwm", r"axis\.yaml:3: supply_v: law pwm needs it"),
+        ("law: cascade", "law: torque", r"axis\.yaml:8: kp: law torque has none"),
+        ("limits: [0.0, 0.25]", "limits: [0.25, 0.0]", r"axis\.yaml:10: limits: .*must rise"),
+        ("limits: [0.0, 0.25]", "weight_sin: 3.0", "weight_sin: a slide has none"),
+        ("coulomb_friction", "coulombfriction", "did you mean 'coulomb_friction'"),
+        ("coulomb_friction", "taxel_creep", "taxel_creep cannot act on an axis"),
+        ("torque_nm: 20.0", "torque_nm: 2000.0", r"axis\.yaml:\d+: .*2000 N, outside of 0 … 200 N"),
+        ("torque_nm: 20.0", "force_n: 20.0", "no parameter 'force_n'"),
     ):
+        assert old in good
         path.write_text(good.replace(old, new))
         with pytest.raises(TaccorlError, match=message):
             load_axis(path)
     path.write_text(good)
+    axis = load_axis(path)
     # the cascade's own numbers: g k_v k_p and g k_v
-    assert load_axis(path).kp == pytest.approx(35.15 * 243.45 * 160.18, rel=1e-4)
-    assert load_axis(path).kd == pytest.approx(35.15 * 243.45, rel=1e-4)
+    assert axis.gains.kp == pytest.approx(35.15 * 243.45 * 160.18, rel=1e-4)
+    assert axis.gains.kd == pytest.approx(35.15 * 243.45, rel=1e-4)
+    again = tmp_path / "again.yaml"
+    again.write_text(axis_text(axis))
+    assert load_axis(again) == axis
 
 
 # a real drive ----------------------------------------------------------------------------------------------------------
@@ -184,6 +224,6 @@ def test_a_real_drive_s_dry_friction_is_found_and_that_something_remains():
     assert "coulomb_friction" in (first.added, *first.ties)
     assert found.errors["after"]["validation"] <= 0.4 * found.errors["fitted"]["validation"]
     row = next(e for e in first.evidence if e.name == "coulomb_friction")
-    assert 15.0 < row.values["coulomb_friction.torque_nm"] * axis.factor("N·m") < 30.0
-    assert 85.0 < row.base["inertia"] * axis.factor("kg·m²") < 115.0
+    assert 15.0 < row.values["coulomb_friction.torque_nm"] < 30.0
+    assert 85.0 < row.base["inertia"] < 115.0
     assert found.status != "at_floor", "one effect does not explain a real drive to the encoder's last step"

@@ -9,10 +9,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from taccorl.alignment.axis_file import AxisConfig
 from taccorl.alignment.joint_kernel import Drive, simulate
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
-from taccorl.diagnosis.axis_problem import AxisConfig, AxisProblem
+from taccorl.diagnosis.axis_problem import AxisProblem
 from taccorl.diagnosis.joint_problem import JointProblem
 from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
 from taccorl.robots import ROBOT
@@ -22,7 +23,7 @@ from taccorl.sim.twin import TwinConfig
 
 INERTIA, KP, KD = 0.05, 40.0, 1.5
 RATE_HZ, PARTS, NOISE_RAD = 200, 50, 1e-3
-AXIS = AxisConfig(name="joint", unit="rad", inertia=INERTIA, kp=KP, kd=KD, timestep_s=1 / 2400)
+AXIS = AxisConfig(name="joint", unit="rad", inertia=INERTIA, kp=KP, kd=KD)
 NEW = ("torque_speed_limit", "position_dependent_friction", "end_stop")
 
 

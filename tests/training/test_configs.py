@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import yaml
 
+from taccorl.alignment.axis_file import load_axis
 from taccorl.cli.parse import parse
 from taccorl.cli.post_train import PostTrainConfig
-from taccorl.diagnosis.axis_problem import load_axis
 from taccorl.sim.twin_file import load_twin
 
 CONFIGS = Path(__file__).parents[2] / "configs"

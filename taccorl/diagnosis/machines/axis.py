@@ -1,0 +1,243 @@
+"""One driven axis as a machine: ``kind: axis`` (``taccorl.alignment.axis_file``)."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from taccorl.alignment.axis_file import AxisConfig, axis_digest, axis_text, load_axis
+from taccorl.alignment.clock_checks import check_against_twin
+from taccorl.alignment.measurement import UNITS, Measurement
+from taccorl.alignment.measurements import Measurements, Use
+from taccorl.alignment.noise_floor import noise_floor
+from taccorl.alignment.telemetry_checks import MOVED
+from taccorl.alignment.touch_motion import PressedObject
+from taccorl.data.finding import Finding as DataFinding
+from taccorl.diagnosis.axis_problem import AxisProblem, axis_motion, simulated
+from taccorl.diagnosis.comparison import USES, Comparison, Kind, Trace
+from taccorl.diagnosis.machine import Addition, GainsAre, Machine, machines
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects.effect import Effect
+
+SMOOTH_S = 0.05
+"""Window of the quadratic whose second derivative is the measured acceleration."""
+INERTIA_OFF = 5.0
+"""Factor between the file's inertia and the one in the recording from which the file cannot be right."""
+INERTIA_SURE = 0.6
+"""Correlation of acceleration and the torque that friction, damping and weight leave, from which that says something."""
+
+
+@machines.register("axis")
+@dataclass(frozen=True)
+class Axis(Machine):
+    """An axis, which is its only part."""
+
+    config: AxisConfig
+    name: str
+    part_word: ClassVar[str] = "axis"
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        return cls(load_axis(path), Path(path).stem)
+
+    def save(self, path: Path) -> None:
+        path = Path(path)
+        new = path.with_name(f".{path.name}.new")
+        try:
+            new.write_text(axis_text(self.config), encoding="utf-8")
+            new.replace(path)
+        except OSError as error:
+            new.unlink(missing_ok=True)
+            raise TaccorlError(f"{path}: cannot be written: {error}") from error
+
+    def digest(self) -> str:
+        return axis_digest(self.config)
+
+    @property
+    def file_name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return f"{self.name}.yaml"
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.config.effects)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        return {self.config.name: self.config.unit}
+
+    def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
+        """Positions beyond the limits, an inertia that cannot be right, an effort of the wrong sign."""
+        found = {}
+        for m in measurements.all:
+            self._check_signal(m)
+            found[m.name] = [*_beyond_limits(self.config, m), *_wrong_inertia(self.config, m)]
+        return found
+
+    def parts(self, measurements: Measurements) -> tuple[str, ...]:
+        name = self.config.name
+        for m in measurements.fit:
+            self._check_signal(m)
+            if np.nanmax(m.measured[:, m.column(name)]) - np.nanmin(m.measured[:, m.column(name)]) > self._moved:
+                return (name,)
+        raise TaccorlError(
+            f"no fit recording moves {name} by more than {self._moved:.2g} {self.config.unit}; record motions"
+        )
+
+    @property
+    def _moved(self) -> float:
+        return MOVED[self.config.unit]
+
+    def _check_signal(self, m: Measurement) -> None:
+        if self.config.name not in m.signals:
+            raise TaccorlError(
+                f"{m.name} has no signal {self.config.name!r}, which its file names; {nearest(self.config.name, m.signals)}"
+            )
+
+    def compare(
+        self,
+        measurements: Measurements,
+        *,
+        name: str = "",
+        pressed: PressedObject | None = None,
+        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
+    ) -> Comparison:
+        if pressed is not None:
+            raise TaccorlError(f"--pressed: {self.name} has no pads; leave it out")
+        uses: list[tuple[Use, Measurement]] = [(use, m) for use in USES for m in getattr(measurements, use)]
+        every = [m for _, m in uses]
+        kinds: tuple[Kind, ...] = ("position", "effort")
+        floors = {kind: noise_floor(every, kind) for kind in kinds}
+        signal, traces, clock = self.config.name, [], {}
+        for k, (use, m) in enumerate(uses):
+            progress(m.name, k, len(uses))
+            motion = axis_motion(self.config, m)
+            answer = simulated(self.config, motion, [])
+            j = m.column(signal)
+            replayed = {"position": answer.reported, "effort": answer.effort}
+            measured = {"position": motion.measured, "effort": motion.effort}
+            units = {"position": m.units[j], "effort": UNITS[m.units[j]][1]}
+            position_target = self.config.law in ("impedance", "cascade", "pwm")
+            for kind in kinds:
+                if np.isfinite(measured[kind]).any() and signal in floors[kind]:
+                    traces.append(
+                        Trace(
+                            recording=m.name,
+                            use=use,
+                            signal=signal,
+                            kind=kind,
+                            unit=units[kind],
+                            way="joint",
+                            time_s=m.time_s,
+                            target=motion.target if position_target else answer.reported,
+                            position=motion.measured,
+                            measured=measured[kind],
+                            replayed=replayed[kind],
+                            torque=answer.effort,
+                            touched=np.zeros(m.num_rows, dtype=bool),
+                            floor=floors[kind][signal],
+                            origin=m.origin,
+                        )
+                    )
+            if position_target and np.isfinite(motion.measured).any():
+                reported = np.full(m.target.shape, np.nan)
+                reported[:, j] = answer.reported
+                alone = dataclasses.replace(
+                    m,
+                    **{key: getattr(m, key)[:, [j]] for key in ("target", "measured", "velocity", "effort")},
+                    signals=(signal,),
+                    units=(m.units[j],),
+                    target_kinds=(),
+                    load=np.empty(0),
+                    quantum=m.quantum[[j]],
+                )
+                floor = {signal: floors["position"][signal].value}
+                clock[m.name] = tuple(check_against_twin(alone, reported[:, [j]], floor))
+        progress("", len(uses), len(uses))
+        if not traces:
+            raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")
+        return Comparison(
+            twin=name or self.name,
+            effects=self.effects,
+            traces=tuple(traces),
+            split=measurements.record(),
+            clock=clock,
+        )
+
+    def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> AxisProblem:
+        if gains == "fitted":
+            raise TaccorlError(f"--gains=fitted: those of {self.name} stand in its file; leave --gains out")
+        return AxisProblem(self.config, measurements)
+
+    def effect(
+        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
+    ) -> Effect | None:
+        cls = self.config.effect_class(name)
+        if cls is None:
+            return None
+        known = [*(p.name for p in cls.parameters()), "interval", "evidence"]
+        for key in values:
+            if key not in (*known, "arm", "joints"):
+                raise TaccorlError(f"effect {name}: no parameter {key!r}; {nearest(key, known)}")
+        return cls(**{key: value for key, value in values.items() if key in known})
+
+    def with_additions(self, additions: Sequence[Addition]) -> "Axis":
+        config = self.config
+        for a in additions:
+            config = config.with_numbers(a.base).with_effects(a.effects)
+        return dataclasses.replace(self, config=config)
+
+
+def _beyond_limits(axis: AxisConfig, m: Measurement) -> list[DataFinding]:
+    if axis.limits is None:
+        return []
+    q, (low, high) = m.measured[:, m.column(axis.name)], axis.limits
+    beyond = np.nan_to_num(np.maximum(q - high, low - q), nan=-1.0)
+    rows = np.flatnonzero(beyond > 0.02 * (high - low))
+    if not len(rows):
+        return []
+    row = int(rows[np.argmax(beyond[rows])])
+    text = (
+        f"{axis.name} is at {q[row]:.4g} {axis.unit} at {m.time_s[row]:.3f} s, its limits are [{low:g}, {high:g}]; if the column "
+        f"is in another unit or offset, write its `unit:` and `factor:` in a columns file, else write "
+        f"`limits: [{min(low, float(np.nanmin(q))):.4g}, {max(high, float(np.nanmax(q))):.4g}]`"
+    )
+    return [DataFinding("beyond_limits", "error", axis.name, text, (row, row + 1))]
+
+
+def _wrong_inertia(axis: AxisConfig, m: Measurement) -> list[DataFinding]:
+    """The inertia by least squares: effort on acceleration, velocity, its sign, position's sine and cosine, a constant."""
+    j = m.column(axis.name)
+    q, torque = m.measured[:, j], m.effort[:, j]
+    if not m.has_effort()[j] or not np.isfinite([q, torque]).all():
+        return []
+    rows = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
+    if m.num_rows < 4 * rows:
+        return []
+    v, a = (savgol_filter(q, rows, 2, deriv=d, delta=m.period_s) for d in (1, 2))
+    around = np.column_stack([v, np.sign(v), np.sin(q), np.cos(q), np.ones_like(q), m.known_load(axis.name)])
+    left = [x - around @ np.linalg.lstsq(around, x, rcond=None)[0] for x in (a, savgol_filter(torque, rows, 2))]
+    size = float(np.linalg.norm(left[0]) * np.linalg.norm(left[1]))
+    alike = float(left[0] @ left[1]) / size if size > 0 else 0.0
+    if abs(alike) < INERTIA_SURE:
+        return []
+    inertia = float(left[0] @ left[1]) / float(left[0] @ left[0])
+    unit, carried = axis.scale.unit_of("kg·m²"), m.payload_kg.get(axis.name, 0.0)
+    stated = axis.inertia + carried * (axis.lever_m**2 if axis.unit == "rad" else 1.0)
+    if inertia < 0:
+        text = (
+            f"effort of {axis.name} pushes against its acceleration (correlation {alike:.2f}): its sign is reversed; write "
+            "`factor: -1` beside the unit of tau in a columns file"
+        )
+        return [DataFinding("reversed_effort", "error", axis.name, text)]
+    if 1 / INERTIA_OFF <= inertia / stated <= INERTIA_OFF:
+        return []
+    text = (
+        f"effort and acceleration of {axis.name} say {inertia:.3g} {unit}, its file {stated:.3g}: {inertia / stated:.2g} times. "
+        f"Write `inertia: {max(inertia - stated + axis.inertia, 1e-3 * inertia):.3g}`, or the right unit or factor of q and tau "
+        "in a columns file"
+    )
+    return [DataFinding("wrong_inertia", "error", axis.name, text)]

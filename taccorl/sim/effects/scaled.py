@@ -1,0 +1,95 @@
+"""Joint effects in the size and the units of another machine: 20 N of dry friction on a slide instead of 0.4 N·m on a small arm.
+
+Bounds, typical values and starts of effects are those of joints of an arm. ``scaled`` makes a class of the same effect whose
+bounds are multiplied by the machine's scale and whose units are the machine's; its numbers are in those units.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from taccorl.sim.effects import effects
+from taccorl.sim.effects.effect import Effect
+
+_POWERS = {  # of force unit and length unit in each unit of a parameter
+    "N·m": (1, 0),
+    "rad": (0, 1),
+    "rad/s": (0, 1),
+    "N·m/rad": (1, -1),
+    "N·m·s/rad": (1, -1),
+    "N·m·s²/rad²": (1, -2),
+    "kg·m²": (1, -1),
+    "rad/(N·m)": (-1, 1),
+}
+"""Units that are not here (1, s, 1/s …) are the same on every machine."""
+_SLIDE = {"N·m": "N", "rad": "m", "kg·m²": "kg"}
+OF_A_TURN = ("cogging", "encoder_eccentricity")
+"""Effects that repeat with the turns of a joint: no slide has them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """Size of a machine's forces and motions over those of a joint of a small arm."""
+
+    unit: Literal["rad", "m"] = "rad"
+    force: float = 1.0
+    """N·m or N."""
+    length: float = 1.0
+    """rad or m."""
+
+    def factor(self, unit: str) -> float:
+        """Number of this machine / number of a small arm, for parameters in ``unit``."""
+        force, length = _POWERS.get(unit, (0, 0))
+        return self.force**force * self.length**length
+
+    def unit_of(self, unit: str) -> str:
+        """Name of a parameter's unit on this machine: of a slide N for N·m, m for rad."""
+        if self.unit == "m":
+            for angular, linear in _SLIDE.items():
+                unit = unit.replace(angular, linear)
+        return unit.replace("(N)", "N")
+
+
+@functools.cache
+def scaled(name: str, scale: Scale) -> type[Effect]:
+    """The class of an effect for a machine of that size.
+
+    Raises:
+        TaccorlError: no such effect.
+    """
+    base = effects.get(name)
+    if scale == Scale():
+        return base
+    factors = {p.name: scale.factor(p.unit) for p in base.parameters()}
+    fields: dict[str, Any] = {"__module__": base.__module__, "__annotations__": {}}
+    for p in base.parameters():
+        number = {
+            key: value if value is None or not math.isfinite(value) else value * factors[p.name]
+            for key, value in (("absent", p.absent), ("low", p.low), ("high", p.high), ("typical", p.typical))
+        }
+        meta = {f: getattr(p, f) for f in ("symbol", "source", "over")} | number | {"unit": scale.unit_of(p.unit)}
+        default = number["typical"] if p.absent is None else number["absent"]
+        fields[p.name] = dataclasses.field(default=default, metadata={"parameter": meta})
+        fields["__annotations__"][p.name] = float
+
+    def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:
+        units = {"nm": scale.force, "rad": scale.length, "rad_per_s": scale.length}
+        own = {
+            key: value / next((u for end, u in units.items() if key.endswith(f"_{end}")), 1.0)
+            for key, value in seen.items()
+        }
+        return [{key: value * factors[key] for key, value in start.items()} for start in base.starts(own)]
+
+    def again(self: Effect) -> tuple[Any, ...]:  # such a class has no name that pickle could import
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return _made, (name, scale, values)
+
+    fields |= {"starts": classmethod(starts), "__reduce__": again}
+    return dataclass(kw_only=True)(type(base.__name__, (base,), fields))
+
+
+def _made(name: str, scale: Scale, values: dict[str, Any]) -> Effect:
+    return scaled(name, scale)(**values)

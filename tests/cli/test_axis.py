@@ -1,0 +1,139 @@
+"""An axis by itself as a user types it: compare, diagnose, add-effect, compare. Simulated by this test, not a real drive."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.axis_file import load_axis
+from taccorl.cli.main import main
+from taccorl.sim.effects import effects
+
+MASS_KG, FRICTION_N, KP, KD = 40.0, 12.0, 4e4, 2000.0
+RATE_HZ, PARTS = 250, 40
+CONSIDERED = ("coulomb_friction", "viscous_friction", "command_delay")
+FEW = f"--without=[{','.join(name for name in effects if name not in CONSIDERED)}]"
+FILE = f"kind: axis\nname: slide\nunit: m\ninertia: {MASS_KG}\nkp: {KP}\nkd: {KD}\nlimits: [-0.15, 0.15]\nforce_unit_n: 10.0\n"
+
+
+def write(path: Path, amplitude_m: float, hz: float, seed: int, effort: float = 1.0) -> None:
+    """A mass with dry friction under PD control, at 0.1 ms: equations of this test."""
+    time_s = np.arange(4 * RATE_HZ) / RATE_HZ
+    fade = np.clip(np.minimum(time_s - 0.3, 3.7 - time_s) / 0.4, 0, 1)
+    target = amplitude_m * fade**2 * (3 - 2 * fade) * np.sin(2 * np.pi * hz * (time_s - 0.3))
+    dt_s, at, speed, goal, rows = 1.0 / (RATE_HZ * PARTS), 0.0, 0.0, 0.0, []
+    stops = dt_s * FRICTION_N / MASS_KG
+    for following in target.tolist():
+        rows.append((at, KP * (goal - at) - KD * speed))
+        goal = following
+        for _ in range(PARTS):
+            free = speed + dt_s * (KP * (goal - at) - KD * speed) / MASS_KG
+            speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+            at += dt_s * speed
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal((2, len(rows))) * [[2e-5], [1.0]]
+    lines = ["t,slide.q,slide.q_target,slide.tau"]
+    for t, goal, (q, tau), (dq, dtau) in zip(time_s, target, rows, noise.T, strict=True):
+        lines.append(f"{t:.4f},{q + dq:.7f},{goal:.7f},{effort * (tau + dtau):.4f}")
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("axis")
+    (folder / "bench").mkdir()
+    for name, amplitude_m, hz, seed in (("one", 0.1, 0.6, 1), ("again", 0.1, 0.6, 2), ("held", 0.08, 0.8, 3)):
+        write(folder / "bench" / f"{name}.csv", amplitude_m, hz, seed)
+    (folder / "bench" / "measurements.yaml").write_text(
+        "recordings:\n  again.csv: {repeat_of: one.csv}\n  held.csv: {use: validation}\n"
+    )
+    (folder / "drive.yaml").write_text(FILE)
+    return folder
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Any:
+    def run(verb: str, *words: Any) -> tuple[int, str]:
+        code = main([verb, *map(str, words)])
+        shown = capsys.readouterr()
+        return code, shown.out + shown.err
+
+    return run
+
+
+def error(report: Path, use: str, kind: str) -> float:
+    found = json.loads((report / "report.json").read_text())["scores"]
+    return next(s["rmse"] for s in found if (s["use"], s["kind"]) == (use, kind))
+
+
+def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path, said: Any, tmp_path: Path):
+    drive = bench / "drive.yaml"
+    code, text = said("compare", bench / "bench", f"--twin={drive}", f"--out={tmp_path / 'before'}")
+    assert code == 0 and "slide position" in text and "slide effort" in text
+    code, text = said("diagnose", bench / "bench", f"--twin={drive}", f"--out={tmp_path / 'found'}", FEW)
+    assert code in (0, 1) and "slide lacks coulomb_friction" in text, text
+    assert "_joint" not in text and "PiPER" not in text
+    assert f"next: taccorl add-effect coulomb_friction --twin={drive}" in text
+    page = (tmp_path / "found" / "report.html").read_text()
+    assert page.count("<img") >= 5 and "slide" in page
+    code, text = said("add-effect", "coulomb_friction", f"--twin={drive}", f"--diagnosis={tmp_path / 'found'}")
+    assert code == 0
+    mended = load_axis(bench / "drive+coulomb_friction.yaml")
+    (effect,) = mended.effects
+    assert effect.name == "coulomb_friction"
+    # The model takes steps of 0.2 ms.
+    assert effect.values["torque_nm"] == pytest.approx(FRICTION_N, rel=0.15)
+    low, high = effect.values["interval"]["torque_nm"]
+    assert low < effect.values["torque_nm"] < high
+    new = tmp_path / "after"
+    assert said("compare", bench / "bench", f"--twin={bench / 'drive+coulomb_friction.yaml'}", f"--out={new}")[0] == 0
+    for kind in ("position", "effort"):
+        assert error(new, "validation", kind) < 0.3 * error(tmp_path / "before", "validation", kind)
+    assert drive.read_text() == FILE
+
+
+def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench: Path, said: Any, tmp_path: Path):
+    words = ["coulomb_friction", f"--twin={bench / 'drive.yaml'}", "--values={torque_nm: 3.0}"]
+    assert said("add-effect", *words, f"--out={tmp_path / 'x.yaml'}")[0] == 0
+    assert load_axis(tmp_path / "x.yaml").effects[0].values == {"torque_nm": 3.0, "evidence": "by hand"}
+    code, text = said("add-effect", *words, "--pads=left", f"--out={tmp_path / 'y.yaml'}")
+    assert code == 2 and "drive has no pads" in text
+    code, text = said("add-effect", *words, "--joints=[slde]", f"--out={tmp_path / 'y.yaml'}")
+    assert code == 2 and "no such axis here; did you mean 'slide'" in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("inertia: 40.0", "inertia: 4.0", "Write `inertia: "),
+        ("limits: [-0.15, 0.15]", "limits: [0.0, 0.05]", "its limits are [0, 0.05]"),
+        ("name: slide", "name: sled", "did you mean"),
+    ],
+)
+def test_a_file_that_does_not_fit_the_recordings_is_refused_with_the_line_to_write(
+    bench: Path, said: Any, tmp_path: Path, old: str, new: str, message: str
+):
+    (tmp_path / "drive.yaml").write_text(FILE.replace(old, new))
+    code, text = said("compare", bench / "bench", f"--twin={tmp_path / 'drive.yaml'}")
+    assert code != 0 and message in text
+
+
+def test_an_effort_of_the_wrong_sign_is_refused_with_the_line_to_write(bench: Path, said: Any, tmp_path: Path):
+    (tmp_path / "bench").mkdir()
+    write(tmp_path / "bench" / "one.csv", 0.1, 0.6, 1, effort=-1.0)
+    code, text = said("compare", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
+    assert code == 1 and "`factor: -1`" in text
+
+
+def test_columns_with_a_factor_mend_sign_and_unit(bench: Path, said: Any, tmp_path: Path):
+    (tmp_path / "bench").mkdir()
+    write(tmp_path / "bench" / "one.csv", 0.1, 0.6, 1, effort=-1e3)
+    (tmp_path / "bench" / "columns.yaml").write_text(
+        "time: {column: t, unit: s}\nsignals: {slide: {q: {column: slide.q, unit: m}, q_target: {column: slide.q_target, "
+        "unit: m}, tau: {column: slide.tau, unit: N, factor: -0.001}}}\n"
+    )
+    (tmp_path / "bench" / "measurements.yaml").write_text("columns: columns.yaml\n")
+    code, text = said("compare", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
+    assert code == 0 and "slide effort" in text
