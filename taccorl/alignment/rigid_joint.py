@@ -28,7 +28,8 @@ Position = tuple[float, float, float]
 AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 """m, in link 6's frame: the middle between the pads, where the PiPER's gripper holds its payload."""
 _START_S = 0.1  # of a rest at the start is averaged
-_STILL = 0.01  # rad, m: another joint that moves less counts as held
+STILL = 0.01
+"""rad, m: another joint that moves less counts as held."""
 _SMOOTH_HZ = 10.0  # of the other joints' measured motion
 
 
@@ -180,8 +181,8 @@ def smooth_motion(m: Measurement, signal: str) -> np.ndarray:
     return _smooth(seen if np.isfinite(seen).any() else m.target[:, j], m.rate_hz)
 
 
-def moved_by_others(m: Measurement, signal: str, others: Sequence[str]) -> dict[str, np.ndarray]:
-    """Smooth motion of ``signal`` and of those ``others`` that the recording has and that do not stand still.
+def moved_by_others(m: Measurement, signal: str, others: Sequence[str], still: float = STILL) -> dict[str, np.ndarray]:
+    """Smooth motion of ``signal`` and of those ``others`` that the recording has and that move by more than ``still``.
 
     Only ``signal``'s own is in it where all the others stand still.
     """
@@ -189,7 +190,7 @@ def moved_by_others(m: Measurement, signal: str, others: Sequence[str]) -> dict[
     for other in others:
         if other != signal and other in m.signals:
             motion = smooth_motion(m, other)
-            if np.ptp(motion) > _STILL:
+            if np.ptp(motion) > still:
                 found[other] = motion
     return found
 

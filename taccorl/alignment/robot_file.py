@@ -58,6 +58,7 @@ TODO = "TODO"
 _LONGEST_STEP_S = 1.0 / 1200.0  # of the physics: as the PiPER's twin
 _GIVES = ("target", "position", "velocity", "acceleration", "effort", "load")
 """What the model of one joint knows (``Effect.needs``)."""
+_STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
 _NEED_ROTOR = ("backlash", "joint_compliance")
 """Effects in a gear, which need the inertia on the motor's side of it."""
 _HEADER = "# A robot: taccorl/alignment/robot_file.py says what may stand here.\n"
@@ -343,7 +344,7 @@ class RobotJoint(RigidJoint):
         if slide:
             still = np.zeros((1, model.nv))
             constant += needed_nm(model, self.signal, pose[None], still, still)[0]
-        angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints))
+        angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
         if len(angles) == 1:
             return constant
         both = []
