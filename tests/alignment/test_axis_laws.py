@@ -1,0 +1,99 @@
+"""Control laws of an axis against this test's own integration of their equations (10 µs steps), not the kernel's."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.axis_file import AxisConfig, DrivenAxis
+from taccorl.alignment.joint_model import JointModel, JointResponse
+from taccorl.alignment.joint_motion import motion_of
+from taccorl.alignment.measurement import Measurement, TargetKind
+from taccorl.errors import TaccorlError
+
+RATE_HZ, DT_S = 200, 1e-5
+SERVO = AxisConfig(
+    name="servo",
+    unit="rad",
+    inertia=0.02,
+    law="pwm",
+    kp=6.0,
+    supply_v=12.0,
+    resistance_ohm=4.0,
+    torque_nm_per_a=1.0,
+    emf_v_s_per_rad=1.1,
+    lever_m=0.15,
+)
+
+
+def recording(target: np.ndarray, kind: TargetKind = "position", payload_kg: float = 0.0) -> Measurement:
+    return Measurement(
+        name="made",
+        time_s=np.arange(len(target)) / RATE_HZ,
+        target=target[:, None],
+        measured=np.zeros((len(target), 1)),
+        signals=("servo",),
+        units=("rad",),
+        target_kinds=(kind,),
+        payload_kg={"servo": payload_kg},
+    )
+
+
+def answer(axis: AxisConfig, m: Measurement) -> JointResponse:
+    model = JointModel.of(DrivenAxis(axis))
+    return model.simulate(motion_of(m, "servo", DrivenAxis(axis)), model.gains)
+
+
+def integrated(target: np.ndarray, torque, inertia: float, weight_nm: float = 0.0) -> np.ndarray:
+    """(T,) position of inertia · q̈ = torque(target, q, v) − weight sin q from rest at 0, targets held."""
+    q = v = 0.0
+    found = []
+    for goal in target.tolist():
+        found.append(q)
+        for _ in range(round(1 / (RATE_HZ * DT_S))):
+            v += DT_S * (torque(goal, q, v) - weight_nm * math.sin(q)) / inertia
+            q += DT_S * v
+    return np.array(found)
+
+
+def test_a_pwm_servo_with_a_pendulum_clips_its_duty_and_loses_the_back_emf():
+    """τ = k_t (V d − k_e q̇) / R, d = kp (q* − q) within ± 1: at a step of 0.8 rad d is clipped, and the speed is k_e's."""
+    target = np.where(np.arange(400) < 10, 0.0, 0.8)
+
+    def torque(goal: float, q: float, v: float) -> float:
+        duty = min(max(6.0 * (goal - q), -1.0), 1.0)
+        return 1.0 * (12.0 * duty - 1.1 * v) / 4.0
+
+    inertia, weight = 0.02 + 0.3 * 0.15**2, 0.3 * 9.81 * 0.15
+    truth = integrated(target, torque, inertia, weight)
+    m = recording(target, payload_kg=0.3)
+    found = answer(SERVO, m)
+    assert np.abs(found.reported - truth).max() < 8e-3  # 1 % of the step: the model's steps are 0.7 ms
+    # At the end it stands: 12 V · kp · e / R holds the weight.
+    assert 3.0 * 6.0 * (0.8 - found.reported[-1]) == pytest.approx(weight * math.sin(found.reported[-1]), rel=0.03)
+    assert found.effort[-1] == pytest.approx(weight * math.sin(found.reported[-1]), rel=0.03)
+    stiff = dataclasses.replace(SERVO, emf_v_s_per_rad=1e-6)
+    assert np.abs(answer(stiff, m).reported - truth).max() > 0.05, "without back-EMF it is much faster"
+
+
+def test_a_velocity_loop_reaches_its_velocity_as_a_lag_of_inertia_over_gain():
+    """J q̈ = kd (v* − q̇): q = v* (t − T (1 − e^(−t/T))), T = J / kd = 0.1 s."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
+    time_s = np.arange(200) / RATE_HZ
+    found = answer(axis, recording(np.full(200, 1.5), "velocity"))
+    np.testing.assert_allclose(found.reported, 1.5 * (time_s - 0.1 * (1 - np.exp(-time_s / 0.1))), atol=3e-3)
+
+
+def test_a_torque_accelerates_and_none_lets_the_axis_coast():
+    """0.01 N·m on 0.02 kg·m² for 0.5 s: 0.0625 rad and 0.25 rad/s, kept with the motor off."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")
+    target = np.where(np.arange(200) < 100, 0.01, 0.0)
+    found = answer(axis, recording(target, "torque")).reported
+    assert found[100] == pytest.approx(0.0625, rel=0.01)
+    assert found[-1] == pytest.approx(0.0625 + 0.25 * 99 / RATE_HZ, rel=0.01)
+
+
+def test_a_target_that_the_law_does_not_take_is_refused():
+    with pytest.raises(TaccorlError, match=r"servo is commanded by velocity, its law takes a position; .*q_target"):
+        answer(SERVO, recording(np.zeros(50), "velocity"))
