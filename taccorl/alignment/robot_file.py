@@ -299,13 +299,21 @@ class RobotJoint(RigidJoint):
                 )
             if unit != self._robot.units[name]:
                 raise TaccorlError(f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}")
+            if m.target_kind(name) != "position":
+                raise TaccorlError(
+                    f"{m.name}: {name} is commanded by {m.target_kind(name)}, a robot file's joints by position"
+                )
+            if m.known_load(name).any():
+                raise TaccorlError(
+                    f"{m.name}: {name} has a known load, which a robot file cannot take; remove the column"
+                )
         kp, kd = dict(m.kp), dict(m.kd)
         for name, joint in self._robot.config.joints.items():
             if joint.gains == "commanded":
                 scale = m.gain_scale.get(name, 1.0)
                 kp.setdefault(name, scale * joint.kp)
                 kd.setdefault(name, scale * joint.kd)
-        m = dataclasses.replace(m, kp=kp, kd=kd)
+        m = dataclasses.replace(m, kp=kp, kd=kd, load=np.empty(0), target_kinds=())
         if m.signals == names:
             return m
         arrays: dict[str, np.ndarray] = {
