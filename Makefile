@@ -54,6 +54,7 @@ clean:  ## remove .venv, outputs and caches
 	$$python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null || { \
 	  echo "Python 3.12 is needed, found: $$($$python --version 2>&1). Install it (pyenv install 3.12) or make PYTHON=/path/to/python3.12 …"; exit 1; }; \
 	echo "setting up .venv with $$python (about 6 GB, most of it PyTorch's CUDA libraries; a minute or more)"; \
+	if [ -L .venv ]; then echo '.venv is a link: a set-up here would empty the environment it points to. Remove the link'; exit 1; fi; \
 	$$python -m venv --clear .venv
 	@$(BIN)/python -m pip install -q --disable-pip-version-check "$$(grep -E '^uv==' requirements.lock)"
 	@$(BIN)/uv pip install -q --python $(BIN)/python -r requirements.lock || $(BIN)/python -m pip install -q -r requirements.lock
