@@ -136,6 +136,13 @@ def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
                     link.remove(shape)
                     shapes += 1
         remarks = [f"{shapes} visual and collision shapes of the URDF are not used"] * bool(shapes)
+        for joint in root.iter("joint"):
+            mimic = joint.find("mimic")
+            if mimic is not None:
+                remarks.append(
+                    f"joint {joint.get('name')} follows {mimic.get('joint')} (<mimic>): that is not modelled, it is taken for a "
+                    "joint of its own; leave it out of the robot file if nothing drives it"
+                )
         return mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode")), remarks
     except (ValueError, mujoco.FatalError) as error:
         raise TaccorlError(f"{path}: MuJoCo cannot read it: {_one_line(error)}") from error

@@ -58,7 +58,7 @@ def main(argv: list[str]) -> int:
         for effect in addition.effects:
             _say(addition, effect)
     mended.save(out)
-    print(f"wrote {out}; next: taccorl compare --twin={out} --measurements=YOUR_SWEEPS")
+    print(f"wrote {out}; next: taccorl compare YOUR_RECORDINGS --twin={out}")
     return 0
 
 

@@ -44,5 +44,5 @@ def main(argv: list[str]) -> int:
     print(f"write {len(left)} values where it says {TODO}: lines {', '.join(map(str, left))}")
     name = next(iter(robot.joints))
     print(f"record each joint: tables with columns t, {name}.q, {name}.q_target, and where you have them .qd and .tau")
-    print(f"next: taccorl compare YOUR_SWEEPS --twin={out}")
+    print(f"next: taccorl compare YOUR_RECORDINGS --twin={out}")
     return 0

@@ -51,6 +51,7 @@ def load_twin(path: Path) -> TwinConfig:
     path = Path(path)
     if _says_nothing(path):
         return TwinConfig()
+    _refuse_other_kind(path)
     document = EffectsDocument(TwinConfig, path)
     try:
         present(document.value.effects)
@@ -65,6 +66,21 @@ def _says_nothing(path: Path) -> bool:
     except (OSError, UnicodeDecodeError):
         return False  # what reads it says so
     return all(not line.strip() or line.lstrip().startswith("#") for line in lines)
+
+
+def _refuse_other_kind(path: Path) -> None:
+    """Of a file that describes another machine: ``kind: robot``, ``axis``, ``cells``."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return  # what reads it says so
+    for number, line in enumerate(lines, 1):
+        if line.startswith("kind:"):
+            kind = line.removeprefix("kind:").split("#")[0].strip()
+            raise SpecError(
+                f"{path}:{number}: describes a machine of kind {kind!r}, which compare, diagnose and add-effect take; a "
+                "twin.yaml of the PiPER is needed here"
+            )
 
 
 def twin_text(config: TwinConfig) -> str:

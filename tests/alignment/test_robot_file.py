@@ -138,6 +138,14 @@ INERTIAL = (
 )
 
 
+def test_a_joint_that_mimics_another_is_told_of(tmp_path: Path):
+    path = tmp_path / "gripper.urdf"
+    text = URDF.format(inertial=INERTIAL).replace("<axis", '<mimic joint="thumb"/><axis', 1)
+    assert "<mimic" in text
+    path.write_text(text)
+    assert any("mimic" in remark and "thumb" in remark for remark in load_robot_model(path).remarks)
+
+
 def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
     path = tmp_path / "r.urdf"
     path.write_text(URDF.format(inertial=INERTIAL))

@@ -68,6 +68,14 @@ def error(report: Path, use: str, kind: str) -> float:
     return next(s["rmse"] for s in found if (s["use"], s["kind"]) == (use, kind))
 
 
+def test_rows_that_all_stand_twice_are_named_and_not_compared(bench: Path, tmp_path: Path, said: Any) -> None:
+    head, *rows = (bench / "bench" / "one.csv").read_text().splitlines()
+    (tmp_path / "twice").mkdir()
+    (tmp_path / "twice" / "one.csv").write_text("\n".join([head, *(row for row in rows for _ in range(2))]) + "\n")
+    code, text = said("compare", tmp_path / "twice", f"--twin={bench / 'drive.yaml'}")
+    assert code == 1 and "time_backwards" in text and "not compared" in text
+
+
 def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path, said: Any, tmp_path: Path):
     drive = bench / "drive.yaml"
     code, text = said("compare", bench / "bench", f"--twin={drive}", f"--out={tmp_path / 'before'}")

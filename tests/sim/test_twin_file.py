@@ -45,6 +45,14 @@ def test_a_file_that_says_nothing_is_the_nominal_twin(tmp_path: Path, text: str)
     assert read(tmp_path, text) == TwinConfig()
 
 
+@pytest.mark.parametrize("kind", ["robot", "axis", "cells"])
+def test_a_file_of_another_machine_is_refused_with_its_kind_and_line(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "drive.yaml"
+    path.write_text(f"# mine\nkind: {kind}  # of the bench\nname: slide\n")
+    with pytest.raises(SpecError, match=rf"drive\.yaml:2: .*'{kind}'.*twin\.yaml"):
+        load_twin(path)
+
+
 def test_the_shipped_file_names_only_commands_that_exist() -> None:
     text = (CONFIGS / "twin.yaml").read_text(encoding="utf-8")
     assert not re.search(r"taccorl (diagnose|add-effect)", text)
