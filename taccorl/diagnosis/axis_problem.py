@@ -1,4 +1,5 @@
-"""A driven axis by itself as a problem for the search: a slide on a bench, a motor with a mass, a servo with a pendulum.
+"""Identification of one driven axis: its fitted numbers, candidate effects and recordings, as the search for missing effects
+needs them. An axis is a slide on a bench, a motor with a mass, a servo with a pendulum.
 
 Inertia and a constant torque are fitted, and the weight where the file states one. So are the gains, within ``GAINS_WITHIN`` of
 those commanded, where the effort was recorded, which identifies them: a few per cent of them outweigh the friction of a fast

@@ -14,11 +14,11 @@ from taccorl.alignment.arm_joint import HasJoints
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.noise_floor import SignalFloor
-from taccorl.diagnosis.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.identifiable import Known, absolute_numbers, identifiable_numbers
 from taccorl.diagnosis.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
-from taccorl.diagnosis.problem import split_rows
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.search import Diagnosis, SearchConfig
+from taccorl.diagnosis.solve import solve
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
@@ -106,35 +106,19 @@ def diagnose_joint(
         raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
     own = dataclasses.replace(measurements, fit=sides[0], validation=sides[1], test=sides[2])
     problem = JointProblem(machine, signal, own, gains=gains)
-    fit_to, validation = (problem.fit, problem.validation) if problem.validation else split_rows(problem.fit)
-    if not any(np.isfinite(r.measured).any() for r in validation):
-        raise TaccorlError(
-            f"{signal}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so no effect can "
-            "be judged; record a motion that is measured to its end, or mark another one with use: validation"
-        )
-    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
-    found = diagnose(
-        problem,
-        fit_to,
-        validation,
-        problem.test,
-        start=problem.start,
-        present=problem.present,
-        without=without,
-        config=search,
-    )
-    known = known_numbers(problem, found)
+    solved = solve(signal, problem, problem.fit, problem.validation, problem.test, search, without)
+    known = known_numbers(problem, solved.diagnosis)
     return JointFinding(
         signal=signal,
         known=known,
-        diagnosis=with_intervals(found, known),
-        can_tell=can_tell,
+        diagnosis=with_intervals(solved.diagnosis, known),
+        can_tell=solved.can_tell,
         floors=tuple(problem.floors),
         commanded=problem.commanded,
         recordings={
             use: tuple(m.name for m in side) for use, side in zip(("fit", "validation", "test"), sides, strict=True)
         },
-        rows_split=not problem.validation,
+        rows_split=solved.rows_split,
     )
 
 

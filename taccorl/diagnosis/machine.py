@@ -13,21 +13,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
-import numpy as np
-import yaml
-
 from taccorl.alignment.measurements import Measurements, read_measurements
 from taccorl.alignment.touch_motion import PressedObject
 from taccorl.data.finding import Finding as DataFinding
+from taccorl.data.finding import listed
 from taccorl.diagnosis.comparison import Comparison
-from taccorl.diagnosis.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.identifiable import Known
 from taccorl.diagnosis.joints import each
-from taccorl.diagnosis.problem import Problem, Recording, Values, split_rows
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.problem import Recording
+from taccorl.diagnosis.search import Diagnosis, SearchConfig
+from taccorl.diagnosis.solve import Startable, solve
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.plugins import Registry
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.twin_file import kind_of
 
 GainsAre = Literal["auto", "commanded", "fitted"]
 """``auto``: gains that every recording states stay fixed, others are fitted."""
@@ -113,16 +113,12 @@ class Addition(NamedTuple):
     """Number → 95 % interval."""
 
 
-class PartProblem(Problem, Protocol):
+class PartProblem(Startable, Protocol):
     """A problem with the recordings that it is solved on."""
 
     fit: Sequence[Recording]
     validation: Sequence[Recording]
     test: Sequence[Recording]
-    start: Values
-    """Numbers from which the search starts."""
-    present: tuple[str, ...]
-    """Effects that the file has already."""
     noise: str
     numbers: str
     measured: str
@@ -135,10 +131,13 @@ class Machine(ABC):
     """For titles and tables: the file's stem."""
     part_word: ClassVar[str] = "part"
     """What messages call one of its parts: joint, axis, pad."""
-    file_name: str
-    """Name of the file that ``diagnose --until=noise_floor`` writes."""
     saved_words: ClassVar[str] = "compare and diagnose load it"
     """Use of a file that ``save`` has written."""
+
+    @property
+    def file_name(self) -> str:
+        """Name of the file, in the folder of the report, that ``diagnose --until=noise_floor`` writes the mended machine to."""
+        return f"{self.name}.yaml"
 
     @classmethod
     @abstractmethod
@@ -198,9 +197,14 @@ class Machine(ABC):
         """
         if pads:
             raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; leave --pads out")
+        known = [*self.units] or parts
         for name in joints:
+            if name not in known:
+                raise TaccorlError(f"--joints={name}: no such {self.part_word}; {nearest(name, known)}")
             if name not in parts:
-                raise TaccorlError(f"{name}: no such {self.part_word} here; {nearest(name, parts)}")
+                raise TaccorlError(
+                    f"--joints={name}: no fit recording moves it; those that are moved: {listed(list(parts))}"
+                )
         return tuple(p for p in parts if not joints or p in joints)
 
     @abstractmethod
@@ -276,7 +280,7 @@ class Machine(ABC):
 
     @abstractmethod
     def with_additions(self, additions: Sequence[Addition]) -> Self:
-        """With these effects and numbers; an effect of the same name at the same part is replaced.
+        """A copy of the machine with these effects and numbers; an effect of the same name at the same part is replaced.
 
         Raises:
             TaccorlError: parts that share a number need different ones.
@@ -300,40 +304,21 @@ class Machine(ABC):
 def solved(
     part: str, problem: PartProblem, search: SearchConfig | None = None, without: Sequence[str] = ()
 ) -> PartFinding:
-    """Search for the effect that is missing in one part's problem.
-
-    Args:
-        without: effects that are not considered.
+    """``solve`` of a problem that holds its recordings.
 
     Raises:
         TaccorlError: nothing was measured in the validation rows.
     """
-    fit_to, validation = (problem.fit, problem.validation) if problem.validation else split_rows(problem.fit)
-    if not any(np.isfinite(r.measured).any() for r in validation):
-        raise TaccorlError(
-            f"{part}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so no effect "
-            "can be judged; record a motion that is measured to its end, or mark another one with use: validation"
-        )
-    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
-    found = diagnose(
-        problem,
-        fit_to,
-        validation,
-        problem.test,
-        start=problem.start,
-        present=problem.present,
-        without=without,
-        config=search,
-    )
+    found = solve(part, problem, problem.fit, problem.validation, problem.test, search, without)
     return PartFinding(
         part=part,
-        diagnosis=found,
-        can_tell=can_tell,
+        diagnosis=found.diagnosis,
+        can_tell=found.can_tell,
         noise=problem.noise,
         numbers=problem.numbers,
         measured=problem.measured,
         recordings={use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")},
-        rows_split=not problem.validation,
+        rows_split=found.rows_split,
     )
 
 
@@ -351,24 +336,12 @@ def load_machine(path: Path | None) -> Machine:
     if path is None:
         return PiperTwin.nominal()
     path = Path(path)
-    kind, line = _kind(path)
+    kind, line = kind_of(path)
     if kind is None:
         return PiperTwin.load(path)
     if kind not in machines:
         raise SpecError(f"{path}:{line}: kind: no kind of machine {kind!r}; {nearest(kind, machines)}")
     return machines.get(kind).load(path)
-
-
-def _kind(path: Path) -> tuple[str | None, int]:
-    """Value and line of the key ``kind``. None where the file is not YAML or cannot be read, too: what reads it says so."""
-    try:
-        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
-        return None, 1
-    for key, value in root.value if isinstance(root, yaml.MappingNode) else ():
-        if key.value == "kind":
-            return str(value.value), key.start_mark.line + 1
-    return None, 1
 
 
 def diagnose_parts(

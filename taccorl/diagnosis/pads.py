@@ -16,10 +16,11 @@ from taccorl.alignment.noise_floor import repeat_pairs
 from taccorl.alignment.touch_motion import TouchMotion
 from taccorl.diagnosis.evidence import block_squares, standard_score
 from taccorl.diagnosis.fit import fit
-from taccorl.diagnosis.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.problem import Recording, split_rows
 from taccorl.diagnosis.replays import matched_contact
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose, gain_of
+from taccorl.diagnosis.search import Diagnosis, SearchConfig, gain_of
+from taccorl.diagnosis.solve import solve
 from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -123,32 +124,22 @@ def diagnose_arm(
     problem = TouchProblem(every, config)
     fit_to, validation, test = problem.recordings(motions["fit"], motions["validation"], motions["test"])
     floor_count = float(np.median(np.concatenate([r.floor for r in fit_to])))
-    rows_split = not validation
-    if rows_split:
-        fit_to, validation = split_rows(fit_to)
-    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
-    found = diagnose(
-        problem,
-        fit_to,
-        validation,
-        test,
-        start=problem.start,
-        present=problem.present,
-        without=without,
-        config=search,
-    )
-    gains = unjudged_gains(problem, found, fit_to, validation, search or SearchConfig()) if not rows_split else None
+    solved = solve(part_of(arm), problem, fit_to, validation, test, search, without)
+    gains = None
+    if not solved.rows_split:
+        found = solved.diagnosis
+        gains = unjudged_gains(problem, found, solved.fit_to, solved.validation, search or SearchConfig())
     return PadFinding(
         gains=gains,
         not_shared=tuple(problem.not_shared),
         arm=arm,
         pads=problem.pads,
-        diagnosis=found,
-        can_tell=can_tell,
+        diagnosis=solved.diagnosis,
+        can_tell=solved.can_tell,
         floor_count=floor_count,
         lower_bound=not repeat_pairs(m for some in uses.values() for m in some),
         recordings={use: tuple(m.name for m in some) for use, some in uses.items()},
-        rows_split=rows_split,
+        rows_split=solved.rows_split,
     )
 
 

@@ -263,7 +263,7 @@ def named(row: dict[str, Any]) -> bool:
 
 
 def exact_but_for_algebra(row: dict[str, Any]) -> bool:
-    """As ``exact``, with effects counted as one that no position measurement can separate."""
+    """``exact``, where effects that give identical positions (``IDENTICAL``) count as the same effect."""
     found = row["found"] if len(row["hidden"]) > 1 else row["found"][:1]
     return all(any(h == f or any({h, f} <= group for group in IDENTICAL) for f in found) for h in row["hidden"])
 
@@ -273,7 +273,7 @@ AT_FLOOR = ("at_floor", "gains_moved")
 
 
 def silently_wrong(row: dict[str, Any]) -> bool:
-    """True if the search ends at the floor without having found or named any hidden effect."""
+    """Whether the search reached the noise floor, and so reports success, although it neither found nor named a hidden effect."""
     return row["status"] in AT_FLOOR and not set(row["found"]) & set(row["hidden"]) and not named(row)
 
 

@@ -51,7 +51,12 @@ def load_twin(path: Path) -> TwinConfig:
     path = Path(path)
     if _says_nothing(path):
         return TwinConfig()
-    _refuse_other_kind(path)
+    kind, line = kind_of(path)
+    if kind is not None:
+        raise SpecError(
+            f"{path}:{line}: describes a machine of kind {kind!r}, which compare, diagnose and add-effect take; a twin.yaml of "
+            "the PiPER is needed here"
+        )
     document = EffectsDocument(TwinConfig, path)
     try:
         present(document.value.effects)
@@ -68,19 +73,19 @@ def _says_nothing(path: Path) -> bool:
     return all(not line.strip() or line.lstrip().startswith("#") for line in lines)
 
 
-def _refuse_other_kind(path: Path) -> None:
-    """Of a file that describes another machine: ``kind: robot``, ``axis``, ``cells``."""
+def kind_of(path: Path) -> tuple[str | None, int]:
+    """Value and line of the key ``kind``, which files of machines other than the PiPER begin with.
+
+    None where there is none, and where the file is not YAML or cannot be read: what reads it says so.
+    """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        return  # what reads it says so
-    for number, line in enumerate(lines, 1):
-        if line.startswith("kind:"):
-            kind = line.removeprefix("kind:").split("#")[0].strip()
-            raise SpecError(
-                f"{path}:{number}: describes a machine of kind {kind!r}, which compare, diagnose and add-effect take; a "
-                "twin.yaml of the PiPER is needed here"
-            )
+        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
+        return None, 1
+    for key, value in root.value if isinstance(root, yaml.MappingNode) else ():
+        if key.value == "kind":
+            return str(value.value), key.start_mark.line + 1
+    return None, 1
 
 
 def twin_text(config: TwinConfig) -> str:

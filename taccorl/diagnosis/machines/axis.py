@@ -22,6 +22,7 @@ from taccorl.diagnosis.comparison import USES, Comparison, Kind, Trace
 from taccorl.diagnosis.machine import Addition, GainsAre, Machine, machines
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.twin_file import write_whole
 
 SMOOTH_S = 0.05
 """Window of the quadratic whose second derivative is the measured acceleration."""
@@ -45,21 +46,10 @@ class Axis(Machine):
         return cls(load_axis(path), Path(path).stem)
 
     def save(self, path: Path) -> None:
-        path = Path(path)
-        new = path.with_name(f".{path.name}.new")
-        try:
-            new.write_text(axis_text(self.config), encoding="utf-8")
-            new.replace(path)
-        except OSError as error:
-            new.unlink(missing_ok=True)
-            raise TaccorlError(f"{path}: cannot be written: {error}") from error
+        write_whole(path, axis_text(self.config))
 
     def digest(self) -> str:
         return axis_digest(self.config)
-
-    @property
-    def file_name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return f"{self.name}.yaml"
 
     @property
     def effects(self) -> tuple[str, ...]:

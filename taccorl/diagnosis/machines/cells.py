@@ -41,7 +41,6 @@ class CellsMachine(Machine):
 
     config: CellsConfig
     name: str = "cells"
-    file_name: str = "cells.yaml"
     part_word: ClassVar[str] = "sensor"
     of_joints: ClassVar[bool] = False
 

@@ -30,7 +30,6 @@ class PiperTwin(Machine):
 
     config: TwinConfig
     name: str = "twin"
-    file_name: str = "twin.yaml"
     part_word: ClassVar[str] = "joint"
     saved_words: ClassVar[str] = "it is what collect and training load"
 
@@ -42,6 +41,10 @@ class PiperTwin(Machine):
     def nominal(cls) -> "PiperTwin":
         """The twin without any file."""
         return cls(TwinConfig(), "nominal twin")
+
+    @property
+    def file_name(self) -> str:
+        return "twin.yaml"
 
     def save(self, path: Path) -> None:
         save_twin(self.config, path)

@@ -14,14 +14,13 @@ from taccorl.alignment.robot_checks import check_robot
 from taccorl.alignment.robot_file import Robot, load_robot
 from taccorl.alignment.touch_motion import PressedObject
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.data.finding import listed
 from taccorl.diagnosis.compare import moving, traces_of
 from taccorl.diagnosis.comparison import USES, Comparison, Kind
 from taccorl.diagnosis.joints import diagnose_joint, moves
 from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine, machines
 from taccorl.diagnosis.replays import replay_joints
 from taccorl.diagnosis.search import SearchConfig
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin_file import write_whole
@@ -45,10 +44,6 @@ class RobotMachine(Machine):
 
     def digest(self) -> str:
         return self.robot.digest()
-
-    @property
-    def file_name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return f"{self.name}.yaml"
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -78,18 +73,6 @@ class RobotMachine(Machine):
                 "± 0.3 rad, 0.1 to 2 Hz, 10 s, twice"
             )
         return found
-
-    def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
-        if pads:
-            raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; leave --pads out")
-        for name in joints:
-            if name not in self.robot.config.joints:
-                raise TaccorlError(f"--joints={name}: no such joint; {nearest(name, self.robot.config.joints)}")
-            if name not in parts:
-                raise TaccorlError(
-                    f"--joints={name}: no fit recording moves it; those that are moved: {listed(list(parts))}"
-                )
-        return tuple(p for p in parts if not joints or p in joints)
 
     def compare(
         self,
