@@ -96,9 +96,17 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine") -> list["Addition"]:
     offers, refused = [], []
     for part in machine.select(list(diagnoses), config.joints, config.pads):
         try:
-            offers += _offer(machine, config.effect, part, diagnoses[part])
+            found = _offer(machine, config.effect, part, diagnoses[part])
         except TaccorlError as error:
             refused.append(error)
+            continue
+        offers += found
+        ends = diagnoses[part]["at_bound"]
+        if found and ends:
+            print(
+                f"warning: {part}: the fit ended with {', '.join(ends)} at the end of its range, so the other numbers may be "
+                "wrong, too: check units, gains and time stamps, or look for more effects (--until=noise_floor)"
+            )
     if refused and (wanted or not offers):
         raise refused[0]
     if not offers:

@@ -57,6 +57,19 @@ def words(folder: Path) -> list[str]:
     return [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={folder / 'diagnosis'}"]
 
 
+@pytest.mark.parametrize("ends", [["kp"], []])
+def test_numbers_of_a_fit_that_ended_at_a_bound_are_written_with_a_warning(
+    folder: Path, said: Any, tmp_path: Path, ends: list[str]
+):
+    report = json.loads((folder / "diagnosis" / "report.json").read_text())
+    assert report["diagnoses"][SIGNAL]["at_bound"] == []
+    report["diagnoses"][SIGNAL]["at_bound"] = ends
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    words = [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={tmp_path}", f"--out={tmp_path / 'new.yaml'}"]
+    code, text = said("coulomb_friction", *words)
+    assert code == 0 and (f"warning: {SIGNAL}: the fit ended with kp" in text) == bool(ends)
+
+
 def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said: Any, words: list[str]):
     before = (folder / "twin.yaml").read_bytes()
     code, text = said("coulomb_friction", *words)
