@@ -100,7 +100,7 @@ class Load:
 
 @dataclass(kw_only=True)
 class Reading:
-    """What each cell reads."""
+    """Unit, converter range and direction of the readings, the same for all cells."""
 
     unit: str
     """A key of ``READINGS``."""

@@ -39,7 +39,7 @@ class AirAssembly(ScriptedExpert):
 
     @abstractmethod
     def world_from_level(self) -> np.ndarray:
-        """Rotation (3, 3) in which the hole is held: its axis along +y."""
+        """Rotation (3, 3), world from the held part, at which its hole is presented: the hole's axis points along world +y."""
 
     @abstractmethod
     def plug(self) -> tuple[Part, str]:

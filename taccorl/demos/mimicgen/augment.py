@@ -120,7 +120,7 @@ class AugmentPlan:
         return attempt_seeds(self.seed, self.spec.task, k)[0]
 
     def draw(self, k: int) -> dict[str, np.ndarray]:
-        """Random draw of attempt ``k`` at its reset, without simulating it."""
+        """Values that the reset of attempt ``k`` draws at random (poses of parts and others), by name; nothing is simulated."""
         return draw(self._rows, np.random.default_rng(self.scene_seed(k)), self.randomization)
 
     def twin_config(self) -> TwinConfig:

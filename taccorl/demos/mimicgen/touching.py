@@ -19,7 +19,7 @@ class Touching:
         self.pairs: set[frozenset[str]] = set()
 
     def look(self, row: np.ndarray) -> None:
-        """Compute the contacts of a stored row (row_size,) of ``Simulation.state_rows``; ``data`` then has its poses."""
+        """Set ``data`` to a stored row (row_size,) of ``Simulation.state_rows``, and compute which bodies touch in it."""
         mujoco.mj_setState(self.model, self.data, row[1 : 1 + self._size], mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_collision(self.model, self.data)

@@ -305,7 +305,7 @@ class TactilePI05Config(PI05Config):
         return len(bodies_of(self.require_part_names()))
 
     def require_part_names(self) -> list[str]:
-        """Names of the numbers of the parts' poses, which must be known.
+        """Names of the numbers in the pose input, part after part: position [m] and rotation.
 
         Raises:
             TaccorlError: neither a dataset nor a checkpoint has them.
