@@ -101,6 +101,9 @@ class AxisConfig:
     """Distance from the axis at which a recording's ``payload_kg`` is held; 0 on a slide, which carries it."""
     hangs_at_rad: float = 0.0
     """Angle at which that payload hangs straight down."""
+    command_hz: float | None = None
+    """Rate at which the drive receives targets, where they are logged more slowly: a replay joins the rows by straight
+    lines of such steps. If not given, rows slower than 150 Hz are joined so, if targets are positions; others are held."""
     limits: tuple[float, float] | None = None
     """Lowest and highest position [rad]."""
     effort_limit: float | None = None
@@ -116,7 +119,7 @@ class AxisConfig:
         check_numbers("axis", self, positive=("inertia",), not_negative=("kp", "kd", "lever_m"))
         check_numbers("axis", self, finite=("torque_ff", "weight_sin", "weight_cos", "hangs_at_rad"))
         of_pwm = ("supply_v", "resistance_ohm", "torque_nm_per_a", "emf_v_s_per_rad")
-        optional = (*of_pwm, "effort_limit", "force_unit_n", "length_unit_m")
+        optional = (*of_pwm, "effort_limit", "command_hz", "force_unit_n", "length_unit_m")
         check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
         needed = {
             "impedance": ("kp",),
@@ -327,6 +330,8 @@ class DrivenAxis(RigidJoint):
     @property
     def command_hz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
         """A target that is no position is held until the next one."""
+        if self.config.command_hz is not None:
+            return self.config.command_hz
         return 0.0 if self.config.law in _COMMANDS else 150.0
 
     @property

@@ -21,6 +21,8 @@ MOVING = 0.02
 """rad (a tenth of it in m): a joint that is commanded further than this tells about time."""
 SURE = 4.0
 """Standard deviations beyond which an offset is one."""
+HALF_ROW_MOST = 0.75
+"""Rows: a lead below this may come from targets that are held in the replay and were not by the drive."""
 LEAD_ROWS = 0.3
 """A lead of less could be the fit's own error."""
 LATE_ROWS = 1.2
@@ -152,6 +154,11 @@ def check_against_twin(m: Measurement, reported: np.ndarray, floor: dict[str, fl
                     "or commands too late, or paired one row off; set `latency_s` of the state's channel (or "
                     "target_rows_late) and read again"
                 )
+                if -shift_s < HALF_ROW_MOST * period_s:
+                    text += (
+                        ". Half a row is also what a drive shows that receives targets faster than they are logged: state that "
+                        "rate as `command_hz` in the file of your robot or axis"
+                    )
             else:
                 text = (
                     f"{name}: the measurement comes {where} after the twin's replay: a real delay (effects "

@@ -75,8 +75,9 @@ class RigidJoint(ABC):
     unit: Literal["rad", "m"] = "rad"
     gains: Gains
     """Of a recording that states none."""
-    command_hz: ClassVar[float] = 150.0
-    """Slower rows are sent in straight lines of such steps."""
+    command_hz: float = 150.0
+    """Rate at which its drive receives targets: rows that are logged more slowly are joined by straight lines of such steps, at a
+    higher rate a target is held until the next row."""
     effort_holds_weight: ClassVar[bool] = False
     """Whether the reported effort holds the torque by which the controller carries the weight."""
 

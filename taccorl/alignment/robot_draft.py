@@ -67,6 +67,7 @@ def _joint(facts: JointFacts) -> list[str]:
         lines += [f"    effort_limit: {limit:.6g}   # {torque}; torques beyond are clipped"]
     else:
         lines += [f"    # effort_limit: 10.0       # {torque}; the model names none"]
+    lines += ["    # command_hz: 1000.0       # where the drive receives targets faster than they are logged"]
     effects = []
     if facts.damping > 0:
         effects.append(f"{{effect: viscous_friction, damping_nms_per_rad: {facts.damping:.6g}}}")

@@ -86,6 +86,9 @@ class JointConfig:
     """N·m at the joint: larger torques are clipped."""
     loop_hz: float | None = None
     """Rate of the drive's control loop."""
+    command_hz: float | None = None
+    """Rate at which the drive receives targets, where they are logged more slowly: a replay joins the rows by straight
+    lines of such steps. If not given, a target is held until the next row."""
     position_age_s: float = 0.0
     """How much older than the loop's timing says the measured position is when the torque acts; ``diagnose`` fits it."""
     effects: list[Effect] = field(default_factory=list)
@@ -94,7 +97,7 @@ class JointConfig:
         check_numbers(
             "joint", self, positive=("kp", "gear"), not_negative=("kd", "rotor_inertia"), finite=("torque_ff",)
         )
-        for name in ("effort_limit", "loop_hz"):
+        for name in ("effort_limit", "loop_hz", "command_hz"):
             if getattr(self, name) is not None:
                 check_numbers("joint", self, positive=(name,))
 
@@ -246,7 +249,6 @@ def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool) -> bool:
 class RobotJoint(RigidJoint):
     """One joint of a robot file. Positions of a pose are the model's ``qpos``."""
 
-    command_hz: ClassVar[float] = 0.0  # a target is held until the next row
     effort_holds_weight: ClassVar[bool] = True
     exact_timing: ClassVar[bool] = True
 
@@ -254,6 +256,7 @@ class RobotJoint(RigidJoint):
         self._robot, self._config = robot, robot.config.joints[signal]
         self.signal, self.unit = signal, robot.rigid.joints[signal].unit
         self.gains = Gains(self._config.kp, self._config.kd, self._config.torque_ff)
+        self.command_hz = self._config.command_hz or 0.0
         self.torque_max = np.inf if self._config.effort_limit is None else self._config.effort_limit
         # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again.
         loop_s = 0.0 if self._config.loop_hz is None else 1.0 / self._config.loop_hz

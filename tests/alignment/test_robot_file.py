@@ -128,6 +128,22 @@ def test_a_draft_says_all_that_the_model_says_and_loads_once_its_todos_are_writt
         init_robot.main([str(tmp_path / "arm.xml"), f"--out={out}"])
 
 
+def test_targets_that_move_between_rows_lead_held_ones_by_half_a_row(tmp_path: Path):
+    ramp = swept(
+        shoulder=np.zeros(400), elbow=np.clip(np.arange(400) / 200 - 0.5, 0, 1)
+    )  # 1 rad/s from 0.5 s on, 200 Hz
+    fast = ROBOT_YAML.replace("kd: 1.0", "kd: 1.0, command_hz: 1000")
+    assert fast != ROBOT_YAML
+    reached = []
+    for text in (ROBOT_YAML, fast):
+        model = JointModel(robot(tmp_path, text), "elbow")
+        motion = dataclasses.replace(motion_of(ramp, "elbow", model.joint), start=0.0)
+        reached.append(model.simulate(motion, model.gains).reported)
+    # Held for 5 ms a target is 2.5 ms late on average; in five steps of 1 ms that jump to their ends it is 0.5 ms early.
+    lead_s = float(np.median((reached[1] - reached[0])[250:290]))
+    assert lead_s == pytest.approx(0.0025 + 0.0005, abs=2e-4)
+
+
 URDF = """<robot name="r"><link name="base"/>
 <link name="a"><visual><geometry><mesh filename="package://x/a.stl"/></geometry></visual>{inertial}</link>
 <joint name="j1" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>

@@ -76,6 +76,39 @@ def test_rows_that_all_stand_twice_are_named_and_not_compared(bench: Path, tmp_p
     assert code == 1 and "time_backwards" in text and "not compared" in text
 
 
+def write_smooth(path: Path, seed: int) -> None:
+    """The mass without friction under a target that moves on at 0.1 ms, logged at 250 Hz."""
+    dt_s = 1.0 / (RATE_HZ * PARTS)
+    time_s = np.arange(4 * RATE_HZ * PARTS) * dt_s
+    fade = np.clip(np.minimum(time_s - 0.3, 3.7 - time_s) / 0.4, 0, 1)
+    target = 0.1 * fade**2 * (3 - 2 * fade) * np.sin(2 * np.pi * 0.6 * (time_s - 0.3))
+    at = speed = 0.0
+    rng = np.random.default_rng(seed)
+    lines = ["t,slide.q,slide.q_target"]
+    for k, goal in enumerate(target.tolist()):
+        if k % PARTS == 0:
+            lines.append(f"{time_s[k]:.4f},{at + 2e-5 * rng.standard_normal():.7f},{goal:.7f}")
+        speed += dt_s * (KP * (goal - at) - KD * speed) / MASS_KG
+        at += dt_s * speed
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_a_drive_whose_targets_are_logged_too_slowly_is_compared_once_its_rate_is_stated(tmp_path: Path, said: Any):
+    (tmp_path / "bench").mkdir()
+    for name, seed in (("one", 1), ("again", 2)):
+        write_smooth(tmp_path / "bench" / f"{name}.csv", seed)
+    (tmp_path / "bench" / "measurements.yaml").write_text("recordings:\n  again.csv: {repeat_of: one.csv}\n")
+    (tmp_path / "held.yaml").write_text(FILE)
+    (tmp_path / "drive.yaml").write_text(FILE + "command_hz: 2500\n")
+    code, text = said("compare", tmp_path / "bench", f"--twin={tmp_path / 'held.yaml'}", f"--out={tmp_path / 'a'}")
+    assert code == 1 and "shifted_from_twin" in text and "command_hz" in text
+    code, text = said("compare", tmp_path / "bench", f"--twin={tmp_path / 'drive.yaml'}", f"--out={tmp_path / 'b'}")
+    assert code == 0 and "shifted_from_twin" not in text, text
+    assert (
+        error(tmp_path / "b", "fit", "position") < 4e-5
+    )  # noise of 2e-5 m; held, half a row of 4 ms at 0.38 m/s is 7e-4 m
+
+
 def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path, said: Any, tmp_path: Path):
     drive = bench / "drive.yaml"
     code, text = said("compare", bench / "bench", f"--twin={drive}", f"--out={tmp_path / 'before'}")
@@ -109,7 +142,7 @@ def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench: Path, said: Any
     code, text = said("add-effect", *words, "--pads=left", f"--out={tmp_path / 'y.yaml'}")
     assert code == 2 and "drive has no pads" in text
     code, text = said("add-effect", *words, "--joints=[slde]", f"--out={tmp_path / 'y.yaml'}")
-    assert code == 2 and "no such axis here; did you mean 'slide'" in text
+    assert code == 2 and "--joints=slde: no such axis; did you mean 'slide'" in text
 
 
 @pytest.mark.parametrize(
