@@ -202,7 +202,7 @@ def _error_cells(s: "Score") -> list:
     from rich.text import Text
 
     from taccorl.diagnosis.comparison import shown
-    from taccorl.diagnosis.search import SearchConfig
+    from taccorl.diagnosis.search_result import SearchConfig
 
     return [shown(s.rmse, s.unit), Text(f"{s.ratio:.3g}", "green" if s.ratio <= SearchConfig().stop_at else "yellow")]
 

@@ -119,7 +119,7 @@ def _diagnosed(
 ) -> "list[Finding]":
     from taccorl.cli.tables import Bars
     from taccorl.diagnosis.machine import diagnose_parts
-    from taccorl.diagnosis.search import SearchConfig
+    from taccorl.diagnosis.search_result import SearchConfig
 
     search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
     with Bars(len(parts)) as bars:

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from taccorl.diagnosis.cells_problem import CellsProblem
-from taccorl.diagnosis.search import SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.diagnosis.surrogate.cells import HIDDEN, draw_cells, simulated
 
 ASKED = (

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from taccorl.diagnosis.search import Diagnosis, Evidence, SearchConfig
+from taccorl.diagnosis.search_result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect

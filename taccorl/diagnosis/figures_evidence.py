@@ -10,7 +10,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from scipy.stats import binomtest
 
 from taccorl.diagnosis.figure_style import AFTER, BEFORE, FLOOR, legend, new_figure, tidy
-from taccorl.diagnosis.search import SearchConfig
+from taccorl.diagnosis.search_result import SearchConfig
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from taccorl.alignment.noise_floor import SignalFloor
 from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.identifiable import Known, absolute_numbers, identifiable_numbers
 from taccorl.diagnosis.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
-from taccorl.diagnosis.search import Diagnosis, SearchConfig
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 from taccorl.diagnosis.solve import solve
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT

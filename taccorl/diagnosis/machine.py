@@ -22,7 +22,7 @@ from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.identifiable import Known
 from taccorl.diagnosis.joints import each
 from taccorl.diagnosis.problem import Recording
-from taccorl.diagnosis.search import Diagnosis, SearchConfig
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 from taccorl.diagnosis.solve import Startable, solve
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.plugins import Registry

@@ -19,7 +19,8 @@ from taccorl.diagnosis.fit import fit
 from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.problem import Recording, split_rows
 from taccorl.diagnosis.replays import matched_contact
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, gain_of
+from taccorl.diagnosis.search import gain_of
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 from taccorl.diagnosis.solve import solve
 from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem
 from taccorl.errors import TaccorlError

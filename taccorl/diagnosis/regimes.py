@@ -14,7 +14,7 @@ from taccorl.alignment.measurements import Use
 from taccorl.diagnosis.along import variable_unit
 from taccorl.diagnosis.comparison import USES, Trace
 from taccorl.diagnosis.localise import LEAST_SHARE, REGIMES, Motion, bridged, motions_of
-from taccorl.diagnosis.search import SearchConfig
+from taccorl.diagnosis.search_result import SearchConfig
 
 ALL = "all rows"
 GROUPS = ("speed", "direction", "pose")

@@ -24,7 +24,7 @@ from taccorl.diagnosis.identifiable import Known
 from taccorl.diagnosis.localise import WHERE_NOT_WHY, Cell, heat_map
 from taccorl.diagnosis.localise_touch import touch_heat_map
 from taccorl.diagnosis.regimes import RegimeErrors, regime_errors
-from taccorl.diagnosis.search import Diagnosis
+from taccorl.diagnosis.search_result import Diagnosis
 from taccorl.diagnosis.verdict import Verdict, verdict
 from taccorl.errors import TaccorlError
 

@@ -12,7 +12,7 @@ from taccorl.diagnosis.identifiable import TIMING_S, Known
 from taccorl.diagnosis.joint_problem import OF_RECORDINGS
 from taccorl.diagnosis.regimes import ALL, AT_FLOOR, RegimeError, RegimeErrors
 from taccorl.diagnosis.report_html import figure, note, table
-from taccorl.diagnosis.search import Diagnosis, Evidence, Round
+from taccorl.diagnosis.search_result import Diagnosis, Evidence, Round
 from taccorl.diagnosis.verdict import Verdict, refitted_words
 from taccorl.sim.effects.effect import Effect
 

@@ -19,7 +19,7 @@ from taccorl.diagnosis.localise import WHERE_NOT_WHY, Cell, worst_regime
 from taccorl.diagnosis.report import GENERATOR, Report, cells_of
 from taccorl.diagnosis.report_evidence import diagnosis_section, first_read
 from taccorl.diagnosis.report_html import figure, note, table
-from taccorl.diagnosis.search import SearchConfig
+from taccorl.diagnosis.search_result import SearchConfig
 
 STYLE = """
 :root{color-scheme:light}

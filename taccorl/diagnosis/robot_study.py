@@ -18,7 +18,7 @@ from statistics import median
 from typing import Any
 
 from taccorl.diagnosis.joints import diagnose_joint
-from taccorl.diagnosis.search import SearchConfig
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.diagnosis.surrogate.foreign import KINDS, ROBOTS, draw, with_robot
 from taccorl.evaluation.statistics import wilson_interval
 from taccorl.sim.effects import effects

@@ -7,7 +7,8 @@ import numpy as np
 
 from taccorl.diagnosis.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.problem import Problem, Recording, Values, split_rows
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 from taccorl.errors import TaccorlError
 
 

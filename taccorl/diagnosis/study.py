@@ -16,7 +16,8 @@ from typing import Any
 
 from taccorl.alignment.measurement import Measurement
 from taccorl.diagnosis.joint_problem import JointProblem
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 from taccorl.diagnosis.surrogate.cases import Case, draw_case
 from taccorl.diagnosis.surrogate.hidden import KINDS
 from taccorl.diagnosis.surrogate.recordings import recordings

@@ -10,7 +10,7 @@ from typing import Literal
 from taccorl.diagnosis.evidence_words import effect_class, excite_command, unjudged
 from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.identifiable import Known
-from taccorl.diagnosis.search import Diagnosis, SearchConfig
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 
 Kind = Literal[
     "nothing_missing", "effects", "ties", "more", "something_else", "gains_moved", "not_converged", "data_first"

@@ -14,7 +14,8 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
 from taccorl.diagnosis.problem import split_rows
-from taccorl.diagnosis.search import SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects.scaled import scaled
 

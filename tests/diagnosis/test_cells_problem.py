@@ -13,7 +13,8 @@ from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.cells_problem import CellsProblem, reading_floor
 from taccorl.diagnosis.machines.cells import CellsMachine
 from taccorl.diagnosis.problem import split_rows
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 from taccorl.diagnosis.surrogate.cells import HIDDEN, CellsCase, draw_cells, record, simulated
 
 RATE_HZ = 100.0

@@ -10,7 +10,8 @@ from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.fit import fit, rms, stacked
 from taccorl.diagnosis.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.motions import AGAIN, CHIRP, HELD_STEPS, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
-from taccorl.diagnosis.search import SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect

@@ -21,7 +21,7 @@ from taccorl.diagnosis.joints import (
 from taccorl.diagnosis.machine import diagnose_parts
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
-from taccorl.diagnosis.search import SearchConfig
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect

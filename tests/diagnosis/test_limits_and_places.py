@@ -15,7 +15,8 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.diagnosis.axis_problem import AxisProblem
 from taccorl.diagnosis.joint_problem import JointProblem
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.dropped_commands import uniform

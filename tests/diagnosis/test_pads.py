@@ -16,7 +16,7 @@ from taccorl.diagnosis.joints import moves, swept_joints
 from taccorl.diagnosis.machine import Addition, diagnose_parts
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.pads import PadFinding, agreed, diagnose_arm, pads_of, pressed_arms
-from taccorl.diagnosis.search import Evidence, SearchConfig
+from taccorl.diagnosis.search_result import Evidence, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig

@@ -17,7 +17,7 @@ from taccorl.diagnosis.compare import compare
 from taccorl.diagnosis.joints import JointFinding, diagnose_joint
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.report import NUMBERS, PAGE, Report, Written, check_folder, write_report
-from taccorl.diagnosis.search import SearchConfig
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
 from taccorl.sim.twin import TwinConfig

@@ -8,7 +8,8 @@ import pytest
 from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, drive, record
 
 from taccorl.diagnosis import search
-from taccorl.diagnosis.search import SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.errors import TaccorlError
 
 

@@ -17,7 +17,8 @@ from taccorl.diagnosis.fit import fit
 from taccorl.diagnosis.pads import gain_words, unjudged_gains
 from taccorl.diagnosis.problem import Problem, split_rows
 from taccorl.diagnosis.screen import probe
-from taccorl.diagnosis.search import SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.diagnosis.touch_problem import FRAMES_A_ROW, TouchProblem, _noise_gain, _repeat_floor
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect

@@ -8,7 +8,8 @@ from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
 
 from taccorl.diagnosis.identifiability import Identifiability
 from taccorl.diagnosis.identifiable import Identified, Known
-from taccorl.diagnosis.search import Diagnosis, SearchConfig, diagnose
+from taccorl.diagnosis.search import diagnose
+from taccorl.diagnosis.search_result import Diagnosis, SearchConfig
 from taccorl.diagnosis.verdict import Verdict, verdict
 
 PART = "left_joint5"

@@ -25,7 +25,7 @@ from taccorl.diagnosis.cells_problem import CellsProblem, prepared_all, reading_
 from taccorl.diagnosis.comparison import USES, Comparison, TouchTrace
 from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine, machines, solved
 from taccorl.diagnosis.problem import chosen
-from taccorl.diagnosis.search import Diagnosis, Evidence, SearchConfig
+from taccorl.diagnosis.search_result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect

@@ -15,7 +15,7 @@ from taccorl.diagnosis.compare import compare
 from taccorl.diagnosis.comparison import Comparison
 from taccorl.diagnosis.joint_problem import selectors
 from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine
-from taccorl.diagnosis.search import SearchConfig
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect

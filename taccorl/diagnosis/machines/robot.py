@@ -19,7 +19,7 @@ from taccorl.diagnosis.comparison import USES, Comparison, Kind
 from taccorl.diagnosis.joints import diagnose_joint, moves
 from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine, machines
 from taccorl.diagnosis.replays import replay_joints
-from taccorl.diagnosis.search import SearchConfig
+from taccorl.diagnosis.search_result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
