@@ -63,7 +63,7 @@ class Drive(NamedTuple):
     # Bodies and friction.
     added_inertia: float = 0.0
     speed_delay: float = 0.0
-    """s: takes K_d times it from the inertia, at most ``MOST_LOST`` of it."""
+    """s: takes K_d times it from the inertia, at most ``MOST_LOST`` of it. The motor gives that torque: the effort holds it."""
     viscous: float = 0.0
     quadratic_drag: float = 0.0
     coulomb: float = 0.0
@@ -250,7 +250,8 @@ def simulate(
     spring = 1.0 / p.compliance if p.compliance > 0.0 else 0.0
     spring_damping = p.compliance_damping * spring
     inertia = p.inertia + p.added_inertia
-    inertia -= min(p.kd * p.speed_delay, MOST_LOST * inertia)
+    lost = min(p.kd * p.speed_delay, MOST_LOST * inertia)
+    inertia -= lost
     link = p.inertia - p.rotor_inertia  # beyond the gear
     free = inertia * (link + _GEAR_INERTIA) - link * link
     motor_mobility, gear_mobility = (link + _GEAR_INERTIA) / free, inertia / free
@@ -286,6 +287,7 @@ def simulate(
         torque += missing / p.torque_scale
         missing = 0.0
     z = min(max(-missing, -static), static) / bristle if bristle > 0.0 else 0.0
+    acceleration = 0.0
 
     for n in range(sent.size * hold):
         row, within = divmod(n, hold * parts)
@@ -304,7 +306,7 @@ def simulate(
         if within == 0 or p.load_friction > 0.0:
             given = torque if p.torque_lag > 0.0 else _asked(p, until_now, until_now, q, v, integral)[0]
         if within == 0:
-            effort[row] = strength * given
+            effort[row] = strength * given + lost * acceleration
             reported[row] = _reading(p, q)
             if late > 0.0:
                 newer, older = ring[(n - whole) % ring.size], ring[(n - whole - 1) % ring.size]
@@ -398,6 +400,7 @@ def simulate(
             torque += newest_share * (at_end - torque)
         if p.integral_rate > 0.0:
             integral += h * (command[n] - p.encoder_scale * q)
+        acceleration = (v_next - v) / h
         v = v_next
         q += h * v
     return reported, effort

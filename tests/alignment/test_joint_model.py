@@ -9,7 +9,8 @@ from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
 from taccorl.alignment import arm_bench
 from taccorl.alignment.joint_kernel import Drive, simulate
 from taccorl.alignment.joint_model import Gains, JointModel
-from taccorl.alignment.joint_motion import joint_motion
+from taccorl.alignment.joint_motion import joint_motion, motion_of
+from taccorl.alignment.measurement import Measurement
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
@@ -101,6 +102,25 @@ def test_effects_act_together_as_in_mujoco() -> None:
     # In the twin's own config they do the same.
     own = JointModel(TwinConfig(effects=together), signal).simulate(motion, model.gains)
     np.testing.assert_array_equal(own.reported, quick.reported)
+
+
+def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
+    """−K_d (q̇ − τ q̈) on a free mass: what the motor gives is J q̈, not (J − K_d τ) q̈, which is 5 % less here."""
+    joint = JointModel.axis("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), timestep_s=1e-3)
+    time_s = np.arange(2000) * 1e-3
+    m = Measurement(
+        name="made",
+        time_s=time_s,
+        target=(0.3 * np.sin(2 * np.pi * 2.0 * time_s) * np.clip(time_s, 0.0, 1.0))[:, None],
+        measured=np.zeros((2000, 1)),
+        signals=("mass",),
+        units=("rad",),
+    )
+    late = make_effect("speed_delay", delay_s=1.5e-3)
+    answer = joint.simulate(motion_of(m, "mass", joint.joint), joint.gains, [late])
+    q = answer.reported
+    acceleration = (q[2:] - 2 * q[1:-1] + q[:-2]) / 1e-3**2  # of the physics step that ends at q[2:]
+    np.testing.assert_allclose(answer.effort[2:], 0.05 * acceleration, rtol=0, atol=1e-9 * np.abs(answer.effort).max())
 
 
 def test_an_effect_takes_the_place_of_the_config_s_own() -> None:

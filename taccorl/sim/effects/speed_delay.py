@@ -27,7 +27,8 @@ class SpeedDelay(JointEffect):
 
     τ is half a period for the difference of two samples, half a period for the output that is held, and the time constant of the
     speed's filter. The diagnosis fits it with the gains wherever recordings say anything about it (recorded effort, known weight,
-    commanded gains), so it is no candidate of the search.
+    commanded gains), so it is no candidate of the search. The effort of the one-joint model holds K_d τ q̈, which the
+    motor gives; that of a whole twin in MuJoCo, where only the inertia is changed, does not.
     """
 
     name: ClassVar = "speed_delay"
