@@ -25,7 +25,10 @@ law             motor's torque                                     meaning of th
                 within ± 1
 ==============  =================================================  ========================================================
 
-Targets stand in the column ``q_target``; of law velocity in ``qd_target``, of law torque in ``tau_target``.
+Targets stand in the column ``q_target``; of law velocity in ``qd_target``, of law torque in ``tau_target``. V is ``supply_v`` of
+the file, or of a recording (``NAME.supply``, or measurements.yaml). While ``NAME.enabled`` is 0 the motor neither drives nor
+brakes. What a recording mounts on a turning axis is m l² of inertia and m g l sin(q − q₀) of weight: ``payload_kg`` at
+``lever_m``, and an arm of ``arm_kg``, a uniform rod of that length.
 """
 
 import dataclasses
@@ -34,8 +37,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import numpy as np
 import yaml
 
 from taccorl.alignment.joint_kernel import POSITION, TORQUE, VELOCITY
@@ -54,8 +58,8 @@ if TYPE_CHECKING:
 GRAVITY_M_PER_S2 = 9.81
 LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4
 """Of the physics."""
-STEP_SHARE = 0.01
-"""Of inertia / K_d: a step of this share damps the axis 1 % too little."""
+STEP_SHARE = 0.05
+"""Of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
 Law = Literal["impedance", "cascade", "velocity", "torque", "pwm"]
 _COMMANDS = {"velocity": VELOCITY, "torque": TORQUE}
 _HEADER = "# An axis: taccorl/alignment/axis_file.py says what may stand here.\n"
@@ -81,8 +85,11 @@ class AxisConfig:
     """kg·m²."""
     law: Law = "impedance"
     kp: float = 0.0
-    """In the unit that the law asks for; commanded, unless a recording states another one."""
+    """In the unit that the law asks for, over ``kp_factor``; commanded, unless a recording states another one."""
     kd: float = 0.0
+    kp_factor: float = 1.0
+    """``kp`` times this is in the law's unit, here and in measurements.yaml: what one step of a gain's register is worth."""
+    kd_factor: float = 1.0
     torque_ff: float = 0.0
     """N·m."""
     supply_v: float | None = None
@@ -98,7 +105,10 @@ class AxisConfig:
     weight_cos: float = 0.0
     """C [N·m]."""
     lever_m: float = 0.0
-    """Distance from the axis at which a recording's ``payload_kg`` is held; 0 on a slide, which carries it."""
+    """Distance from the axis at which a recording's ``payload_kg`` is held, unless the recording states another one; a slide
+    has none."""
+    arm_kg: float = 0.0
+    """Of the arm that holds the payload, unless a recording states another one: a uniform rod as long as the lever."""
     hangs_at_rad: float = 0.0
     """Angle at which that payload hangs straight down."""
     command_hz: float | None = None
@@ -116,7 +126,8 @@ class AxisConfig:
     effects: tuple[EffectEntry, ...] = ()
 
     def __post_init__(self) -> None:
-        check_numbers("axis", self, positive=("inertia",), not_negative=("kp", "kd", "lever_m"))
+        check_numbers("axis", self, positive=("inertia", "kp_factor", "kd_factor"))
+        check_numbers("axis", self, not_negative=("kp", "kd", "lever_m", "arm_kg"))
         check_numbers("axis", self, finite=("torque_ff", "weight_sin", "weight_cos", "hangs_at_rad"))
         of_pwm = ("supply_v", "resistance_ohm", "torque_nm_per_a", "emf_v_s_per_rad")
         optional = (*of_pwm, "effort_limit", "command_hz", "force_unit_n", "length_unit_m")
@@ -139,7 +150,8 @@ class AxisConfig:
             raise TaccorlError(f"axis.{foreign[0]}: law {self.law} has none; remove it, or mend the law")
         if self.limits is not None and not self.limits[0] < self.limits[1]:
             raise TaccorlError(f"axis.limits: {list(self.limits)} must rise; write the lowest position first")
-        of_turning = [name for name in ("weight_sin", "weight_cos", "lever_m", "hangs_at_rad") if getattr(self, name)]
+        of_turning = ("weight_sin", "weight_cos", "lever_m", "arm_kg", "hangs_at_rad")
+        of_turning = [name for name in of_turning if getattr(self, name)]
         if self.unit == "m" and of_turning:
             raise TaccorlError(
                 f"axis.{of_turning[0]}: a slide has none; a constant weight is part of torque_ff, which is fitted"
@@ -166,11 +178,12 @@ class AxisConfig:
     @property
     def gains(self) -> Gains:
         """Of the position error and the velocity [N·m/rad, N·m·s/rad, N·m], whatever the law."""
+        kp, kd = self.kp * self.kp_factor, self.kd * self.kd_factor
         if self.law == "cascade":
-            return Gains(self.kp * self.kd, self.kd, self.torque_ff)
+            return Gains(kp * kd, kd, self.torque_ff)
         if self.law == "pwm":
-            return Gains(self.kp * self.stall_nm, self.kd * self.stall_nm, self.torque_ff)
-        return Gains(self.kp, self.kd, self.torque_ff)
+            return Gains(kp * self.stall_nm, kd * self.stall_nm, self.torque_ff)
+        return Gains(kp, kd, self.torque_ff)
 
     def effect_class(self, name: str) -> type[Effect] | None:
         """The effect in the size and units of this axis; None if an axis cannot have it.
@@ -209,10 +222,12 @@ class AxisConfig:
             new["torque_nm_per_a"] = base["stall_nm"] * ohms / volts
             new["emf_v_s_per_rad"] = base["back_emf"] * ohms / new["torque_nm_per_a"]
         elif "kd" in base and "kp" in base:
-            new["kd"] = base["kd"]
-            new["kp"] = base["kp"] / base["kd"] if self.law == "cascade" else base["kp"]
+            new["kd"] = base["kd"] / self.kd_factor
+            new["kp"] = (base["kp"] / base["kd"] if self.law == "cascade" else base["kp"]) / self.kp_factor
         elif "kd" in base:
-            new["kd"] = base["kd"]
+            new["kd"] = base["kd"] / self.kd_factor
+        elif "kp" in base:
+            new["kp"] = base["kp"] / self.kp_factor
         return dataclasses.replace(self, **{name: float(value) for name, value in new.items()})
 
     def with_effects(self, found: Sequence[Effect]) -> "AxisConfig":
@@ -314,6 +329,7 @@ class DrivenAxis(RigidJoint):
     """The axis of a file as the one-joint model sees it."""
 
     config: AxisConfig
+    follows_line: ClassVar[bool] = True
 
     @property
     def signal(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -343,7 +359,7 @@ class DrivenAxis(RigidJoint):
     def facts(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Numbers of ``joint_kernel.Drive`` that the file knows."""
         c = self.config
-        found: dict[str, float] = {"command": _COMMANDS.get(c.law, POSITION)}
+        found: dict[str, float] = {"command": _COMMANDS.get(c.law, POSITION), "midpoint": 1.0}
         limit = math.inf if c.effort_limit is None else c.effort_limit
         if c.law == "pwm":
             found |= {"duty_torque": c.stall_nm, "back_emf": c.back_emf}
@@ -358,20 +374,48 @@ class DrivenAxis(RigidJoint):
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
     def rigid(self, motion: "JointMotion", bodies: Sequence[Effect]) -> Rigid:
-        c, mass = self.config, motion.payload_kg
-        if c.unit == "m":
-            return Rigid(c.inertia + mass)
-        weight = mass * GRAVITY_M_PER_S2 * c.lever_m  # m g l sin(q − q₀)
+        c = self.config
+        weight = motion.moment_kgm * GRAVITY_M_PER_S2  # m l g sin(q − q₀)
         sine, cosine = weight * math.cos(c.hangs_at_rad), -weight * math.sin(c.hangs_at_rad)
-        return Rigid(c.inertia + mass * c.lever_m**2, 0.0, c.weight_sin + sine, c.weight_cos + cosine)
+        return Rigid(c.inertia + motion.mounted_kgm2, 0.0, c.weight_sin + sine, c.weight_cos + cosine)
 
     def surroundings(self, m: Measurement) -> Surroundings:
-        """The known external force, with the sign of what must be held against it, and the payload at its lever."""
-        return Surroundings(
-            coupling_nm=-m.known_load(self.signal),
-            payload_kg=m.payload_kg.get(self.signal, 0.0),
-            payload_at_known=True,
+        """The known external force, with the sign of what must be held against it, what is mounted, and the motor's supply.
+
+        Raises:
+            TaccorlError: a payload without a lever, an arm on a slide, a supply voltage that the law has no use for.
+        """
+        c, name = self.config, self.signal
+        payload, lever, arm = (
+            getattr(m, key).get(name, getattr(c, key, 0.0)) for key in ("payload_kg", "lever_m", "arm_kg")
         )
+        if c.unit == "m" and (lever or arm):
+            raise TaccorlError(f"{m.name}: lever_m or arm_kg of {name} is stated, and a slide has none; remove it")
+        if c.unit == "rad" and payload + arm > 0.0 and lever == 0.0:
+            raise TaccorlError(
+                f"{m.name}: payload_kg or arm_kg of {name} is stated, and nothing says how long its arm is; write `lever_m: …` "
+                f"in the axis file, or `lever_m: {{{name}: …}}` in measurements.yaml"
+            )
+        return Surroundings(
+            coupling_nm=-m.known_load(name),
+            supply=self._supply(m),
+            payload_kg=payload,
+            payload_at_known=True,
+            moment_kgm=payload * lever + 0.5 * arm * lever,
+            mounted_kgm2=payload * lever**2 + arm * lever**2 / 3.0 if c.unit == "rad" else payload,
+        )
+
+    def _supply(self, m: Measurement) -> np.ndarray:
+        """(T,) voltage over that of the file; NaN while the motor is off."""
+        j, share = m.column(self.signal), np.ones(m.num_rows)
+        if m.supply_v.size and np.isfinite(m.supply_v[:, j]).any():
+            if self.config.supply_v is None:
+                raise TaccorlError(
+                    f"{m.name}: a supply voltage of {self.signal} is stated, and law {self.config.law} has no use for it; "
+                    "remove it"
+                )
+            share = np.nan_to_num(m.supply_v[:, j] / self.config.supply_v, nan=1.0)
+        return np.where(m.enabled[:, j] == 0.0, np.nan, share) if m.enabled.size else share
 
     def effects(self, more: Sequence[Effect]) -> list[Effect]:
         own = {e.name: e for e in (*self.config.made(), *more)}

@@ -52,8 +52,9 @@ def even_rows(m: Measurement) -> Measurement:
     grid = start_s + np.arange(round((m.time_s[-1] - start_s) / period) + 1) * period
     columns = {name: _between(grid, m.time_s, getattr(m, name), period) for name in ("measured", "velocity", "effort")}
     target = _commands(grid, m.time_s, m.target, period)
-    if m.load.size:
-        columns["load"] = _commands(grid, m.time_s, m.load, period)
+    columns |= {name: _commands(grid, m.time_s, getattr(m, name), period) for name in m.extra_columns}
+    if m.enabled.size:
+        columns["enabled"] = np.where(columns["enabled"] < 0.5, 0.0, 1.0)
     masked = int((~np.isfinite(columns["measured"]).any(axis=1)).sum())
     where = ""
     if gaps.any():

@@ -10,6 +10,11 @@ It takes the same steps as MuJoCo's discrete integrator does (``mjINT_DISCRETE``
 and dry friction f within ± F from a soft constraint, M̂ a = τ − h K v + f, f = −(a − a_ref) / R. K_p and K_d belong to K and D
 except while the motor's torque is at its limit. With play or a spring in the gear the link is a second mass.
 
+A machine without a twin in MuJoCo (``Drive.midpoint``) takes K and D in the middle of the step instead, which is exact to the
+second order in h:
+
+    v⁺ = v + h (τ − ½ h K v + f) / M̂,    M̂ = J + ½ h D + ¼ h² K,    q⁺ = q + ½ h (v + v⁺)
+
 Rows follow the rule of ``taccorl.alignment.measurement``: row k is the joint at the time of command k, before it acts.
 """
 
@@ -117,6 +122,8 @@ class Drive(NamedTuple):
     """Torque of the whole supply voltage at rest, V k_t / R: what the controller asks for is clipped to it …"""
     back_emf: float = 0.0
     """… before k_t k_e / R times the speed is lost."""
+    midpoint: float = 0.0
+    """1: steps of second order, 0: those of MuJoCo."""
     # Gear.
     backlash: float = 0.0
     """Whole play."""
@@ -185,9 +192,13 @@ def _limit(p: Drive, torque: float, v: float) -> float:
 
 
 @numba.njit(cache=True)
-def _asked(p: Drive, command: float, before: float, q: float, v: float, integral: float) -> tuple[float, float, float]:
+def _asked(
+    p: Drive, command: float, before: float, q: float, v: float, integral: float, supply: float
+) -> tuple[float, float, float]:
     """The controller's torque, and how far it counts as a spring and a damper. ``before`` is the command until now: whether the
-    error lies within the dead band is known from it."""
+    error lies within the dead band is known from it. ``supply`` is as in ``simulate``."""
+    if math.isnan(supply):
+        return 0.0, 0.0, 0.0
     if p.command == TORQUE:
         return command + p.torque_ff, 0.0, 0.0
     if p.command == VELOCITY:
@@ -205,6 +216,7 @@ def _asked(p: Drive, command: float, before: float, q: float, v: float, integral
     asked = p.kp * (error + p.integral_rate * integral) - damping * v + p.torque_ff
     if abs(asked) > p.duty_torque:
         asked, stiffness, damping = math.copysign(p.duty_torque, asked), 0.0, 0.0
+    asked, stiffness, damping = supply * asked, supply * stiffness, supply * damping
     if p.back_emf != 0.0:
         asked, damping = asked - p.back_emf * v, damping + p.back_emf
     return asked, stiffness, damping
@@ -222,6 +234,7 @@ def simulate(
     drive: Drive,
     sent: np.ndarray,
     coupling: np.ndarray,
+    supply: np.ndarray,
     start: float,
     hold: int,
     parts: int,
@@ -232,6 +245,7 @@ def simulate(
     Args:
         sent: (R · parts,) targets [rad], each held for ``hold`` physics steps.
         coupling: (R,) torque [N·m] that must be held against the other joints' motion, linear in between.
+        supply: (R,) voltage that a position controller gets, over the one that its gains are for; NaN while the motor is off.
         start: angle [rad] that the encoder reports at rest.
         parts: targets a row.
 
@@ -247,11 +261,16 @@ def simulate(
     weighs = p.gravity_sin != 0.0 or p.gravity_cos != 0.0 or p.compensation_sin != 0.0 or p.compensation_cos != 0.0
     geared = p.backlash > 0.0 or p.compliance > 0.0
     half_play = 0.5 * p.backlash
+    ahead = (
+        0.5 if p.midpoint > 0.0 and not geared else 1.0
+    )  # share of a step by which springs and dampers are taken ahead
+    early = 0.5 * h if p.midpoint > 0.0 and geared else 0.0
     spring = 1.0 / p.compliance if p.compliance > 0.0 else 0.0
     spring_damping = p.compliance_damping * spring
     inertia = p.inertia + p.added_inertia
     lost = min(p.kd * p.speed_delay, MOST_LOST * inertia)
     inertia -= lost
+    inertia -= min(early * (p.kd + p.back_emf), 0.5 * inertia)
     link = p.inertia - p.rotor_inertia  # beyond the gear
     free = inertia * (link + _GEAR_INERTIA) - link * link
     motor_mobility, gear_mobility = (link + _GEAR_INERTIA) / free, inertia / free
@@ -277,7 +296,7 @@ def simulate(
             if p.compliance == 0.0:  # the soft end of the play
                 gear -= load * _LIMIT_SOFTNESS * gear_mobility / _LIMIT_STIFFNESS
     integral = 0.0
-    torque = _asked(p, command[0], command[0], q, v, integral)[0]
+    torque = _asked(p, command[0], command[0], q, v, integral, supply[0])[0]
     missing = weight + coupling[0] + p.spring_stiffness * (q - p.spring_rest) + p.coulomb * p.asymmetry
     missing -= p.torque_scale * (torque + carried) + p.cogging_torque * math.sin(
         p.cogging_periods * q + p.cogging_phase
@@ -298,13 +317,13 @@ def simulate(
             carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
         load = weight + coupling[row]
         if row + 1 < rows:
-            load += within / (hold * parts) * (coupling[row + 1] - coupling[row])
+            load += (within + 1.0 - ahead) / (hold * parts) * (coupling[row + 1] - coupling[row])
 
         # What can be seen now: the new command has not acted yet.
         until_now = command[n if p.command_delay > 0.0 else max(n - 1, 0)]
         given = 0.0
         if within == 0 or p.load_friction > 0.0:
-            given = torque if p.torque_lag > 0.0 else _asked(p, until_now, until_now, q, v, integral)[0]
+            given = torque if p.torque_lag > 0.0 else _asked(p, until_now, until_now, q, v, integral, supply[row])[0]
         if within == 0:
             effort[row] = strength * given + lost * acceleration
             reported[row] = _reading(p, q)
@@ -315,7 +334,9 @@ def simulate(
             ring[n % ring.size] = _reading(p, q)
 
         # The drive.
-        asked, stiffness, damping = _asked(p, command[n], until_now, q, v, integral)
+        asked, stiffness, damping = _asked(p, command[n], until_now, q, v, integral, supply[row])
+        if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
+            asked, damping = asked + early * stiffness * v, damping - early * stiffness
         gain = newest_share * strength
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
@@ -363,8 +384,10 @@ def simulate(
         if p.spot_friction > 0.0:
             limit += p.spot_friction * math.exp(-(((q - p.spot_angle) / p.spot_width) ** 2))
 
-        f1 = force - load - h * stiffness * v
-        m11 = inertia + h * damping + h * h * stiffness
+        if ahead < 1.0 and weighs:
+            stiffness += p.gravity_sin * cosine - p.gravity_cos * sine
+        f1 = force - load - ahead * h * stiffness * v
+        m11 = inertia + ahead * h * damping + ahead * ahead * h * h * stiffness
         if not geared:
             if limit > 0.0:
                 f1 += _friction(f1, m11, 1.0 / m11, v, limit, h)
@@ -401,6 +424,6 @@ def simulate(
         if p.integral_rate > 0.0:
             integral += h * (command[n] - p.encoder_scale * q)
         acceleration = (v_next - v) / h
+        q += h * (ahead * v_next + (1.0 - ahead) * v)
         v = v_next
-        q += h * v
     return reported, effort

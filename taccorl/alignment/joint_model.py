@@ -139,7 +139,8 @@ class JointModel:
             gravity_cos=drive.gravity_cos + weight * lever.cos_m,
         )
         drive = Drive(*(float(x) for x in drive))
-        reported, effort = simulate(drive, sent, motion.coupling_nm, motion.start, hold, parts, step_s)
+        supply = np.ones(len(motion.coupling_nm)) if motion.supply is None else motion.supply
+        reported, effort = simulate(drive, sent, motion.coupling_nm, supply, motion.start, hold, parts, step_s)
         if self.joint.effort_holds_weight:
             effort = effort + drive.gravity_carried * self.carried_nm(motion, reported)
         return JointResponse(reported, effort)
@@ -164,7 +165,8 @@ class JointModel:
         return weighs(self._body(motion, []))
 
     def _body(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
-        key = (motion.pose.tobytes(), motion.payload_kg, motion.payload_at_m, *map(repr, bodies))
+        mounted = motion.moment_kgm, motion.mounted_kgm2
+        key = (motion.pose.tobytes(), motion.payload_kg, *mounted, motion.payload_at_m, *map(repr, bodies))
         if key not in self._rigid:
             if len(self._rigid) > 1000:  # a search that changes bodies would fill the memory
                 self._rigid.clear()
@@ -186,7 +188,8 @@ class JointModel:
         if parts == 1:
             return motion.target, 1, round(steps), step_s
         following = np.append(motion.target[1:], motion.target[-1])
-        share = np.arange(1, parts + 1) / parts
+        # A replay in the twin sends the first part of the way at once; a drive follows the line.
+        share = (np.arange(parts) + (not self.joint.follows_line)) / parts
         sent = motion.target[:, None] + share * (following - motion.target)[:, None]
         return sent.ravel(), parts, round(steps) // parts, step_s
 

@@ -46,6 +46,12 @@ class JointMotion:
     kd_known: bool = False
     payload_kg: float = 0.0
     """Known mass in the gripper."""
+    supply: np.ndarray | None = None
+    """(T,) voltage of the motor over the one of its file, NaN while the motor is off; None: 1."""
+    moment_kgm: float = 0.0
+    """Σ m l of what the recording mounts on an axis,"""
+    mounted_kgm2: float = 0.0
+    """and Σ m l²; on a slide Σ m in kg."""
     payload_at_m: Position = AT_TCP
     """Its centre of mass in link 6's frame."""
     payload_at_known: bool = False
@@ -100,6 +106,7 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         measured=measured,
         effort=m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan),
         coupling_nm=rest.coupling_nm,
+        supply=rest.supply,
         start=resting(m, j),
         pose=rest.pose,
         kp_scale=known.get("kp", m.gain_scale.get(signal, 1.0)),
@@ -107,6 +114,8 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         kp_known="kp" in known,
         kd_known="kd" in known,
         payload_kg=rest.payload_kg,
+        moment_kgm=rest.moment_kgm,
+        mounted_kgm2=rest.mounted_kgm2,
         payload_at_m=rest.payload_at_m,
         payload_at_known=rest.payload_at_known,
     )

@@ -70,6 +70,10 @@ class Measurement:
     """(T, J) N·m, N as the driver reports it; NaN where it does not. PiPER firmware may report another scale."""
     load: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) N·m, N: external torque that is known to push the joint, positive where it drives it forwards; empty if none is."""
+    supply_v: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) V that feeds the motor; NaN where it was not recorded; empty if it never was."""
+    enabled: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) 0 while the motor is off, else 1; empty if it is never off."""
     signals: tuple[str, ...] = ROBOT.action_names
     units: tuple[str, ...] = ROBOT_UNITS
     """Of positions, one per signal: rad or m."""
@@ -95,6 +99,10 @@ class Measurement:
     """Signal → factor of both gains over the other recordings', where no more than that is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
     """Arm → known mass in its gripper."""
+    lever_m: dict[str, float] = field(default_factory=dict)
+    """Axis → distance from it at which its payload is held, where it is not the one of the axis's file."""
+    arm_kg: dict[str, float] = field(default_factory=dict)
+    """Axis → mass of the arm that holds the payload: a uniform rod from the axis to the lever's end."""
     payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Arm → where the payload's centre of mass is, in link 6's frame (origin at the flange, z along the hand); the TCP,
     (0, 0, 0.168) m, where it is not stated."""
@@ -115,7 +123,7 @@ class Measurement:
                 object.__setattr__(self, name, np.full(shape, np.nan))
         if self.quantum.size == 0:
             object.__setattr__(self, "quantum", np.zeros(shape[1]))
-        for name in ("target", "measured", "velocity", "effort", *(["load"] if self.load.size else [])):
+        for name in ("target", "measured", "velocity", "effort", *self.extra_columns):
             found = getattr(self, name).shape
             if found != shape:
                 raise TaccorlError(f"measurement {self.name}: {name} is {found}, times and signals say {shape}")
@@ -129,6 +137,11 @@ class Measurement:
         wrong = [u for u in self.units if u not in self.known_units]
         if wrong:
             raise TaccorlError(f"measurement {self.name}: units are {' or '.join(self.known_units)}, not {wrong[0]!r}")
+
+    @property
+    def extra_columns(self) -> list[str]:
+        """Of ``load``, ``supply_v`` and ``enabled`` those that it has."""
+        return [name for name in ("load", "supply_v", "enabled") if getattr(self, name).size]
 
     @property
     def num_rows(self) -> int:
@@ -162,6 +175,19 @@ class Measurement:
         """(T,) external torque on a signal; 0 where none is known."""
         return self.load[:, self.column(signal)] if self.load.size else np.zeros(self.num_rows)
 
+    def only_axes_take(self, signal: str) -> str:
+        """What the recording has of a signal that only ``kind: axis`` can take, and what to do; empty if nothing."""
+        j = self.column(signal)
+        if self.known_load(signal).any():
+            return "a known load; remove the column"
+        if self.supply_v.size and np.isfinite(self.supply_v[:, j]).any():
+            return "a supply voltage; remove supply_v"
+        if self.enabled.size and not self.enabled[:, j].all():
+            row = int(np.argmin(self.enabled[:, j]))
+            return f"a motor that is off at {self.time_s[row]:.3f} s; cut the recording there"
+        stated = next((key for key in ("lever_m", "arm_kg") if signal in getattr(self, key)), "")
+        return stated and f"{stated}; remove it from measurements.yaml"
+
     def has_effort(self) -> np.ndarray:
         """(J,) bool: recorded, and not only zeros."""
         return np.isfinite(self.effort).any(axis=0) & (np.nan_to_num(self.effort) != 0).any(axis=0)
@@ -178,8 +204,10 @@ class Measurement:
         time_s = self.time_s[0] + np.arange(steps) / rate_hz
         columns = {
             name: np.column_stack([np.interp(time_s, self.time_s, c) for c in getattr(self, name).T])
-            for name in ("target", "measured", "velocity", "effort", *(["load"] if self.load.size else []))
+            for name in ("target", "measured", "velocity", "effort", *self.extra_columns)
         }
+        if self.enabled.size:
+            columns["enabled"] = np.where(columns["enabled"] < 0.5, 0.0, 1.0)
         return dataclasses.replace(self, time_s=time_s, **columns)
 
     def on_robot(self, rest: np.ndarray) -> "Measurement":
@@ -198,10 +226,8 @@ class Measurement:
                 raise TaccorlError(f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}")
             if (kind := self.target_kind(name)) != "position":
                 raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
-            if self.known_load(name).any():
-                raise TaccorlError(
-                    f"{self.name}: {name} has a known load, which the robot's twin cannot take; remove the column"
-                )
+            if extra := self.only_axes_take(name):
+                raise TaccorlError(f"{self.name}: {name} has {extra}: the robot's twin cannot take it")
         at = [ROBOT.action_names.index(name) for name in self.signals]
         arrays: dict[str, np.ndarray] = {
             name: np.full((self.num_rows, ROBOT.num_actions), np.nan) for name in ("measured", "velocity", "effort")
@@ -216,6 +242,8 @@ class Measurement:
             **arrays,
             quantum=quantum,
             load=np.empty(0),
+            supply_v=np.empty(0),
+            enabled=np.empty(0),
             signals=ROBOT.action_names,
             units=ROBOT_UNITS,
             target_kinds=(),

@@ -10,6 +10,7 @@ A folder of recordings may hold a ``measurements.yaml`` that says what the files
       sweep_02.mcap: {repeat_of: sweep_01.mcap}
       sweep_03.mcap: {kp: {left_joint5: 40}, kd: {left_joint5: 4}, effort_scale: {left_joint1: 0.25}}
       sweep_04.mcap: {payload_kg: {left: 0.5}, payload_position_m: {left: [0, 0, 0.2]}}
+      swing_01.csv: {payload_kg: {servo: 0.3}, lever_m: {servo: 0.15}, arm_kg: {servo: 0.02}, supply_v: {servo: 7.4}}
       press_01.mcap: {pressed: &ball {shape: sphere, radius_m: 0.012, arm: left, position_m: [0.001, 0, 0.003]}}
       press_02.mcap: {pressed: *ball, use: validation}
       press_03.mcap: {pressed: {shape: rod, radius_m: 0.008, length_m: 0.04, arm: left, rpy_rad: [0, 1.5708, 0]}}
@@ -90,6 +91,12 @@ class RecordingNote:
     """Signal → factor of both gains over the other recordings', where no more than that is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
     """Arm, or an axis of its own file → mass held."""
+    lever_m: dict[str, float] = field(default_factory=dict)
+    """Axis of its own file → distance from the axis to the payload, where it is not that file's."""
+    arm_kg: dict[str, float] = field(default_factory=dict)
+    """Axis of its own file → mass of the arm that holds the payload, a uniform rod as long as the lever."""
+    supply_v: dict[str, float] = field(default_factory=dict)
+    """Axis of its own file → voltage of its motor's supply, where no column has it."""
     payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Arm → centre of mass of what is held, in link 6's frame (flange, z along the hand); the TCP, [0, 0, 0.168], by default."""
     effort_scale: dict[str, float] = field(default_factory=dict)
@@ -256,16 +263,20 @@ def _load_index(folder: Path, holders: Sequence[str]) -> MeasurementIndex:
     document = Document(MeasurementIndex, path)
     index = document.value
     for name, note in index.recordings.items():
-        for key in ("kp", "kd", "gain_scale", "payload_kg"):
+        for key in ("kp", "kd", "gain_scale", "payload_kg", "lever_m", "arm_kg", "supply_v"):
             bad = next((s for s, v in getattr(note, key).items() if v < 0), None)
             if bad:
                 raise document.error(f"recordings/{name}/{key}/{bad}", f"{getattr(note, key)[bad]:g} is below 0")
-        for key in ("payload_kg", "payload_position_m"):
-            known = holders if key == "payload_kg" else ROBOT.arms
+        axes = [h for h in holders if h not in (*ROBOT.arms, *ROBOT.action_names)]
+        for key in ("payload_kg", "payload_position_m", "lever_m", "arm_kg", "supply_v"):
+            known = {"payload_kg": holders, "payload_position_m": ROBOT.arms}.get(key, axes)
             arm = next((a for a in getattr(note, key) if a not in known), None)
             if arm:
                 others = [h for h in known if h not in ROBOT.action_names]
-                raise document.error(f"recordings/{name}/{key}/{arm}", f"no arm {arm!r}; {', '.join(others)}")
+                what = "arm" if set(known) & set(ROBOT.arms) else "axis of a file of kind axis"
+                raise document.error(
+                    f"recordings/{name}/{key}/{arm}", f"no {what} {arm!r}; {', '.join(others) or 'there is none'}"
+                )
         _check_payload_positions(document, f"recordings/{name}/payload_position_m", note)
         if note.pressed is not None:
             _check_pressed(document, f"recordings/{name}/pressed", note.pressed)
@@ -319,7 +330,7 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
                 f"{folder / INDEX}: recordings → {m.name} → repeat_of: no recording {note.repeat_of!r} here; "
                 f"{nearest(note.repeat_of, names)}"
             )
-        for key in ("kp", "kd", "effort_scale"):
+        for key in ("kp", "kd", "effort_scale", "supply_v"):
             for name in getattr(note, key):
                 if name not in m.signals:
                     raise TaccorlError(
@@ -344,6 +355,13 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
                 f"{folder / INDEX}: recordings → {m.name} → pressed: it repeats {repeat_of}, for which pressed is not the same; "
                 "mend pressed, or repeat_of"
             )
+        supply_v = m.supply_v
+        if note.supply_v:
+            if supply_v.size:
+                raise TaccorlError(
+                    f"{folder / INDEX}: recordings → {m.name} → supply_v: the recording has a column of it; remove one of them"
+                )
+            supply_v = np.tile([note.supply_v.get(name, np.nan) for name in m.signals], (m.num_rows, 1))
         scale = np.array([note.effort_scale.get(name, 1.0) for name in m.signals])
         noted.append(
             dataclasses.replace(
@@ -353,6 +371,9 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
                 kd=m.kd | note.kd,
                 gain_scale=m.gain_scale | note.gain_scale,
                 payload_kg=m.payload_kg | note.payload_kg,
+                lever_m=note.lever_m,
+                arm_kg=note.arm_kg,
+                supply_v=supply_v,
                 payload_position_m=m.payload_position_m | note.payload_position_m,
                 pressed=note.pressed.made() if note.pressed is not None else None,
                 effort=m.effort * scale,

@@ -50,7 +50,7 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
     """
     if first.signals != second.signals:
         raise TaccorlError(f"{second.name} and {first.name} hold different signals; one cannot repeat the other")
-    for what in ("kp", "kd", "gain_scale", "payload_kg", "payload_position_m"):
+    for what in ("kp", "kd", "gain_scale", "payload_kg", "lever_m", "arm_kg", "payload_position_m"):
         one, other = getattr(first, what), getattr(second, what)
         silent = what in ("kp", "kd") and not (one and other)  # nobody wrote them down: not known to differ
         if one != other and not silent:

@@ -61,6 +61,12 @@ class Surroundings:
 
     coupling_nm: np.ndarray
     """(T,) torque that the joint must hold against the measured motion of the others."""
+    supply: np.ndarray | None = None
+    """(T,) voltage of the motor over the one of its file, NaN while the motor is off; None: 1."""
+    moment_kgm: float = 0.0
+    """Σ m l of what the recording mounts on an axis, with the arm that holds it;"""
+    mounted_kgm2: float = 0.0
+    """Σ m l²; on a slide Σ m in kg."""
     pose: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(N,) where the other joints are held, in the machine's own order."""
     payload_kg: float = 0.0
@@ -93,6 +99,9 @@ class RigidJoint(ABC):
     exact_timing: ClassVar[bool] = False
     """Whether the half step by which the integrator is early is taken off, and the age of the position is fitted where gains are
     commanded: half a millisecond is 18 noise floors of 0.1 mrad at 3.7 rad/s."""
+
+    follows_line: ClassVar[bool] = False
+    """Whether targets between the rows are those of the line at their own time; else those of the next time, as in a replay."""
 
     def timestep_s(self, rate_hz: float) -> float:
         """Physics step for rows at ``rate_hz``."""

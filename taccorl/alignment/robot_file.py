@@ -306,17 +306,17 @@ class RobotJoint(RigidJoint):
                 raise TaccorlError(
                     f"{m.name}: {name} is commanded by {m.target_kind(name)}, a robot file's joints by position"
                 )
-            if m.known_load(name).any():
-                raise TaccorlError(
-                    f"{m.name}: {name} has a known load, which a robot file cannot take; remove the column"
-                )
+            if extra := m.only_axes_take(name):
+                raise TaccorlError(f"{m.name}: {name} has {extra}: a robot file cannot take it")
         kp, kd = dict(m.kp), dict(m.kd)
         for name, joint in self._robot.config.joints.items():
             if joint.gains == "commanded":
                 scale = m.gain_scale.get(name, 1.0)
                 kp.setdefault(name, scale * joint.kp)
                 kd.setdefault(name, scale * joint.kd)
-        m = dataclasses.replace(m, kp=kp, kd=kd, load=np.empty(0), target_kinds=())
+        m = dataclasses.replace(
+            m, kp=kp, kd=kd, load=np.empty(0), supply_v=np.empty(0), enabled=np.empty(0), target_kinds=()
+        )
         if m.signals == names:
             return m
         arrays: dict[str, np.ndarray] = {

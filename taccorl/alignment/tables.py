@@ -2,8 +2,9 @@
 
 Without a columns file the table speaks our own language: ``t`` [s], and for every signal ``left_joint5.q`` [rad, m],
 ``left_joint5.q_target``, and where recorded ``left_joint5.qd`` [rad/s, m/s], ``left_joint5.tau`` [N·m, N] and
-``left_joint5.load`` [N·m, N], an external torque that is known to push the joint, positive forwards. Other names and units are
-written down in a columns file; no unit is ever guessed::
+``left_joint5.load`` [N·m, N], an external torque that is known to push the joint, positive forwards. An axis by itself may have
+``servo.supply`` [V] and ``servo.enabled``, 0 while its motor is off. Other names and units are written down in a columns file; no
+unit is ever guessed::
 
     time: {column: stamp, unit: ms}
     signals:
@@ -12,6 +13,8 @@ written down in a columns file; no unit is ever guessed::
         q_target: {column: cmd_5, unit: deg}
         qd:       {column: speed_5, unit: rpm}
         tau:      {column: current_5, unit: Nm, factor: 0.000082}    # mA, 0.082 Nm/A; a factor of -1 mends a sign
+        supply:   {column: volts_5, unit: V, factor: 0.1}            # of ``kind: axis`` only
+        enabled:  {column: torque_enable_5, unit: "1"}
 """
 
 import csv
@@ -57,6 +60,7 @@ EFFORT |= {"kgcm": ("rad", 0.0980665), "N": ("m", 1.0), "kN": ("m", 1e3), "mN": 
 constant is somebody's guess until it is written down as a column in N·m."""
 _CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT, "load": EFFORT}
 _CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
+_CONVERSIONS |= {"supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
 TARGETS = ("q_target", "qd_target", "tau_target")
 """Exactly one of them commands a signal."""
 _KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
@@ -90,6 +94,10 @@ class SignalColumns:
     """Effort of the motor."""
     load: Column | None = None
     """Known external torque, positive where it drives the joint forwards."""
+    supply: Column | None = None
+    """Voltage of the motor's supply."""
+    enabled: Column | None = None
+    """0 while the motor is off, else 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +153,8 @@ def load_table_spec(path: Path) -> TableSpec:
                 raise document.error(where, f"{column.unit!r} is no unit of {key}; {nearest(column.unit, known)}{hint}")
             if not math.isfinite(column.factor) or column.factor == 0.0:
                 raise document.error(where, f"factor {column.factor:g}; give a finite number other than 0")
-            kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
+            if known[column.unit][0]:
+                kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
         if len(kinds) > 1:
             raise document.error(f"signals/{name}", f"{' and '.join(kinds.values())}: does it turn or slide?")
         unit = POSITION[signal.q.unit][0]
@@ -195,8 +204,8 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
         if key not in _CONVERSIONS or not name:
             own = [f"{n}.{key}" for n in known for key in _CONVERSIONS]
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r} is not NAME.q, .qd, .tau, .load, .q_target, .qd_target or .tau_target; "
-                + nearest(column, own)
+                f"{path}: column {k + 1} {column!r} is not NAME.q, .qd, .tau, .load, .supply, .enabled, .q_target, .qd_target or "
+                f".tau_target; " + nearest(column, own)
             )
         if name not in known:
             raise RecordingError(
@@ -227,6 +236,8 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
         },
         "m": {"q": "m", "q_target": "m", "qd": "m/s", "tau": "N", "load": "N", "qd_target": "m/s", "tau_target": "N"},
     }
+    for keys in units.values():
+        keys |= {"supply": "V", "enabled": "1"}
     signals = {
         name: SignalColumns(
             **{key: Column(column=f"{name}.{key}", unit=units[known[name]][key]) for key in parts[name]}
@@ -257,7 +268,8 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     if len(time_s) < 2:
         raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
     shape = (len(time_s), len(spec.signals))
-    values = {key: np.full(shape, 0.0 if key == "load" else np.nan) for key in _CONVERSIONS}
+    nothing = {"load": 0.0, "enabled": 1.0}
+    values = {key: np.full(shape, nothing.get(key, np.nan)) for key in _CONVERSIONS}
     units = []
     kinds: list[TargetKind] = []
     for j, signal in enumerate(spec.signals.values()):
@@ -268,6 +280,17 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
             values["q_target" if key in TARGETS else key][:, j] = (
                 columns[column.column] * column.factor * _CONVERSIONS[key][column.unit][1]
             )
+    between = ~np.isin(values["enabled"], (0.0, 1.0))
+    if between.any():
+        row, j = np.argwhere(between)[0]
+        raise RecordingError(
+            f"{path}: row {row + 1}: {list(spec.signals)[j]}.enabled is {values['enabled'][row, j]:g}; write 0 while the "
+            "motor is off, else 1"
+        )
+
+    def extra(key: str) -> np.ndarray:
+        return values[key][rows] if any(getattr(s, key) for s in spec.signals.values()) else np.empty(0)
+
     late = spec.target_rows_late
     if abs(late) >= len(time_s) - 1:
         raise RecordingError(f"{path}: target_rows_late {late} leaves nothing of {len(time_s)} rows")
@@ -280,7 +303,9 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         measured=values["q"][rows],
         velocity=values["qd"][rows],
         effort=values["tau"][rows],
-        load=values["load"][rows] if any(s.load for s in spec.signals.values()) else np.empty(0),
+        load=extra("load"),
+        supply_v=extra("supply"),
+        enabled=extra("enabled"),
         signals=tuple(spec.signals),
         units=tuple(units),
         target_kinds=tuple(kinds),

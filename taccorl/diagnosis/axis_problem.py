@@ -176,10 +176,6 @@ def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
     if m.units[j] != axis.unit:
         raise TaccorlError(f"{m.name}: {axis.name} is in {m.units[j]}, the axis's file says {axis.unit}")
     motion = motion_of(m, axis.name, DrivenAxis(axis))
-    if motion.payload_kg > 0.0 and axis.unit == "rad" and axis.lever_m == 0.0:
-        raise TaccorlError(
-            f"{m.name}: payload_kg of {axis.name} is stated, and its file does not say where it is held; write `lever_m: …`"
-        )
     for name in ("kp", "kd"):
         stated = getattr(m, name).get(axis.name)
         if stated is not None and not getattr(axis, name):

@@ -1,5 +1,6 @@
 """CSV and parquet: units are converted as written, never guessed; errors name file, line and column."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from taccorl.alignment.tables import load_table_spec, read_table
-from taccorl.errors import RecordingError, SpecError
+from taccorl.errors import RecordingError, SpecError, TaccorlError
+from taccorl.robots import ROBOT
 
 COLUMNS = """\
 time: {column: stamp, unit: ms}
@@ -163,3 +165,27 @@ def test_empty_and_missing_files(tmp_path):
     ):
         with pytest.raises(RecordingError, match=message):
             read_table(tmp_path / name)
+
+
+def test_supply_and_enabled_of_an_axis_are_read_and_a_robot_refuses_them(tmp_path: Path):
+    """Ticks of 2π / 4096 rad, tenths of a volt, and a motor that is off in the last row."""
+    path = tmp_path / "swing.csv"
+    path.write_text("stamp,pos,goal,volts,torque\n0,2048,2048,74,1\n10,2148,2248,73,1\n20,2248,2248,72,0\n")
+    (tmp_path / "columns.yaml").write_text(
+        "time: {column: stamp, unit: ms}\nsignals:\n  servo:\n    q: {column: pos, unit: rad, factor: 0.00153398}\n"
+        "    q_target: {column: goal, unit: rad, factor: 0.00153398}\n    supply: {column: volts, unit: V, factor: 0.1}\n"
+        '    enabled: {column: torque, unit: "1"}\n'
+    )
+    m = read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    np.testing.assert_allclose(m.supply_v[:, 0], [7.4, 7.3, 7.2])
+    np.testing.assert_array_equal(m.enabled[:, 0], [1, 1, 0])
+    with pytest.raises(RecordingError, match=r"swing\.csv: row 2: servo\.enabled is 0\.5; write 0"):
+        path.write_text("stamp,pos,goal,volts,torque\n0,2048,2048,74,1\n10,2148,2248,73,0.5\n20,2248,2248,72,0\n")
+        read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    for change, message in (
+        ({}, "left_joint5 has a supply voltage"),
+        ({"supply_v": np.empty(0)}, r"left_joint5 has a motor that is off at 0\.020 s"),
+    ):
+        robots = dataclasses.replace(m, signals=("left_joint5",), **change)
+        with pytest.raises(TaccorlError, match=message):
+            robots.on_robot(np.zeros(len(ROBOT.action_names)))

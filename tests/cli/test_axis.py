@@ -99,7 +99,7 @@ def test_a_drive_whose_targets_are_logged_too_slowly_is_compared_once_its_rate_i
         write_smooth(tmp_path / "bench" / f"{name}.csv", seed)
     (tmp_path / "bench" / "measurements.yaml").write_text("recordings:\n  again.csv: {repeat_of: one.csv}\n")
     (tmp_path / "held.yaml").write_text(FILE)
-    (tmp_path / "drive.yaml").write_text(FILE + "command_hz: 2500\n")
+    (tmp_path / "drive.yaml").write_text(FILE + "command_hz: 10000\n")
     code, text = said("compare", tmp_path / "bench", f"--twin={tmp_path / 'held.yaml'}", f"--out={tmp_path / 'a'}")
     assert code == 1 and "shifted_from_twin" in text and "command_hz" in text
     code, text = said("compare", tmp_path / "bench", f"--twin={tmp_path / 'drive.yaml'}", f"--out={tmp_path / 'b'}")

@@ -202,7 +202,7 @@ def _wrong_inertia(axis: AxisConfig, m: Measurement) -> list[DataFinding]:
     """The inertia by least squares: effort on acceleration, velocity, its sign, position's sine and cosine, a constant."""
     j = m.column(axis.name)
     q, torque = m.measured[:, j], m.effort[:, j]
-    if not m.has_effort()[j] or not np.isfinite([q, torque]).all():
+    if not m.has_effort()[j] or not np.isfinite([q, torque]).all() or (m.enabled.size and not m.enabled[:, j].all()):
         return []
     rows = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
     if m.num_rows < 4 * rows:
@@ -215,8 +215,8 @@ def _wrong_inertia(axis: AxisConfig, m: Measurement) -> list[DataFinding]:
     if abs(alike) < INERTIA_SURE:
         return []
     inertia = float(left[0] @ left[1]) / float(left[0] @ left[0])
-    unit, carried = axis.scale.unit_of("kg·m²"), m.payload_kg.get(axis.name, 0.0)
-    stated = axis.inertia + carried * (axis.lever_m**2 if axis.unit == "rad" else 1.0)
+    unit = axis.scale.unit_of("kg·m²")
+    stated = axis.inertia + axis_motion(axis, m).mounted_kgm2
     if inertia < 0:
         text = (
             f"effort of {axis.name} pushes against its acceleration (correlation {alike:.2f}): its sign is reversed; write "
