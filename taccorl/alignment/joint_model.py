@@ -182,14 +182,17 @@ class JointModel:
                 f"{motion.name}: {motion.rate_hz:g} Hz is {steps:.3f} physics steps of {step_s * 1e3:.3f} ms a "
                 f"row; bring it to {1 / (max(1, round(steps)) * step_s):g} Hz first (Measurement.resampled)"
             )
-        parts = max(1, math.ceil(self.joint.command_hz / motion.rate_hz))
+        received = max(1, math.ceil(self.joint.command_hz / motion.rate_hz))
+        parts = received
         while round(steps) % parts:
             parts -= 1
-        if parts == 1:
+        if received == 1 or (parts == 1 and not self.joint.follows_line):
             return motion.target, 1, round(steps), step_s
         following = np.append(motion.target[1:], motion.target[-1])
-        # A replay in the twin sends the first part of the way at once; a drive follows the line.
-        share = (np.arange(parts) + (not self.joint.follows_line)) / parts
+        share = np.arange(1, parts + 1) / parts
+        if self.joint.follows_line:
+            # The mean of what is held in each part: targets may be held for less than a physics step.
+            share -= 0.5 / parts + 0.5 / received
         sent = motion.target[:, None] + share * (following - motion.target)[:, None]
         return sent.ravel(), parts, round(steps) // parts, step_s
 
