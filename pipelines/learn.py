@@ -15,6 +15,7 @@ import yaml
 
 from pipelines.cotrain import run
 from taccorl.cli.parse import parse
+from taccorl.demos.mimicgen.spec import mimic_spec_path
 from taccorl.errors import TaccorlError
 from taccorl.training.lerobot_commands import Training
 
@@ -72,7 +73,7 @@ def main(words: list[str]) -> Learned:
     sources, actions, rows = out / "sources", out / f"actions_{config.episodes}", out / f"rows_{config.episodes}"
     spec, kept, engine = out / "mimicgen.yaml", f"--store={store}", f"--engine.workers={config.workers}"
     out.mkdir(parents=True, exist_ok=True)
-    told = yaml.safe_load(Path(f"data_specs/mimicgen/{config.task}.yaml").read_text(encoding="utf-8"))
+    told = yaml.safe_load(mimic_spec_path(config.task).read_text(encoding="utf-8"))
     spec.write_text(yaml.safe_dump(told | {"datagen_config": told.get("datagen_config", {}) | HOW}), encoding="utf-8")
     run("taccorl", "collect", task, f"--episodes={config.sources}", "--images=false", f"--out={sources}", kept)
     made = ("--rows=actions", f"--spec={spec}", f"--episodes={config.episodes}")

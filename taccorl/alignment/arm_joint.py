@@ -24,8 +24,8 @@ from taccorl.alignment.rigid_joint import (
     resting,
 )
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 if TYPE_CHECKING:

@@ -23,10 +23,10 @@ from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.sweep_range import SWEEP_HZ, SWEEP_S
 from taccorl.benchmark import Row, against_reference, benchmark, spread
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect, JointEffect
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 NOISE_RAD = 2e-4

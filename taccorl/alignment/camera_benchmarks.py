@@ -22,7 +22,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.effects.camera_exposure import blurred, toned
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 
 ORIGIN = "surrogate: the twin under other light, not a camera"

@@ -42,7 +42,7 @@ class AugmentConfig:
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given. It need not be that of the sources."""
     spec: str | None = None
-    """Settings of the generation: a file like those of data_specs/mimicgen/; by default the shipped one of the task."""
+    """Settings of the generation: a file like mimicgen.yaml of a task's folder; the task's own if not given."""
     images: bool = True
     """Render the three cameras (needs OpenGL)."""
     seed: int = 0
@@ -102,7 +102,7 @@ def _plan(config: AugmentConfig) -> "AugmentPlan":
     from taccorl.demos.mimicgen.augment import AugmentPlan
     from taccorl.demos.mimicgen.from_dataset import open_sources
     from taccorl.demos.mimicgen.spec import check_task, load_mimic_spec
-    from taccorl.sim.tasks import tasks
+    from taccorl.sim.task import tasks
 
     task = tasks.get(config.task)(config.difficulty)
     spec = load_mimic_spec(config.spec or config.task)

@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
     """Run ``taccorl collect``; returns the exit status 0."""
     config = parse(CollectConfig, argv, positional=None)
     if not config.task and not isinstance(config.source, ActionsSource):
-        from taccorl.sim.tasks import tasks
+        from taccorl.sim.task import tasks
 
         raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
     plan = Plan(

@@ -21,7 +21,7 @@ import numpy as np
 import taccorl
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record
 from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
 from taccorl.demos.twin_recording import write_twin_mcap
@@ -32,7 +32,7 @@ from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
@@ -66,7 +66,7 @@ class ExpertSource(Source):
     """How human the hands are."""
 
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        expert = experts.get(sim.task.name)(sim, rng, self.hands)
+        expert = expert_of(sim.task)(sim, rng, self.hands)
         expert.start()
         for _ in range(round(AFTER_S * CONTROL_HZ)):
             while not expert.done:

@@ -25,7 +25,7 @@ import taccorl
 from taccorl.data.dataset import PROVENANCE, episode_record
 from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
 from taccorl.demos.collect import AFTER_S, assemble, in_the_way, outcome_of
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.demos.mimicgen.attempt import state_digest
 from taccorl.demos.mimicgen.execution import Demonstration
 from taccorl.demos.mimicgen.spec import GatesSpec
@@ -41,7 +41,7 @@ from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
@@ -106,8 +106,8 @@ class CorrectionPlan:
         Raises:
             TaccorlError: an unknown word (the nearest is given), a number out of its range, an expert that cannot take over.
         """
-        tasks.get(self.task)(self.difficulty)
-        if not experts.get(self.task).can_resume():
+        task = tasks.get(self.task)(self.difficulty)
+        if not expert_of(task).can_resume():
             raise TaccorlError(
                 f"--task={self.task}: its expert cannot take over within a task; implement its remaining()"
             )
@@ -220,7 +220,7 @@ def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, ep
     done = Correction("unfinished", takeover_step=step, cause=cause)
     sim.judge.restart_clock()
     done.recorder = EpisodeRecorder(sim, spec, np.random.default_rng([episode.seed, _PADS]))
-    expert = experts.get(plan.task)(sim, np.random.default_rng([episode.seed, _EXPERT]))
+    expert = expert_of(sim.task)(sim, np.random.default_rng([episode.seed, _EXPERT]))
     try:
         expert.resume()
         after = 0

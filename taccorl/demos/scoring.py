@@ -7,7 +7,7 @@ import numpy as np
 
 from taccorl.benchmark import cpu_s
 from taccorl.demos.collect import ExpertSource, Plan, outcome_of
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.errors import UnreachableError
 from taccorl.sim.simulation import Watch
 from taccorl.sim.twin import CONTROL_HZ
@@ -55,7 +55,7 @@ def score_expert(
         before = cpu_s()
         episode_seed = plan.attempt_seed(k)
         sim.reset([episode_seed])
-        expert = experts.get(task)(sim, np.random.default_rng([episode_seed, 1]), plan.source.hands)
+        expert = expert_of(sim.task)(sim, np.random.default_rng([episode_seed, 1]), plan.source.hands)
         expert.start()
         depth_m = force_n = 0.0
 

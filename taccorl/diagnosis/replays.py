@@ -21,9 +21,9 @@ from taccorl.alignment.rigid_joint import AT_TCP
 from taccorl.alignment.touch_motion import PressedObject, TouchMotion, touch_motion
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 CONTACT_COUNTS = 30.0

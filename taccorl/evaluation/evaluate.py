@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, EpisodeRow, read_rows
 from taccorl.evaluation.rollouts import Actor, Progress, Rollout, roll_out
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
 from taccorl.sim.vector_env import TaccorlVectorEnv

@@ -14,7 +14,7 @@ from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.rollouts import Rollout
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 
 NUM_INSTANTS = 6
 

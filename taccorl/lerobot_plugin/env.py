@@ -63,7 +63,7 @@ class TaccorlEnvConfig(EnvConfig):
             raise TaccorlError(f"env.fps: {self.fps}; the twin is controlled at {_FPS} steps a second")
         if self.part_poses:
             from taccorl.sim.part_poses import part_pose_names
-            from taccorl.sim.tasks import tasks
+            from taccorl.sim.task import tasks
 
             numbers = len(part_pose_names(tasks.get(str(self.task))))
             self.features[_PARTS] = PolicyFeature(FeatureType.ENV, (numbers,))

@@ -16,7 +16,7 @@ from taccorl.sim.pad import OneSim, PadArray
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.spaces import Observation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
 

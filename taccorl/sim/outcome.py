@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taccorl.robots import ROBOT
-from taccorl.sim.tasks.task import HOLD_S, Task, Verdict
+from taccorl.sim.task import HOLD_S, Task, Verdict
 
 if TYPE_CHECKING:
     from taccorl.sim.simulation import Simulation

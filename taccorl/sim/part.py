@@ -19,6 +19,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.shapes import Solid, add_geom
 
 PART_CONTACT: Mapping[str, Any] = {
@@ -51,6 +53,33 @@ COLORS: Mapping[str, tuple[float, float, float]] = {
     "teal": (0.05, 0.46, 0.48),
 }
 """Matte colours by name, RGB 0–1."""
+
+# Per side; 0.001 is easy, 0.0003 hard. A choice between 0.06 mm (Isaac Lab's Factory) and 3 mm (ManiSkill's PegInsertionSide).
+CLEARANCE_M = 0.0005
+_FINGER_ROOM_M = 0.004  # between the fingers' tips and what lies below them
+TCP_ABOVE_M = ROBOT.pad.length_m / 2 + _FINGER_ROOM_M  # lowest TCP over a surface: the pads reach 32 mm beyond it
+
+
+def frame_pose(x_axis: tuple = (1, 0, 0), z_axis: tuple = (0, 0, 1), at: tuple = (0, 0, 0)) -> np.ndarray:
+    """Pose (4, 4) of a frame with these axes and its origin at ``at`` [m]."""
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = x_axis, np.cross(z_axis, x_axis), z_axis, at
+    return pose
+
+
+LEADING_END = frame_pose(z_axis=(0, 0, -1))  # of a part whose origin is at its tip and whose z runs to its tail
+
+
+def check_clearance(name: str, clearance_m: float) -> None:
+    """
+    Raises:
+        TaccorlError: the clearance per side of a hole, moved out from its part's outline, is not within 0 and 2 mm.
+    """
+    if not 0 < clearance_m <= 0.002:
+        raise TaccorlError(
+            f"{name}: clearance_m={clearance_m} is not within 0 and 0.002 m per side; "
+            "0.0005 is the default, 0.001 easy, 0.0003 hard"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 if TYPE_CHECKING:  # it would load MuJoCo wherever LeRobot loads its plug-ins
-    from taccorl.sim.tasks.task import Task
+    from taccorl.sim.task import Task
 
 PARTS_KEY = "observation.environment_state"  # LeRobot's name
 POSE_NAMES = ("x", "y", "z", "r00", "r10", "r20", "r01", "r11", "r21")

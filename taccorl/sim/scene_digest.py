@@ -9,7 +9,7 @@ from taccorl.lineage.canonical import canonical_text
 from taccorl.sim.twin_file import twin_text
 
 if TYPE_CHECKING:
-    from taccorl.sim.tasks.task import Task
+    from taccorl.sim.task import Task
     from taccorl.sim.twin import TwinConfig
 
 _BITS = 52  # a float64 holds so many exactly

@@ -15,7 +15,7 @@ from taccorl.sim.pad import PadArray
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.sensors import Noise, Sensor, TactileFrames
 from taccorl.sim.sensors.noise import ScanNoise
-from taccorl.sim.tasks.task import Contact, Task
+from taccorl.sim.task import Contact, Task
 from taccorl.sim.twin import TwinConfig
 
 

@@ -23,7 +23,7 @@ from taccorl.sim.randomize import draw
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.scene_digest import scene_digest
 from taccorl.sim.seen_scene import SeenScene
-from taccorl.sim.tasks.task import Reset, Task
+from taccorl.sim.task import Reset, Task
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig, build_spec
 
 SUB_COMMANDS = 5

@@ -15,7 +15,7 @@ from taccorl.sim.robot import RobotConfig, add_arm
 from taccorl.sim.sensors import SensorConfig
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.settings import check_numbers
-from taccorl.sim.tasks.task import Task
+from taccorl.sim.task import Task
 
 CONTROL_HZ = 30  # the dataset's fps: one action a row
 

@@ -37,7 +37,7 @@ from taccorl.sim.spaces import (
     action_space,
     observation_space,
 )
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin
 

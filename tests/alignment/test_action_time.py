@@ -22,9 +22,9 @@ from taccorl.demos.stand_in import StandInConfig, publish
 from taccorl.demos.stand_in_streams import Streams
 from taccorl.demos.twin_recording import LEAD_S, TwinStory
 from taccorl.errors import DatasetError
+from taccorl.sim.bench import Bench
 from taccorl.sim.replay import replay_episode
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 
 FPS, SECONDS = 30, 6.0
 JOINTS = np.arange(14) % 7 != 6

@@ -15,7 +15,7 @@ from taccorl.demos.recorder import EpisodeRecorder, with_simulator
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 
 OFFSET = {"turn_x_rad": 0.03, "turn_y_rad": -0.02, "turn_z_rad": 0.01, "shift_x_m": -0.01, "shift_z_m": 0.015}

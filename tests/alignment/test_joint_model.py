@@ -13,11 +13,11 @@ from taccorl.alignment.joint_motion import joint_motion, motion_of
 from taccorl.alignment.measurement import Measurement
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 STEP_S = TWIN.physics.timestep_s

@@ -29,9 +29,9 @@ from taccorl.demos.stand_in_streams import Streams
 from taccorl.demos.twin_recording import LEAD_S, TwinStory
 from taccorl.errors import RecordingError
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.trajectory import SAMPLE_HZ, DenseRecorder, Trajectory
 
 STEP = 1.0005327 * 0.017444 * 1e-3  # rad: 0.001° times piper_ros's factor and its correction

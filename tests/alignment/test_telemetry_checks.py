@@ -14,11 +14,11 @@ from taccorl.alignment.noise_floor import noise_floor
 from taccorl.alignment.telemetry_checks import ERRORS, check_measurement, check_measurements, check_names
 from taccorl.data.episode import ChannelTiming
 from taccorl.errors import TaccorlError
+from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import JointEffect
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 

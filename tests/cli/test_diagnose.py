@@ -194,9 +194,9 @@ def test_recordings_that_sweep_no_joint_are_refused(said: Any, tmp_path: Path):
 
 def stepped(folder: Path, late_rows: int) -> Path:
     """One table of steps of left_joint5, as the nominal twin answers them, its positions stamped ``late_rows`` too late."""
+    from taccorl.sim.bench import Bench
     from taccorl.sim.replay import replay
     from taccorl.sim.simulation import Simulation
-    from taccorl.sim.tasks.bench import Bench
 
     sim = Simulation(Bench())
     sim.reset([0])

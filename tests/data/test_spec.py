@@ -17,7 +17,6 @@ from taccorl.data.spec import (
     load_recording_spec,
     load_sensor_spec,
 )
-from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.errors import SpecError
 
 REMOVE = object()
@@ -164,7 +163,7 @@ def leaves(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 @pytest.mark.parametrize("path", sorted(data_specs_folder().rglob("*.yaml")), ids=lambda p: p.stem)
 def test_every_shipped_spec_loads(path):
-    loaders = {"sensors": load_sensor_spec, "recordings": load_recording_spec, "mimicgen": load_mimic_spec}
+    loaders = {"sensors": load_sensor_spec, "recordings": load_recording_spec}
     load = loaders.get(path.parent.name, load_dataset_spec)
     assert load(path).spec_version == 1
     assert find_spec(path.stem) == path

@@ -20,7 +20,7 @@ from taccorl.demos.correct import (
     read_policy_episode,
     write_policy_episodes,
 )
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import EXACT
 from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
 from taccorl.demos.mimicgen.stored_actions import CORRECTION, read_stored, write_stored
@@ -29,7 +29,7 @@ from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 
 TASK = "assembly_2"
 PUSH_RAD = 0.02
@@ -65,7 +65,7 @@ def held_still(sim: Simulation, seed: int, steps: int) -> PolicyEpisode:
 
 def pushed_expert(sim: Simulation, seed: int, after: int) -> PolicyEpisode:
     """The expert; ``after`` steps after both parts are held its joints are pushed off by 0.02 rad over 10 steps, and it ends."""
-    expert = experts.get(sim.task.name)(sim, np.random.default_rng([seed, 1]))
+    expert = expert_of(sim.task)(sim, np.random.default_rng([seed, 1]))
     push = np.random.default_rng(seed).normal(size=14) * PUSH_RAD
     push[[6, 13]] = 0.0
     held_at: list[int] = []
@@ -130,7 +130,7 @@ def test_wrong_words_are_named(changes: dict, message: str) -> None:
 def test_an_expert_that_begins_at_the_beginning_only_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     from taccorl.demos.experts.scripted import ScriptedExpert
 
-    monkeypatch.setattr(experts.get("puzzle"), "remaining", ScriptedExpert.remaining)
+    monkeypatch.setattr(expert_of(tasks.get("puzzle")), "remaining", ScriptedExpert.remaining)
     with pytest.raises(TaccorlError, match="--task=puzzle"):
         plan(task="puzzle")
 
@@ -156,7 +156,7 @@ class Stub:
 @pytest.fixture
 def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("taccorl.demos.correct.AFTER_S", 0.1)
-    monkeypatch.setattr("taccorl.demos.correct.experts.get", lambda task: Stub)
+    monkeypatch.setattr("taccorl.demos.correct.expert_of", lambda task: Stub)
 
 
 def test_without_a_grasp_the_takeover_is_drawn_over_all_steps(sim: Simulation, stub: None) -> None:
@@ -257,14 +257,14 @@ def test_a_part_that_cannot_be_gripped_is_a_lost_state(sim: Simulation, part: st
     sim.reset([0])
     put(sim, part, **how)
     with pytest.raises(LostError, match=f"{part} .*{message}"):
-        experts.get(TASK)(sim, np.random.default_rng(0)).resume()
+        expert_of(sim.task)(sim, np.random.default_rng(0)).resume()
 
 
 def test_a_lost_state_is_counted(sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
     def lost(expert: object, arm: str) -> None:
         raise LostError("plug is lost")
 
-    monkeypatch.setattr(experts.get(TASK), "remaining", lost)
+    monkeypatch.setattr(expert_of(tasks.get(TASK)), "remaining", lost)
     done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, 3, 4))
     assert (done.outcome, done.reason) == ("not taken over", "plug is lost")
 
@@ -277,7 +277,7 @@ def test_arms_do_not_jump_at_the_takeover(task: str) -> None:
     for k in range(4):
         sim.step((sim.targets[0] + (goal - sim.targets[0]) * (k + 1) / 4)[None])
     before = sim.targets[0].copy()
-    expert = experts.get(task)(sim, np.random.default_rng(0), EXACT)
+    expert = expert_of(sim.task)(sim, np.random.default_rng(0), EXACT)
     expert.resume()
     assert np.abs(expert.act() - before)[[*range(6), *range(7, 13)]].max() < 0.02
     sim.close()

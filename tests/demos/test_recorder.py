@@ -6,7 +6,7 @@ import pytest
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.collect import ExpertSource, Plan, attempt, outcome_of
 from taccorl.demos.recorder import EpisodeRecorder, with_simulator
-from taccorl.sim.tasks.task import HOLD_S
+from taccorl.sim.task import HOLD_S
 from taccorl.sim.twin import CONTROL_HZ
 
 

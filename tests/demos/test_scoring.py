@@ -3,25 +3,20 @@
 import numpy as np
 import pytest
 
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of, tasks_with_expert
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.demos.scoring import score_expert
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 
-WITH_EXPERT = ("assembly_1", "assembly_2", "puzzle", "test_tube")
-
-
-def test_every_task_but_the_empty_bench_has_an_expert():
-    assert tuple(experts) == WITH_EXPERT
-    assert set(tasks) - {"bench"} == set(WITH_EXPERT)
+WITH_EXPERT = tasks_with_expert()
 
 
 @pytest.mark.parametrize("task", ["assembly_1", *(pytest.param(t, marks=pytest.mark.slow) for t in WITH_EXPERT[1:])])
 def test_an_expert_s_grip_is_felt_and_saturates_no_taxel(task):
     sim = Simulation(tasks.get(task)())
     sim.reset([3])
-    expert = experts.get(task)(sim, np.random.default_rng(3), ScriptedExpertConfig())
+    expert = expert_of(sim.task)(sim, np.random.default_rng(3), ScriptedExpertConfig())
     expert.start()
     highest, above = 0, 0
     while not sim.judge.outcome.over[0]:

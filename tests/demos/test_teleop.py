@@ -30,7 +30,7 @@ from taccorl.demos.teleop_jog import AXES, COMMAND_KEYS, Command, Gamepad, GlfwG
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 
 UP, DOWN, LEFT, RIGHT, HOME, END = 265, 264, 263, 262, 268, 269  # mjui.h, the same as GLFW's
 INSERT, DELETE, PAGE_DOWN, ENTER, F9, SPACE = 260, 261, 267, 257, 298, 32
@@ -510,7 +510,7 @@ import numpy as np
 from taccorl.demos import teleop
 from taccorl.demos.teleop_actions import ActionLog
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 assert not {"torch", "lerobot"} & set(sys.modules), "teleoperation starts without them"
 sim = Simulation(tasks.get("bench")())
 sim.reset([7])

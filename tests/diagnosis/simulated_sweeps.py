@@ -10,10 +10,10 @@ import yaml
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.effects import make_effect
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 RATE_HZ = 200.0

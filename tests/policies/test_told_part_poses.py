@@ -23,7 +23,7 @@ from taccorl.policies.tactile_pi05.part_poses import (
 )
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import make_tactile_pi05_pre_post_processors
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 
 NAMES = list(part_pose_names(tasks.get("assembly_2")))
 TOLD: dict[str, Any] = {

@@ -19,7 +19,7 @@ from taccorl.rl.settings import PolicySettings
 from taccorl.rl.twin_shard import TwinShard
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 

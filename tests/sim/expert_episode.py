@@ -5,9 +5,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.sim.simulation import Simulation, Snapshot
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 
 SEED = 0
 MIDDLE = 240  # control steps: both parts are in the hands
@@ -29,7 +29,7 @@ class ExpertEpisode:
 def expert_episode() -> ExpertEpisode:
     sim = Simulation(tasks.get("assembly_1")())
     sim.reset([SEED])
-    expert = experts.get("assembly_1")(sim, np.random.default_rng([SEED, 7]))
+    expert = expert_of(sim.task)(sim, np.random.default_rng([SEED, 7]))
     expert.start()
     actions, states = [], []
     while not sim.judge.outcome.over[0]:

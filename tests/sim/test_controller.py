@@ -6,9 +6,9 @@ import pytest
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig, empty_bench
 
 

@@ -15,7 +15,7 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.env import TaccorlEnv, env_id
 from taccorl.sim.episode_seeds import episode_seed
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin_file import load_twin
 from taccorl.sim.vector_env import TaccorlVectorEnv
 

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from taccorl.sim.bench import Bench
 from taccorl.sim.outcome import Judge
-from taccorl.sim.tasks.bench import Bench
-from taccorl.sim.tasks.task import Subtask, Verdict
+from taccorl.sim.task import Subtask, Verdict
 
 
 class Scripted(Bench):

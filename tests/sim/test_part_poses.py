@@ -10,7 +10,7 @@ from taccorl.sim.env import TaccorlEnv
 from taccorl.sim.lerobot_env import raw_names
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names, part_poses, posed_bodies
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from taccorl.sim.randomize import PAPER_ROWS, Row, draw
+from taccorl.sim.randomize import Row, draw
+from taccorl.sim.task import tasks
 
 DEG = math.pi / 180
 TABLE = {  # half ranges, as printed in the paper's appendix E
@@ -26,8 +27,8 @@ TABLE = {  # half ranges, as printed in the paper's appendix E
 
 @pytest.mark.parametrize("task", TABLE)
 def test_rows_are_the_paper_s(task):
-    rows = {row.name: row for row in PAPER_ROWS[task]}
-    assert (rows.pop("friction").low, PAPER_ROWS[task][0].high) == ((0.3,), (0.7,))
+    rows = {row.name: row for row in tasks.get(task).rows}
+    assert (rows.pop("friction").low, tasks.get(task).rows[0].high) == ((0.3,), (0.7,))
     assert set(rows) == set(TABLE[task])
     for name, half in TABLE[task].items():
         np.testing.assert_allclose(rows[name].high, np.broadcast_to(half, len(rows[name].high)))
@@ -37,14 +38,14 @@ def test_rows_are_the_paper_s(task):
 
 def test_draws_fill_their_range_and_never_leave_it():
     rng = np.random.default_rng(0)
-    frictions = np.array([draw(PAPER_ROWS["test_tube"], rng)["friction"][0] for _ in range(2000)])
+    frictions = np.array([draw(tasks.get("test_tube").rows, rng)["friction"][0] for _ in range(2000)])
     assert 0.3 <= frictions.min() < 0.301
     assert 0.699 < frictions.max() <= 0.7
     assert frictions.mean() == pytest.approx(0.5, abs=3 * 0.4 / math.sqrt(12 * 2000))  # three standard errors
 
 
 def test_scale_zero_is_the_nominal_scene_and_one_half_halves_the_spread():
-    rows = PAPER_ROWS["puzzle"]
+    rows = tasks.get("puzzle").rows
     whole, half, none = (draw(rows, np.random.default_rng(5), scale) for scale in (1.0, 0.5, 0.0))
     for row in rows:
         np.testing.assert_allclose(none[row.name], row.absent)

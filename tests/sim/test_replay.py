@@ -7,10 +7,10 @@ from taccorl.data.episode import Episode
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.effects import make_effect
 from taccorl.sim.replay import replay, replay_episode
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.trajectory import SAMPLE_HZ, DenseRecorder
 from taccorl.sim.twin import TwinConfig
 

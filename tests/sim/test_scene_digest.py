@@ -2,8 +2,8 @@
 
 from taccorl.sim.effects import make_effect
 from taccorl.sim.scene_digest import scene_digest
-from taccorl.sim.tasks.assembly_1 import Assembly1
 from taccorl.sim.twin import TwinConfig
+from taccorl.tasks.assembly_1.scene import Assembly1
 
 
 def digest(**effect) -> float:

@@ -9,9 +9,9 @@ from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.simulation import SUB_COMMANDS, Simulation, Watch
-from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.assembly_1 import Assembly1
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
+from taccorl.tasks.assembly_1.scene import Assembly1
 
 
 def waving(steps: int) -> np.ndarray:

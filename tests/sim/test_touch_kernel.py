@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from taccorl.robots import ROBOT
 from taccorl.sim.felt_shapes import shapes_of
 from taccorl.sim.pad import KINEMATIC_FIELDS, OneSim, PadArray
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig, build_spec
 
 NUM_SIMS = 12

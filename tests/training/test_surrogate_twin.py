@@ -8,7 +8,7 @@ import pytest
 
 from taccorl.errors import TaccorlError
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin
 from taccorl.training.surrogate_twin import ORIGIN, draw_surrogate_twin

@@ -1,6 +1,35 @@
-"""Scripted experts, one file per task: they demonstrate in place of a person who teleoperates."""
+"""Scripted experts: they demonstrate in place of a person who teleoperates. A task names its own (``Task.expert``)."""
+
+import pkgutil
 
 from taccorl.demos.experts.scripted import ScriptedExpert
-from taccorl.plugins import Registry
+from taccorl.errors import TaccorlError
+from taccorl.sim.task import Task, tasks
 
-experts: Registry[type[ScriptedExpert]] = Registry("expert", "taccorl.demos.experts")
+
+def expert_of(task: Task | type[Task]) -> type[ScriptedExpert]:
+    """The scripted expert that ``task`` names.
+
+    Raises:
+        TaccorlError: it names none, or one that cannot be imported or is none.
+    """
+    if task.expert is None:
+        have = ", ".join(tasks_with_expert())
+        raise TaccorlError(
+            f"task {task.name} has no scripted expert; tasks with one: {have}. One of your own: a ScriptedExpert, named in "
+            f'its task by expert = "module:Class"'
+        )
+    try:
+        expert = pkgutil.resolve_name(task.expert)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise TaccorlError(f"task {task.name}: its expert {task.expert!r} cannot be imported: {error}") from error
+    if not (isinstance(expert, type) and issubclass(expert, ScriptedExpert)):
+        raise TaccorlError(
+            f"task {task.name}: its expert {task.expert!r} is no class of ScriptedExpert, but {expert!r}"
+        )
+    return expert
+
+
+def tasks_with_expert() -> tuple[str, ...]:
+    """Names of the registered tasks that have a scripted expert."""
+    return tuple(name for name in tasks if tasks.get(name).expert)

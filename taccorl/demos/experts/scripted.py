@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -117,8 +116,6 @@ class ScriptedExpert(ABC):
     Subclasses write ``script(arm)``: a generator that moves ``self.hands[arm]`` and yields once a control step.
     """
 
-    task: ClassVar[str]
-
     def __init__(self, sim: Simulation, rng: np.random.Generator, config: ScriptedExpertConfig | None = None) -> None:
         if sim.num_sims != 1:
             raise TaccorlError(f"an expert drives one simulation, not {sim.num_sims}")
@@ -147,7 +144,9 @@ class ScriptedExpert(ABC):
         Raises:
             TaccorlError: this demonstrator can only begin at the beginning.
         """
-        raise TaccorlError(f"expert of {self.task}: cannot begin in the middle of {subtask!r}; implement its finish()")
+        raise TaccorlError(
+            f"expert of {self.sim.task.name}: cannot begin in the middle of {subtask!r}; implement its finish()"
+        )
 
     @classmethod
     def can_finish(cls) -> bool:
@@ -204,7 +203,7 @@ class ScriptedExpert(ABC):
             TaccorlError: this demonstrator can only begin at the beginning.
         """
         raise TaccorlError(
-            f"expert of {self.task}: cannot take over in the middle of a task; implement its remaining()"
+            f"expert of {self.sim.task.name}: cannot take over in the middle of a task; implement its remaining()"
         )
 
     @classmethod

@@ -24,7 +24,7 @@ from taccorl.demos.mimicgen.spec import check_closed_loop
 from taccorl.demos.mimicgen.touching import Touching
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.task import HOLD_S
+from taccorl.sim.task import HOLD_S
 from taccorl.sim.twin import CONTROL_HZ
 
 _UNREACHABLE_M = 0.005  # that inverse kinematics leaves: the hand would be elsewhere

@@ -43,7 +43,7 @@ from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.randomize import Row, draw
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.demos.mimicgen.director import Wish
 from taccorl.sim.simulation import Simulation
 
@@ -18,7 +18,7 @@ class ExpertContact:
 
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
         """After a reset."""
-        self._expert = experts.get(sim.task.name)(sim, rng)
+        self._expert = expert_of(sim.task)(sim, rng)
         self._expert.stand_by()
 
     @property

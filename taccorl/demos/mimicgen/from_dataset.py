@@ -22,7 +22,7 @@ from taccorl.demos.mimicgen.touching import Touching
 from taccorl.errors import DatasetError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin_file import load_twin
 
 COLUMNS = ("sim.state", "sim.seed", "sim.subtask", "action")

@@ -13,7 +13,7 @@ from taccorl.demos.mimicgen.source import Source, SourcePool
 from taccorl.demos.mimicgen.spec import MimicSpec
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 
 

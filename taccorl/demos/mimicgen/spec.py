@@ -1,4 +1,4 @@
-"""Settings of generation for a task: ``data_specs/mimicgen/<task>.yaml``, with IsaacLab Mimic's field names.
+"""Settings of generation for a task: the YAML file that ``Task.mimicgen`` names, with IsaacLab Mimic's field names.
 
 Every distance is in metres, every angle in radians; a step is a control step, 1/30 s.
 """
@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
-from taccorl.data.spec import SPEC_VERSION, find_spec
+from taccorl.data.spec import SPEC_VERSION
 from taccorl.data.strict_yaml import Document
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.demos.mimicgen.schedule import Constraint, DeadlockError, rehearse
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.robots import ROBOT
-from taccorl.sim.tasks.task import Task
+from taccorl.sim.task import Task, tasks
 
 UNTIL_THE_END = "until the end"
 """Name of a last subtask without a signal."""
@@ -43,7 +43,7 @@ class SubtaskSpec:
     """One subtask of one arm."""
 
     subtask_term_signal: str | None
-    """The task's subtask (``taccorl.sim.tasks``) that this one is; it ends when that one's ``done`` turns true. Null, last of
+    """The task's subtask (``Task.subtasks``) that this one is; it ends when that one's ``done`` turns true. Null, last of
     an arm: what it does until the source ends, its retreat say, so that nobody has to wait for that."""
     object_ref: str | None = None
     """Body that carries the motion over: T' = O_new · O_src⁻¹ · T_src. Null: the motion is repeated joint by joint, blended
@@ -213,18 +213,36 @@ class MimicSpec:
 
 
 def load_mimic_spec(name: str | Path) -> MimicSpec:
-    """Load a spec by path, or the shipped one by the task's name.
+    """Load a spec by path, or a task's own by the task's name.
 
     Raises:
         SpecError: with file, line, the key, and the way out.
     """
-    document = Document(MimicSpec, find_spec(name))
+    document = Document(MimicSpec, mimic_spec_path(name))
     spec = document.value
     if spec.spec_version != SPEC_VERSION:
         raise document.error("spec_version", f"{spec.spec_version}; this taccorl reads version {SPEC_VERSION}")
     for key, text in _mistakes(spec):
         raise document.error(key, text)
     return spec
+
+
+def mimic_spec_path(name: str | Path) -> Path:
+    """Path of a spec: ``name`` itself if it is a file, else the file that the task of that name states (``Task.mimicgen``).
+
+    Raises:
+        SpecError: neither a file nor a task, or a task without a spec.
+    """
+    if Path(name).is_file():
+        return Path(name)
+    if str(name) not in tasks:
+        raise SpecError(f"no MimicGen spec {str(name)!r}: neither a file nor a task; {nearest(Path(name).stem, tasks)}")
+    path = tasks.get(str(name)).mimicgen
+    if path is None:
+        raise SpecError(
+            f"task {name} has no MimicGen spec: name one by its class attribute mimicgen, or give --spec=FILE"
+        )
+    return path
 
 
 def _mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
@@ -370,7 +388,7 @@ def check_closed_loop(spec: MimicSpec) -> None:
     where = f"mimicgen spec of {spec.task}"
     for key, text in _closed_loop_mistakes(spec.datagen_config):
         raise SpecError(f"{where}: {key.replace('/', ' → ')}: {text}")
-    if spec.datagen_config.contact_mode == "closed_loop_expert" and not experts.get(spec.task).can_finish():
+    if spec.datagen_config.contact_mode == "closed_loop_expert" and not expert_of(tasks.get(spec.task)).can_finish():
         raise SpecError(
             f"{where}: datagen_config → contact_mode: closed_loop_expert, but the expert of {spec.task} cannot begin in the "
             "middle of a subtask: implement its finish(), or set contact_mode: replay"

@@ -21,7 +21,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.part import Part
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.assembly_1 import Assembly1
+from taccorl.tasks.assembly_1.scene import Assembly1
 
 
 class OneHand(ScriptedExpert):

@@ -11,7 +11,7 @@ import pytest
 from taccorl.data.dataset import Dataset
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.collect import Plan
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.scripted import EXACT
 from taccorl.demos.mimicgen.attempt import Attempts, Hands, attempt_seeds
@@ -27,7 +27,7 @@ from taccorl.demos.recorder import EpisodeRecorder, with_simulator
 from taccorl.errors import DatasetError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.assembly_2 import Assembly2
+from taccorl.tasks.assembly_2.scene import Assembly2
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_poses_of_a_source_are_the_simulators_own(collected, pool, sim):
 def test_goals_are_what_the_hand_wanted_and_not_what_it_commanded(rows_spec):
     sim = Simulation(Assembly2())
     sim.reset([5])
-    expert, recorder = experts.get("assembly_2")(sim, np.random.default_rng(0), EXACT), EpisodeRecorder(sim, rows_spec)
+    expert, recorder = expert_of(sim.task)(sim, np.random.default_rng(0), EXACT), EpisodeRecorder(sim, rows_spec)
     expert.start()
     wanted, commanded = [], []
     while not expert.done and not sim.judge.outcome.over[0]:

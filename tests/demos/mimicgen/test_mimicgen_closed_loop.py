@@ -11,7 +11,7 @@ from ideal_hands import BOX, HZ, TOUCH_ROW, demonstration, mimic_spec, pose, sce
 
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.collect import Plan, collect
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import ScriptedExpert
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts
 from taccorl.demos.mimicgen.director import Director, Wish
@@ -30,8 +30,8 @@ from taccorl.demos.recorder import with_simulator
 from taccorl.errors import SpecError, TaccorlError
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.assembly_2 import Assembly2
+from taccorl.sim.task import tasks
+from taccorl.tasks.assembly_2.scene import Assembly2
 
 LEAD = 15  # GenerationSpec.contact_lead_steps
 SEED = 13  # its first attempt succeeds after two corrections
@@ -280,7 +280,7 @@ def test_options_are_checked_like_a_file():
 
 
 def test_an_expert_that_cannot_begin_in_the_middle_is_refused(monkeypatch, pools, sim):
-    expert = experts.get("assembly_2")
+    expert = expert_of(tasks.get("assembly_2"))
     assert expert.can_finish()
     monkeypatch.setattr(expert, "finish", ScriptedExpert.finish)
     said = r"the expert of assembly_2 cannot begin in the middle of a subtask: .* finish\(\)"

@@ -20,7 +20,7 @@ from taccorl.errors import DatasetError
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.assembly_2 import Assembly2
+from taccorl.tasks.assembly_2.scene import Assembly2
 
 LEFT, RIGHT = np.r_[:6], np.r_[7:13]
 SPEC = with_options(load_mimic_spec("assembly_2"), disturbance=DisturbanceSpec(joint_rad=0.02, time_s=0.7))

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from taccorl.demos.experts import tasks_with_expert
 from taccorl.demos.mimicgen.augment import AugmentPlan
 from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of
 from taccorl.demos.mimicgen.report import Spent, _page, coverage_figure, numbers, pages_of
 from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.errors import TaccorlError
-from taccorl.sim.randomize import PAPER_ROWS, draw
+from taccorl.sim.randomize import draw
+from taccorl.sim.task import tasks
 
 
 def plan(task="assembly_2", **changes):
@@ -30,7 +32,7 @@ def attempts_of(task, num, failed=(), unseen=(), **drawn):
             reason="it <fell>" if k in failed else "",
             scene_seed=100 + k,
             sources=frozenset({f"demo {k % 2}"}),
-            draw=draw(PAPER_ROWS[task], rng) | {name: np.array(values[k]) for name, values in drawn.items()},
+            draw=draw(tasks.get(task).rows, rng) | {name: np.array(values[k]) for name, values in drawn.items()},
             rows=0 if k in unseen else 300,
             process_s=2.0 if k in failed else 3.0,
             folder=Path(f"/a store/mimicgen/{k:016x}"),
@@ -61,13 +63,13 @@ def test_boxes_cover_the_papers_range_and_each_attempt_lies_in_one():
     assert plug[-0.03, -0.03] == Share(successes=1, attempts=1)
     assert plug[-0.01, -0.01] == Share(successes=1, attempts=2)
     assert plug[0.01, -0.03] == Share(successes=1, attempts=1)
-    for row in PAPER_ROWS["assembly_2"]:
+    for row in tasks.get("assembly_2").rows:
         assert sum(b.share.attempts for b in boxes if b.row == row.name) == 4
 
 
 def test_where_less_is_drawn_the_boxes_are_smaller():
     small = plan(randomization=0.5)
-    attempts = [dataclasses.replace(a, draw=draw(PAPER_ROWS["assembly_2"], np.random.default_rng(a.k), 0.5))
+    attempts = [dataclasses.replace(a, draw=draw(tasks.get("assembly_2").rows, np.random.default_rng(a.k), 0.5))
                 for a in attempts_of("assembly_2", 3)]  # fmt: skip
     plug = [b for b in bins_of(small, attempts) if b.row == "plug_position"]
     assert min(b.low[0] for b in plug) == pytest.approx(-0.015)
@@ -105,13 +107,13 @@ def test_the_page_names_poor_boxes_and_every_failure_and_needs_no_other_file():
     assert not [part for part in ("http:", "https:", "<script", "<link") if part in page]
 
 
-@pytest.mark.parametrize("task", sorted(set(PAPER_ROWS) - {"bench"}))
+@pytest.mark.parametrize("task", tasks_with_expert())
 def test_coverage_has_a_panel_for_each_row_of_every_task(task):
     told = numbers(plan(task), attempts_of(task, 12, failed={3}), None)
     figure = coverage_figure(plan(task), told)
     shown = [ax.get_title() for ax in figure.axes if ax.get_visible()]
-    assert shown == [row.name.replace("_", " ") for row in PAPER_ROWS[task]]
-    for ax, row in zip(figure.axes, PAPER_ROWS[task], strict=False):
+    assert shown == [row.name.replace("_", " ") for row in tasks.get(task).rows]
+    for ax, row in zip(figure.axes, tasks.get(task).rows, strict=False):
         drawn = sum(len(c.get_offsets()) for c in ax.collections if c.get_offsets().size and "Path" in type(c).__name__)
         assert drawn == 12, row.name
 

@@ -11,8 +11,8 @@ from taccorl.demos.mimicgen.from_dataset import read_sources
 from taccorl.demos.mimicgen.scoring import Score, _holds, score_generation, stiffened
 from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.assembly_2 import Assembly2
 from taccorl.sim.twin import TwinConfig
+from taccorl.tasks.assembly_2.scene import Assembly2
 
 
 def test_a_stiffened_twin_has_other_gains_and_nothing_else():

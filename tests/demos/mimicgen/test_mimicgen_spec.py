@@ -5,11 +5,10 @@ import re
 import pytest
 import yaml
 
-from taccorl.data.spec import find_spec
 from taccorl.demos.mimicgen.schedule import rehearse
-from taccorl.demos.mimicgen.spec import GenerationSpec, check_task, load_mimic_spec, with_options
+from taccorl.demos.mimicgen.spec import GenerationSpec, check_task, load_mimic_spec, mimic_spec_path, with_options
 from taccorl.errors import SpecError, TaccorlError
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 
 TASKS = ("assembly_1", "assembly_2", "puzzle", "test_tube")
 
@@ -40,7 +39,7 @@ def test_a_spec_says_of_each_subtask_what_the_task_says():
 
 def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
     path = tmp_path / "a.yaml"
-    document = yaml.safe_load(find_spec("assembly_2").read_text())
+    document = yaml.safe_load(mimic_spec_path("assembly_2").read_text())
     path.write_text(yaml.safe_dump(document, default_flow_style=True))
     spec = load_mimic_spec("assembly_2")
     assert load_mimic_spec(path).digest == spec.digest
@@ -98,7 +97,7 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
     ],
 )
 def test_a_slip_in_a_spec_is_named_with_its_place(old, new, said, tmp_path):
-    text = find_spec("assembly_2").read_text()
+    text = mimic_spec_path("assembly_2").read_text()
     assert old in text
     path = tmp_path / "mine.yaml"
     path.write_text(text.replace(old, new, 1))
@@ -122,7 +121,7 @@ def test_a_slip_in_a_spec_is_named_with_its_place(old, new, said, tmp_path):
 )
 def test_a_spec_that_is_not_the_tasks_is_named(old, new, said, tmp_path):
     path = tmp_path / "mine.yaml"
-    path.write_text(find_spec("assembly_2").read_text().replace(old, new, 1))
+    path.write_text(mimic_spec_path("assembly_2").read_text().replace(old, new, 1))
     with pytest.raises(SpecError, match=said):
         check_task(load_mimic_spec(path), tasks.get("assembly_2")())
 

@@ -5,9 +5,8 @@ import numpy as np
 
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.randomize import Row
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict
+from taccorl.sim.task import Reset, Scene, Subtask, Task, Verdict
 from taccorl.sim.twin import TwinConfig, empty_bench
 
 LEFT_HOME = (0.003, 1.732, -0.883, -0.528, 0.884, -1.213)
@@ -35,10 +34,6 @@ class PressBench(Task):
         quat = np.empty(4)
         mujoco.mju_mat2Quat(quat, data.site("left_tcp").xmat)
         self._block_pose = np.r_[data.site("left_tcp").xpos, quat]
-
-    @property
-    def rows(self) -> tuple[Row, ...]:
-        return ()
 
     def add_parts(self, spec: mujoco.MjSpec) -> None:
         block = spec.worldbody.add_body(name="block", mocap=True)

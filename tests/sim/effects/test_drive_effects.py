@@ -21,10 +21,10 @@ from joint_bench import (
 from press_bench import RIGHT_HOME, perform, start
 
 from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.bench import Bench
 from taccorl.sim.twin import TwinConfig
 
 SHOULDER = ROBOT.action_names.index("right_joint2")

@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import DT_S, Aim, Mating, Script, ScriptedExpert
 from taccorl.demos.experts.se3 import inverse, turn
 from taccorl.errors import LostError
 from taccorl.sim.part import Part
-from taccorl.sim.tasks.puzzle import Puzzle
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.tasks.puzzle.scene import Puzzle
 
 # Heights of a piece's underside over the tray's top: when carried (clear of the other knobs), and before it is pressed.
 _CARRY_M, _HOVER_M = 0.045, 0.003
@@ -30,11 +29,8 @@ _MOST_TRIES = 4  # to place one piece
 _HAND = {"triangle": "right", "circle": "left", "heart": "right"}
 
 
-@experts.register("puzzle")
 class PuzzleExpert(ScriptedExpert):
     """Expert of the puzzle: the right hand places triangle and heart, the left one the circle in between; one at a time."""
-
-    task = "puzzle"
 
     def script(self, arm: str) -> Script:
         return self._left() if arm == "left" else self._right()

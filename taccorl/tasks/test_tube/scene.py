@@ -4,14 +4,17 @@ The tube lies in a clamped stand, its bottom towards −y; stand and tube are dr
 its handle towards the left arm. Failures: the paper's failure analysis.
 """
 
+import math
+from pathlib import Path
+
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
-from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.parts import glass_tube, tube_rack, tube_stand
-from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell
+from taccorl.sim.randomize import OBJECT_FRICTION, symmetric
+from taccorl.sim.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell, tasks
+from taccorl.tasks.test_tube.parts import glass_tube, tube_rack, tube_stand
 
 TUBE_AT_M, TUBE_YAW_RAD = (0.175, -0.315), np.pi / 2  # of the tube's middle; heading from its bottom to its cap
 RACK_AT_M, RACK_YAW_RAD = (0.400, 0.035), -np.pi / 2  # nominal; the handle looks to +y
@@ -42,6 +45,14 @@ class TestTube(Task):
         "left": (-0.085, 2.021, -1.094, -0.582, 0.784, -1.228),
         "right": (0.636, 1.815, -0.673, -0.497, 0.873, -0.544),
     }
+    rows = (
+        OBJECT_FRICTION,
+        symmetric("tube_position", (0.02, 0.02), "m"),
+        symmetric("tube_yaw", math.radians(20), "rad"),
+        symmetric("holder_position", (0.005, 0.005), "m"),
+    )
+    expert = f"{__package__}.expert:TestTubeExpert"
+    mimicgen = Path(__file__).with_name("mimicgen.yaml")
 
     def __init__(self, difficulty: str = "train") -> None:
         super().__init__(difficulty)

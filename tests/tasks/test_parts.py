@@ -17,18 +17,10 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.part import COLORS, Part, add_part, measure_fit
 from taccorl.sim.shapes import Box, Cylinder, Prism, circle_outline, extrude, heart_outline
-from taccorl.sim.tasks.parts import (
-    PIECES,
-    cradle_plug,
-    glass_tube,
-    open_cradle,
-    puzzle_piece,
-    puzzle_tray,
-    tenon_plug,
-    tenon_socket,
-    tube_rack,
-    tube_stand,
-)
+from taccorl.tasks.assembly_1.parts import tenon_plug, tenon_socket
+from taccorl.tasks.assembly_2.parts import cradle_plug, open_cradle
+from taccorl.tasks.puzzle.parts import PIECES, puzzle_piece, puzzle_tray
+from taccorl.tasks.test_tube.parts import glass_tube, tube_rack, tube_stand
 
 ALL = [glass_tube(), tube_stand(), tube_rack(), puzzle_tray(), *map(puzzle_piece, PIECES)]
 ALL += [tenon_plug("tenon"), tenon_socket(), cradle_plug("plug"), open_cradle()]

@@ -4,20 +4,29 @@ The left hand holds the socket, the right hand the plug; both lie on the table a
 """
 
 from collections.abc import Callable
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
-from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.parts import tenon_plug, tenon_socket
-from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict, at_rest, fell
+from taccorl.sim.randomize import OBJECT_FRICTION, symmetric
+from taccorl.sim.task import Reset, Scene, Subtask, Task, Verdict, at_rest, fell, tasks
+from taccorl.tasks.assembly_1.parts import tenon_plug, tenon_socket
 
 SOCKET_AT_M, PLUG_AT_M = (0.30, 0.14), (0.30, -0.16)  # of their mating ends, nominal
 HOME_RAD = {
     "left": (0.003, 1.732, -0.883, -0.528, 0.884, -1.213),
     "right": (-0.003, 1.732, -0.883, 0.528, 0.884, 1.213),
 }
+# The table says Δp ∈ [−0.03, 0.03] m for a part that stands on the table: x and y.
+PAPER_ROWS = (
+    OBJECT_FRICTION,
+    symmetric("plug_position", (0.03, 0.03), "m"),
+    symmetric("socket_position", (0.03, 0.03), "m"),
+    symmetric("plug_mass", 0.03, "kg"),
+    symmetric("socket_mass", 0.03, "kg"),
+)
 LIFTED_M = 0.03
 _IN_DEPTH_M, _IN_TILT_RAD, _IN_LATERAL_M = 0.034, np.deg2rad(2.0), 0.003
 _WEDGED_M, _WEDGED_N = (0.004, 0.030), 15.0
@@ -36,6 +45,9 @@ class Assembly1(Task):
     # The expert touches the socket beside the mortise for 0.2 s at most (16 scenes, simulated).
     failures = {"dropped": 0.0, "wedged": 1.0, "sliding": 1.0}  # noqa: RUF012
     home_rad = HOME_RAD
+    rows = PAPER_ROWS
+    expert = f"{__package__}.expert:Assembly1Expert"
+    mimicgen = Path(__file__).with_name("mimicgen.yaml")
 
     def __init__(self, difficulty: str = "train") -> None:
         super().__init__(difficulty)

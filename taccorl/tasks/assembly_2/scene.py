@@ -4,14 +4,15 @@ The left hand holds the cradle with its open side up, the right hand slides the 
 the table at first, their axes along y. Let go too early, the plug tips over the cradle's lip (the paper's failure analysis).
 """
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 
 from taccorl.sim.part import Fit, Part, add_part, measure_fit
-from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.assembly_1 import HOME_RAD, LIFTED_M, lift_and_join, lying_apart
-from taccorl.sim.tasks.parts import cradle_plug, open_cradle
-from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict, at_rest, fell
+from taccorl.sim.task import Reset, Scene, Subtask, Task, Verdict, at_rest, fell, tasks
+from taccorl.tasks.assembly_1.scene import HOME_RAD, LIFTED_M, PAPER_ROWS, lift_and_join, lying_apart
+from taccorl.tasks.assembly_2.parts import cradle_plug, open_cradle
 
 _COM_INSIDE_M = 0.002
 _IN_TILT_RAD, _IN_LATERAL_M = np.deg2rad(5.0), 0.004  # it lies on the cradle's floor, between its walls
@@ -31,6 +32,9 @@ class Assembly2(Task):
     mating = (("plug", "cradle"),)
     failures = {"dropped": 0.0, "fell_out": 0.1, "unsupported": 1.0}  # noqa: RUF012
     home_rad = HOME_RAD
+    rows = PAPER_ROWS
+    expert = f"{__package__}.expert:Assembly2Expert"
+    mimicgen = Path(__file__).with_name("mimicgen.yaml")
 
     def __init__(self, difficulty: str = "train") -> None:
         super().__init__(difficulty)

@@ -1,4 +1,6 @@
-"""Base class of tasks: parts on the bench, a reset distribution, predicates on the simulator's state, subtasks of each arm.
+"""Base class and registry of tasks: parts on the bench, reset distribution, predicates on the simulator's state, subtasks.
+
+Each task is a folder of ``taccorl/tasks``, or an outside package; the simulation finds it by its registration.
 
 Letters in shapes: N simulations.
 """
@@ -6,13 +8,15 @@ Letters in shapes: N simulations.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import ClassVar, Protocol
 
 import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.randomize import PAPER_ROWS, Row
+from taccorl.plugins import Registry
+from taccorl.sim.randomize import Row
 
 CLEARANCES_M = {"easy": 0.0010, "train": 0.0005, "hard": 0.0003}
 """Gap on each side between mating parts (research: at 0.6 m a D415 pixel is 3.7 mm after scaling to 224)."""
@@ -111,17 +115,19 @@ class Task(ABC):
     """Category that ``look`` can name → seconds for which it must last; ``timeout`` and ``diverged`` come on top."""
     home_rad: ClassVar[dict[str, tuple[float, ...]]]
     """Arm → six joint angles at reset; grippers open."""
+    rows: ClassVar[tuple[Row, ...]] = ()
+    """Randomisation at reset; values of the paper's table "Domain randomization parameter values" (App. E) in its four tasks."""
+    expert: ClassVar[str | None] = None
+    """Scripted expert as ``module:Class``, a class of ``taccorl.demos.experts.ScriptedExpert``; imported when it is asked for.
+    None: there is none."""
+    mimicgen: ClassVar[Path | None] = None
+    """YAML file that states how demonstrations become new ones (``taccorl/demos/mimicgen/spec.py``); None: they cannot."""
 
     def __init__(self, difficulty: str = "train") -> None:
         if difficulty not in CLEARANCES_M:
             raise TaccorlError(f"task {self.name}: no difficulty {difficulty!r}; {nearest(difficulty, CLEARANCES_M)}")
         self.difficulty = difficulty
         self.clearance_m = CLEARANCES_M[difficulty]
-
-    @property
-    def rows(self) -> tuple[Row, ...]:
-        """The paper's randomisation of this task."""
-        return PAPER_ROWS[self.name]
 
     @abstractmethod
     def add_parts(self, spec: mujoco.MjSpec) -> None:
@@ -138,6 +144,9 @@ class Task(ABC):
     @abstractmethod
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
         """Arm → its subtasks in order."""
+
+
+tasks: Registry[type[Task]] = Registry("task", "taccorl.tasks")
 
 
 def at_rest(scene: Scene, part: str, holder: str) -> np.ndarray:

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from taccorl.demos.experts import test_tube
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
 from taccorl.demos.experts.se3 import transform, turn
-from taccorl.demos.experts.test_tube import TestTubeExpert
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.test_tube import TestTube
+from taccorl.tasks.test_tube import expert as test_tube
+from taccorl.tasks.test_tube.expert import TestTubeExpert
+from taccorl.tasks.test_tube.scene import TestTube
 
 JOINT_LOW, JOINT_HIGH = np.array([link.range_rad for link in ROBOT.links]).T
 MARGIN_RAD = 0.1

@@ -2,20 +2,17 @@
 
 import numpy as np
 
-from taccorl.demos.experts import experts
-from taccorl.demos.experts.assembly_1 import AirAssembly
 from taccorl.demos.experts.scripted import Mating, Script
 from taccorl.sim.part import Part
-from taccorl.sim.tasks.assembly_2 import Assembly2
+from taccorl.tasks.assembly_1.expert import AirAssembly
+from taccorl.tasks.assembly_2.scene import Assembly2
 
 _LET_DOWN_M, _LET_DOWN_MPS = 0.001, 0.01  # so that the cradle, not the hand, carries the plug before it is let go
 
 
-@experts.register("assembly_2")
 class Assembly2Expert(AirAssembly):
     """Expert of assembly_2. The cradle is 34 mm deep; at its stop the plug's centre of mass is 15 mm inside."""
 
-    task = "assembly_2"
     enough_m = 0.032
 
     def holder(self) -> tuple[Part, str, str]:

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from taccorl.demos.experts import experts
+from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import EXACT, ScriptedExpert, ScriptedExpertConfig
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks import tasks
+from taccorl.sim.task import tasks
 
 TASKS = ("assembly_1", "assembly_2")
 SEED = {"assembly_1": 12, "assembly_2": 0}  # the first try misses the hole
@@ -32,7 +32,7 @@ def episode(
     sim: Simulation, seed: int, config: ScriptedExpertConfig | None = None, longest_s: float = 30.0, rng_seed: int = 7
 ) -> Told:
     sim.reset([seed])
-    expert = experts.get(sim.task.name)(sim, np.random.default_rng([seed, rng_seed]), config)
+    expert = expert_of(sim.task)(sim, np.random.default_rng([seed, rng_seed]), config)
     expert.start()
     told = Told(expert)
     while not sim.judge.outcome.over[0] and told.steps < 30 * longest_s:

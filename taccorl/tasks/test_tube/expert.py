@@ -5,13 +5,12 @@ from itertools import chain
 
 import numpy as np
 
-from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert, ScriptedExpertConfig
 from taccorl.demos.experts.se3 import inverse, transform, turn
 from taccorl.errors import LostError
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.test_tube import TestTube
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.tasks.test_tube.scene import TestTube
 
 _LEAN_LEFT_RAD = 0.40  # away from the right hand
 _TIPS_M = 0.034  # from the TCP to the fingertips, about which the left hand leans: they keep clear of the rack's body
@@ -32,12 +31,10 @@ _GIVE_WAY = 0.25  # at least: both plates of the rack hold the tube, and a stiff
 _OPEN_M = 0.040  # at the rack, wide enough for the cap: the left hand is near
 
 
-@experts.register("test_tube")
 class TestTubeExpert(ScriptedExpert):
     """Expert of the task: the left hand holds the rack, the right hand inserts the tube."""
 
     __test__ = False
-    task = "test_tube"
 
     def __init__(self, sim: Simulation, rng: np.random.Generator, config: ScriptedExpertConfig | None = None) -> None:
         config = config or ScriptedExpertConfig()

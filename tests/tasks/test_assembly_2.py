@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.sim.outcome import Judge
 from taccorl.sim.part import Mate
-from taccorl.sim.randomize import PAPER_ROWS, draw
+from taccorl.sim.randomize import draw
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.assembly_2 import Assembly2
-from taccorl.sim.tasks.task import Contact
+from taccorl.sim.task import Contact
+from taccorl.tasks.assembly_2.scene import Assembly2
 
 TASK = Assembly2()
 MATE = cast(Mate, TASK.plug.mate)
@@ -89,7 +89,7 @@ def test_the_centre_of_mass_is_the_parts_own_and_a_change_of_mass_leaves_it_wher
     body = sim.model.body("plug")
     assert sim.model.body_ipos[body.id, 1] == pytest.approx(0, abs=1e-9)
     np.testing.assert_allclose(sim.model.body_ipos[body.id], TASK.plug.com_part_m, atol=1e-7)
-    reset = TASK.reset(draw(PAPER_ROWS["assembly_2"], np.random.default_rng(1)))
+    reset = TASK.reset(draw(Assembly2.rows, np.random.default_rng(1)))
     assert set(reset.mass_change_kg) == {"plug", "cradle"}  # the table's socket is the cradle
 
 

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from taccorl.errors import TaccorlError
 from taccorl.sim.outcome import Judge
 from taccorl.sim.part import Mate
-from taccorl.sim.randomize import PAPER_ROWS, draw
+from taccorl.sim.randomize import draw
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.assembly_1 import PLUG_AT_M, SOCKET_AT_M, Assembly1
-from taccorl.sim.tasks.task import Contact
+from taccorl.sim.task import Contact
+from taccorl.tasks.assembly_1.scene import PLUG_AT_M, SOCKET_AT_M, Assembly1
 
 TASK = Assembly1()
 MATE = cast(Mate, TASK.plug.mate)
@@ -175,7 +175,7 @@ def test_both_parts_lie_on_the_table_within_the_papers_ranges(sim):
     ]  # fmt: skip
     corners = []
     for seed in range(40):
-        reset = TASK.reset(draw(PAPER_ROWS["assembly_1"], np.random.default_rng(seed)))
+        reset = TASK.reset(draw(Assembly1.rows, np.random.default_rng(seed)))
         for part, at in (("plug", PLUG_AT_M), ("socket", SOCKET_AT_M)):
             shift = reset.poses[part][:2] - at
             assert np.abs(shift).max() <= 0.03

@@ -17,8 +17,8 @@ from taccorl.sim.randomize import draw
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.shapes import Box, Cylinder, Prism
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.parts import PIECES
-from taccorl.sim.tasks.puzzle import PIECES_AT_M, TRAY_AT_M, YAW_RAD, Puzzle
+from taccorl.tasks.puzzle.parts import PIECES
+from taccorl.tasks.puzzle.scene import PIECES_AT_M, TRAY_AT_M, YAW_RAD, Puzzle
 
 STEP_S = 1 / 30
 IN_HOLE_M = 0.004  # height of a piece's underside when it lies in: the tray's base is 4 mm thick

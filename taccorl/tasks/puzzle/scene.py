@@ -4,7 +4,9 @@ The tray is clamped in the middle, its row of holes along y: circle to the left.
 hand triangle and heart, one hand at the tray at a time.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -12,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.robots import ROBOT
 from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
-from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.parts import PIECES, puzzle_piece, puzzle_tray
-from taccorl.sim.tasks.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell
+from taccorl.sim.randomize import OBJECT_FRICTION, symmetric
+from taccorl.sim.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell, tasks
+from taccorl.tasks.puzzle.parts import PIECES, puzzle_piece, puzzle_tray
 
 # Nominal places [m]: outlines stay ≥ 4 mm apart whatever is drawn, and all are reached ≥ 0.2 rad from the joint limits.
 TRAY_AT_M, YAW_RAD = (0.27, -0.02), -np.pi / 2  # the tray's x runs to the right; pieces lie as their holes do
@@ -48,6 +50,18 @@ class Puzzle(Task):
         "left": (-0.310, 1.704, -0.795, 0.0, 0.749, -0.310),
         "right": (0.310, 1.704, -0.795, 0.0, 0.749, 0.310),
     }
+    rows = (
+        OBJECT_FRICTION,
+        symmetric("tray_position", (0.005, 0.005), "m"),
+        symmetric("tray_yaw", math.radians(5), "rad"),
+        *(symmetric(f"{piece}_position", (0.01, 0.01), "m") for piece in PIECES),
+        *(symmetric(f"{piece}_yaw", math.radians(10), "rad") for piece in PIECES),
+        symmetric("circle_support", (0.03, 0.03), "m"),
+        symmetric("heart_support", (0.03, 0.027), "m"),
+        symmetric("triangle_support", (0.03, 0.027), "m"),
+    )
+    expert = f"{__package__}.expert:PuzzleExpert"
+    mimicgen = Path(__file__).with_name("mimicgen.yaml")
 
     def __init__(self, difficulty: str = "train") -> None:
         super().__init__(difficulty)

@@ -5,12 +5,11 @@ from itertools import chain
 
 import numpy as np
 
-from taccorl.demos.experts import experts
 from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert
 from taccorl.demos.experts.se3 import inverse, rotvec, transform
 from taccorl.sim.part import Part
-from taccorl.sim.tasks.assembly_1 import Assembly1
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.tasks.assembly_1.scene import Assembly1
 
 _LEAN_RAD = 0.40  # hands lean away from each other, so that wrists and cameras keep apart
 _GRIP_M = 0.028  # from the TCP to the part: it is gripped near the fingers' tips
@@ -174,11 +173,9 @@ class AirAssembly(ScriptedExpert):
         self.flags.add("plug is in")
 
 
-@experts.register("assembly_1")
 class Assembly1Expert(AirAssembly):
     """Expert of assembly_1. The mortise is 38 mm deep; the plug counts as inserted from 34 mm on."""
 
-    task = "assembly_1"
     enough_m = 0.0352
 
     def holder(self) -> tuple[Part, str, str]:

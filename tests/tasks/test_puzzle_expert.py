@@ -5,15 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
-from taccorl.demos.experts import puzzle
 from taccorl.demos.experts.kinematics import ArmKinematics
-from taccorl.demos.experts.puzzle import PuzzleExpert
 from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
 from taccorl.demos.experts.se3 import transform, turn
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.puzzle import PIECES_AT_M, TRAY_AT_M, Puzzle
+from taccorl.tasks.puzzle import expert as puzzle
+from taccorl.tasks.puzzle.expert import PuzzleExpert
+from taccorl.tasks.puzzle.scene import PIECES_AT_M, TRAY_AT_M, Puzzle
 
 ARM_OF = {"circle": "left", "heart": "right", "triangle": "right"}
 GRIP_ABOVE_M = 0.056 + 0.001  # TCP over a piece's underside when it is gripped

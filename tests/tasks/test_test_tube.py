@@ -10,8 +10,8 @@ from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.sim.randomize import draw
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.tasks.parts import tube_stand
-from taccorl.sim.tasks.test_tube import RACK_AT_M, TUBE_AT_M, TestTube
+from taccorl.tasks.test_tube.parts import tube_stand
+from taccorl.tasks.test_tube.scene import RACK_AT_M, TUBE_AT_M, TestTube
 
 DEG = np.pi / 180
 HOLD_STEPS = 15  # 0.5 s at 30 Hz

@@ -3,8 +3,7 @@
 import mujoco
 import numpy as np
 
-from taccorl.sim.tasks import tasks
-from taccorl.sim.tasks.task import Reset, Scene, Subtask, Task, Verdict
+from taccorl.sim.task import Reset, Scene, Subtask, Task, Verdict, tasks
 
 
 @tasks.register("bench")

@@ -1,0 +1,104 @@
+"""Every registered task: reset, predicates, rows of randomisation, scripted expert and MimicGen spec fit together."""
+
+import numpy as np
+import pytest
+
+from taccorl.demos.collect import Plan
+from taccorl.demos.experts import tasks_with_expert
+from taccorl.demos.mimicgen.schedule import rehearse
+from taccorl.demos.mimicgen.spec import check_task, load_mimic_spec
+from taccorl.robots import ROBOT
+from taccorl.sim.randomize import draw
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.task import CLEARANCES_M, tasks
+
+WITH_SPEC = tuple(name for name in tasks if tasks.get(name).mimicgen)
+
+
+@pytest.fixture(scope="module", params=list(tasks))
+def sim(request: pytest.FixtureRequest) -> Simulation:
+    return Simulation(tasks.get(request.param)())
+
+
+def test_it_states_what_it_is(sim):
+    task = sim.task
+    assert tasks.get(task.name) is type(task)
+    assert task.instruction.strip()
+    assert task.__doc__
+    assert task.time_limit_s > 0
+    assert set(task.home_rad) == set(ROBOT.arms)
+    for arm, home in task.home_rad.items():
+        low, high = ROBOT.action_low[ROBOT.joint_slice(arm)], ROBOT.action_high[ROBOT.joint_slice(arm)]
+        assert (low <= home).all(), arm
+        assert (home <= high).all(), arm
+    assert {tasks.get(task.name)(difficulty).clearance_m for difficulty in CLEARANCES_M} == set(CLEARANCES_M.values())
+
+
+def test_the_same_seed_gives_the_same_scene_and_another_seed_another(sim):
+    def state(seed: int) -> bytes:
+        sim.reset([seed])
+        return sim.state_rows()[0].tobytes()
+
+    first, second = state(1), state(2)
+    assert state(1) == first
+    assert (second != first) == bool(sim.task.rows)
+
+
+def test_nothing_is_reached_or_failed_at_reset_and_for_a_second_of_rest(sim):
+    sim.reset([3])
+    names = {arm: [s.name for s in own] for arm, own in sim.task.subtasks().items()}
+    assert set(names) == set(ROBOT.arms)
+    assert len({name for own in names.values() for name in own}) == sum(map(len, names.values()))
+    command = sim.arrays["ctrl"][:, sim.action_actuators].copy()
+    for _ in range(30):
+        now = sim.task.look(sim)
+        assert not now.goal.any()
+        assert set(now.failures) == set(sim.task.failures)
+        assert not any(seen.any() for seen in now.failures.values()), now.failures
+        assert (now.partial >= 0).all()
+        assert (now.partial <= sim.task.max_partial).all()
+        assert not any(own[0].done(sim).any() for own in sim.task.subtasks().values() if own)
+        sim.step(command)
+    assert not sim.judge.outcome.over.any()
+
+
+def test_rows_are_drawn_within_their_bounds_and_every_one_moves_the_reset(sim):
+    task, rng = sim.task, np.random.default_rng(0)
+    nominal = draw(task.rows, rng, 0.0)
+    assert len(nominal) == len(task.rows), "two rows of one name"
+    for row in task.rows:
+        assert row.unit
+        assert len(row.low) == len(row.high)
+        assert all(a < b for a, b in zip(row.low, row.high, strict=True)), row.name
+        values = np.array([draw(task.rows, rng)[row.name] for _ in range(50)])
+        assert (row.low <= values).all()
+        assert (values <= row.high).all()
+        assert repr(task.reset(nominal | {row.name: np.array(row.high)})) != repr(task.reset(nominal)), row.name
+
+
+def test_all_but_the_empty_bench_can_be_demonstrated_and_multiplied():
+    assert set(tasks_with_expert()) == set(WITH_SPEC) == set(tasks) - {"bench"}
+
+
+@pytest.mark.parametrize("name", WITH_SPEC)
+def test_its_mimicgen_spec_fits_it(name):
+    spec, task = load_mimic_spec(name), tasks.get(name)()
+    check_task(spec, task)
+    rehearse(spec.signals, spec.constraints)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", tasks_with_expert())
+def test_its_expert_succeeds_and_ends_every_subtask(name):
+    plan = Plan(task=name, images=False)
+    sim = plan.make()
+    for k in range(3):  # it may fail in one of ten scenes
+        sim.reset([plan.attempt_seed(k)])
+        for action in plan.source.actions(sim, np.random.default_rng(k)):
+            sim.step(action[None].astype(float))
+            if sim.judge.outcome.over[0]:
+                break
+        if sim.judge.outcome.success[0]:
+            assert sim.judge.subtask[0].tolist() == [len(sim.task.subtasks()[arm]) for arm in ROBOT.arms]
+            return
+    raise AssertionError(f"{name}: no success in 3 attempts")
