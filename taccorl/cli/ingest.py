@@ -62,8 +62,8 @@ class InspectConfig:
     split_bag: bool = False
     """Files x_0, x_1, … of a folder are one recording."""
     draft: Path | None = None
-    """Write the draft spec here, and the draft of its dataset spec beside it (…_dataset.yaml), instead of printing them;
-    existing files are left alone."""
+    """Write the draft spec here, and beside it the drafts of its dataset spec (…_dataset.yaml) and of an unknown kind of
+    pad (…_sensor.yaml), instead of printing them; existing files are left alone."""
 
 
 def main(argv: list[str]) -> int:
@@ -258,12 +258,12 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
 
 def _inspect(config: InspectConfig) -> int:
     from taccorl.cli.tables import inventory_table
-    from taccorl.data.draft import dataset_path
+    from taccorl.data.draft import dataset_path, sensor_path
     from taccorl.data.inspection import inspect_source
     from taccorl.data.recording import without_place
 
     draft = config.draft
-    for path in (draft, dataset_path(draft)) if draft is not None else ():
+    for path in (draft, dataset_path(draft), sensor_path(draft)) if draft is not None else ():
         if os.path.lexists(path):
             raise TaccorlError(f"{path} exists; give another --draft, it would be overwritten")
     found, failed = _find_all(config)
@@ -315,20 +315,23 @@ def _say_fit(inventory: "Inventory", path: Path) -> None:
 
 
 def _write_drafts(inventory: "Inventory", path: Path) -> None:
-    from taccorl.data.draft import dataset_path, draft_specs
+    from taccorl.data.draft import draft_specs
 
-    drafts = draft_specs(inventory, path)
-    for place, text in ((path, drafts.recording), (dataset_path(path), drafts.dataset)):
+    files = draft_specs(inventory, path).files(path)
+    for place, text in files.items():
         with place.open("x", encoding="utf-8") as file:
             file.write(text)
-    print(f"draft spec: {path}\nand of its dataset: {dataset_path(path)}\nreplace the TODOs in both\n")
+    named = zip(("draft spec", "and of its dataset", "and of its pads"), files, strict=False)
+    print("\n".join(f"{what}: {place}" for what, place in named) + "\nreplace the TODOs in all of them\n")
 
 
 def _print_drafts(inventory: "Inventory") -> None:
-    from taccorl.data.draft import dataset_path, draft_specs
+    from taccorl.data.draft import draft_specs
 
     path = Path("draft.yaml")
-    drafts = draft_specs(inventory, path)
-    print(f"no shipped spec fits; drafts of two specs (--draft={path} writes them):\n")
-    print(f"# ---- {path}: how it is read ----\n{drafts.recording}")
-    print(f"# ---- {dataset_path(path)}: what its dataset holds ----\n{drafts.dataset}")
+    files = draft_specs(inventory, path).files(path)
+    print(f"no shipped spec fits; drafts of {len(files)} specs (--draft={path} writes them):\n")
+    for what, (place, text) in zip(
+        ("how it is read", "what its dataset holds", "its pads"), files.items(), strict=False
+    ):
+        print(f"# ---- {place}: {what} ----\n{text}")

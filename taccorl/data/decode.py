@@ -154,18 +154,9 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
 def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], np.ndarray]:
     """Function that returns the counts of one pad frame, (rows · columns,), in the pad's own order and the wire's dtype."""
     wire = sensor.wire
-    dtype = np.dtype(wire.dtype).newbyteorder("<")
 
     def extract(value: Any) -> np.ndarray:
-        found = get(value, channel.field) if channel.field else value
-        if isinstance(found, str):
-            found = _from_base64(found)
-        if isinstance(found, bytes | bytearray | memoryview):
-            if len(found) % dtype.itemsize:
-                raise RecordingError(f"{len(found)} bytes are no whole number of {wire.dtype} counts")
-            counts = np.frombuffer(found, dtype)
-        else:
-            counts = _exact_counts(found, dtype)
+        counts = pad_counts(get(value, channel.field) if channel.field else value, wire.dtype)
         if counts.size != wire.rows * wire.columns:
             raise RecordingError(
                 f"{counts.size} taxels, sensor {sensor.name} has {wire.rows}×{wire.columns}; "
@@ -185,6 +176,22 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
         return (frame.T if wire.transpose else frame).reshape(-1)
 
     return extract
+
+
+def pad_counts(found: Any, dtype: str) -> np.ndarray:
+    """Counts in little-endian bytes, base64 text, or a list or array of whole numbers, in its own shape.
+
+    Raises:
+        RecordingError: not that, or counts that do not fit ``dtype``.
+    """
+    wire = np.dtype(dtype).newbyteorder("<")
+    if isinstance(found, str):
+        found = _from_base64(found)
+    if not isinstance(found, bytes | bytearray | memoryview):
+        return _exact_counts(found, wire)
+    if len(found) % wire.itemsize:
+        raise RecordingError(f"{len(found)} bytes are no whole number of {dtype} counts")
+    return np.frombuffer(found, wire)
 
 
 def _exact_counts(found: Any, dtype: np.dtype) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Draft two specs from a recording: how recordings are read, and what their dataset holds.
+"""Draft specs from a recording: how recordings are read, what their dataset holds, and of which kind unknown pads are.
 
 Filled in is what the recording states: topics, types, names of joints, rates, shapes. What it does not state (units, valid
 ranges, the instruction) is ``TODO`` with a comment that says what to write there.
@@ -6,16 +6,20 @@ ranges, the instruction) is ``TODO`` with a comment that says what to write ther
 
 import itertools
 import json
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from taccorl.data.inspection import JOINTS, PICTURES, TEXTS, Inventory, TopicSummary
 from taccorl.data.spec import UNITS, data_specs_folder, load_sensor_spec
 from taccorl.errors import printable
 
 COMMAND_WORDS = ("command", "cmd", "ctrl", "target", "action", "master", "leader", "desired", "goal")
+TOUCH_WORDS = ("tact", "touch", "taxel", "skin", "finger", "pad")
 STATE_WORDS = ("qpos", "state", "position", "joint")
 YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 PICTURE_SHAPE = (224, 224, 3)
@@ -25,15 +29,23 @@ FPS = 30
 ROW_CLOCK_READERS = ("hdf5", "lerobot")
 """Their files hold rows without times: ``lead_frames`` says which row a command is valid at."""
 ACTION_TIME = "action_time: next_row   # action of row t: the last command sent before row t + 1"
+COUNT_UNIT = "adc_count"
 STALE_PERIODS = 2.4
 """A sample may be late by this many periods before a row counts as stale."""
 
 
 class Drafts(NamedTuple):
-    """Texts of a drafted recording spec and a drafted dataset spec, in YAML."""
+    """Texts of a drafted recording spec, dataset spec and sensor spec, in YAML."""
 
     recording: str
     dataset: str
+    sensor: str = ""
+    """Of pads that no shipped sensor fits; empty where there are none."""
+
+    def files(self, path: Path) -> dict[Path, str]:
+        """File → text, for a recording spec at ``path``: the others lie beside it."""
+        texts = {path: self.recording, dataset_path(path): self.dataset, sensor_path(path): self.sensor}
+        return {place: text for place, text in texts.items() if text}
 
 
 def dataset_path(path: Path) -> Path:
@@ -41,10 +53,16 @@ def dataset_path(path: Path) -> Path:
     return path.with_name(f"{path.stem}_dataset.yaml")
 
 
+def sensor_path(path: Path) -> Path:
+    """Path of the sensor spec that is drafted beside the recording spec at ``path``."""
+    return path.with_name(f"{path.stem}_sensor.yaml")
+
+
 def draft_specs(inventory: Inventory, path: Path = Path("draft.yaml")) -> Drafts:
-    """Draft a recording spec for ``path`` and the dataset spec beside it, which it names."""
+    """Draft a recording spec for ``path``, and the specs beside it that it needs."""
     roles = _roles(inventory)
-    return Drafts(_recording(inventory, roles, path), _dataset(inventory, roles, path))
+    sensor = _sensor(inventory, roles, path) if roles.pads and not roles.pads[0].sensor else ""
+    return Drafts(_recording(inventory, roles, path), _dataset(inventory, roles, path), sensor)
 
 
 # ---- which topic is what ----
@@ -57,7 +75,7 @@ class _Roles:
     """Empty: no topic is named as a command."""
     pictures: list[TopicSummary]
     pads: list[TopicSummary]
-    """Of one sensor."""
+    """Of one sensor: a shipped one, or one that is unknown."""
     vectors: list[TopicSummary]
     """Poses, wrenches, IMU readings …: a feature each."""
     spare: list[TopicSummary]
@@ -82,10 +100,10 @@ def _roles(inventory: Inventory) -> _Roles:
     topics = {t.topic for t in useful}
     pictures = [t for t in useful if t.holds(PICTURES) or (t.type.shape is not None and len(t.type.shape) == 3)]
     pictures = [t for t in pictures if "depth" not in t.topic.lower() and f"{t.topic}/compressed" not in topics]
-    pads = [t for t in useful if t.sensor]
-    pads = [t for t in pads if t.sensor == pads[0].sensor]
+    pads = [t for t in useful if t.sensor] or [t for t in useful if t.counts and _says(t, TOUCH_WORDS)]
+    pads = [t for t in pads if (t.sensor, t.counts) == (pads[0].sensor, pads[0].counts)]
     vectors = [t for t in useful if t.units]
-    numbers = [t for t in useful if t.num_values and not t.sensor and not t.units]
+    numbers = [t for t in useful if t.num_values and not (t.sensor or t.counts or t.units)]
     commands = [t for t in numbers if _says(t, COMMAND_WORDS)]
     commands = [t for t in commands if t.names] or commands
     measured = [t for t in numbers if not _says(t, COMMAND_WORDS)]
@@ -160,11 +178,19 @@ def _recording(inventory: Inventory, roles: _Roles, path: Path) -> str:
             for t in roles.used
         ),
         *(f"  # {roles.names[t.topic]}: {_channel(t, clock, known)}" for t in roles.spare),
-        *(f"  # not used: {printable(t.problem or f'{t.topic} ({t.type.name})')}" for t in unused),
+        *(f"  # not used: {printable(_unused(t))}" for t in unused),
         "features:   # several channels are joined in the order of the list",
         *_mappings(roles),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _unused(t: TopicSummary) -> str:
+    if t.problem or t.counts is None:
+        return t.problem or f"{t.topic} ({t.type.name})"
+    dtype, shape = t.counts
+    how = "a channel like the others, in a feature like those of data_specs/taccorl_bimanual.yaml, with a sensor file"
+    return f"{t.topic}: {' × '.join(map(str, shape))} counts of {dtype}. If it is a tactile pad: {how}"
 
 
 def _head(inventory: Inventory) -> list[str]:
@@ -257,7 +283,7 @@ def _dataset(inventory: Inventory, roles: _Roles, path: Path) -> str:
             f"    {{dtype: video, shape: {list(PICTURE_SHAPE)}, unit: rgb8, frame: {name}_optical, rate_hz: {rate}, "
             "range: [0, 255]}",
         ]
-    return "\n".join(lines + (_touch(roles, known) if roles.pads else [])) + "\n"
+    return "\n".join(lines + (_touch(roles, path, known) if roles.pads else [])) + "\n"
 
 
 def _elements(topics: list[TopicSummary], roles: _Roles) -> list[str]:
@@ -278,7 +304,7 @@ def _elements(topics: list[TopicSummary], roles: _Roles) -> list[str]:
 def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: bool) -> list[str]:
     size = sum(t.num_values or 0 for t in topics)
     each = elements[0] if elements else ""
-    known_units = ", ".join(u for u in UNITS if u not in ("adc_count", "rgb8", "unknown"))
+    known_units = ", ".join(u for u in UNITS if u not in (COUNT_UNIT, "rgb8", "unknown"))
     units = [u for t in topics for u in t.units]
     unit = f"TODO   # one for all, rad, or a list of {size}, [rad, …, m]; known: {known_units}"
     if units and all(units):
@@ -305,17 +331,61 @@ def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: b
     ]
 
 
-def _touch(roles: _Roles, known: bool) -> list[str]:
-    sensor_path = data_specs_folder() / "sensors" / f"{roles.pads[0].sensor}.yaml"
-    sensor = load_sensor_spec(sensor_path)
-    pads = [roles.names[t.topic] for t in roles.pads]
-    rate, size = f"{_rate_hz(roles.pads):g}" if known else "TODO", len(pads) * sensor.rows * sensor.columns
+def _touch(roles: _Roles, path: Path, known: bool) -> list[str]:
+    """Feature of the pads."""
+    pads, name = [roles.names[t.topic] for t in roles.pads], roles.pads[0].sensor
+    rate = f"{_rate_hz(roles.pads):g}" if known else "TODO"
+    if name:
+        place = data_specs_folder() / "sensors" / f"{name}.yaml"
+        shipped = load_sensor_spec(place)
+        size, unit, most = shipped.rows * shipped.columns, shipped.unit, str(shipped.max_count)
+    else:
+        place = Path(sensor_path(path).name)
+        dtype, shape = _counts(roles.pads[0])
+        size, unit, most = math.prod(shape), COUNT_UNIT, str(np.iinfo(dtype).max) if dtype == "uint8" else "TODO"
+    note = "" if most != "TODO" else "   # ± the largest count that the converter sends"
     return [
         "  observation.tactile:",
-        f"    {{dtype: int16, shape: [{size}], unit: {sensor.unit}, frame: pad, rate_hz: {rate}, "
-        f"range: [{-sensor.max_count}, {sensor.max_count}],",
-        f"     sensor: {_yaml(str(sensor_path))}, pads: [{', '.join(pads)}]}}",
+        f"    {{dtype: int16, shape: [{len(pads) * size}], unit: {unit}, frame: pad, rate_hz: {rate}, "
+        f"range: [-{most}, {most}],{note}",
+        f"     sensor: {_yaml(str(place))}, pads: [{', '.join(pads)}]}}",
     ]
+
+
+def _sensor(inventory: Inventory, roles: _Roles, path: Path) -> str:
+    """Sensor spec of pads that no shipped one fits."""
+    dtype, shape = _counts(roles.pads[0])
+    size = math.prod(shape)
+    pairs = [(rows, size // rows) for rows in range(1, size + 1) if size % rows == 0]
+    likely = sorted(pairs, key=lambda p: (abs(math.log(p[0] / p[1])), p))[:3]
+    rows, columns = map(str, shape) if len(shape) == 2 else ("TODO", "TODO")
+    known = roles.pads[0].rate_hz if inventory.times_known else 0.0
+    bits = {"uint8": "8   # of the converter; if it has more, wire_shift_bits low ones are not sent"}
+    lines = [
+        f"# Draft from {printable(inventory.source.name)}: replace every TODO as the comment behind it says.",
+        "spec_version: 1",
+        f"name: {_yaml(re.sub(r'[^A-Za-z0-9_]+', '_', sensor_path(path).stem))}",
+        f"rows: {rows}   # of taxels; rows × columns are {size}: {', '.join(f'{r} × {c}' for r, c in likely)} …",
+        f"columns: {columns}",
+        f"wire: {{rows: {rows}, columns: {columns}, dtype: {dtype}, transpose: false}}   "
+        "# as it is sent, row after row; transpose: true if its rows are the pad's columns",
+        f"adc_bits: {bits.get(dtype, 'TODO   # of the converter, at most 15: 10, 12')}",
+        "wire_shift_bits: 0",
+        f"rate_hz: {f'{known:.3g}' if known else 'TODO   # readings a second'}",
+        f"scan_time_s: {f'{1 / known:.3g}' if known else 'TODO'}   # time of one scan of the pad, at most 1 / rate_hz",
+        f"unit: {COUNT_UNIT}",
+        "baseline: {rule: median_of_first, frames: 30, max_spread_count: TODO}   "
+        "# a pad whose first 30 frames spread more, in counts, is not at rest: 12",
+        "noise_count: TODO   # counts above the baseline that an untouched taxel may show: 15",
+        "scheme: fixed_scale",
+        "gain_per_count: TODO   # the policy reads counts × gain and calls a taxel above 0.4 touched: 0.0133 for 30 counts",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _counts(pad: TopicSummary) -> tuple[str, tuple[int, ...]]:
+    assert pad.counts is not None
+    return pad.counts
 
 
 def _rate_hz(topics: list[TopicSummary]) -> float:

@@ -3,14 +3,21 @@
 import contextlib
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
 from taccorl.data import decode
 from taccorl.data.recording import Damage, Reader, Source, TopicType, readers
 from taccorl.data.ros_vectors import unit_of, vector_type
-from taccorl.data.spec import ChannelSpec, SensorSpec, data_specs_folder, load_sensor_spec, shipped_recording_specs
+from taccorl.data.spec import (
+    ChannelSpec,
+    SensorSpec,
+    WireSpec,
+    data_specs_folder,
+    load_sensor_spec,
+    shipped_recording_specs,
+)
 from taccorl.data.timing import NS_PER_S, SIM_TIME_S
 from taccorl.errors import RecordingError
 
@@ -18,6 +25,7 @@ PICTURES = ("CompressedImage", "Image")
 JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
+WIRE_DTYPES = get_args(get_type_hints(WireSpec)["dtype"])
 IMU_PARTS = ("orientation", "angular_velocity", "linear_acceleration")
 
 
@@ -53,6 +61,8 @@ class TopicSummary:
     """Numbers in a message of joints or of an array; None where it holds no list of numbers."""
     sensor: str | None = None
     """Shipped sensor whose pad frames fit it."""
+    counts: tuple[str, tuple[int, ...]] | None = None
+    """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits: a pad of another kind, perhaps."""
     misfit: str = ""
     """Why its first message cannot be used: a picture in an encoding that is not read, names without values."""
 
@@ -167,7 +177,8 @@ def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpe
     if shape is not None:
         sizes = [name for name, s in sensors.items() if t.type.name == s.wire.dtype and shape in _frames(s)]
         size = math.prod(shape) if len(shape) <= 1 else None
-        return {"names": t.type.names, "num_values": size, "sensor": next(iter(sizes), None)}
+        counts = (t.type.name, shape) if not sizes and t.type.name in WIRE_DTYPES and len(shape) in (1, 2) else None
+        return {"names": t.type.names, "num_values": size, "sensor": next(iter(sizes), None), "counts": counts}
     if not t.holds((*JOINTS, *ARRAYS, *PICTURES)) and vector_type(t.type.name) is None:
         return {}
     try:
@@ -202,6 +213,10 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
         if sensor.wire.dtype in t.type.name.lower():
             with contextlib.suppress(RecordingError):
                 return {"sensor": name, "num_values": decode.pad_extractor(channel, sensor)(value).size}
+    for dtype in WIRE_DTYPES:
+        if dtype in t.type.name.lower():
+            size = decode.pad_counts(decode.get(value, "data"), dtype).size
+            return {"num_values": size, "counts": (dtype, (size,))} if size else {"misfit": "data is empty"}
     return {"num_values": decode.vector_extractor(channel)(value).size}
 
 

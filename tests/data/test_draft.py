@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -233,3 +234,29 @@ def test_every_draft_of_other_peoples_bags_is_yaml() -> None:
             assert {"name", "fps", "features"} <= set(yaml.safe_load(pair.dataset))
             drafts += 1
     assert drafts >= 8
+
+
+def _counts(path: Path, arrays: dict[str, np.ndarray]) -> Path:
+    """HDF5 datasets of three equal rows each, beside joints."""
+    with h5py.File(path, "w") as file:
+        file["/observations/qpos"] = np.zeros((3, 2))
+        for name, row in arrays.items():
+            file[name] = np.stack([row] * 3)
+    return path
+
+
+def test_pads_that_no_shipped_sensor_fits_get_a_sensor_file_with_what_is_known(tmp_path: Path) -> None:
+    arrays = {"/tactile/a": np.zeros((5, 8), np.uint16), "/tactile/b": np.zeros((5, 8), np.uint16)}
+    drafts = drafted(_counts(tmp_path / "a.hdf5", arrays | {"/tactile/other": np.zeros(7, np.uint16)}))
+    sensor = yaml.safe_load(drafts.sensor)
+    assert (sensor["rows"], sensor["columns"], sensor["wire"]["dtype"]) == (5, 8, "uint16")
+    assert sensor["adc_bits"] == sensor["noise_count"] == sensor["gain_per_count"] == "TODO"
+    touch = yaml.safe_load(drafts.dataset)["features"]["observation.tactile"]
+    assert (touch["shape"], touch["pads"], touch["sensor"]) == ([80], ["tactile_a", "tactile_b"], "mine_sensor.yaml")
+    assert "# not used: /tactile/other: 7 counts of uint16" in drafts.recording  # another kind than the first
+
+
+def test_counts_under_a_topic_that_is_not_named_as_touch_are_named_and_left_out(tmp_path: Path) -> None:
+    drafts = drafted(_counts(tmp_path / "a.hdf5", {"/board/adc": np.zeros(32, np.uint8)}))
+    assert not drafts.sensor and "observation.tactile" not in drafts.dataset
+    assert "# not used: /board/adc: 32 counts of uint8" in drafts.recording
