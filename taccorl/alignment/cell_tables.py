@@ -104,7 +104,7 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
                 if not config.load.shared
                 else "all cells share one load"
             )
-            raise document.error(key, f"{key.replace('/', ' → ')} is missing: by the cells file {shared}")
+            raise document.error(key, f"is missing: by the cells file {shared}")
         if LOADS.get(load.unit, ("",))[0] != kind:
             same = [unit for unit, (other, _) in LOADS.items() if other == kind]
             raise document.error(

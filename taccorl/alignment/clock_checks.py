@@ -13,6 +13,7 @@ import numpy as np
 
 from taccorl.alignment.first_order import FirstOrder, delay_between, fit_first_order
 from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.tables import is_table
 from taccorl.data.finding import Finding, listed, not_judged
 from taccorl.data.lag_checks import LAG_SURE, find_lag
 from taccorl.errors import TaccorlError
@@ -35,6 +36,9 @@ STEP_FLOORS = 8.0
 """A step is judged if the joint's first row of movement is so many noise floors."""
 REST_S = 0.25
 """All commands must have rested so long before a step."""
+EXCHANGED = 0.7
+"""Columns of target and position are exchanged if the lag, fitted from position to target, leaves less than this share of what it
+leaves from target to position."""
 USUAL_TAU_S = 0.12
 """The slowest joint of the paper (Fig. "Per-joint controller SysID"): what a step moves in its first row is at least
 step · period / τ."""
@@ -100,7 +104,10 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
     for t in timings:
         if t.signal in led:
             continue
-        if t.lag_s < -0.5 * m.period_s:
+        if t.lag_s < -0.5 * m.period_s and _exchanged(m, t):
+            led.add(t.signal)
+            findings.append(_exchange(t.signal, -t.lag_s, m))
+        elif t.lag_s < -0.5 * m.period_s:
             led.add(t.signal)
             findings.append(_lead(t.signal, -t.lag_s, m, "its movement correlates best with a later command"))
         elif t.described and t.fit.delay_s + SURE * t.fit.delay_sd_s < -LEAD_ROWS * m.period_s:
@@ -112,10 +119,13 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
     unclear = [t for t in timings if t.signal not in led and not t.described]
     if unclear:
         worst = max(unclear, key=lambda t: t.fit.rms / floor[t.signal])
+        step = max(_least_step(m, floor[t.signal]) for t in unclear)
         why = (
             f"{listed([t.signal for t in unclear])} answer unlike a lag (it leaves "
-            f"{worst.fit.rms / floor[worst.signal]:.0f} noise floors at {worst.signal}). Record a step from rest: "
-            "its first row of movement tells"
+            f"{worst.fit.rms / floor[worst.signal]:.0f} noise floors at {worst.signal}), so that motion does not show it. "
+            "Nothing is held up. To have it judged, add a recording in which each of them rests for "
+            f"{2 * REST_S:g} s and its target then jumps by {step:.2g} {m.units[m.column(worst.signal)]} or more, twice: the row "
+            "in which it first moves shows an offset"
         )
         findings.append(not_judged(worst.signal, f"an offset of one row ({m.period_s * 1e3:.1f} ms)", why))
     return findings
@@ -150,9 +160,8 @@ def check_against_twin(m: Measurement, reported: np.ndarray, floor: dict[str, fl
             where = f"{abs(shift_s) * 1e3:.1f} ± {sd_s * 1e3:.1f} ms ({abs(shift_s) / period_s:.1f} rows)"
             if shift_s < 0:
                 text = (
-                    f"{name}: the measurement leads the twin's replay by {where}: positions stamped too early "
-                    "or commands too late, or paired one row off; set `latency_s` of the state's channel (or "
-                    "target_rows_late) and read again"
+                    f"{name}: the measurement leads the twin's replay by {where}: positions stamped too early or commands too "
+                    f"late, or paired one row off. {_earlier_targets(m, -shift_s)}"
                 )
                 if -shift_s < HALF_ROW_MOST * period_s:
                     text += (
@@ -183,9 +192,41 @@ def _lead(signal: str, lead_s: float, m: Measurement, how: str) -> Finding:
         "error",
         signal,
         f"{signal} answers {lead_s * 1e3:.1f} ms ({lead_s / m.period_s:.1f} rows) before its command ({how}), all "
-        f"through {m.time_s[-1] - m.time_s[0]:.1f} s: stamps of commands are late or those of positions early. Set "
-        "`latency_s` of the state's channel (tables: target_rows_late), or log both by one clock",
+        f"through {m.time_s[-1] - m.time_s[0]:.1f} s: stamps of commands are late or those of positions early. "
+        f"{_earlier_targets(m, lead_s)}, or log both by one clock",
     )
+
+
+def _exchanged(m: Measurement, t: CommandTiming) -> bool:
+    """Whether the target follows the position as a joint follows its target, and the position does not follow the target so."""
+    even, j = m.resampled(m.rate_hz), m.column(t.signal)
+    if not np.isfinite(even.measured[:, j]).all():
+        return False
+    turned = fit_first_order(even.measured[:, j], even.target[:, j], even.period_s)
+    return turned.rms < EXCHANGED * t.fit.rms and turned.delay_s > -LEAD_ROWS * m.period_s
+
+
+def _exchange(signal: str, lead_s: float, m: Measurement) -> Finding:
+    where = (
+        f"give {signal}.q the column that {signal}.q_target has now, and the other way round, in a columns file"
+        if is_table(m)
+        else f"exchange the channels of state and command of {signal} in the recording spec"
+    )
+    return Finding(
+        "measured_before_command",
+        "error",
+        signal,
+        f"{signal}: the target follows the measured position by {lead_s * 1e3:.1f} ms, as a joint follows its target, over "
+        f"{m.time_s[-1] - m.time_s[0]:.1f} s: the two are exchanged; {where}",
+    )
+
+
+def _earlier_targets(m: Measurement, lead_s: float) -> str:
+    """What mends positions that are ``lead_s`` ahead of their targets. The joint's own lag hides a part of an offset: rows are
+    rounded up."""
+    if is_table(m):
+        return f"Write `target_rows_late: {math.ceil(lead_s / m.period_s)}` (or more) into the columns file"
+    return "Set `latency_s` of the state's channel in the recording spec"
 
 
 def _lead_at_step(m: Measurement, signal: str, rows: list[int]) -> Finding:
@@ -195,8 +236,7 @@ def _lead_at_step(m: Measurement, signal: str, rows: list[int]) -> Finding:
         "error",
         signal,
         f"{signal} has moved at row {at} ({m.time_s[at]:.3f} s), where its step is only commanded ({len(rows)} such "
-        "steps): one row or more too early. Set `latency_s` of the state's channel (tables: target_rows_late), or "
-        "log both by one clock",
+        f"steps): one row or more too early. {_earlier_targets(m, m.period_s)}, or log both by one clock",
         (at, at + 1),
     )
 
@@ -220,7 +260,7 @@ def _early_steps(m: Measurement, floor: dict[str, float]) -> dict[str, list[int]
     still = np.all(np.abs(changes) < 1e-6, axis=1)
     found: dict[str, list[int]] = {}
     for j in moving_signals(m):
-        least = STEP_FLOORS * floor[m.signals[j]] * USUAL_TAU_S / m.period_s
+        least = _least_step(m, floor[m.signals[j]])
         steps = [
             k + 1 for k in np.flatnonzero(np.abs(changes[:, j]) > least) if k >= before and still[k - before : k].all()
         ]
@@ -232,6 +272,11 @@ def _early_steps(m: Measurement, floor: dict[str, float]) -> dict[str, list[int]
         if early and len(early) >= len(steps) / 2:
             found[m.signals[j]] = early
     return found
+
+
+def _least_step(m: Measurement, floor: float) -> float:
+    """rad, m: what a step from rest must be for its first row of movement to be seen."""
+    return STEP_FLOORS * floor * USUAL_TAU_S / m.period_s
 
 
 def _moved(values: np.ndarray, settle: int, step: float, floor: float) -> bool:

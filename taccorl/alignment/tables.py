@@ -117,6 +117,11 @@ class TableSpec:
     instruction: str = ""
 
 
+def is_table(m: Measurement) -> bool:
+    """Whether a measurement was read from a table, whose user has a columns file and no recording spec."""
+    return m.source.suffix in SUFFIXES
+
+
 def load_table_spec(path: Path) -> TableSpec:
     """A columns file, checked.
 

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 
 from taccorl.alignment.clock_checks import moving_signals
 from taccorl.alignment.measurement import Measurement, other_arm
+from taccorl.alignment.tables import is_table
 from taccorl.data.finding import Finding, listed
 from taccorl.robots import ROBOT
 
@@ -40,7 +41,13 @@ VELOCITY_FACTORS = {
     -1.0: "the other sign",
 }
 VELOCITY_GAIN = (0.8, 1.25)
-_UNIT_WAY_OUT = "state the unit in the columns file (recordings: `scale` of the channel)"
+
+
+def _unit_way_out(m: Measurement, *columns: str) -> str:
+    """Line to write where a number is in another unit."""
+    if is_table(m):
+        return f"Write the `unit:` of {' and '.join(columns)} in a columns file"
+    return "State `scale` of the channel in the recording spec"
 
 
 def check_wiring(m: Measurement) -> list[Finding]:
@@ -112,12 +119,18 @@ def _follower(m: Measurement, follows: np.ndarray, j: int) -> int | None:
 
 
 def _reversed(m: Measurement, j: int, own: float) -> Finding:
+    name = m.signals[j]
+    sign = (
+        f"write `factor: -1` for {name}.q or {name}.q_target in a columns file"
+        if is_table(m)
+        else "put a minus into `scale` of its channel in the recording spec"
+    )
     return Finding(
         "reversed",
         "error",
         m.signals[j],
         f"{m.signals[j]} moves against its command (correlation {own:.2f} over {m.time_s[-1]:.1f} s): the sign of "
-        "one of the two is turned; put a minus into `scale` of its channel, or mend the logger",
+        f"one of the two is turned; {sign}, or mend the logger",
     )
 
 
@@ -128,8 +141,8 @@ def _swaps(m: Measurement, swapped: dict[str, str]) -> list[Finding]:
     if len(across) == len(swapped) and len(across) > 1:
         text = (
             f"{listed(across)} follow the other arm's commands over {m.time_s[-1]:.1f} s: left and right are "
-            "exchanged in either positions or commands (CAN adapters or topics swapped); mend `channels` in the "
-            "recording spec"
+            "exchanged in either positions or commands (CAN adapters or topics swapped); mend "
+            f"{'the columns file' if is_table(m) else '`channels` in the recording spec'}"
         )
         return [Finding("swapped_arms", "error", across[0], text)]
     return [
@@ -138,7 +151,7 @@ def _swaps(m: Measurement, swapped: dict[str, str]) -> list[Finding]:
             "error",
             name,
             f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are "
-            "exchanged; pick elements by name, and mend the recording spec or the columns file",
+            f"exchanged; pick elements by name, and mend the {'columns file' if is_table(m) else 'recording spec'}",
         )
         for name, other in swapped.items()
     ]
@@ -159,7 +172,7 @@ def _check_range(m: Measurement) -> list[Finding]:
                 text = (
                     f"{name} is {what} at {values[row]:.4g} {unit} at row {row} ({m.time_s[row]:.2f} s), its limits "
                     f"are [{ROBOT.action_low[k]:.3g}, {ROBOT.action_high[k]:.3g}]: in {other}? "
-                    f"{_UNIT_WAY_OUT[0].upper()}{_UNIT_WAY_OUT[1:]}"
+                    f"{_unit_way_out(m, f'{name}.q', f'{name}.q_target')}"
                 )
                 findings.append(Finding("unit", "error", name, text, (row, row + 1)))
                 break
@@ -176,7 +189,8 @@ def _check_gain(m: Measurement, even: Measurement, lagged: np.ndarray, j: int) -
     near = abs(np.log(max(gain, 1e-9) / factor)) < 1.0
     text = (
         f"{m.signals[j]} goes {gain:.3g} times as far as its command over {m.time_s[-1]:.1f} s: "
-        f"{KNOWN_FACTORS[factor] if near else 'in another unit'}? {_UNIT_WAY_OUT[0].upper()}{_UNIT_WAY_OUT[1:]}"
+        f"{KNOWN_FACTORS[factor] if near else 'in another unit'}? "
+        f"{_unit_way_out(m, f'{m.signals[j]}.q', f'{m.signals[j]}.q_target')}"
     )
     return [Finding("unit", "error", m.signals[j], text)]
 
@@ -197,6 +211,6 @@ def _check_velocity(m: Measurement, even: Measurement, j: int) -> list[Finding]:
     near = [text for f, text in VELOCITY_FACTORS.items() if abs(gain / f - 1) < 0.2]
     text = (
         f"{m.signals[j]}: its reported velocity is {gain:.3g} times the slope of its position"
-        f"{f' ({near[0]}?)' if near else ''}; {_UNIT_WAY_OUT}, or leave it out"
+        f"{f' ({near[0]}?)' if near else ''}. {_unit_way_out(m, f'{m.signals[j]}.qd')}, or leave it out"
     )
     return [Finding("velocity_unit", "warning", m.signals[j], text)]

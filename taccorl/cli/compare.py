@@ -108,7 +108,7 @@ def _check_outputs(config: CompareConfig) -> None:
     if config.out is not None:
         from taccorl.diagnosis.report import check_folder
 
-        check_folder(config.out)
+        check_folder(config.out, config.measurements)
     if config.rerun is not None:
         from taccorl.views.outputs import check_free
 

@@ -74,9 +74,10 @@ def main(argv: list[str]) -> int:
     config = parse(DiagnoseConfig, argv, positional="measurements")
     from taccorl.diagnosis.report import check_folder
 
-    check_folder(config.out)
+    check_folder(config.out, config.measurements)
     from taccorl.alignment.telemetry_checks import accepted, check_names
     from taccorl.cli.measured import checked, clock_is_off, print_findings, unused_accepts
+    from taccorl.diagnosis.joints import of_joints
     from taccorl.diagnosis.machine import load_machine
     from taccorl.sim.effects import effects
 
@@ -87,6 +88,8 @@ def main(argv: list[str]) -> int:
     measurements = machine.read(
         config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
     )
+    if config.joints and not config.pads:  # recordings of other joints, and what is wrong with them, hold nothing up
+        measurements = of_joints(measurements, machine.select(machine.parts(measurements), config.joints, []))
     findings = checked(machine, measurements, "not diagnosed", config.accept)
     if findings is None:
         return 1
@@ -310,12 +313,17 @@ def _write(
     written = write_report(report, config.out)
     again = f" (replaced the report of {written.replaced})" if written.replaced else ""
     print(f"\nwrote {written.page} and {written.numbers.name}{again}")
+    held = [part for part, v in report.verdicts().items() if v.kind == "data_first"]
     names = list(dict.fromkeys(e.name for f in found for e in f.diagnosis.effects if e.name not in f.diagnosis.present))
     if config.until == "noise_floor":
         path = config.out / mended.file_name
         mended.save(path)
         names = [name for name in names if name in mended.effects]
         print(f"wrote {path}: {', '.join(names) or 'the refitted gains, no effect'}; {mended.saved_words}")
+    elif held:
+        print(
+            f"next: mend the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
+        )
     elif names:
         words = ["taccorl", "add-effect", names[0]]
         words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]

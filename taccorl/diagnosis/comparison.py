@@ -95,6 +95,8 @@ class TouchTrace:
     load: np.ndarray | None = None
     """(N, P, R, C) what pressed each cell, in ``load_unit``; None where only its shape and place are known."""
     load_unit: str = ""
+    repeated: bool = False
+    """``floor`` holds what repeats of a press do not repeat; else it is the noise of each cell, a lower bound."""
 
     @property
     def residual(self) -> np.ndarray:
@@ -247,6 +249,7 @@ def _touch_score(traces: Sequence[TouchTrace], pad: str | None = None) -> Score 
     rmse = math.sqrt(total.sum() / number.sum())
     level = float(np.sqrt(np.mean(np.concatenate(floors) ** 2)))
     spread = float(np.std(np.concatenate(readings)))
+    repeated = all(t.repeated for t in traces)
     return Score(
         signal="touch" if pad is None else pad,
         kind="touch",
@@ -256,8 +259,8 @@ def _touch_score(traces: Sequence[TouchTrace], pad: str | None = None) -> Score 
         interval=_rms_interval(total, number),
         nrmse=rmse / spread if spread > 0 else math.inf,
         floor=level,
-        floor_words=f"{level:.3g} {traces[0].unit} (residue of each taxel; a lower bound)",
-        lower_bound=True,
+        floor_words=f"{level:.3g} {traces[0].unit} ({'repeats' if repeated else 'residue of each taxel; a lower bound'})",
+        lower_bound=not repeated,
         n=int(number.sum()),
         recordings=len(traces),
     )

@@ -84,6 +84,15 @@ def moves(m: Measurement, signal: str) -> bool:
     return signal in m.signals and float(np.ptp(m.target[:, m.column(signal)])) > MOVES_RAD
 
 
+def of_joints(measurements: Measurements, signals: Sequence[str]) -> Measurements:
+    """Without the recordings that move none of ``signals``."""
+    sides = {
+        use: tuple(m for m in getattr(measurements, use) if any(moves(m, s) for s in signals))
+        for use in ("fit", "validation", "test")
+    }
+    return dataclasses.replace(measurements, **sides)
+
+
 def diagnose_joint(
     machine: TwinConfig | HasJoints,
     signal: str,
@@ -98,13 +107,9 @@ def diagnose_joint(
     Raises:
         TaccorlError: none of the fit recordings moves it.
     """
-    sides = [
-        tuple(m for m in side if moves(m, signal))
-        for side in (measurements.fit, measurements.validation, measurements.test)
-    ]
-    if not sides[0]:
+    own = of_joints(measurements, [signal])
+    if not own.fit:
         raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
-    own = dataclasses.replace(measurements, fit=sides[0], validation=sides[1], test=sides[2])
     problem = JointProblem(machine, signal, own, gains=gains)
     solved = solve(signal, problem, problem.fit, problem.validation, problem.test, search, without)
     known = known_numbers(problem, solved.diagnosis)
@@ -115,9 +120,7 @@ def diagnose_joint(
         can_tell=solved.can_tell,
         floors=tuple(problem.floors),
         commanded=problem.commanded,
-        recordings={
-            use: tuple(m.name for m in side) for use, side in zip(("fit", "validation", "test"), sides, strict=True)
-        },
+        recordings={use: tuple(m.name for m in getattr(own, use)) for use in ("fit", "validation", "test")},
         rows_split=solved.rows_split,
     )
 

@@ -86,27 +86,29 @@ class Report:
                 d,
                 can_tell=self.can_tell.get(part),
                 known=self.known.get(part),
-                data=self.unsettled(),
+                data=self.unsettled(part),
                 doubts=regimes[part].remarks if part in regimes else (),
                 options=self.options,
             )
             for part, d in self.diagnoses.items()
         }
 
-    def unsettled(self) -> list[str]:
-        """Errors that the checks found in the recordings.
+    def unsettled(self, part: str) -> list[str]:
+        """Errors that the checks found in the recordings of one part; of a joint those that move it.
 
-        An offset of the clock counts if the fitted twin sees it: one that lacks an effect may see an offset that is not there.
+        An offset of the clock counts if the fitted twin sees it at this part: one that lacks an effect may see an offset that is
+        not there.
         """
         last = self.comparison if self.after is None else self.after
+        moved = {t.recording for t in self.comparison.of(part)}
         own = [
             (name, f)
             for name, found in self.findings.items()
             for f in found
             if f not in self.comparison.clock.get(name, ())
         ]
-        own += [(name, f) for name, found in last.clock.items() for f in found]
-        return [f"{name}: {f.text}" for name, f in own if f.severity == "error"]
+        own += [(name, f) for name, found in last.clock.items() for f in found if not moved or f.feature == part]
+        return [f"{name}: {f.text}" for name, f in own if f.severity == "error" and (not moved or name in moved)]
 
 
 def cells_of(c: Comparison) -> list[Cell]:
@@ -124,12 +126,17 @@ class Written:
     """When the report was made that stood there before; empty if there was none."""
 
 
-def check_folder(folder: Path) -> str:
+def check_folder(folder: Path, measurements: Path | None = None) -> str:
     """Check that a report may be written there; returns the date of the report that it will replace, empty if there is none.
 
+    Args:
+        measurements: folder of recordings, which is read as a whole and so must hold no report.
+
     Raises:
-        TaccorlError: a file of its name that is not ours, or no folder can be there.
+        TaccorlError: a file of its name that is not ours, no folder can be there, or it is the folder of the recordings.
     """
+    if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
+        raise TaccorlError(f"{folder}: holds the recordings; give another folder for the report")
     if folder.exists() and not folder.is_dir():
         raise TaccorlError(f"{folder}: is a file; give a folder for the report")
     for name in (PAGE, NUMBERS):

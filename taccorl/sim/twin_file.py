@@ -182,8 +182,10 @@ class EffectsDocument[T](Document[T]):
         except SpecError:
             raise
         except TaccorlError as error:
-            named = sorted((str(error).index(name), name) for name in values if name in str(error))
-            raise self.error(f"{key}/{named[0][1]}".lstrip("/") if named else key, str(error)) from error
+            text = str(error)
+            named = sorted((text.index(name), name) for name in values if name in text)
+            place = f"{key}/{named[0][1]}".lstrip("/") if named else key
+            raise self.error(place, text.removeprefix(f"{place.rsplit('/', 1)[-1]}: ")) from error
 
     def _plugin(self, tag: str, registry: Registry[Any], default: type | None, node: yaml.Node, key: str) -> Any:
         """A plug-in named by the key ``tag``, with its settings."""

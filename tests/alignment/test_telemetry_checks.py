@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -91,11 +92,22 @@ def test_positions_one_row_early_are_an_error_at_every_joint(seed, rows):
 
 
 def test_lead_names_joint_time_and_way_out(clean):
-    text = text_of(shifted(clean, 2), "measured_before_command")
-    assert "answers" in text
-    assert "ms" in text
-    assert "latency_s" in text
-    assert "target_rows_late" in text
+    recorded = text_of(shifted(clean, 2), "measured_before_command")
+    assert "answers" in recorded and "ms" in recorded
+    assert "latency_s" in recorded and "target_rows_late" not in recorded
+    table = text_of(dataclasses.replace(shifted(clean, 2), source=Path("a.csv")), "measured_before_command")
+    assert "target_rows_late: 2" in table and "latency_s" not in table
+
+
+def test_exchanged_columns_of_target_and_position_are_no_latency(clean):
+    for m in (clean, sweep(0, friction_nm=0.3, seconds=6.0)):
+        swapped = dataclasses.replace(m, target=m.measured, measured=m.target, source=Path("a.csv"))
+        errors = [f for f in check_measurement(swapped) if f.severity == "error"]
+        assert {f.check for f in errors} == {"measured_before_command"}
+        assert len(errors) == len(ARMS_JOINTS)
+        assert all("exchanged" in f.text and f"{f.feature}.q_target" in f.text for f in errors)
+    for rows in (1, 5, 20):  # a clock that is off is none
+        assert not any("exchanged" in f.text for f in check_measurement(shifted(clean, rows)))
 
 
 def test_positions_one_row_late_could_be_a_delay_and_the_note_says_that_it_cannot_be_told(clean):
@@ -125,7 +137,9 @@ def test_where_nothing_can_be_known_it_says_so():
     findings = check_clock(m, floors(m))
     assert [f.check for f in findings] == ["not_judged"]
     assert "an offset of one row (5.0 ms) not judged: left_joint5, left_joint6 answer unlike a lag" in findings[0].text
-    assert "Record a step from rest" in findings[0].text
+    # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.
+    least = 8 * max(floors(m)[s] for s in ("left_joint5", "left_joint6")) * 0.12 / 0.005
+    assert f"jumps by {least:.2g} rad or more" in findings[0].text
 
 
 def test_first_order_fit_recovers_lag_and_delay_within_its_interval():

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -144,6 +145,7 @@ def test_a_wrong_line_of_the_file_is_said_with_the_way_out(
     assert code == 2
     assert words in shown
     assert f"taxel.yaml:{line}:" in shown
+    assert not re.search(r"\b(\w+): \1:", shown), "a key is said once"
 
 
 def held(values: np.ndarray, rows: int) -> np.ndarray:

@@ -82,7 +82,7 @@ def test_errors_of_the_data_stop_it_with_what_to_do(folder: Path, said: Any, tmp
     write_folder(tmp_path / "early", dataclasses.replace(good, fit=(dataclasses.replace(m, **early),), validation=()))
     code, text = said(tmp_path / "early", f"--out={tmp_path / 'report'}")
     assert code == 1
-    assert "before its command" in text and "latency_s" in text, "what is wrong, and the way out"
+    assert "before its command" in text and "target_rows_late: 3" in text, "what is wrong, and the way out"
     assert "not compared: errors in sweep_0.csv" in text
     assert "RMSE" not in text and not (tmp_path / "report").exists()
 
@@ -120,6 +120,7 @@ def test_only_the_joints_that_were_asked_for(folder: Path, said: Any):
         (["{folder}/sweeps", "--twin={folder}/no.yaml"], "no.yaml"),
         (["{folder}/sweeps", "--rerun={tmp}/x.png"], "must end in .rrd"),
         (["{folder}/sweeps", "--out={folder}/twin.yaml"], "is a file; give a folder"),
+        (["{folder}/sweeps", "--out={folder}/./sweeps"], "holds the recordings; give another folder"),
         (["{folder}/sweeps", "--pressed.shape=cube"], "cube"),
         ([], "missing --measurements="),
     ],

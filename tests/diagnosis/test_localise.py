@@ -206,6 +206,12 @@ def test_contact_and_thirds_of_the_pad_are_regimes_too():
     assert cells["in contact"].n + cells["no contact"].n == 1000 * 10 * 6
 
 
+def test_a_floor_of_touch_is_a_lower_bound_unless_presses_were_repeated():
+    for repeated in (False, True):
+        scores = comparison(touches=(dataclasses.replace(press("hold"), repeated=repeated),)).pad_scores()
+        assert [s.lower_bound for s in scores] == [not repeated]
+
+
 def test_contact_is_taken_from_geometry_where_it_is_known():
     soft = press()
     soft.measured[:] *= 0.2  # 24 counts at most: no taxel says contact

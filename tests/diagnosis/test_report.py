@@ -82,6 +82,20 @@ def test_numbers_are_those_of_the_comparison(tmp_path: Path):
     assert "5 mrad" in text and "-96%" in text and "mended twin" in text
 
 
+def test_errors_hold_up_the_joints_of_their_own_recordings_only():
+    both = comparison(
+        trace(0 * POSITION, POSITION, recording="a.csv", signal="left_joint5"),
+        trace(0 * POSITION, POSITION, recording="b.csv", signal="left_joint4"),
+        clock={"b.csv": (Finding("shifted_from_twin", "error", "left_joint4", "leads"),)},
+    )
+    report = small(
+        comparison=both, findings={"a.csv": [], "b.csv": [Finding("unit", "error", "left_joint4", "degrees")]}
+    )
+    assert report.unsettled("left_joint5") == []
+    assert report.unsettled("left_joint4") == ["b.csv: degrees", "b.csv: leads"]
+    assert report.unsettled("left pads") == report.unsettled("left_joint4"), "a part without traces sees all"
+
+
 def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(written: Written, tmp_path: Path):
     shutil.copytree(written.page.parent, tmp_path, dirs_exist_ok=True)
     again = write_report(small(title="the second"), tmp_path)

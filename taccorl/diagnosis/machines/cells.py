@@ -19,6 +19,7 @@ from taccorl.alignment.cells import (
     save_cells,
 )
 from taccorl.alignment.measurements import Measurements, read_measurements
+from taccorl.alignment.noise_floor import repeat_pairs
 from taccorl.alignment.touch_motion import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.cells_problem import CellsProblem, prepared_all, reading_floor
@@ -125,6 +126,7 @@ class CellsMachine(Machine):
                         thirds=THIRDS if config.shape[0] >= len(THIRDS) else (),
                         load=m.target.reshape(shape),
                         load_unit=config.load.unit,
+                        repeated=bool(repeat_pairs(measurements.all)),
                     )
                 )
         return Comparison(
