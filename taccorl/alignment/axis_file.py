@@ -14,21 +14,9 @@
     effects:               # physics beyond that; taccorl add-effect writes them
     - {effect: coulomb_friction, torque_nm: 20.4}    # in N on a slide
 
-==============  =================================================  ========================================================
-law             motor's torque                                     meaning of the target
-==============  =================================================  ========================================================
-``impedance``   kp (q* − q) − kd q̇ + torque_ff                     position; kp in N·m/rad, kd in N·m·s/rad
-``cascade``     kd (kp (q* − q) − q̇) + torque_ff                   position; kp in 1/s, kd in N·m·s/rad
-``velocity``    kd (q̇* − q̇) + torque_ff                            velocity; no kp
-``torque``      τ* + torque_ff                                     torque; no gains. 0: the motor is off
-``pwm``         k_t (V d − k_e q̇) / R,  d = kp (q* − q) − kd q̇     position; duty d is clipped to ± 1, kp in 1/rad, kd in s/rad
-                within ± 1
-==============  =================================================  ========================================================
-
-Targets stand in the column ``q_target``; of law velocity in ``qd_target``, of law torque in ``tau_target``. V is ``supply_v`` of
-the file, or of a recording (``NAME.supply``, or measurements.yaml). While ``NAME.enabled`` is 0 the motor neither drives nor
-brakes. What a recording mounts on a turning axis is m l² of inertia and m g l sin(q − q₀) of weight: ``payload_kg`` at
-``lever_m``, and an arm of ``arm_kg``, a uniform rod of that length.
+Laws, targets and what a recording may state of them are those of ``drive_law``. What a recording mounts on a turning axis is
+m l² of inertia and m g l sin(q − q₀) of weight: ``payload_kg`` at ``lever_m``, and an arm of ``arm_kg``, a uniform rod of that
+length.
 """
 
 import dataclasses
@@ -39,10 +27,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
 import yaml
 
-from taccorl.alignment.joint_kernel import POSITION, TORQUE, VELOCITY
+from taccorl.alignment.drive_law import DriveLaw
 from taccorl.alignment.measurement import Measurement, TargetKind
 from taccorl.alignment.rigid_joint import Gains, Rigid, RigidJoint, Surroundings
 from taccorl.data.strict_yaml import Document
@@ -56,12 +43,6 @@ if TYPE_CHECKING:
     from taccorl.alignment.joint_motion import JointMotion
 
 GRAVITY_M_PER_S2 = 9.81
-LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4
-"""Of the physics."""
-STEP_SHARE = 0.05
-"""Of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
-Law = Literal["impedance", "cascade", "velocity", "torque", "pwm"]
-_COMMANDS = {"velocity": VELOCITY, "torque": TORQUE}
 _HEADER = "# An axis: taccorl/alignment/axis_file.py says what may stand here.\n"
 
 
@@ -74,8 +55,9 @@ class EffectEntry:
 
 
 @dataclass(kw_only=True)
-class AxisConfig:
-    """One driven axis. Units are those of a turning one; of a slide N for N·m, m for rad, kg for kg·m²."""
+class AxisConfig(DriveLaw):
+    """One driven axis. Gains are those that are commanded, unless a recording states others. Units are those of a turning one; of
+    a slide N for N·m, m for rad, kg for kg·m²."""
 
     kind: Literal["axis"] = "axis"
     name: str
@@ -83,23 +65,6 @@ class AxisConfig:
     unit: Literal["rad", "m"]
     inertia: float
     """kg·m²."""
-    law: Law = "impedance"
-    kp: float = 0.0
-    """In the unit that the law asks for, over ``kp_factor``; commanded, unless a recording states another one."""
-    kd: float = 0.0
-    kp_factor: float = 1.0
-    """``kp`` times this is in the law's unit, here and in measurements.yaml: what one step of a gain's register is worth."""
-    kd_factor: float = 1.0
-    torque_ff: float = 0.0
-    """N·m."""
-    supply_v: float | None = None
-    """V: of law pwm."""
-    resistance_ohm: float | None = None
-    """Ω: of the winding, law pwm."""
-    torque_nm_per_a: float | None = None
-    """k_t at the axis, gear included [N·m/A], law pwm."""
-    emf_v_s_per_rad: float | None = None
-    """k_e at the axis [V·s/rad], law pwm; k_t if not given, which it is in SI units."""
     weight_sin: float = 0.0
     """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
     weight_cos: float = 0.0
@@ -116,8 +81,6 @@ class AxisConfig:
     lines of such steps. If not given, rows slower than 150 Hz are joined so, if targets are positions; others are held."""
     limits: tuple[float, float] | None = None
     """Lowest and highest position [rad]."""
-    effort_limit: float | None = None
-    """N·m at which the drive's torque is clipped."""
     force_unit_n: float | None = None
     """N·m that are for this axis what 1 N·m is for a joint of a small arm: effects are searched for within bounds that grow with
     it. A tenth of effort_limit if not given, else 1."""
@@ -126,28 +89,11 @@ class AxisConfig:
     effects: tuple[EffectEntry, ...] = ()
 
     def __post_init__(self) -> None:
-        check_numbers("axis", self, positive=("inertia", "kp_factor", "kd_factor"))
-        check_numbers("axis", self, not_negative=("kp", "kd", "lever_m", "arm_kg"))
-        check_numbers("axis", self, finite=("torque_ff", "weight_sin", "weight_cos", "hangs_at_rad"))
-        of_pwm = ("supply_v", "resistance_ohm", "torque_nm_per_a", "emf_v_s_per_rad")
-        optional = (*of_pwm, "effort_limit", "command_hz", "force_unit_n", "length_unit_m")
+        check_numbers("axis", self, positive=("inertia",), not_negative=("lever_m", "arm_kg"))
+        check_numbers("axis", self, finite=("weight_sin", "weight_cos", "hangs_at_rad"))
+        optional = ("command_hz", "force_unit_n", "length_unit_m")
         check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
-        needed = {
-            "impedance": ("kp",),
-            "cascade": ("kp", "kd"),
-            "velocity": ("kd",),
-            "torque": (),
-            "pwm": ("kp", *of_pwm[:3]),
-        }
-        for name in needed[self.law]:
-            if not getattr(self, name):
-                raise TaccorlError(f"axis.{name}: law {self.law} needs it; write `{name}: …`")
-        foreign = [] if self.law == "pwm" else [name for name in of_pwm if getattr(self, name) is not None]
-        foreign += [
-            name for name in {"velocity": ("kp",), "torque": ("kp", "kd")}.get(self.law, ()) if getattr(self, name)
-        ]
-        if foreign:
-            raise TaccorlError(f"axis.{foreign[0]}: law {self.law} has none; remove it, or mend the law")
+        self.check_law("axis")
         if self.limits is not None and not self.limits[0] < self.limits[1]:
             raise TaccorlError(f"axis.limits: {list(self.limits)} must rise; write the lowest position first")
         of_turning = ("weight_sin", "weight_cos", "lever_m", "arm_kg", "hangs_at_rad")
@@ -164,27 +110,6 @@ class AxisConfig:
         stroke = self.limits[1] - self.limits[0] if self.limits and self.unit == "m" else 1.0
         return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke)
 
-    @property
-    def stall_nm(self) -> float:
-        """V k_t / R of law pwm [N·m]."""
-        return (self.supply_v or 0.0) * (self.torque_nm_per_a or 0.0) / (self.resistance_ohm or 1.0)
-
-    @property
-    def back_emf(self) -> float:
-        """k_t k_e / R of law pwm [N·m·s/rad]."""
-        emf = self.torque_nm_per_a if self.emf_v_s_per_rad is None else self.emf_v_s_per_rad
-        return (self.torque_nm_per_a or 0.0) * (emf or 0.0) / (self.resistance_ohm or 1.0)
-
-    @property
-    def gains(self) -> Gains:
-        """Of the position error and the velocity [N·m/rad, N·m·s/rad, N·m], whatever the law."""
-        kp, kd = self.kp * self.kp_factor, self.kd * self.kd_factor
-        if self.law == "cascade":
-            return Gains(kp * kd, kd, self.torque_ff)
-        if self.law == "pwm":
-            return Gains(kp * self.stall_nm, kd * self.stall_nm, self.torque_ff)
-        return Gains(kp, kd, self.torque_ff)
-
     def effect_class(self, name: str) -> type[Effect] | None:
         """The effect in the size and units of this axis; None if an axis cannot have it.
 
@@ -192,7 +117,7 @@ class AxisConfig:
             TaccorlError: no such effect.
         """
         cls = registry.get(name)
-        if not issubclass(cls, JointEffect) or (self.unit == "m" and name in OF_A_TURN):
+        if not issubclass(cls, JointEffect) or (self.unit == "m" and name in OF_A_TURN) or not self.takes(name):
             return None
         own = scaled(name, self.scale)
         numbers: dict[str, Any] = {p.name: p.typical for p in own.parameters()}
@@ -216,18 +141,8 @@ class AxisConfig:
 
     def with_numbers(self, base: Mapping[str, float]) -> "AxisConfig":
         """With fitted numbers, which are called as in ``AxisProblem``."""
-        new = {name: base[name] for name in ("inertia", "torque_ff", "weight_sin", "weight_cos") if name in base}
-        if self.law == "pwm" and "stall_nm" in base:
-            volts, ohms = self.supply_v or 1.0, self.resistance_ohm or 1.0
-            new["torque_nm_per_a"] = base["stall_nm"] * ohms / volts
-            new["emf_v_s_per_rad"] = base["back_emf"] * ohms / new["torque_nm_per_a"]
-        elif "kd" in base and "kp" in base:
-            new["kd"] = base["kd"] / self.kd_factor
-            new["kp"] = (base["kp"] / base["kd"] if self.law == "cascade" else base["kp"]) / self.kp_factor
-        elif "kd" in base:
-            new["kd"] = base["kd"] / self.kd_factor
-        elif "kp" in base:
-            new["kp"] = base["kp"] / self.kp_factor
+        new = {name: base[name] for name in ("inertia", "weight_sin", "weight_cos") if name in base}
+        new |= self.law_numbers(base)
         return dataclasses.replace(self, **{name: float(value) for name, value in new.items()})
 
     def with_effects(self, found: Sequence[Effect]) -> "AxisConfig":
@@ -301,7 +216,8 @@ class _AxisDocument(Document[AxisConfig]):
 def axis_text(config: AxisConfig) -> str:
     """As a file has it: keys at their defaults are left out."""
     content: dict[str, Any] = {"kind": "axis"}
-    for field in dataclasses.fields(config):
+    law = {f.name for f in dataclasses.fields(DriveLaw)}
+    for field in sorted(dataclasses.fields(config), key=lambda f: f.name in law):
         value = getattr(config, field.name)
         if field.name not in ("kind", "effects") and value != field.default:
             content[field.name] = list(value) if isinstance(value, tuple) else value
@@ -341,37 +257,28 @@ class DrivenAxis(RigidJoint):
 
     @property
     def gains(self) -> Gains:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.gains
+        return self.config.loop_gains
 
     @property
     def command_hz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
         """A target that is no position is held until the next one."""
         if self.config.command_hz is not None:
             return self.config.command_hz
-        return 0.0 if self.config.law in _COMMANDS else 150.0
+        return 150.0 if self.config.target_kind == "position" else 0.0
 
     @property
     def target_kind(self) -> TargetKind:  # pyright: ignore[reportIncompatibleVariableOverride]
-        kinds: dict[str, TargetKind] = {"velocity": "velocity", "torque": "torque"}
-        return kinds.get(self.config.law, "position")
+        return self.config.target_kind
 
     @property
     def facts(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Numbers of ``joint_kernel.Drive`` that the file knows."""
-        c = self.config
-        found: dict[str, float] = {"command": _COMMANDS.get(c.law, POSITION), "midpoint": 1.0}
-        limit = math.inf if c.effort_limit is None else c.effort_limit
-        if c.law == "pwm":
-            found |= {"duty_torque": c.stall_nm, "back_emf": c.back_emf}
-        if math.isfinite(limit):
-            found["torque_max"] = limit
-        return found
+        return self.config.facts
+
+    def gain_scales(self, m: Measurement) -> tuple[float, float]:
+        return self.config.gain_scales(self.signal, m)
 
     def timestep_s(self, rate_hz: float) -> float:
-        c = self.config
-        damping = c.gains.kd + (c.back_emf if c.law == "pwm" else 0.0)
-        wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * c.inertia / max(damping, 1e-9)))
-        return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
+        return self.config.timestep_s(rate_hz, self.config.inertia)
 
     def rigid(self, motion: "JointMotion", bodies: Sequence[Effect]) -> Rigid:
         c = self.config
@@ -398,24 +305,12 @@ class DrivenAxis(RigidJoint):
             )
         return Surroundings(
             coupling_nm=-m.known_load(name),
-            supply=self._supply(m),
+            supply=c.supply(name, m),
             payload_kg=payload,
             payload_at_known=True,
             moment_kgm=payload * lever + 0.5 * arm * lever,
             mounted_kgm2=payload * lever**2 + arm * lever**2 / 3.0 if c.unit == "rad" else payload,
         )
-
-    def _supply(self, m: Measurement) -> np.ndarray:
-        """(T,) voltage over that of the file; NaN while the motor is off."""
-        j, share = m.column(self.signal), np.ones(m.num_rows)
-        if m.supply_v.size and np.isfinite(m.supply_v[:, j]).any():
-            if self.config.supply_v is None:
-                raise TaccorlError(
-                    f"{m.name}: a supply voltage of {self.signal} is stated, and law {self.config.law} has no use for it; "
-                    "remove it"
-                )
-            share = np.nan_to_num(m.supply_v[:, j] / self.config.supply_v, nan=1.0)
-        return np.where(m.enabled[:, j] == 0.0, np.nan, share) if m.enabled.size else share
 
     def effects(self, more: Sequence[Effect]) -> list[Effect]:
         own = {e.name: e for e in (*self.config.made(), *more)}

@@ -131,7 +131,7 @@ class JointModel:
         if numbers is None or any(drive is None for _, drive in drives):
             return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
-        drive = Drive(*scaled, **self._body(motion, bodies)._asdict(), torque_max=self.joint.torque_max)
+        drive = Drive(*scaled, **self._body(motion, bodies)._asdict())
         drive = drive._replace(**numbers)
         weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
         drive = drive._replace(

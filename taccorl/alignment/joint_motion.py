@@ -94,10 +94,8 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
             "read; this has more: log the driver's or the bus's own stamps, or cut the recording at the gap"
         )
     rest = Surroundings(coupling_nm=np.zeros(m.num_rows)) if joint is None else joint.surroundings(m)
-    known: dict[str, float] = {}
-    if joint is not None:
-        stated = {"kp": (m.kp, joint.gains.kp), "kd": (m.kd, max(joint.gains.kd, 1e-9))}
-        known = {name: gains[signal] / own for name, (gains, own) in stated.items() if signal in gains}
+    factor = m.gain_scale.get(signal, 1.0)
+    kp_scale, kd_scale = (factor, factor) if joint is None else joint.gain_scales(m)
     return JointMotion(
         name=m.name,
         time_s=m.time_s,
@@ -109,10 +107,10 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         supply=rest.supply,
         start=resting(m, j),
         pose=rest.pose,
-        kp_scale=known.get("kp", m.gain_scale.get(signal, 1.0)),
-        kd_scale=known.get("kd", m.gain_scale.get(signal, 1.0)),
-        kp_known="kp" in known,
-        kd_known="kd" in known,
+        kp_scale=kp_scale,
+        kd_scale=kd_scale,
+        kp_known=joint is not None and signal in m.kp,
+        kd_known=joint is not None and signal in m.kd,
         payload_kg=rest.payload_kg,
         moment_kgm=rest.moment_kgm,
         mounted_kgm2=rest.mounted_kgm2,

@@ -91,8 +91,6 @@ class RigidJoint(ABC):
     """What its controller takes as a target."""
     facts: Mapping[str, float] = {}
     """Numbers of ``joint_kernel.Drive`` that are known of the drive; those of effects are added or take their place."""
-    torque_max: float = math.inf
-    """N·m: a limit that is known."""
     position_age_s: float = 0.0
     """How old the measured position is, on average, when the drive's torque acts; with ``speed_delay_s`` of a velocity."""
     speed_delay_s: float = 0.0
@@ -102,6 +100,16 @@ class RigidJoint(ABC):
 
     follows_line: ClassVar[bool] = False
     """Whether targets between the rows are those of the line at their own time; else those of the next time, as in a replay."""
+
+    def gain_scales(self, m: Measurement) -> tuple[float, float]:
+        """Gains of a recording over ``gains``: of the position error, of the velocity."""
+        own = (self.gains.kp, max(self.gains.kd, 1e-9))
+        factor = m.gain_scale.get(self.signal, 1.0)
+        kp, kd = (
+            stated[self.signal] / one if self.signal in stated else factor
+            for stated, one in zip((m.kp, m.kd), own, strict=True)
+        )
+        return kp, kd
 
     def timestep_s(self, rate_hz: float) -> float:
         """Physics step for rows at ``rate_hz``."""

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from taccorl.alignment.axis_file import AxisConfig, DrivenAxis
+from taccorl.alignment.drive_law import WINDING_WITHIN
 from taccorl.alignment.joint_model import JointModel, JointMotion, JointResponse
 from taccorl.alignment.joint_motion import motion_of
 from taccorl.alignment.measurement import Measurement
@@ -24,15 +25,12 @@ from taccorl.sim.effects.effect import Effect
 
 GAINS_WITHIN = 1.25
 """Factor to both sides."""
-WINDING_WITHIN = 3.0
-"""Factor to both sides."""
 WEIGHT_WITHIN = 3.0
 """Times the weight's torque that the file states, of both signs."""
 MOST_TORQUE = 20.0
 """Of a constant torque, in force units of the axis."""
 _NO_CANDIDATES = ("armature", "gravity_mismatch")
 """More inertia is the inertia, which is fitted; an axis carries no weight by itself."""
-_OF_POSITION_LOOPS = ("integral_action", "error_deadband", "velocity_feedforward")
 
 
 class AxisProblem:
@@ -86,8 +84,6 @@ class AxisProblem:
         for name in registry:
             if not registry.get(name).fitted or name in _NO_CANDIDATES:
                 continue
-            if self.axis.law in ("velocity", "torque") and name in _OF_POSITION_LOOPS:
-                continue
             cls = self.axis.effect_class(name)
             if cls is not None:
                 self.candidates[name] = candidate(cls, seen)
@@ -116,7 +112,7 @@ class AxisProblem:
         if axis.law == "pwm":
             within, numbers = WINDING_WITHIN, {"stall_nm": axis.stall_nm, "back_emf": axis.back_emf}
         elif self.effort:
-            within, numbers = GAINS_WITHIN, {"kp": axis.gains.kp, "kd": axis.gains.kd}
+            within, numbers = GAINS_WITHIN, {"kp": axis.loop_gains.kp, "kd": axis.loop_gains.kd}
         else:
             within, numbers = 1.0, {}
         units = {"stall_nm": "N·m", "kp": "N·m/rad"}
@@ -152,7 +148,7 @@ class AxisProblem:
         bare = self._bare.with_numbers(values)
         answers = [simulated(bare, m, []) for m in motions]
         asked = [
-            m.target if self.axis.law in ("impedance", "cascade", "pwm") else a.reported
+            m.target if self.axis.target_kind == "position" else a.reported
             for m, a in zip(motions, answers, strict=True)
         ]
         speeds = np.concatenate([np.abs(np.gradient(q, 1.0 / m.rate_hz)) for q, m in zip(asked, motions, strict=True)])
@@ -175,22 +171,7 @@ def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
     j = m.column(axis.name)
     if m.units[j] != axis.unit:
         raise TaccorlError(f"{m.name}: {axis.name} is in {m.units[j]}, the axis's file says {axis.unit}")
-    motion = motion_of(m, axis.name, DrivenAxis(axis))
-    for name in ("kp", "kd"):
-        stated = getattr(m, name).get(axis.name)
-        if stated is not None and not getattr(axis, name):
-            raise TaccorlError(
-                f"{m.name}: {name} of {axis.name} is stated, and its file has no {name} with law {axis.law}; remove it from "
-                "measurements.yaml, or write it into the file"
-            )
-    kd_scale = m.kd[axis.name] / axis.kd if axis.name in m.kd else motion.kd_scale
-    kp_scale = m.kp[axis.name] / axis.kp if axis.name in m.kp else motion.kp_scale
-    # Of a cascade K_p is the product of both gains.
-    return dataclasses.replace(
-        motion,
-        kp_scale=kp_scale * (kd_scale if axis.law == "cascade" and axis.name in m.kd else 1.0),
-        kd_scale=kd_scale,
-    )
+    return motion_of(m, axis.name, DrivenAxis(axis))
 
 
 def simulated(axis: AxisConfig, motion: JointMotion, effects: Sequence[Effect]) -> JointResponse:

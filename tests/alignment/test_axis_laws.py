@@ -135,8 +135,8 @@ def test_a_recording_s_own_lever_and_arm_are_those_of_its_pendulum():
 
 def test_a_gain_s_register_is_worth_its_factor():
     """800 steps of 0.0075 / rad are 6 / rad: 18 N·m/rad at 12 V, 4 Ω and 1 N·m/A."""
-    assert dataclasses.replace(SERVO, kp=800.0, kp_factor=0.0075).gains == pytest.approx(SERVO.gains)
-    assert SERVO.gains.kp == pytest.approx(18.0)
+    assert dataclasses.replace(SERVO, kp=800.0, kp_factor=0.0075).loop_gains == pytest.approx(SERVO.loop_gains)
+    assert SERVO.loop_gains.kp == pytest.approx(18.0)
     fitted = AxisConfig(name="servo", unit="rad", inertia=0.02, kp=400.0, kp_factor=0.02, kd=10.0, kd_factor=0.1)
     again = fitted.with_numbers({"kp": 9.0, "kd": 1.1})
     assert (again.kp, again.kd) == pytest.approx((450.0, 11.0)), "the file keeps its register's steps"

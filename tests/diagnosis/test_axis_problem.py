@@ -135,7 +135,7 @@ def test_gains_that_a_recording_states_are_those_it_is_simulated_with(slide: Mea
     motion = axis_motion(AXIS, twice)
     assert (motion.kp_scale, motion.kd_scale) == pytest.approx((2.0, 0.5))
     cascade = dataclasses.replace(AXIS, law="cascade", kp=KP / KD)
-    assert cascade.gains == pytest.approx(AXIS.gains)
+    assert cascade.loop_gains == pytest.approx(AXIS.loop_gains)
     stated = dataclasses.replace(slide.fit[0], kp={"drive": 2 * KP / KD}, kd={"drive": 0.5 * KD})
     motion = axis_motion(cascade, stated)
     assert (motion.kp_scale, motion.kd_scale) == pytest.approx((1.0, 0.5)), "K_p is the product of both"
@@ -189,8 +189,8 @@ def test_a_file_of_an_axis_is_strict(tmp_path: Path):
     path.write_text(good)
     axis = load_axis(path)
     # the cascade's own numbers: g k_v k_p and g k_v
-    assert axis.gains.kp == pytest.approx(35.15 * 243.45 * 160.18, rel=1e-4)
-    assert axis.gains.kd == pytest.approx(35.15 * 243.45, rel=1e-4)
+    assert axis.loop_gains.kp == pytest.approx(35.15 * 243.45 * 160.18, rel=1e-4)
+    assert axis.loop_gains.kd == pytest.approx(35.15 * 243.45, rel=1e-4)
     again = tmp_path / "again.yaml"
     again.write_text(axis_text(axis))
     assert load_axis(again) == axis

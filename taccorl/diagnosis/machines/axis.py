@@ -110,7 +110,7 @@ class Axis(Machine):
             replayed = {"position": answer.reported, "effort": answer.effort}
             measured = {"position": motion.measured, "effort": motion.effort}
             units = {"position": m.units[j], "effort": UNITS[m.units[j]][1]}
-            position_target = self.config.law in ("impedance", "cascade", "pwm")
+            position_target = self.config.target_kind == "position"
             for kind in kinds:
                 if np.isfinite(measured[kind]).any() and signal in floors[kind]:
                     traces.append(
