@@ -36,7 +36,7 @@ class CotrainConfig:
     """Demonstrations of both domains → policy → scores. Numbers are the paper's."""
 
     task: str = "assembly_2"
-    """assembly_1, assembly_2, puzzle, test_tube."""
+    """Task: {tasks}."""
     secret: int = 7
     """Which surrogate robot."""
     real: int = 50
@@ -86,7 +86,7 @@ def main(words: list[str]) -> None:
     out, task, store = config.out / config.task, f"--task={config.task}", f"--store={config.out / 'store'}"
     recipe, name = config.train or Path(f"configs/cotrain/{config.task}.yaml"), f"surrogate_{config.secret}"
     if not recipe.is_file():  # before hours of collecting
-        raise SystemExit(f"--train={recipe}: no such file")
+        raise SystemExit(f"--train={recipe}: no such file; for a task of your own, copy one of configs/cotrain")
     parts = (f"{name}.yaml", f"{name}_recordings_{config.real}", name, f"{name}_and_twin")
     robot, recordings, real, both = (out / part for part in parts)
     sources, many = out / "sources", out / "augmented"

@@ -31,7 +31,7 @@ class LearnConfig:
     """Demonstrations of the twin → policy → score."""
 
     task: str = "assembly_2"
-    """assembly_1, assembly_2, puzzle, test_tube."""
+    """Task: {tasks}."""
     sources: int = 10
     """Episodes of the scripted expert …"""
     episodes: int = 1000

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 from taccorl.cli import main as cli
+from taccorl.demos.experts import tasks_with_expert
 
 OUT = Path("outputs/mimicgen")
-TASKS = ("assembly_1", "assembly_2", "puzzle", "test_tube")
 SOURCES = 20
 OPTIONS = {"episodes": "200", "workers": "2", "images": "true"}
 
@@ -37,12 +37,13 @@ def make(task: str, options: dict[str, str], out: Path = OUT, sources: int = SOU
 
 
 def main(words: list[str]) -> None:
-    """Words: tasks, all four by default, and options."""
+    """Words: tasks, all that have an expert by default, and options."""
+    tasks = tasks_with_expert()
     options = OPTIONS | dict(word.removeprefix("--").split("=", 1) for word in words if word.startswith("--"))
-    named = [word for word in words if not word.startswith("--")] or list(TASKS)
-    odd = [*(set(options) - set(OPTIONS)), *(set(named) - set(TASKS))]
+    named = [word for word in words if not word.startswith("--")] or list(tasks)
+    odd = [*(set(options) - set(OPTIONS)), *(set(named) - set(tasks))]
     if odd:
-        raise SystemExit(f"no {odd[0]!r}; tasks: {', '.join(TASKS)}; options: {', '.join(f'--{o}=' for o in OPTIONS)}")
+        raise SystemExit(f"no {odd[0]!r}; tasks: {', '.join(tasks)}; options: {', '.join(f'--{o}=' for o in OPTIONS)}")
     lines = []
     for task in named:
         began_s = time.perf_counter()

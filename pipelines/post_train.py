@@ -30,7 +30,7 @@ class PostTrainPipelineConfig:
     """Policy and demonstrations → post-training → paired scores."""
 
     task: str = "assembly_2"
-    """assembly_1, assembly_2, puzzle, test_tube."""
+    """Task: {tasks}."""
     policy: Path | None = None
     """Folder pretrained_model of the start; that of pipelines.learn if not given, made first if it is missing."""
     dataset: Path | None = None

@@ -1,19 +1,28 @@
-"""``make pictures``: the four tasks as the cameras and the pads see them, for the README (docs/task_*.png). All simulated."""
+"""``make pictures``: the tasks as the cameras see them (docs/task_*.png), and their rows in docs/twin.md. All simulated."""
 
+import re
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from taccorl.demos.collect import ExpertSource, Plan
+from taccorl.demos.experts import tasks_with_expert
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
+from taccorl.sim.task import tasks
 
-TASKS = ("test_tube", "puzzle", "assembly_1", "assembly_2")
 VIEWS = (ROBOT.cameras[0], ROBOT.cameras[-1])
 MOMENTS = (0.0, 0.4, 0.75, 1.0)  # shares of the episode
 SIZE = (240, 320)  # rows, columns of a picture
 OUT = Path("docs")
+PAGE = OUT / "twin.md"
+
+
+def with_rows(page: str) -> str:
+    """The page with one row for each task in its table of pictures."""
+    rows = [f"| `{name}` | ![{tasks.get(name).instruction}](task_{name}.png) |\n" for name in tasks_with_expert()]
+    return re.sub(r"(?<=^\|---\|---\|\n)(\|.*\n)+", "".join(rows), page, count=1, flags=re.MULTILINE)
 
 
 def episode(sim: Simulation, plan: Plan, seed: int) -> np.ndarray:
@@ -33,7 +42,7 @@ def episode(sim: Simulation, plan: Plan, seed: int) -> np.ndarray:
 
 def main() -> None:
     """One strip a task: ``VIEWS`` at four moments."""
-    for task in TASKS:
+    for task in tasks_with_expert():
         plan = Plan(task=task, source=ExpertSource())
         sim = plan.make()
         states = episode(sim, plan, seed=1)
@@ -47,6 +56,7 @@ def main() -> None:
         cv2.imwrite(str(path), strip[:, :, ::-1])
         print(f"{path}: {sim.task.instruction} ({len(states) / 30:.0f} s, simulated)")
         sim.close()
+    PAGE.write_text(with_rows(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ class AugmentConfig:
     source: Path
     """Dataset of successful demonstrations from the twin, of this task."""
     task: str
-    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's."""
+    """Task: {tasks}."""
     episodes: int = 200
     """Number of successful demonstrations to generate."""
     out: Path | None = None

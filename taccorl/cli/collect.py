@@ -24,7 +24,7 @@ class CollectConfig:
     """Collect demonstrations in the twin."""
 
     task: str | None = None
-    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's. Action files state it."""
+    """Task: {tasks}. Action files state it."""
     source: Source = field(default_factory=ExpertSource)
     """Who demonstrates: --source.type=expert, keyboard, gamepad, leader, actions."""
     episodes: int = 20

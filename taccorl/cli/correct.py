@@ -29,7 +29,7 @@ class CorrectConfig:
     policy: PolicyChoice = field(default_factory=PolicyChoice)
     """--policy.path=CHECKPOINT."""
     task: str
-    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's whose expert can take over."""
+    """Task whose expert can take over: {tasks}."""
     out: Path | None = None
     """The dataset's folder; outputs/TASK_corrections if not given. It must not hold anything else."""
     episodes: int = 128

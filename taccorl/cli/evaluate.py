@@ -49,7 +49,7 @@ class EvaluateConfig:
     policy: PolicyChoice = field(default_factory=PolicyChoice)
     """--policy.path=CHECKPOINT or --policy.type=expert."""
     task: list[str] = field(default_factory=list)
-    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's; repeat the option for several tasks."""
+    """Task, or several by repeating the option: {tasks}."""
     against: str | None = None
     """A checkpoint, expert, or an earlier evaluation's folder, to compare with on the same scenes."""
     episodes: int = 128

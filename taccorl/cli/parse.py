@@ -124,7 +124,7 @@ def _kinds(hint: Any) -> tuple[Any, ...]:
 
 
 def _print_help(config_class: type, hints: dict[str, Any], positional: str | None, prog: str | None) -> None:
-    """The verb's own words, then draccus's list of options."""
+    """The verb's own words, then draccus's list of options. ``{tasks}`` in a field's text: the names of all tasks with parts."""
     from draccus.argparsing import ArgumentParser
 
     module, required = sys.modules[config_class.__module__], _required(config_class)
@@ -137,6 +137,11 @@ def _print_help(config_class: type, hints: dict[str, Any], positional: str | Non
     said = (module.__doc__ or "").strip().replace("``", "")
     options = ArgumentParser(config_class, usage=" ".join([prog, *words, "[options]"]), description=said).parser
     for action in options._actions:
+        if "{tasks}" in (action.help or ""):  # imported for the few verbs that have it: it takes a second
+            from taccorl.sim.task import tasks
+
+            named = ", ".join(name for name in tasks if tasks.get(name).parts)
+            action.help = (action.help or "").replace("{tasks}", named)
         action.option_strings = [name.rstrip("_") for name in action.option_strings]
         if action.dest in required:
             action.help = f"{action.help} (required)"

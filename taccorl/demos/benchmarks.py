@@ -18,6 +18,7 @@ from typing import Any
 
 from taccorl.benchmark import ROOT, Row, against_reference, benchmark, cpu_s, spread
 from taccorl.data.spec import data_specs_folder, load_recording_spec
+from taccorl.demos.experts import tasks_with_expert
 
 RECORDING_S = 24.0
 LONG_RECORDING_S = 240.0
@@ -28,7 +29,6 @@ EXPERT_EPISODES = 100
 PENETRATION_EPISODES = 20
 MIMICGEN_ATTEMPTS = 100
 MIMICGEN_SOURCES = 20
-TASKS = ("test_tube", "puzzle", "assembly_1", "assembly_2")
 COST_ATTEMPTS, COST_SOURCES = 20, 5
 NATIVE = [480, 640, 3]
 
@@ -275,10 +275,10 @@ def _children_cpu_s(command: list[str]) -> float:
 
 @benchmark("experts")
 def expert_rows() -> Iterator[Row]:
-    """The experts of the four tasks under the paper's randomisation. Simulated."""
+    """The experts of all tasks under the paper's randomisation. Simulated."""
     from taccorl.demos.scoring import score_expert
 
-    for task in TASKS:
+    for task in tasks_with_expert():
         score = score_expert(task, EXPERT_EPISODES)
         n = len(score.outcomes)
         rate = score.success_rate
@@ -331,7 +331,7 @@ def mimicgen_cost() -> Iterator[Row]:
     from taccorl.demos.scoring import score_expert
     from taccorl.sim.twin import TwinConfig
 
-    for task in TASKS:
+    for task in tasks_with_expert():
         made = score_generation(
             load_mimic_spec(task), _mimicgen_sources(task, COST_SOURCES), TwinConfig(), COST_ATTEMPTS
         )
@@ -389,5 +389,5 @@ def _yield_row(name: str, score: Any, goal: str) -> Row:
     )  # fmt: skip
 
 
-for _task in TASKS:  # one by one: each takes half an hour
+for _task in tasks_with_expert():  # one by one: each takes half an hour
     benchmark(f"mimicgen_{_task}")(functools.partial(mimicgen_cells, _task, MIMICGEN_ATTEMPTS, MIMICGEN_SOURCES))

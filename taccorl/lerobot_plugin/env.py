@@ -39,7 +39,7 @@ class TaccorlEnvConfig(EnvConfig):
     """A task in the twin. Synchronous environments share one batch and its threads, asynchronous ones are processes."""
 
     task: str | None = "assembly_1"
-    """assembly_1, assembly_2, puzzle or test_tube, or a task of your own."""
+    """A task of the twin, shipped or of your own; ``taccorl collect --help`` lists them."""
     fps: int = _FPS
     """Control steps a second; the twin has no other."""
     features: dict[str, PolicyFeature] = field(default_factory=lambda: dict(_FEATURES))

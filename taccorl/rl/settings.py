@@ -38,7 +38,7 @@ class EnvSettings:
     """Settings of the environments: task, twin, number of environments and processes."""
 
     task: str | None = None
-    """assembly_1, assembly_2, puzzle, test_tube, or a plug-in's."""
+    """Task: {tasks}."""
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     num_envs: int = 128

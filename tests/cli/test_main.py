@@ -62,6 +62,15 @@ def test_an_unknown_verb_names_the_nearest(typo: str, meant: str, capsys: pytest
     assert capsys.readouterr().err == f"taccorl: no verb {typo!r}; did you mean {meant!r}?\n"
 
 
+def test_help_names_every_registered_task_but_the_empty_bench(capsys: pytest.CaptureFixture[str]) -> None:
+    from taccorl.sim.task import tasks
+
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--help"])
+    shown = capsys.readouterr().out.split("--task ", 1)[1].split("--against", 1)[0]
+    assert {name for name in tasks if f" {name}" in shown} == set(tasks) - {"bench"}
+
+
 @pytest.mark.parametrize("words", HELP, ids=" ".join)
 def test_help_of_every_verb_shows_what_each_option_is(
     words: tuple[str, ...], capsys: pytest.CaptureFixture[str]

@@ -1,8 +1,11 @@
 """Every registered task: reset, predicates, rows of randomisation, scripted expert and MimicGen spec fit together."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from pipelines.task_pictures import PAGE, with_rows
 from taccorl.demos.collect import Plan
 from taccorl.demos.experts import tasks_with_expert
 from taccorl.demos.mimicgen.schedule import rehearse
@@ -12,6 +15,7 @@ from taccorl.sim.randomize import draw
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import CLEARANCES_M, tasks
 
+ROOT = Path(__file__).resolve().parents[2]
 WITH_SPEC = tuple(name for name in tasks if tasks.get(name).mimicgen)
 
 
@@ -78,6 +82,12 @@ def test_rows_are_drawn_within_their_bounds_and_every_one_moves_the_reset(sim):
 
 def test_all_but_the_empty_bench_can_be_demonstrated_and_multiplied():
     assert set(tasks_with_expert()) == set(WITH_SPEC) == set(tasks) - {"bench"}
+
+
+def test_the_page_of_the_twin_shows_each_with_its_picture():
+    page = (ROOT / PAGE).read_text(encoding="utf-8")
+    assert with_rows(page) == page, "run make pictures"
+    assert [name for name in tasks_with_expert() if not (ROOT / "docs" / f"task_{name}.png").is_file()] == []
 
 
 @pytest.mark.parametrize("name", WITH_SPEC)
