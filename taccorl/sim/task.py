@@ -57,19 +57,14 @@ class Contact:
 
 @dataclass(frozen=True, kw_only=True)
 class Subtask:
-    """One segment of one arm's motion, as MimicGen cuts demonstrations: it ends when ``done`` becomes true."""
+    """One segment of one arm's motion; it ends when ``done`` becomes true.
+
+    The body that it refers to, the body that is held and the order between the arms stand in the task's MimicGen spec.
+    """
 
     name: str
-    object_ref: str | None
-    """Body whose pose carries the motion over to a new scene; None: the motion does not depend on an object."""
     done: Callable[[Scene], np.ndarray]
     """(N,) bool."""
-    held: str | None = None
-    """Body that this arm holds during the subtask."""
-    coordinated_with: str | None = None
-    """Subtask of the other arm that must run at the same time (MimicGen's COORDINATION)."""
-    after: str | None = None
-    """Subtask of the other arm that must have ended before this one begins (MimicGen's SEQUENTIAL)."""
 
 
 @dataclass(frozen=True)

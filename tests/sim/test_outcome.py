@@ -29,7 +29,7 @@ class Scripted(Bench):
         def done(name):
             return lambda scene: np.array(self.now[name])
 
-        steps = tuple(Subtask(name=name, object_ref=None, done=done(name)) for name in ("first", "second"))
+        steps = tuple(Subtask(name=name, done=done(name)) for name in ("first", "second"))
         return {"left": steps, "right": ()}
 
 

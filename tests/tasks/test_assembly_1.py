@@ -231,18 +231,6 @@ def put(sim: Simulation, part: str, pose: np.ndarray) -> None:
 # subtasks ---------------------------------------------------------------------------------------------------------------
 
 
-def test_the_subtasks_say_what_is_held_and_what_runs_together():
-    left, right = TASK.subtasks()["left"], TASK.subtasks()["right"]
-    assert [(s.name, s.object_ref, s.held, s.coordinated_with) for s in left] == [
-        ("grasp socket", "socket", None, None),
-        ("hold socket", "plug", "socket", "insert plug"),
-    ]
-    assert [(s.name, s.object_ref, s.held, s.coordinated_with) for s in right] == [
-        ("grasp plug", "plug", None, None),
-        ("insert plug", "socket", "plug", "hold socket"),
-    ]
-
-
 def test_a_grasp_is_done_when_its_part_is_three_centimetres_up():
     low, high = placed(-200.0, height_m=0.029), placed(-200.0, height_m=0.031)
     for arm in ("left", "right"):

@@ -1,7 +1,5 @@
 """Test Tube Insertion: where things begin, what counts as inserted, what is a near miss and what a failure."""
 
-import itertools
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -262,15 +260,6 @@ def test_failures_of_the_verdict_are_those_that_are_declared(sim):
 
 
 # subtasks -------------------------------------------------------------------------------------------------------------
-
-
-def test_subtasks_name_what_is_held_and_what_it_refers_to():
-    left, right = (TestTube().subtasks()[arm] for arm in ("left", "right"))
-    assert [(s.object_ref, s.held) for s in left] == [("rack", None), ("rack", "rack")]
-    assert [(s.object_ref, s.held) for s in right] == [("tube", None), (None, "tube"), ("rack", "tube")]
-    names = {s.name: s for s in itertools.chain(left, right)}
-    assert names["hold rack"].coordinated_with == "insert tube"
-    assert names["insert tube"].coordinated_with == "hold rack"
 
 
 def test_a_tube_that_floats_upright_over_the_rack_has_not_been_lifted_by_anyone(sim):

@@ -116,14 +116,13 @@ def lift_and_join(holder: str, plug: str, joined: Callable[[Scene], np.ndarray])
     def lifted(part: str) -> Callable[[Scene], np.ndarray]:
         return lambda scene: scene.poses(part)[:, 2, 3] > LIFTED_M
 
-    hold, insert = f"hold {holder}", f"insert {plug}"
     return {
         "left": (
-            Subtask(name=f"grasp {holder}", object_ref=holder, done=lifted(holder)),
-            Subtask(name=hold, object_ref=plug, held=holder, done=joined, coordinated_with=insert),
+            Subtask(name=f"grasp {holder}", done=lifted(holder)),
+            Subtask(name=f"hold {holder}", done=joined),
         ),
         "right": (
-            Subtask(name=f"grasp {plug}", object_ref=plug, done=lifted(plug)),
-            Subtask(name=insert, object_ref=holder, held=plug, done=joined, coordinated_with=hold),
+            Subtask(name=f"grasp {plug}", done=lifted(plug)),
+            Subtask(name=f"insert {plug}", done=joined),
         ),
     }

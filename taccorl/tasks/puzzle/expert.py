@@ -36,11 +36,8 @@ class PuzzleExpert(ScriptedExpert):
         return self._left() if arm == "left" else self._right()
 
     def finish(self, arm: str, subtask: str) -> Script:
-        own = self._task.subtasks()[arm]
-        shape = next(s.held for s in own if s.name == subtask)
-        assert shape is not None
-        yield from self._place(arm, shape, is_near=True)
-        if arm == "right" and subtask == own[-1].name:
+        yield from self._place(arm, subtask.removeprefix("place "), is_near=True)
+        if arm == "right" and subtask == self._task.subtasks()[arm][-1].name:
             yield from self._retreat(arm)
 
     def remaining(self, arm: str) -> Script:

@@ -134,7 +134,7 @@ class Puzzle(Task):
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
         """Subtasks: grasp and place for each piece. One hand places at a time: triangle, then circle (left), then heart."""
 
-        def pair(shape: str, after: str | None = None) -> tuple[Subtask, Subtask]:
+        def pair(shape: str) -> tuple[Subtask, Subtask]:
             def lifted(scene: Scene) -> np.ndarray:
                 return scene.poses(shape)[:, 2, 3] > _LIFTED_M
 
@@ -142,12 +142,11 @@ class Puzzle(Task):
                 return self.placed(scene, shape)
 
             return (
-                Subtask(name=f"grasp {shape}", object_ref=shape, done=lifted),
-                Subtask(name=f"place {shape}", object_ref="tray", held=shape, done=placed, after=after),
+                Subtask(name=f"grasp {shape}", done=lifted),
+                Subtask(name=f"place {shape}", done=placed),
             )
 
-        right = (*pair("triangle"), *pair("heart", after="place circle"))
-        return {"left": pair("circle", after="place triangle"), "right": right}
+        return {"left": pair("circle"), "right": (*pair("triangle"), *pair("heart"))}
 
 
 def _stack(of_piece: Callable[[str], np.ndarray]) -> np.ndarray:

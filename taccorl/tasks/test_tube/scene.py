@@ -133,17 +133,13 @@ class TestTube(Task):
 
         return {
             "left": (
-                Subtask(name="grasp rack", object_ref="rack", done=gripped),
-                Subtask(
-                    name="hold rack", object_ref="rack", held="rack", done=inserted, coordinated_with="insert tube"
-                ),
+                Subtask(name="grasp rack", done=gripped),
+                Subtask(name="hold rack", done=inserted),
             ),
             "right": (
-                Subtask(name="lift tube", object_ref="tube", done=lifted),
-                Subtask(name="turn tube upright", object_ref=None, held="tube", done=upright),
-                Subtask(
-                    name="insert tube", object_ref="rack", held="tube", done=inserted, coordinated_with="hold rack"
-                ),
+                Subtask(name="lift tube", done=lifted),
+                Subtask(name="turn tube upright", done=upright),
+                Subtask(name="insert tube", done=inserted),
             ),
         }
 

@@ -5,36 +5,9 @@ import re
 import pytest
 import yaml
 
-from taccorl.demos.mimicgen.schedule import rehearse
 from taccorl.demos.mimicgen.spec import GenerationSpec, check_task, load_mimic_spec, mimic_spec_path, with_options
 from taccorl.errors import SpecError, TaccorlError
 from taccorl.sim.task import tasks
-
-TASKS = ("assembly_1", "assembly_2", "puzzle", "test_tube")
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_every_task_has_a_spec_that_is_its_own(task):
-    spec = load_mimic_spec(task)
-    assert spec.task == task
-    check_task(spec, tasks.get(task)())
-    rehearse(spec.signals, spec.constraints)
-    held = {s.held_object for subtasks in spec.subtask_configs.values() for s in subtasks} - {None}
-    assert {part for pair in tasks.get(task).mating for part in pair} - {"tray"} <= held | {"rack"}
-    assert spec.datagen_config.retarget == "held_object"
-
-
-def test_a_spec_says_of_each_subtask_what_the_task_says():
-    for name in TASKS:
-        spec = load_mimic_spec(name)
-        for arm, subtasks in tasks.get(name)().subtasks().items():
-            for k, subtask in enumerate(subtasks):
-                told = spec.subtask_configs[arm][k]
-                assert (told.object_ref, told.held_object) == (subtask.object_ref, subtask.held)
-                coordination = spec.coordination(arm, k)
-                assert (coordination is not None) == (subtask.coordinated_with is not None)
-                formers = [spec.signals[other][j] for other, j in spec.formers(arm, k)]
-                assert formers == ([subtask.after] if subtask.after else [])
 
 
 def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
