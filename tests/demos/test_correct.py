@@ -289,7 +289,7 @@ def test_arms_do_not_jump_at_the_takeover(task: str) -> None:
 def test_the_expert_completes_what_was_pushed_by_20_mrad(task: str, after: int) -> None:
     sim = Simulation(tasks.get(task)())
     its = plan(task=task)
-    done = correct_episode(its, sim, its.rows(sim), pushed_expert(sim, 11, after))
+    done = correct_episode(its, sim, its.contract(sim), pushed_expert(sim, 11, after))
     assert done.cause == "drawn" and done.outcome == "success", (done.outcome, done.reason)
     sim.close()
 

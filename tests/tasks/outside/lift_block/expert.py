@@ -1,0 +1,21 @@
+"""The right hand grips the block from above and lifts it; the left hand stays where it is."""
+
+from lift_block.scene import LiftBlock
+from taccorl.demos.experts.scripted import Script, ScriptedExpert
+from taccorl.demos.experts.se3 import transform
+
+
+class LiftBlockExpert(ScriptedExpert):
+    """Expert of lift_block."""
+
+    def script(self, arm: str) -> Script:
+        return self._lift() if arm == "right" else iter(())
+
+    def _lift(self) -> Script:
+        assert isinstance(self.sim.task, LiftBlock)
+        block = self.sim.task.block
+        goal = self.grasp(block, "top", lift_m=0.004)
+        yield from self.move("right", self.near(goal @ transform((0, 0, -0.06))))
+        yield from self.move("right", goal, speed_mps=0.1, settle=True)
+        yield from self.close("right", block.grasps["top"].width_m)
+        yield from self.rise("right", 0.06)

@@ -1,0 +1,89 @@
+"""A task of an outside package, found by its entry point, goes through every command that a shipped task goes through."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+
+from taccorl.cli.main import main
+from taccorl.data.dataset import Dataset
+from taccorl.demos.experts import tasks_with_expert
+from taccorl.plugins import ENTRY_POINT_GROUP
+from taccorl.sim.env import env_id, register_envs
+from taccorl.sim.task import tasks
+
+OUTSIDE, ROOT = Path(__file__).with_name("outside"), Path(__file__).resolve().parents[2]
+
+
+def install(site: Path) -> Path:
+    """The package as pip leaves it: its folder, and a ``dist-info`` with the entry point of its pyproject.toml."""
+    project = tomllib.loads((OUTSIDE / "pyproject.toml").read_text())["project"]
+    shutil.copytree(OUTSIDE / project["name"], site / project["name"])
+    info = site / f"{project['name']}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    points = project["entry-points"][ENTRY_POINT_GROUP]
+    lines = [f"{name} = {value}" for name, value in points.items()]
+    (info / "entry_points.txt").write_text("\n".join([f"[{ENTRY_POINT_GROUP}]", *lines, ""]))
+    return site
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The package installed in this process; its task is forgotten afterwards."""
+    site = install(tmp_path_factory.mktemp("site"))
+    assert "lift_block" not in tasks
+    before = dict(tasks._entries)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(site))
+        patch.setattr(tasks, "_loaded", False)
+        yield
+        tasks._entries = before
+    for name in [name for name in sys.modules if name.partition(".")[0] == "lift_block"]:
+        del sys.modules[name]
+    gymnasium.registry.pop(env_id("lift_block"), None)
+
+
+def taccorl(*words: Any) -> None:
+    assert main([str(word) for word in words]) == 0
+
+
+def test_it_is_collected_augmented_executed_and_evaluated(installed, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    task, rest = "--task=lift_block", ("--store=store",)
+    taccorl("collect", task, "--episodes=1", "--images=false", "--out=sources", *rest)
+    taccorl("augment", task, "--source=sources", "--episodes=1", "--rows=actions", "--out=actions", *rest)
+    taccorl("execute", "--source=actions", "--pictures=none", "--out=many", *rest)
+    made = Dataset(tmp_path / "many")
+    assert [e.instruction for e in (made.episode(0),)] == ["lift the yellow block"]
+    taccorl("evaluate", task, "--policy.type=expert", "--images=false", "--episodes=2", "--failures=0", "--out=scored")
+    assert "expert, lift_block: 2 of 2 episodes succeeded" in capsys.readouterr().out
+
+
+def test_it_is_in_the_lists_that_are_made_by_registration(installed, capsys):
+    assert "lift_block" in tasks_with_expert()
+    register_envs()
+    assert gymnasium.spec(env_id("lift_block")).max_episode_steps == 300
+    with pytest.raises(SystemExit):
+        main(["collect", "--help"])
+    assert "lift_block" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_tests_of_every_task_find_it_and_pass(tmp_path):
+    words = ["tests/tasks/test_every_task.py", "-q", "-k", "lift_block", "-p", "no:cacheprovider"]
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", *words],
+        env={**os.environ, "PYTHONPATH": f"{install(tmp_path / 'site')}:{ROOT}"},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stdout  # 5: no test selected
