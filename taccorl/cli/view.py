@@ -7,9 +7,13 @@ which is executed again. Opens a window; where there is no screen:
     --save=x.rrd          a file for the Rerun program anywhere
     --screenshot=x.png    the view as a picture, where touch is strongest
     --sheet=x.png         a contact sheet: pictures and pads at a few instants, touch and grippers over time
+
+``taccorl view A --against=B [--against_episode=0] [--align=contact]``: two episodes in one view, on one time line. B is what A
+may be, or a twin.yaml: that twin executes the actions of A on an empty bench, without pictures and touch.
 """
 
 import contextlib
+import dataclasses
 import shlex
 import signal
 import sys
@@ -18,14 +22,20 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import given_names, parse
 from taccorl.data.file_kinds import no_dataset
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
     from taccorl.data.episode import Episode
+    from taccorl.views.pair import Align, Pair
+
+    Shown = Episode | Pair
+
+
+ALIGNMENTS = ("start", "contact")
 
 
 @dataclass(kw_only=True)
@@ -38,8 +48,17 @@ class ViewConfig:
     """Number of the episode, counted from 0."""
     spec: str | None = None
     """Recording spec; needed for recordings."""
+    against: Path | None = None
+    """Show this episode (B) beside the one of `path` (A): a dataset, a recording, an attempt, or a twin.yaml, whose twin
+    executes the actions of A."""
+    against_episode: int = 0
+    """Number of the episode in `against`, counted from 0."""
+    against_spec: str | None = None
+    """Recording spec of `against`; `spec` if not given."""
+    align: str = "start"
+    """With `against`: 0 s is the first row of each (start), or the first contact of each (contact)."""
     start_s: float | None = None
-    """Show rows from here on (seconds since the episode's first row)."""
+    """Show rows from here on (seconds since the episode's first row; with `against`, of each)."""
     end_s: float | None = None
     """Show rows before this time."""
     save: Path | None = None
@@ -56,17 +75,66 @@ def main(argv: list[str]) -> int:
     """Run ``taccorl view``; returns the exit status 0."""
     config = parse(ViewConfig, argv, positional="path")
     _check_outputs(config)
-    with _opened(config) as whole:
+    _check_against(config, given_names(argv))
+    with contextlib.ExitStack() as stack:
         from taccorl.views.part import part_of
 
-        episode = part_of(whole, config.start_s, config.end_s)
+        whole = stack.enter_context(_opened(config.path, config.episode, config.spec, "--spec"))
+        shown = episode = part_of(whole, config.start_s, config.end_s)
         _note_codecs(config, episode)
-        wrote = _write(config, episode)
+        if config.against is not None:
+            from taccorl.views.pair import Pair
+
+            other = stack.enter_context(_other(config, config.against, whole))
+            other = part_of(other, config.start_s, config.end_s)
+            _note_codecs(config, other)
+            shown = Pair(episode, other, cast("Align", config.align))
+        wrote = _write(config, shown)
         if config.serve:
-            _serve(episode)
+            _serve(shown)
         elif not wrote:
-            _open_window(episode)
+            _open_window(shown)
     return 0
+
+
+def _check_against(config: ViewConfig, given: set[str]) -> None:
+    if config.align not in ALIGNMENTS:
+        raise TaccorlError(f"--align={config.align}: {nearest(config.align, ALIGNMENTS)}")
+    useless = sorted({"against_episode", "against_spec", "align"} & given) if config.against is None else []
+    if useless:
+        raise TaccorlError(f"--{useless[0]} has no effect without --against=: leave it out, or name the other episode")
+    if config.against is not None and config.sheet is not None:
+        raise TaccorlError("--sheet shows one episode: with --against=, take --screenshot=, or leave --against= out")
+
+
+@contextlib.contextmanager
+def _other(config: ViewConfig, path: Path, episode: "Episode") -> Iterator["Episode"]:
+    """Episode B."""
+    if path.suffix in (".yaml", ".yml") and path.is_file():
+        yield _replayed(path, episode)
+        return
+    is_dataset = (path / "meta" / "info.json").is_file()
+    spec = config.against_spec if is_dataset else config.against_spec or config.spec
+    with _opened(path, config.against_episode, spec, "--against_spec") as other:
+        yield other
+
+
+def _replayed(twin: Path, episode: "Episode") -> "Episode":
+    """The actions of ``episode`` in that twin. What it touches is not in its scene, so touch is left out."""
+    from taccorl.sim.replay import replay_episode
+    from taccorl.sim.simulation import Simulation
+    from taccorl.sim.bench import Bench
+    from taccorl.sim.twin_file import load_twin
+
+    sim = Simulation(Bench(), load_twin(twin))
+    sim.reset([0])
+    done = replay_episode(sim, episode)
+    if sim.diverged[0]:
+        raise TaccorlError(f"--against={twin}: the twin diverged; look at its gains and effects")
+    arrays = {key: values for key, values in done.arrays.items() if key not in done.spec.sensors}
+    facts = {"twin": str(twin), "scene": "empty bench: no parts, no pictures, no touch"}
+    name = f"{episode.name}, replayed in {twin}"
+    return dataclasses.replace(done, name=name, arrays=arrays, success=None, stages=(), baselines={}, provenance=facts)
 
 
 def _check_outputs(config: ViewConfig) -> None:
@@ -85,31 +153,31 @@ def _check_outputs(config: ViewConfig) -> None:
 
 
 @contextlib.contextmanager
-def _opened(config: ViewConfig) -> Iterator["Episode"]:
-    if (config.path / "meta" / "info.json").is_file() and config.spec is None:
+def _opened(path: Path, number: int, spec: str | None, option: str) -> Iterator["Episode"]:
+    if (path / "meta" / "info.json").is_file() and spec is None:
         from taccorl.data.dataset import Dataset
 
-        dataset = Dataset(config.path)
+        dataset = Dataset(path)
         for key, why in dataset.skipped.items():
             print(f"not shown: {key}: {why}")
-        yield dataset.episode(config.episode)
+        yield dataset.episode(number)
         return
-    if not config.path.exists():
-        raise TaccorlError(f"{config.path}: no such file or folder")
-    if config.spec is None and (config.path / "entry.json").is_file():
+    if not path.exists():
+        raise TaccorlError(f"{path}: no such file or folder")
+    if spec is None and (path / "entry.json").is_file():
         from taccorl.demos.mimicgen.augment import attempt_episode, is_attempt
 
-        if is_attempt(config.path):
-            yield attempt_episode(config.path)
+        if is_attempt(path):
+            yield attempt_episode(path)
             return
-    if config.spec is None:
-        raise TaccorlError(no_dataset(config.path))
+    if spec is None:
+        raise TaccorlError(no_dataset(path).replace("--spec=", f"{option}="))
     from taccorl.data.cutting import open_episodes
 
-    with open_episodes(config.path, config.spec) as episodes:
-        if not 0 <= config.episode < len(episodes):
-            raise TaccorlError(f"{config.path}: no episode {config.episode}; it has {len(episodes)}, counted from 0")
-        yield episodes[config.episode]
+    with open_episodes(path, spec) as episodes:
+        if not 0 <= number < len(episodes):
+            raise TaccorlError(f"{path}: no episode {number}; it has {len(episodes)}, counted from 0")
+        yield episodes[number]
 
 
 def _note_codecs(config: ViewConfig, episode: "Episode") -> None:
@@ -123,34 +191,36 @@ def _note_codecs(config: ViewConfig, episode: "Episode") -> None:
         )
 
 
-def _write(config: ViewConfig, episode: "Episode") -> bool:
+def _write(config: ViewConfig, shown: "Shown") -> bool:
     """Was a file asked for?"""
     if config.save is not None:
-        from taccorl.views.episode import save_episode
+        from taccorl.views.pair_view import save_shown
 
-        save_episode(episode, config.save, native=True)
+        save_shown(shown, config.save, native=True)
         command = shlex.join([str(Path(sys.executable).with_name("rerun")), str(config.save)])
         print(f"wrote {config.save}: look at it with {command}")
     if config.sheet is not None:
+        from taccorl.data.episode import Episode
         from taccorl.views.contact_sheet import contact_sheet
 
-        contact_sheet(episode, config.sheet)
+        assert isinstance(shown, Episode)  # checked by _check_against
+        contact_sheet(shown, config.sheet)
         print(f"wrote {config.sheet}")
     if config.screenshot is not None:  # last: it alone needs what a machine may lack
         from taccorl.views.screenshot import screenshot
 
-        who = screenshot(episode, config.screenshot, progress=lambda text: print(text, file=sys.stderr, flush=True))
+        who = screenshot(shown, config.screenshot, progress=lambda text: print(text, file=sys.stderr, flush=True))
         print(f"wrote {config.screenshot}, drawn by {who}")
     return any(path is not None for path in (config.save, config.screenshot, config.sheet))
 
 
-def _serve(episode: "Episode") -> None:
-    from taccorl.views.episode import save_episode
+def _serve(shown: "Shown") -> None:
+    from taccorl.views.pair_view import save_shown
     from taccorl.views.viewer import served
 
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd = Path(folder) / "episode.rrd"
-        save_episode(episode, rrd)
+        save_shown(shown, rrd)
         asked_to_end = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):  # by hand, so that the server never outlives us
             signal.signal(number, lambda *_: asked_to_end.set())
@@ -160,12 +230,12 @@ def _serve(episode: "Episode") -> None:
                 pass
 
 
-def _open_window(episode: "Episode") -> None:
-    from taccorl.views.episode import save_episode
+def _open_window(shown: "Shown") -> None:
+    from taccorl.views.pair_view import save_shown
     from taccorl.views.viewer import open_window, require_screen
 
     require_screen()
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd = Path(folder) / "episode.rrd"
-        save_episode(episode, rrd, native=True)
+        save_shown(shown, rrd, native=True)
         open_window(rrd)

@@ -12,6 +12,7 @@ from taccorl.views.figure import BASE_POS_WORLD, arms_of, floor_z_m, tool_paths
 from taccorl.views.groups import groups_of, short_name, vector_keys
 from taccorl.views.touch import Pad, pads_of
 
+FIGURE_NAME = "arms (schematic): joints in the plots' colours"
 PAD_GAP_TAXELS = 3.0
 MOST_IN_A_ROW, MOST_ROWS = 3, 6
 EYE_SIZES, EYE_M = 1.1, 1.15
@@ -28,14 +29,15 @@ def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blu
     parts = [part for part in (_space(episode, pads), _over_time(episode, pads)) if part is not None]
     return rrb.Blueprint(
         rrb.Horizontal(*parts),
-        _time_panel(at_s),
+        time_panel(at_s),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
     )
 
 
-def _time_panel(at_s: float | None) -> rrb.TimePanel:
+def time_panel(at_s: float | None) -> rrb.TimePanel:
+    """Play from the start, or stand still at ``at_s``."""
     if at_s is None:
         return rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="all")
     # A blueprint cannot set the cursor. A loop one nanosecond long, reached in the first frame, holds it there.
@@ -57,7 +59,7 @@ def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:
     shares = [0.7]
     if arms_of(episode):
         beside = rrb.Horizontal if episode.picture_keys or pads else rrb.Vertical
-        rows[0], shares[0] = beside(_figure(episode), page), 1.4 if pads else 1.0
+        rows[0], shares[0] = beside(figure_view(episode, "/", FIGURE_NAME), page), 1.4 if pads else 1.0
     if episode.picture_keys:
         names = [short_name(key) for key in episode.picture_keys]
         rows.append(rrb.Horizontal(*[rrb.Spatial2DView(origin=f"/observation/images/{n}", name=n) for n in names]))
@@ -68,14 +70,18 @@ def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:
     return rrb.Vertical(*rows, row_shares=shares)
 
 
-def _figure(episode: Episode) -> rrb.Spatial3DView:
-    """Seen from the front right, near enough that arms and tool paths fill the view."""
+def figure_view(episode: Episode, root: str, name: str, away: float = 1.0) -> rrb.Spatial3DView:
+    """The arms below entity ``root``, seen from the front right, near enough that arms and tool paths fill the view.
+
+    Args:
+        away: factor of the eye's distance; a narrow view needs more.
+    """
     points = np.concatenate([*tool_paths(episode).values(), list(BASE_POS_WORLD.values())])
     low, high = points.min(axis=0), points.max(axis=0) + np.array([0, 0, 0.3])  # elbows rise above the bases
     middle, size_m = (low + high) / 2, float(np.linalg.norm(high - low))
     return rrb.Spatial3DView(
-        origin="/figure",
-        name="arms (schematic): joints in the plots' colours",
+        origin=f"{root}figure",
+        name=name,
         background=GROUND_COLOR,
         line_grid=rrb.LineGrid3D(
             visible=True,
@@ -84,7 +90,7 @@ def _figure(episode: Episode) -> rrb.Spatial3DView:
             color=(71, 85, 105, 120),
         ),
         eye_controls=rrb.EyeControls3D(
-            position=middle + max(EYE_SIZES * size_m, EYE_M) * np.array([0.85, -0.22, 0.45]),
+            position=middle + away * max(EYE_SIZES * size_m, EYE_M) * np.array([0.85, -0.22, 0.45]),
             look_target=middle,
             eye_up=(0, 0, 1),
         ),
@@ -126,7 +132,7 @@ def _over_time(episode: Episode, pads: list[Pad]) -> rrb.Container | None:
             ("peak", 1.25, "touch peak [counts above baseline]"),  # two more lines in its legend
             ("active", 0.85, f"active taxels, above the noise floor [of {pads[0].counts[0].size} a pad]"),
         ):
-            views.append(_plot(title, [f"/touch/{path}/**"], rrb.Corner2D.LeftTop))
+            views.append(plot(title, [f"/touch/{path}/**"], rrb.Corner2D.LeftTop))
             shares.append(share)
     plots = _joint_plots(episode)
     in_a_row = MOST_IN_A_ROW if pads or len(plots) > MOST_ROWS else 1
@@ -152,11 +158,12 @@ def _joint_plots(episode: Episode) -> list[rrb.TimeSeriesView]:
         suffix = ": action thin" if len(paths) == 2 else ""
         # The figure's joints wear the lines' colours: no legend in the way.
         corner = None if set(groups[title].name.split()) & on_the_figure else rrb.Corner2D.LeftBottom
-        plots.append(_plot(title + suffix, paths, corner))
+        plots.append(plot(title + suffix, paths, corner))
     return plots
 
 
-def _plot(title: str, contents: list[str], legend: rrb.Corner2D | None) -> rrb.TimeSeriesView:
+def plot(title: str, contents: list[str], legend: rrb.Corner2D | None) -> rrb.TimeSeriesView:
+    """Curves over the time that all views share; without a legend if it has no corner."""
     return rrb.TimeSeriesView(
         origin="/",
         contents=contents,

@@ -18,6 +18,8 @@ LINE_COLORS = (
 )
 PAD_COLORS = ((86, 180, 233), (0, 190, 140), (230, 159, 0), (214, 140, 190))
 ARM_COLORS = {"left": (96, 165, 250), "right": (251, 146, 60)}
+PAIR_COLORS = ((235, 235, 235), (240, 90, 190))
+"""Of two episodes side by side: white and magenta, because blue and orange are the arms."""
 NOISE_COLOR = (148, 163, 184)
 CONTACT_COLOR = (220, 38, 38)
 GROUND_COLOR = (15, 23, 42)

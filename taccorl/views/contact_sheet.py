@@ -65,7 +65,7 @@ class Layout:
 def contact_sheet(episode: Episode, path: Path) -> Layout:
     """Draw the episode to a PNG at ``path``."""
     image, layout = draw_sheet(episode)
-    save_png(image, path, episode)
+    save_png(image, path, episode.name, episode.origin)
     return layout
 
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from taccorl.data.episode import Episode
 from taccorl.robots import ROBOT
 from taccorl.views.colors import ARM_COLORS, LINE_COLORS, heat
+from taccorl.views.rrd import EpisodeLog
 from taccorl.views.touch import Pad
 
 # Schematic from here on.
@@ -85,29 +86,26 @@ def floor_z_m(episode: Episode) -> float:
     return min(0.0, float(lowest) - ROBOT.pad.length_m / 2 - 0.01)
 
 
-def log_figure(rec: rr.RecordingStream, episode: Episode, pads: list[Pad], indexes: list[rr.TimeColumn]) -> None:
+def log_figure(log: EpisodeLog, pads: list[Pad]) -> None:
     """The arms under ``/figure``; a pad's colour is its sum on the pad's fixed scale."""
-    rec.log("figure", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    log.static("figure", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     by_name = {pad.name: pad for pad in pads}
-    for side, joints in arms_of(episode).items():
+    for side, joints in arms_of(log.episode).items():
         root = f"figure/{side}"
         poses = link_poses(joints[:, :-1])
-        _log_still_parts(rec, root, side, floor_z_m(episode))
+        _log_still_parts(log, root, side, floor_z_m(log.episode))
         for i in range(1, len(ROBOT.links) + 1):
-            _send_poses(rec, f"{root}/link_{i}", poses[:, i], indexes)
+            _send_poses(log, f"{root}/link_{i}", poses[:, i])
         faces = pad_poses(poses[:, -1], joints[:, -1])
         for finger, name in enumerate(ROBOT.fingers):
-            _send_poses(rec, f"{root}/finger_{name}", faces[:, finger], indexes)
+            _send_poses(log, f"{root}/finger_{name}", faces[:, finger])
             pad = by_name.get(f"{side}_{name}")
             if pad is None:
-                rec.log(f"{root}/finger_{name}/pad", rr.Boxes3D.from_fields(colors=[PLATE_COLOR]), static=True)
+                log.static(f"{root}/finger_{name}/pad", rr.Boxes3D.from_fields(colors=[PLATE_COLOR]))
             else:  # never static as well: what is static hides what changes
-                columns = rr.Boxes3D.columns(colors=pad_colors(pad))
-                rr.send_columns(f"{root}/finger_{name}/pad", indexes, columns, recording=rec)
-        path = tool_paths(episode)[side] - BASE_POS_WORLD[side]
-        rec.log(
-            f"{root}/tool_path", rr.LineStrips3D([path], colors=[(*ARM_COLORS[side], 120)], radii=0.0015), static=True
-        )
+                log.send(f"{root}/finger_{name}/pad", rr.Boxes3D.columns(colors=pad_colors(pad)))
+        path = tool_paths(log.episode)[side] - BASE_POS_WORLD[side]
+        log.static(f"{root}/tool_path", rr.LineStrips3D([path], colors=[(*ARM_COLORS[side], 120)], radii=0.0015))
 
 
 def pad_colors(pad: Pad) -> np.ndarray:
@@ -116,20 +114,20 @@ def pad_colors(pad: Pad) -> np.ndarray:
     return (rgb[:, 0] << 24) | (rgb[:, 1] << 16) | (rgb[:, 2] << 8) | 255
 
 
-def _send_poses(rec: rr.RecordingStream, path: str, poses: np.ndarray, indexes: list[rr.TimeColumn]) -> None:
+def _send_poses(log: EpisodeLog, path: str, poses: np.ndarray) -> None:
     quat_xyzw = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quat_xyzw)
-    rr.send_columns(path, indexes, columns, recording=rec)
+    log.send(path, columns)
 
 
-def _log_still_parts(rec: rr.RecordingStream, root: str, side: str, floor_z: float) -> None:
+def _log_still_parts(log: EpisodeLog, root: str, side: str, floor_z: float) -> None:
     """Everything that does not change its shape, each in the frame of the link that carries it."""
-    rec.log(root, rr.Transform3D(translation=BASE_POS_WORLD[side]), static=True)
+    log.static(root, rr.Transform3D(translation=BASE_POS_WORLD[side]))
     height, top = 0.03 - floor_z, 0.03
     stand = rr.Cylinders3D(
         lengths=[height], radii=[0.07], centers=[(0, 0, top - height / 2)], colors=[PLATE_COLOR], fill_mode="solid"
     )
-    rec.log(f"{root}/stand", stand, static=True)
+    log.static(f"{root}/stand", stand)
     label = rr.Points3D(
         [(0, 0.12 * np.sign(BASE_POS_WORLD[side][1]), floor_z)],
         labels=[f"{side} arm"],
@@ -137,22 +135,22 @@ def _log_still_parts(rec: rr.RecordingStream, root: str, side: str, floor_z: flo
         colors=[ARM_COLORS[side]],
         show_labels=True,
     )
-    rec.log(f"{root}/label", label, static=True)
+    log.static(f"{root}/label", label)
     ends = [link.pos_parent_m for link in ROBOT.links] + [(0.0, 0.0, 0.1)]
     for i, (radius, end) in enumerate(zip(BONE_RADIUS_M, ends, strict=True)):
         link = f"{root}/link_{i}" if i else root
         if radius:
-            rec.log(f"{link}/bone", _capsule(np.array(end), radius, ARM_COLORS[side]), static=True)
+            log.static(f"{link}/bone", _capsule(np.array(end), radius, ARM_COLORS[side]))
         if i:
             radius, length, z = JOINT_DRUMS_M[i - 1]
             drum = rr.Cylinders3D(
                 lengths=[length], radii=[radius], centers=[(0, 0, z)], colors=[LINE_COLORS[i - 1]], fill_mode="solid"
             )
-            rec.log(f"{link}/joint", drum, static=True)
+            log.static(f"{link}/joint", drum)
     rail = rr.Boxes3D(
         half_sizes=[(0.018, 0.055, 0.016)], centers=[(0, 0, 0.116)], colors=[FINGER_COLOR], fill_mode="solid"
     )
-    rec.log(f"{root}/link_6/rail", rail, static=True)
+    log.static(f"{root}/link_6/rail", rail)
     for name, sign in zip(ROBOT.fingers, (1.0, -1.0), strict=True):
         behind = sign * (PAD_THICKNESS_M + FINGER_THICKNESS_M / 2)
         for part, thickness, y, color in (
@@ -161,7 +159,7 @@ def _log_still_parts(rec: rr.RecordingStream, root: str, side: str, floor_z: flo
         ):
             half = (ROBOT.pad.width_m / 2, thickness / 2, ROBOT.pad.length_m / 2)
             box = rr.Boxes3D(half_sizes=[half], centers=[(0, y, 0)], colors=color, fill_mode="solid")
-            rec.log(f"{root}/finger_{name}/{part}", box, static=True)
+            log.static(f"{root}/finger_{name}/{part}", box)
 
 
 def _capsule(end: np.ndarray, radius_m: float, color: tuple[int, int, int]) -> rr.Capsules3D:

@@ -44,11 +44,20 @@ def vector_keys(episode: Episode) -> list[str]:
     return sorted(shown, key=("observation.state", "action", *shown).index)
 
 
+def units_of(feature: FeatureSpec) -> tuple[str, ...]:
+    """Unit of every element."""
+    return (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
+
+
+def element_names(feature: FeatureSpec) -> tuple[str, ...]:
+    """Name of every element, without ``.pos``; its number where the feature states no names."""
+    names = feature.names or tuple(str(i) for i in range(feature.size))
+    return tuple(re.sub(r"\.(pos|position)$", "", name) for name in names)
+
+
 def groups_of(feature: FeatureSpec) -> list[Group]:
     """Every element of ``feature``, once, in plots of one unit."""
-    units = (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
-    names = feature.names or tuple(str(i) for i in range(feature.size))
-    names = tuple(re.sub(r"\.(pos|position)$", "", name) for name in names)
+    units, names = units_of(feature), element_names(feature)
     groups = []
     for unit in dict.fromkeys(units):
         columns = [i for i, u in enumerate(units) if u == unit]

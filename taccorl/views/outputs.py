@@ -10,7 +10,6 @@ from pathlib import Path
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
 
 SOFTWARE = "taccorl view"
@@ -73,12 +72,12 @@ def replacing(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def save_png(image: Image.Image, path: Path, episode: Episode) -> None:
-    """PNG with the episode's name and origin written inside."""
+def save_png(image: Image.Image, path: Path, name: str, origin: str) -> None:
+    """PNG with the name and the origin of what it shows written inside."""
     check_free(path)
     note = PngInfo()
     note.add_text("Software", SOFTWARE)
-    note.add_itxt("Title", episode.name)
-    note.add_itxt("Source", episode.origin)
+    note.add_itxt("Title", name)
+    note.add_itxt("Source", origin)
     with replacing(path) as part:
         image.save(part, "PNG", pnginfo=note)

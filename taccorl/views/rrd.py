@@ -1,13 +1,45 @@
 """Write .rrd files with errors raised: Rerun's own writer continues when the disk is full, and only logs it."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from taccorl.data.episode import Episode
 from taccorl.views.outputs import APPLICATION
+
+
+@dataclass(frozen=True)
+class EpisodeLog:
+    """Writes the rows of one episode into a recording of Rerun.
+
+    Time lines: ``time`` [s] and, where the recording holds no other episode, ``frame_index``.
+    """
+
+    rec: rr.RecordingStream
+    episode: Episode
+    root: str = ""
+    """Entity above all those of the episode, such as ``a/``; empty if the recording holds no other episode."""
+    begins_s: float = 0.0
+    """Time of row 0 on the time line."""
+
+    def static(self, path: str, data: rr.AsComponents) -> None:
+        """Log what does not change."""
+        self.rec.log(f"{self.root}{path}", data, static=True)
+
+    def send(self, path: str, columns: rr.ComponentColumnList, rows: Sequence[int] | None = None) -> None:
+        """Log what changes, for all rows or some."""
+        index = np.asarray(range(self.episode.num_rows) if rows is None else rows, dtype=np.int64)
+        # Rerun itself would round down.
+        time_ns = np.round(1e9 * (self.begins_s + self.episode.time_s[index])).astype("timedelta64[ns]")
+        indexes = [rr.TimeColumn("time", duration=time_ns)]
+        if not self.root:
+            indexes.append(rr.TimeColumn("frame_index", sequence=index))
+        rr.send_columns(f"{self.root}{path}", indexes, columns, recording=self.rec)
 
 
 @contextlib.contextmanager

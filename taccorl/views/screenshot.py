@@ -13,8 +13,9 @@ import numpy as np
 from PIL import Image
 
 from taccorl.data.episode import Episode
-from taccorl.views.episode import save_episode
 from taccorl.views.outputs import save_png
+from taccorl.views.pair import Pair
+from taccorl.views.pair_view import save_shown
 from taccorl.views.touch import pads_of, peak_row
 from taccorl.views.viewer import PICTURE_TIMEOUT_S, ViewerError, picture_without_window, served
 
@@ -41,9 +42,9 @@ BLANK_LEVELS = 15.0
 
 
 def screenshot(
-    episode: Episode, png: Path, *, at_s: float | None = None, progress: Callable[[str], None] = lambda text: None
+    shown: Episode | Pair, png: Path, *, at_s: float | None = None, progress: Callable[[str], None] = lambda text: None
 ) -> str:
-    """The episode's Rerun view as a PNG, at ``at_s`` or where touch is strongest. Returns who drew it.
+    """The Rerun view of an episode or a pair as a PNG, at ``at_s`` or where touch is strongest. Returns who drew it.
 
     Args:
         progress: called with what is done next and how long it may take.
@@ -52,11 +53,11 @@ def screenshot(
         ViewerError: neither the Rerun program nor a browser can draw here.
         OutputError: ``png`` is somebody else's file.
     """
-    at_s = best_time_s(episode) if at_s is None else at_s
+    at_s = best_time_s(shown) if at_s is None else at_s
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd, drawn = Path(folder) / "episode.rrd", Path(folder) / "drawn.png"
-        progress(f"writing {episode.num_rows} rows for the viewer")
-        save_episode(episode, rrd, at_s=at_s, native=True)
+        progress(f"writing {shown.num_rows} rows for the viewer")
+        save_shown(shown, rrd, at_s=at_s, native=True)
         progress(f"drawing with the Rerun program, at most {PICTURE_TIMEOUT_S:.0f} s")
         who, why_not = "the Rerun program", picture_without_window(rrd, drawn, WIDTH_PX, HEIGHT_PX)
         if why_not is not None:
@@ -68,13 +69,15 @@ def screenshot(
                     f"apt-get install mesa-vulkan-drivers libvulkan1   or   apt-get install chromium && pip install playwright"
                 )
         with Image.open(drawn) as image:
-            save_png(image.convert("RGB"), png, episode)
+            save_png(image.convert("RGB"), png, shown.name, shown.origin)
     return who
 
 
-def best_time_s(episode: Episode) -> float:
+def best_time_s(shown: Episode | Pair) -> float:
     """Time at which touch is strongest; the middle of an episode without touch."""
-    pads = pads_of(episode)
+    if isinstance(shown, Pair):
+        return shown.best_time_s
+    episode, pads = shown, pads_of(shown)
     row = peak_row(pads) if pads else episode.num_rows // 2
     return float(episode.time_s[row])
 

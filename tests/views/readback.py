@@ -34,12 +34,13 @@ def read_rrd(path: Path) -> dict[str, dict[str, Column]]:
                 static.add(key)
                 rows[key] += [(-1, np.nan, v) for v in values]
                 continue
-            frames = batch.column("frame_index").to_pylist()
+            has_frames = "frame_index" in batch.schema.names  # not where two episodes share the time line
+            frames = batch.column("frame_index").to_pylist() if has_frames else [0] * len(values)
             times_s = batch.column("time").cast("int64").to_numpy() / 1e9
             rows[key] += zip(frames, times_s, values, strict=True)
     found: dict[str, dict[str, Column]] = defaultdict(dict)
     for (path_, name), entries in rows.items():
-        entries.sort(key=lambda e: e[0])
+        entries.sort(key=lambda e: e[:2])
         is_static = (path_, name) in static
         found[path_][name] = Column(
             values=[v for _, _, v in entries],

@@ -22,6 +22,16 @@ def view_regions(blueprint: rrb.Blueprint) -> dict[str, Box]:
             found[str(part.name)] = (left, top + TITLE, right, bottom)  # type: ignore[attr-defined]
             return
         contents = list(part.contents)
+        if isinstance(part, rrb.Tabs):  # the first is shown, below the bar of tabs, which is a view's title
+            walk(contents[0], (left, top + TITLE * isinstance(contents[0], rrb.Container), right, bottom))
+            return
+        if isinstance(part, rrb.Grid):
+            columns = int(part.grid_columns or len(contents))
+            width, height = (right - left) / columns, (bottom - top) / -(-len(contents) // columns)
+            for k, child in enumerate(contents):
+                x, y = left + k % columns * width, top + k // columns * height
+                walk(child, (x, y, x + width, y + height))
+            return
         horizontal = isinstance(part, rrb.Horizontal)
         shares = np.array((part.column_shares if horizontal else part.row_shares) or [1] * len(contents), dtype=float)
         edges = np.concatenate([[0.0], np.cumsum(shares / shares.sum())])

@@ -61,6 +61,38 @@ def test_recording_is_shown_without_a_dataset(recording: Path, dataset: Path, tm
     assert np.array_equal(grippers, episode.arrays["observation.state"][:, [6, 13]])
 
 
+def test_recording_beside_an_episode_of_a_dataset(recording: Path, dataset: Path, tmp_path: Path):
+    out = tmp_path / "pair.rrd"
+    words = [str(recording), SPEC, f"--against={dataset}", "--against_episode=1", "--align=contact", f"--save={out}"]
+    assert main(["view", *words]) == 0
+    found = read_rrd(out)
+    for root, episode in (("a", Dataset(dataset).episode(0)), ("b", Dataset(dataset).episode(1))):
+        column = found[f"/{root}/curves/observation/state/left_gripper_m"]["Scalars:scalars"]
+        values = np.array(column.values, dtype=np.float32)[:, 0]
+        assert np.array_equal(values, episode.arrays["observation.state"][:, 6])
+    page = found["/pair"]["TextDocument:text"].values[0][0]
+    assert page.count("surrogate stand-in, not a robot") == 2
+    assert str(recording) in page and "dataset episode 1" in page
+
+
+def test_recorded_actions_in_the_twin_begin_where_they_were_recorded(dataset: Path, tmp_path: Path):
+    """The arms of the stand-in rest at first, as do the twin's; later they move apart, because no physics made the stand-in."""
+    out, twin = tmp_path / "pair.rrd", tmp_path / "twin.yaml"
+    twin.write_text("effects: []\n")
+    assert main(["view", str(dataset), f"--against={twin}", f"--save={out}"]) == 0
+    found = read_rrd(out)
+    a, b = (
+        np.array(found[f"/{root}/curves/observation/state/left_joint_2_rad"]["Scalars:scalars"].values)[:, 0]
+        for root in "ab"
+    )
+    assert len(a) == len(b) == Dataset(dataset).num_rows(0)
+    assert np.abs(a - b)[:10].max() < 2e-3
+    assert 0.01 < np.abs(a - b).max() < 0.3
+    assert "/b/touch/sum/left_a" not in found, "an empty bench has nothing to touch"
+    page = found["/pair"]["TextDocument:text"].values[0][0]
+    assert f"replayed in {twin}" in page and "twin replay of: surrogate stand-in" in page
+
+
 def test_sheet_of_a_part_holds_that_part(dataset: Path, tmp_path: Path):
     out = tmp_path / "sheet.png"
     assert main(["view", str(dataset), f"--sheet={out}", "--start_s=1", "--end_s=2"]) == 0
@@ -82,6 +114,14 @@ def test_sheet_of_a_part_holds_that_part(dataset: Path, tmp_path: Path):
         (["{dataset}", "--save={tmp}/theirs.rrd"], "is there already and not from `taccorl view`"),
         (["{dataset}", "--start_s=60", "--save={tmp}/x.rrd"], "no rows from --start_s=60"),
         (["{dataset}"], "use --serve=true and a browser"),
+        (["{dataset}", "--align=contact", "--save={tmp}/x.rrd"], "--align has no effect without --against="),
+        (
+            ["{dataset}", "--against={dataset}", "--align=touch", "--save={tmp}/x.rrd"],
+            "--align=touch: known: contact, start",
+        ),
+        (["{dataset}", "--against={dataset}", "--sheet={tmp}/x.png"], "--sheet shows one episode"),
+        (["{dataset}", "--against={recording}", "--save={tmp}/x.rrd"], "for a recording give --against_spec="),
+        (["{dataset}", "--against={dataset}", "--against_episode=7", "--save={tmp}/x.rrd"], "no episode 7; it has 2"),
     ],
 )
 def test_what_cannot_be_done_says_why_and_what_to_do(

@@ -1,0 +1,179 @@
+"""Two episodes on one time line: what they share, what one of them lacks, and the page that says so."""
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from taccorl.data.episode import Episode
+from taccorl.data.finding import listed
+from taccorl.errors import TaccorlError
+from taccorl.views.groups import element_names, short_name, units_of, vector_keys
+from taccorl.views.provenance import NO_ORIGIN, outcome
+from taccorl.views.touch import CONTACT_THRESHOLD, Pad, contact_gate, pads_of
+
+Align = Literal["start", "contact"]
+NAMES = ("A", "B")
+COLOR_WORDS = ("white", "magenta")
+"""``colors.PAIR_COLORS`` in words."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One element of a feature, of all episodes that have it."""
+
+    element: str
+    unit: str
+    family: str
+    """``joints`` for state and action, whose curves share a plot; the feature's own name otherwise."""
+
+    @property
+    def title(self) -> str:
+        return f"{self.element} [{self.unit}]" if self.unit else self.element
+
+    @property
+    def name(self) -> str:
+        """The title, with the feature of a curve that is neither state nor action."""
+        return self.title if self.family == "joints" else f"{self.family} {self.title}"
+
+
+class Pair:
+    """Two episodes and the times at which they begin.
+
+    Args:
+        align: ``start``: row 0 of each at 0 s; ``contact``: the first contact of each at 0 s.
+
+    Raises:
+        TaccorlError: ``contact``, and one of them has no touch or no contact.
+    """
+
+    def __init__(self, a: Episode, b: Episode, align: Align = "start") -> None:
+        self.episodes = (a, b)
+        self.align = align
+        self.pads = (pads_of(a), pads_of(b))
+        self.begins_s = (0.0, 0.0) if align == "start" else tuple(-_required_contact_s(e) for e in self.episodes)
+        self.curves = tuple(list(dict.fromkeys(c for c, _, _ in elements_of(e))) for e in self.episodes)
+
+    @property
+    def name(self) -> str:
+        return " beside ".join(e.name for e in self.episodes)
+
+    @property
+    def origin(self) -> str:
+        return "; ".join(f"{name}: {e.origin or NO_ORIGIN}" for name, e in zip(NAMES, self.episodes, strict=True))
+
+    @property
+    def num_rows(self) -> int:
+        return sum(e.num_rows for e in self.episodes)
+
+    @property
+    def best_time_s(self) -> float:
+        """Time at which touch is strongest in A while B runs; the middle of that time without touch in A."""
+        rows = self.common_rows()[0] if len(self.common_rows()[0]) else np.arange(self.episodes[0].num_rows)
+        touch = sum(pad.sum_count[rows] for pad in self.pads[0])
+        row = rows[int(np.argmax(touch)) if np.any(touch) else len(rows) // 2]
+        return self.begins_s[0] + float(self.episodes[0].time_s[row])
+
+    def shared_pads(self) -> list[tuple[Pad, Pad]]:
+        """Pads of both with the same name, shape and gain, whose counts can be subtracted."""
+        others = {pad.name: pad for pad in self.pads[1]}
+        pairs = [(pad, others[pad.name]) for pad in self.pads[0] if pad.name in others]
+        return [(a, b) for a, b in pairs if _layout(a) == _layout(b)]
+
+    def common_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of A during which B runs, and for each the newest row of B at or before it."""
+        a, b = self.episodes
+        offset_s = self.begins_s[0] - self.begins_s[1]
+        rows_b = np.floor((a.time_s + offset_s) * b.spec.fps + 1e-6).astype(int)
+        common = np.flatnonzero((rows_b >= 0) & (rows_b < b.num_rows))
+        return common, rows_b[common]
+
+    @functools.cached_property
+    def full_difference(self) -> float:
+        """Counts at which the colour of a difference is full: the largest difference, but at least the contact threshold."""
+        rows_a, rows_b = self.common_rows()
+        found = [np.abs(b.counts[rows_b].astype(np.int32) - a.counts[rows_a]).max() for a, b in self.shared_pads()]
+        return float(max(*found, self.shared_pads()[0][0].gate_count))
+
+
+def elements_of(episode: Episode) -> Iterator[tuple[Curve, str, int]]:
+    """Every element of every feature that is shown as curves, with the feature's key and the element's number."""
+    for key in vector_keys(episode):
+        feature = episode.spec.features[key]
+        family = "joints" if key in ("observation.state", "action") else short_name(key)
+        for i, (name, unit) in enumerate(zip(element_names(feature), units_of(feature), strict=True)):
+            yield Curve(name if feature.names else f"element {name}", unit, family), key, i
+
+
+def cameras_of(episode: Episode) -> list[str]:
+    """Short names of its cameras."""
+    return [short_name(key) for key in episode.picture_keys]
+
+
+def page_of(pair: Pair) -> str:
+    """Which is which, where they are from, how they are aligned and what one of them lacks, in Markdown."""
+    lines = []
+    for name, color, e in zip(NAMES, COLOR_WORDS, pair.episodes, strict=True):
+        facts = f"outcome {outcome(e)}; {e.num_rows / e.spec.fps:.2f} s at {e.spec.fps} fps; {_contact_words(e)}"
+        lines += [f"**{name} ({color}): {e.name}**  \norigin: **{e.origin or NO_ORIGIN}**  \n{facts}", ""]
+    aligned = "first contact" if pair.align == "contact" else "first row"
+    facts = [f"0 s is the {aligned} of each; curves: state thick, action thin", *_lacks(pair)]
+    if pair.shared_pads() and len(pair.common_rows()[0]):
+        more = f"{COLOR_WORDS[1]} where B has more counts, {COLOR_WORDS[0]} where A has more"
+        facts.append(f"B − A: {more}; full colour at ± {pair.full_difference:.0f}")
+    instructions = list(dict.fromkeys(e.instruction for e in pair.episodes))
+    facts.append(f"instruction: *{'* and *'.join(instructions)}*")
+    return "\n".join([*lines, *(f"- {text}" for text in facts)])
+
+
+def _lacks(pair: Pair) -> list[str]:
+    """What only one of them has, and pads of both whose counts cannot be subtracted."""
+    found = []
+    for k, other in ((0, 1), (1, 0)):
+        for what, own, others in (
+            ("cameras", cameras_of(pair.episodes[k]), cameras_of(pair.episodes[other])),
+            ("pads", [p.name for p in pair.pads[k]], [p.name for p in pair.pads[other]]),
+            ("curves", [c.name for c in pair.curves[k]], [c.name for c in pair.curves[other]]),
+        ):
+            names = [name for name in own if name not in others]
+            if names:
+                found.append(f"only in {NAMES[k]}: {what} {listed(names)}")
+    subtracted = {pad.name for pad, _ in pair.shared_pads()}
+    others = {pad.name: pad for pad in pair.pads[1]}
+    for pad in pair.pads[0]:
+        if pad.name in others and pad.name not in subtracted:
+            kinds = [
+                f"{p.sensor.rows} × {p.sensor.columns}, {p.sensor.gain_per_count:.4g} a count"
+                for p in (pad, others[pad.name])
+            ]
+            found.append(f"no difference of {pad.name}: A has {kinds[0]}, B {kinds[1]}")
+    if not len(pair.common_rows()[0]):
+        found.append("no row of A and B is at the same time")
+    return found
+
+
+def _contact_words(episode: Episode) -> str:
+    pads = pads_of(episode)
+    gate = contact_gate(pads) if pads else np.zeros(1, dtype=bool)
+    if not gate.any():
+        return "no contact" if pads else "no touch"
+    return f"first contact at {episode.time_s[int(np.argmax(gate))]:.2f} s"
+
+
+def _required_contact_s(episode: Episode) -> float:
+    pads = pads_of(episode)
+    if not pads:
+        raise TaccorlError(f"--align=contact: {episode.name} has no touch: --align=start puts the first rows together")
+    gate = contact_gate(pads)
+    if not gate.any():
+        raise TaccorlError(
+            f"--align=contact: {episode.name}: no taxel beyond {CONTACT_THRESHOLD} ({pads[0].gate_count:.3g} counts) in "
+            f"{episode.num_rows} rows: --align=start puts the first rows together"
+        )
+    return float(episode.time_s[int(np.argmax(gate))])
+
+
+def _layout(pad: Pad) -> tuple[int, int, float]:
+    return pad.sensor.rows, pad.sensor.columns, pad.sensor.gain_per_count
