@@ -121,9 +121,9 @@ def _other(config: ViewConfig, path: Path, episode: "Episode") -> Iterator["Epis
 
 def _replayed(twin: Path, episode: "Episode") -> "Episode":
     """The actions of ``episode`` in that twin. What it touches is not in its scene, so touch is left out."""
+    from taccorl.sim.bench import Bench
     from taccorl.sim.replay import replay_episode
     from taccorl.sim.simulation import Simulation
-    from taccorl.sim.bench import Bench
     from taccorl.sim.twin_file import load_twin
 
     sim = Simulation(Bench(), load_twin(twin))
