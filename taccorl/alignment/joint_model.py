@@ -104,6 +104,7 @@ class JointModel:
         effects: Sequence[Effect] = (),
         lever: PayloadLever = AT_ITS_PLACE,
         age_s: float = 0.0,
+        facts: Mapping[str, float] | None = None,
     ) -> JointResponse:
         """Its answer to the recording's targets, from rest at ``motion.start``.
 
@@ -111,6 +112,7 @@ class JointModel:
             gains: those of a recording with ``kp_scale`` = 1.
             effects: besides the machine's; one of the same name takes the place of the machine's.
             age_s: of the measured position when the drive's torque acts, besides the joint's own.
+            facts: numbers of the drive in place of the joint's own.
             lever: left out where effects have no ``drive`` and MuJoCo runs.
 
         Raises:
@@ -119,15 +121,15 @@ class JointModel:
         sent, parts, hold, step_s = self._sent(motion)
         present = self.joint.effects(effects)
         kp, kd = gains.kp * motion.kp_scale, gains.kd * motion.kd_scale
-        early_s = 0.5 * step_s if self.joint.exact_timing else 0.0
         # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
-        scaled = Gains(kp, kd - kp * (self.joint.position_age_s + age_s + early_s), gains.torque_ff)
-        speed_late_s = self.joint.speed_delay_s + early_s
+        scaled = Gains(kp, kd - kp * (self.joint.position_age_s + age_s), gains.torque_ff)
+        speed_late_s = self.joint.speed_delay_s
         drives = [(effect.name, effect.drive()) for effect in present]
         timing = [("the drive", {"speed_delay": speed_late_s})] if speed_late_s > 0.0 else []
         of_effects = [(name, drive) for name, drive in drives if drive is not None]
-        facts = {k: v for k, v in self.joint.facts.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
-        numbers = _combined([*timing, ("the drive", facts), *of_effects])
+        known = {**self.joint.facts, **(facts or {})}
+        known = {k: v for k, v in known.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
+        numbers = _combined([*timing, ("the drive", known), *of_effects])
         if numbers is None or any(drive is None for _, drive in drives):
             return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]

@@ -8,6 +8,7 @@ Letters in shapes: T rows, J signals (of the robot: in the order of actions), N 
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
@@ -175,8 +176,8 @@ class Measurement:
         """(T,) external torque on a signal; 0 where none is known."""
         return self.load[:, self.column(signal)] if self.load.size else np.zeros(self.num_rows)
 
-    def only_axes_take(self, signal: str) -> str:
-        """What the recording has of a signal that only ``kind: axis`` can take, and what to do; empty if nothing."""
+    def twin_cannot_take(self, signal: str) -> str:
+        """What the recording has of a signal that the PiPER's twin cannot take, and what to do; empty if nothing."""
         j = self.column(signal)
         if self.known_load(signal).any():
             return "a known load; remove the column"
@@ -187,6 +188,30 @@ class Measurement:
             return f"a motor that is off at {self.time_s[row]:.3f} s; cut the recording there"
         stated = next((key for key in ("lever_m", "arm_kg") if signal in getattr(self, key)), "")
         return stated and f"{stated}; remove it from measurements.yaml"
+
+    def moved(self, signal: str) -> np.ndarray:
+        """(T,) positions by which it is judged whether a signal moves: commanded, or measured where targets are no positions."""
+        return (self.target if self.target_kind(signal) == "position" else self.measured)[:, self.column(signal)]
+
+    def only(self, signals: Sequence[str]) -> Self:
+        """With these signals alone."""
+        at = [self.column(signal) for signal in signals]
+        names = ("target", "measured", "velocity", "effort", *self.extra_columns)
+        return dataclasses.replace(
+            self,
+            **{name: getattr(self, name)[:, at] for name in names},
+            quantum=self.quantum[at],
+            signals=tuple(signals),
+            units=tuple(self.units[j] for j in at),
+            target_kinds=tuple(self.target_kinds[j] for j in at) if self.target_kinds else (),
+        )
+
+    def with_position_targets(self, positions: np.ndarray) -> Self:
+        """With ``positions`` (T, J) as targets of the signals whose targets are no positions."""
+        if not self.target_kinds:
+            return self
+        kept = np.array([kind == "position" for kind in self.target_kinds])
+        return dataclasses.replace(self, target=np.where(kept, self.target, positions), target_kinds=())
 
     def has_effort(self) -> np.ndarray:
         """(J,) bool: recorded, and not only zeros."""
@@ -226,7 +251,7 @@ class Measurement:
                 raise TaccorlError(f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}")
             if (kind := self.target_kind(name)) != "position":
                 raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
-            if extra := self.only_axes_take(name):
+            if extra := self.twin_cannot_take(name):
                 raise TaccorlError(f"{self.name}: {name} has {extra}: the robot's twin cannot take it")
         at = [ROBOT.action_names.index(name) for name in self.signals]
         arrays: dict[str, np.ndarray] = {

@@ -95,11 +95,23 @@ class RigidJoint(ABC):
     """How old the measured position is, on average, when the drive's torque acts; with ``speed_delay_s`` of a velocity."""
     speed_delay_s: float = 0.0
     exact_timing: ClassVar[bool] = False
-    """Whether the half step by which the integrator is early is taken off, and the age of the position is fitted where gains are
-    commanded: half a millisecond is 18 noise floors of 0.1 mrad at 3.7 rad/s."""
+    """Whether the age of the position is fitted where gains are commanded: half a millisecond is 18 noise floors of 0.1 mrad at
+    3.7 rad/s."""
 
     follows_line: ClassVar[bool] = False
     """Whether targets between the rows are those of the line at their own time; else those of the next time, as in a replay."""
+
+    gain_names: tuple[str, ...] = ("kp", "kd")
+    """Gains that a recording can state and a fit can find."""
+
+    @property
+    def winding(self) -> Mapping[str, float]:
+        """Stall torque [N·m] and back-EMF [N·m·s/rad] of a motor on a voltage, which a fit finds in place of gains."""
+        return {}
+
+    def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
+        """Gains, and numbers in place of ``facts``, from fitted values of those names."""
+        return self.gains._replace(**{name: values[name] for name in Gains._fields if name in values}), {}
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         """Gains of a recording over ``gains``: of the position error, of the velocity."""
@@ -189,14 +201,28 @@ def resting(m: Measurement, j: int) -> float:
         raise TaccorlError(
             f"{m.name}: {m.signals[j]} was not measured in its first {rest} rows; cut the recording there"
         )
-    return float(m.target[0, j])
+    return float(_planned(m, j)[0])
 
 
 def smooth_motion(m: Measurement, signal: str) -> np.ndarray:
     """(T,) measured positions, or targets where none were measured, without what is faster than the other joints."""
     j = m.column(signal)
     seen = m.measured[:, j]
-    return _smooth(seen if np.isfinite(seen).any() else m.target[:, j], m.rate_hz)
+    return _smooth(seen if np.isfinite(seen).any() else _planned(m, j), m.rate_hz)
+
+
+def _planned(m: Measurement, j: int) -> np.ndarray:
+    """(T,) targets of a signal that was not measured.
+
+    Raises:
+        TaccorlError: they are no positions.
+    """
+    kind = m.target_kind(m.signals[j])
+    if kind != "position":
+        raise TaccorlError(
+            f"{m.name}: {m.signals[j]} is commanded by {kind} and its position was not measured; log it, or leave the signal out"
+        )
+    return m.target[:, j]
 
 
 def moved_by_others(m: Measurement, signal: str, others: Sequence[str], still: float = STILL) -> dict[str, np.ndarray]:

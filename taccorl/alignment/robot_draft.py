@@ -6,6 +6,13 @@ from pathlib import Path
 from taccorl.alignment.robot_file import TODO
 from taccorl.alignment.robot_model import JointFacts, RobotModel, load_robot_model
 
+_LAWS = {
+    "impedance": "kp (q* − q) − kd q̇ + torque_ff. Columns NAME.q, NAME.q_target, NAME.tau; a PD on a torque interface, too",
+    "cascade": "kd (kp (q* − q) − q̇) + torque_ff. Columns as for impedance; kp in 1/s",
+    "velocity": "kd (q̇* − q̇) + torque_ff. Column NAME.qd_target; no kp",
+    "torque": "τ* + torque_ff. Column NAME.tau_target (a current times k_t: `factor:` in a columns file); no kp, no kd",
+    "pwm": "k_t (V d − k_e q̇) / R, duty d = kp (q* − q) − kd q̇ within ± 1: supply_v, resistance_ohm, torque_nm_per_a",
+}
 _HEADER = """\
 # A robot, drafted from {model}. Write a value for each TODO; loading the file names those that are left.
 # taccorl compare sweeps/ --twin={name}      how far this model is from recordings, and where
@@ -27,6 +34,8 @@ def robot_draft(model: Path, out: Path) -> tuple[str, RobotModel]:
         "kind: robot",
         f"model: {relative}",
         f"gravity_compensation: {TODO}      # 1.0 if the controller adds the arm's weight to its torque, 0.0 if it does not",
+        "# law: what the drive does with its target, and so the numbers that it needs (k_t and k_e at the joint, gear included):",
+        *(f"#   {law + ':':<11}{words}" for law, words in _LAWS.items()),
         "joints:                        # remove those that no recording moves; they are held where the model has them",
     ]
     for facts in robot.joints.values():
@@ -40,13 +49,16 @@ def _joint(facts: JointFacts) -> list[str]:
     per_gear = "turns of the motor for one of the joint" if facts.unit == "rad" else "rad of the motor for one m"
     limits = "no limits" if facts.limits is None else f"{facts.limits[0]:.4g} … {facts.limits[1]:.4g} {turn}"
     servo = next((a for a in facts.actuators if a.kp > 0), None)
-    source = f"   # {torque}/{turn}, of actuator {servo.name}; is it what the drive runs?" if servo else ""
+    speed = next((a for a in facts.actuators if a.kd > 0), None)
     lines = [
         f"  {facts.name}:   # {limits}; inertia {facts.inertia:.3g} {inertia} at the model's zero pose",
-        "    law: impedance             # τ = kp (q* − q) − kd q̇ + torque_ff",
+        f"    law: {'velocity ' if speed and not servo else 'impedance'}             # or another one of those above",
     ]
     if servo:
+        source = f"   # {torque}/{turn}, of actuator {servo.name}; is it what the drive runs?"
         lines += [f"    kp: {servo.kp:.6g}{source}", f"    kd: {servo.kd:.6g}   # {torque}·s/{turn}"]
+    elif speed:
+        lines += [f"    kd: {speed.kd:.6g}   # {torque}·s/{turn}, of actuator {speed.name}; is it what the drive runs?"]
     else:
         lines += [
             f"    kp: {TODO}                   # {torque}/{turn}: position gain of the drive; a guess where nobody knows it",

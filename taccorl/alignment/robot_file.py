@@ -7,7 +7,7 @@
     gravity_compensation: 1.0         # share of the weight that the controller adds to its torque; 0 if it adds none
     joints:
       elbow:                          # as the model calls it, and as the tables' columns do: elbow.q, elbow.q_target
-        law: impedance                # τ = kp (q* − q) − kd q̇ + torque_ff
+        law: impedance                # τ = kp (q* − q) − kd q̇ + torque_ff; others: drive_law
         kp: 40.0                      # N·m/rad; of a sliding joint N/m
         kd: 1.5                       # N·m·s/rad
         gains: commanded              # kp and kd are what the controller runs; fitted: nobody knows, these are a start
@@ -33,6 +33,7 @@ import mujoco
 import numpy as np
 import yaml
 
+from taccorl.alignment.drive_law import DriveLaw
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.rigid_joint import (
     Gains,
@@ -55,7 +56,6 @@ if TYPE_CHECKING:
     from taccorl.alignment.joint_motion import JointMotion
 
 TODO = "TODO"
-_LONGEST_STEP_S = 1.0 / 1200.0  # of the physics: as the PiPER's twin
 _GIVES = ("target", "position", "velocity", "acceleration", "effort", "load")
 """What the model of one joint knows (``Effect.needs``)."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
@@ -65,25 +65,16 @@ _HEADER = "# A robot: taccorl/alignment/robot_file.py says what may stand here.\
 
 
 @dataclass(kw_only=True)
-class JointConfig:
+class JointConfig(DriveLaw):
     """The drive of one joint. Units are those of a hinge; of a sliding joint N for N·m, m for rad, kg for kg·m²."""
 
-    law: Literal["impedance"] = "impedance"
-    """τ = kp (q* − q) − kd q̇ + torque_ff."""
-    kp: float
-    """N·m/rad."""
-    kd: float
-    """N·m·s/rad."""
-    torque_ff: float = 0.0
-    """N·m."""
     gains: Literal["commanded", "fitted"] = "commanded"
-    """Whether kp and kd are what the controller runs, or only where a fit starts."""
+    """Whether kp and kd are what the controller runs, or only where a fit starts. Of law pwm stall torque and back-EMF are
+    fitted instead, with either."""
     rotor_inertia: float = 0.0
     """kg·m² of the motor's rotor, on the motor's side of the gear."""
     gear: float = 1.0
     """Turns of the motor for one of the joint; of a sliding joint rad/m."""
-    effort_limit: float | None = None
-    """N·m at the joint: larger torques are clipped."""
     loop_hz: float | None = None
     """Rate of the drive's control loop."""
     command_hz: float | None = None
@@ -94,12 +85,10 @@ class JointConfig:
     effects: list[Effect] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        check_numbers(
-            "joint", self, positive=("kp", "gear"), not_negative=("kd", "rotor_inertia"), finite=("torque_ff",)
-        )
-        for name in ("effort_limit", "loop_hz", "command_hz"):
-            if getattr(self, name) is not None:
-                check_numbers("joint", self, positive=(name,))
+        check_numbers("joint", self, positive=("gear",), not_negative=("rotor_inertia",))
+        optional = ("loop_hz", "command_hz")
+        check_numbers("joint", self, positive=[name for name in optional if getattr(self, name) is not None])
+        self.check_law("joint")
 
     @property
     def armature(self) -> float:
@@ -200,6 +189,10 @@ def load_robot(path: Path) -> Robot:
             key = f"joints/{name}/effects/{k}"
             if not acts_on_joint(type(effect), weight=True, rotor=True):
                 raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
+            if not joint.takes(effect.name):
+                raise document.error(
+                    key, f"{effect.name} acts in a position loop, and law {joint.law} has none; remove it"
+                )
             if effect.name in _NEED_ROTOR and joint.armature == 0.0:
                 raise document.error(
                     key, f"{effect.name} needs the inertia of the motor: write rotor_inertia (kg·m²) and gear of {name}"
@@ -251,15 +244,18 @@ class RobotJoint(RigidJoint):
 
     effort_holds_weight: ClassVar[bool] = True
     exact_timing: ClassVar[bool] = True
+    follows_line: ClassVar[bool] = True
 
     def __init__(self, robot: Robot, signal: str) -> None:
         self._robot, self._config = robot, robot.config.joints[signal]
         self.signal, self.unit = signal, robot.rigid.joints[signal].unit
-        self.gains = Gains(self._config.kp, self._config.kd, self._config.torque_ff)
+        self.gains = self._config.loop_gains
+        self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
         self.command_hz = self._config.command_hz or 0.0
-        self.torque_max = np.inf if self._config.effort_limit is None else self._config.effort_limit
-        # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again.
+        # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
+        # the output that a row shows before its own target acts.
         loop_s = 0.0 if self._config.loop_hz is None else 1.0 / self._config.loop_hz
+        self.facts = self._config.facts | ({"effort_age": 0.5 * loop_s} if loop_s else {})
         self.position_age_s, self.speed_delay_s = 0.5 * loop_s + self._config.position_age_s, loop_s
 
     @property
@@ -267,8 +263,25 @@ class RobotJoint(RigidJoint):
         """What the model says of the joint."""
         return self._robot.rigid.joints[self.signal]
 
+    def gain_scales(self, m: Measurement) -> tuple[float, float]:
+        return self._config.gain_scales(self.signal, m)
+
+    @property
+    def winding(self) -> dict[str, float]:
+        """Stall torque and back-EMF of law pwm; of others none."""
+        c = self._config
+        return {"stall_nm": c.stall_nm, "back_emf": c.back_emf} if c.law == "pwm" else {}
+
+    def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
+        gains, facts = super().numbers(values)
+        if "stall_nm" not in values:
+            return gains, facts
+        factor = values["stall_nm"] / self._config.stall_nm
+        gains = gains._replace(kp=self.gains.kp * factor, kd=self.gains.kd * factor)
+        return gains, {"duty_torque": values["stall_nm"], "back_emf": values["back_emf"]}
+
     def timestep_s(self, rate_hz: float) -> float:
-        return 1.0 / (rate_hz * max(1, int(np.ceil(1.0 / (rate_hz * _LONGEST_STEP_S) - 1e-6))))
+        return self._config.timestep_s(rate_hz, self.known.inertia + self._config.armature)
 
     def rigid(self, motion: "JointMotion", bodies: Sequence[Effect]) -> Rigid:
         terms = rigid_terms(self._robot.rigid.model, self.signal, motion.pose)
@@ -285,7 +298,8 @@ class RobotJoint(RigidJoint):
         for name in self._robot.rigid.joints:
             if name in m.signals:
                 pose[model.joint(name).qposadr[0]] = resting(m, m.column(name))
-        return Surroundings(coupling_nm=self._coupling(m, pose), pose=pose)
+        coupling = self._coupling(m, pose) - m.known_load(self.signal)
+        return Surroundings(coupling_nm=coupling, pose=pose, supply=self._config.supply(self.signal, m))
 
     def whole(self, m: Measurement) -> Measurement:
         """With all joints of the model, and with the file's gains where they are commanded and the recording states none.
@@ -302,25 +316,31 @@ class RobotJoint(RigidJoint):
                 )
             if unit != self._robot.units[name]:
                 raise TaccorlError(f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}")
-            if m.target_kind(name) != "position":
+            for key in ("lever_m", "arm_kg"):
+                if name in getattr(m, key):
+                    raise TaccorlError(
+                        f"{m.name}: {key} of {name} is stated, which only an axis file takes; remove it from measurements.yaml, "
+                        "and fix the mass to its link in the model"
+                    )
+            if m.enabled.size and not m.enabled[:, m.column(name)].all() and self._robot.config.gravity_compensation:
+                row = int(np.argmin(m.enabled[:, m.column(name)]))
                 raise TaccorlError(
-                    f"{m.name}: {name} is commanded by {m.target_kind(name)}, a robot file's joints by position"
+                    f"{m.name}: the motor of {name} is off at {m.time_s[row]:.3f} s, and by the robot file its controller "
+                    "carries the weight; cut the recording there"
                 )
-            if extra := m.only_axes_take(name):
-                raise TaccorlError(f"{m.name}: {name} has {extra}: a robot file cannot take it")
-        kp, kd = dict(m.kp), dict(m.kd)
+        stated: dict[str, dict[str, float]] = {"kp": dict(m.kp), "kd": dict(m.kd)}
         for name, joint in self._robot.config.joints.items():
             if joint.gains == "commanded":
-                scale = m.gain_scale.get(name, 1.0)
-                kp.setdefault(name, scale * joint.kp)
-                kd.setdefault(name, scale * joint.kd)
-        m = dataclasses.replace(
-            m, kp=kp, kd=kd, load=np.empty(0), supply_v=np.empty(0), enabled=np.empty(0), target_kinds=()
-        )
+                for key in joint.gain_names:
+                    stated[key].setdefault(name, m.gain_scale.get(name, 1.0) * getattr(joint, key))
+        m = dataclasses.replace(m, kp=stated["kp"], kd=stated["kd"])
         if m.signals == names:
             return m
+        kinds = tuple(m.target_kind(name) if name in m.signals else "position" for name in names)
+        absent = {"load": 0.0, "supply_v": np.nan, "enabled": 1.0}
         arrays: dict[str, np.ndarray] = {
-            name: np.full((m.num_rows, len(names)), np.nan) for name in ("measured", "velocity", "effort")
+            name: np.full((m.num_rows, len(names)), absent.get(name, np.nan))
+            for name in ("measured", "velocity", "effort", *m.extra_columns)
         }
         model = self._robot.rigid.model
         rest = [model.qpos0[model.joint(name).qposadr[0]] for name in names]
@@ -331,7 +351,7 @@ class RobotJoint(RigidJoint):
                 quantum[j] = m.quantum[m.column(name)]
                 for key, values in arrays.items():
                     values[:, j] = getattr(m, key)[:, m.column(name)]
-        return dataclasses.replace(m, **arrays, quantum=quantum, signals=names, units=units)
+        return dataclasses.replace(m, **arrays, quantum=quantum, signals=names, units=units, target_kinds=kinds)
 
     def effects(self, more: Sequence[Effect]) -> list[Effect]:
         names = {effect.name for effect in more}
@@ -345,7 +365,7 @@ class RobotJoint(RigidJoint):
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         weight, rotor = self._robot.config.gravity_compensation > 0, self._config.armature > 0
-        return {} if acts_on_joint(cls, weight=weight, rotor=rotor) else None
+        return {} if acts_on_joint(cls, weight=weight, rotor=rotor) and self._config.takes(cls.name) else None
 
     def _coupling(self, m: Measurement, pose: np.ndarray) -> np.ndarray:
         """(T,) torque because other joints move; of a sliding joint its weight as well, which does not change as it slides."""

@@ -109,9 +109,13 @@ def check_measurement(
             raise TaccorlError(f"{m.name}: no signal {name!r} to check; {nearest(name, m.signals)}")
     findings = accepted([*m.findings, *check_time(m), *check_values(m)], accept)
     if not any(f.check in _NO_MORE for f in findings):
-        findings += accepted(check_motion(m, joints) + check_start(m) + check_effort(m) + check_wiring(m), accept)
-        if not any(f.severity == "error" and f.check != "lost_samples" for f in findings):
-            findings += accepted(check_clock(m, floor or _own_floor(m)), accept)
+        findings += accepted(check_effort(m), accept)
+        followed = [s for s in m.signals if m.target_kind(s) == "position"]  # a velocity or a torque is not followed
+        if followed:
+            m = m.only(followed)
+            findings += accepted(check_motion(m, joints) + check_start(m) + check_wiring(m), accept)
+            if not any(f.severity == "error" and f.check != "lost_samples" for f in findings):
+                findings += accepted(check_clock(m, floor or _own_floor(m)), accept)
     return sorted(findings, key=lambda f: _ORDER.index(f.severity))
 
 

@@ -13,8 +13,9 @@ import numpy as np
 
 from taccorl.alignment.arm_joint import HasJoints, joint_of
 from taccorl.alignment.arm_joint import selectors as selectors
+from taccorl.alignment.drive_law import WINDING_WITHIN
 from taccorl.alignment.joint_kernel import MOST_LOST
-from taccorl.alignment.joint_model import Gains, JointModel, JointMotion, PayloadLever
+from taccorl.alignment.joint_model import JointModel, JointMotion, PayloadLever
 from taccorl.alignment.joint_motion import motion_of
 from taccorl.alignment.measurement import UNITS, Measurement
 from taccorl.alignment.measurements import Measurements, motions
@@ -83,14 +84,13 @@ class JointProblem:
         whole = {use: tuple(map(joint.whole, getattr(measurements, use))) for use in ("fit", "validation", "test")}
         measurements = dataclasses.replace(measurements, **whole)
         everything = measurements.all
-        stated = all(signal in m.kp and signal in m.kd for m in everything)
-        if gains == "commanded" and not stated:
-            silent = next(m.name for m in everything if signal not in m.kp or signal not in m.kd)
+        silent = [m.name for m in everything if any(signal not in getattr(m, name) for name in joint.gain_names)]
+        if gains == "commanded" and silent:
             raise TaccorlError(
-                f"{silent}: the commanded gains of {signal} are not stated; write kp and kd into its measurements.yaml, "
-                "or fit them (gains=fitted)"
+                f"{silent[0]}: the commanded gains of {signal} are not stated; write {' and '.join(joint.gain_names)} into its "
+                "measurements.yaml, or fit them (gains=fitted)"
             )
-        self.signal, self.commanded = signal, gains != "fitted" and stated
+        self.signal, self.commanded = signal, not silent and (gains != "fitted" or not joint.gain_names)
         own, bare = joint.freed()
         self.present = tuple(effect.name for effect in own)
         self.model = JointModel.of(bare)
@@ -109,9 +109,11 @@ class JointProblem:
         self.base = self._base()
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.model.gains._asdict())
-        self.start: Values = self.model.gains._asdict() | {
-            f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
-        }
+        self.start: Values = (
+            self.model.gains._asdict()
+            | dict(joint.winding)
+            | {f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()}
+        )
         if any(f.name == SPEED_DELAY.name for f in self.base):
             delays = (e for e in bare.effects([]) if isinstance(e, SpeedDelay))
             self.start[SPEED_DELAY.name] = sum(e.delay_s for e in delays)
@@ -123,7 +125,9 @@ class JointProblem:
 
     def pinned_by(self, names: Sequence[str]) -> tuple[str, ...]:
         """What fixes the scale of the torques (``taccorl.diagnosis.identifiable``) while the effects ``names`` are fitted."""
-        found = ["commanded gains"] * self.commanded + ["recorded effort"] * (self.effort and not self.commanded)
+        commanded = self.commanded and not self.model.joint.winding
+        words = "commanded gains" if self.model.joint.gain_names else "commanded torques"
+        found = [words] * commanded + ["recorded effort"] * (self.effort and not commanded)
         unknown = {"gravity_mismatch", "payload"} & {*names}
         if not unknown and self._weighs():
             found.append("known weight")
@@ -131,7 +135,7 @@ class JointProblem:
 
     def _weight_shows(self, least_floors: float) -> bool:
         """Whether known weight that the controller holds moves the joint by more than so many noise floors."""
-        weights = np.concatenate([self.model.weight_nm(r.data, r.data.target) for r in self.fit])
+        weights = np.concatenate([self.model.weight_nm(r.data, self._asked(r.data)) for r in self.fit])
         return float(np.std(weights)) > least_floors * self.floors[0].value * self.model.gains.kp
 
     def _weighs(self) -> bool:
@@ -139,7 +143,7 @@ class JointProblem:
         if not self._weight_shows(WEIGHS):
             return False
         motions: list[JointMotion] = [r.data for r in self.fit]
-        weights = np.concatenate([self.model.weight_nm(m, m.target) for m in motions])
+        weights = np.concatenate([self.model.weight_nm(m, self._asked(m)) for m in motions])
         torques = []
         for m in motions:
             angle = self.model.simulate(m, self.model.gains).reported
@@ -155,7 +159,8 @@ class JointProblem:
                 SpeedDelay(**self.model.joint.selectors(SpeedDelay) or {}, delay_s=float(base[SPEED_DELAY.name])),
             ]
         age_s = float(base.get(POSITION_AGE.name, 0.0))
-        answer = self.model.simulate(recording.data, self._gains(base), effects, lever, age_s=age_s)
+        gains, facts = self.model.joint.numbers(base)
+        answer = self.model.simulate(recording.data, gains, effects, lever, age_s=age_s, facts=facts)
         if not self.effort:
             return answer.reported[:, None]
         return np.column_stack([answer.reported, base.get("effort_scale", 1.0) * answer.effort])
@@ -166,7 +171,8 @@ class JointProblem:
         for name in registry:
             cls = registry.get(name)
             where = self.model.joint.selectors(cls) if cls.fitted else None
-            if where is not None and (self.commanded or name not in _GAIN_LIKE):
+            scaled = self.commanded and not self.model.joint.winding
+            if where is not None and (scaled or name not in _GAIN_LIKE):
                 self.candidates[name] = candidate(cls, seen, **where)
 
     def prepare(
@@ -175,8 +181,12 @@ class JointProblem:
         """Joints have no maps."""
         return list(effects)
 
-    def _gains(self, values: Mapping[str, float]) -> Gains:
-        return self.model.gains._replace(**{name: values[name] for name in Gains._fields if name in values})
+    def _asked(self, motion: JointMotion) -> np.ndarray:
+        """(T,) targets; measured positions where targets are no positions."""
+        if self.model.joint.target_kind == "position":
+            return motion.target
+        seen = np.isfinite(motion.measured)
+        return np.interp(motion.time_s, motion.time_s[seen], motion.measured[seen])
 
     def _base(self) -> tuple[Free, ...]:
         kp, kd, torque_ff = self.model.gains
@@ -185,11 +195,15 @@ class JointProblem:
         delay = dataclasses.replace(
             SPEED_DELAY, high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9))
         )
+        joint = self.model.joint
         if self.commanded:
-            found += [EFFORT_SCALE] * self.effort + [delay] + [POSITION_AGE] * self.model.joint.exact_timing
-        else:
-            gains = [_around(f, v) for f, v in ((KP, kp), (KD, max(kd, KD.low / WIDER)))]
+            aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
+            found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [POSITION_AGE] * aged
+        elif not joint.winding:
+            starts = {"kp": (KP, kp), "kd": (KD, max(kd, KD.low / WIDER))}
+            gains = [_around(*starts[name]) for name in joint.gain_names]
             found = gains + found + [delay] * (self.effort or self._weight_shows(1.0))
+        found += [_within(name, value) for name, value in joint.winding.items()]
         payloads: list[JointMotion] = [
             r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known
         ]
@@ -219,10 +233,15 @@ class JointProblem:
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""
         motions: list[JointMotion] = [r.data for r in self.fit]
-        answers = [self.model.simulate(m, self._gains(values)) for m in motions]
+        gains, facts = self.model.joint.numbers(values)
+        answers = [self.model.simulate(m, gains, facts=facts) for m in motions]
         weights = [self.model.carried_nm(m, a.reported) for m, a in zip(motions, answers, strict=True)]
-        speeds = np.concatenate([np.abs(np.gradient(m.target, 1.0 / m.rate_hz)) for m in motions])
-        angles = np.concatenate([m.target for m in motions])
+        asked = [
+            m.target if self.model.joint.target_kind == "position" else a.reported
+            for m, a in zip(motions, answers, strict=True)
+        ]
+        speeds = np.concatenate([np.abs(np.gradient(q, 1.0 / m.rate_hz)) for q, m in zip(asked, motions, strict=True)])
+        angles = np.concatenate(asked)
         return {
             "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
             "peak_motor_nm": max(float(np.abs(a.effort + w).max()) for a, w in zip(answers, weights, strict=True)),
@@ -238,6 +257,12 @@ def _around(gain: Free, start: float) -> Free:
     """A gain with wider bounds, which hold its start."""
     low, high = min(gain.low / WIDER, 0.1 * start), gain.high if start < gain.high else 10.0 * start
     return dataclasses.replace(gain, start=start, low=low, high=high)
+
+
+def _within(name: str, value: float) -> Free:
+    """A number of the winding about the one that the file states."""
+    unit = "N·m" if name == "stall_nm" else "N·m·s/rad"
+    return Free(name=name, unit=unit, start=value, low=value / WINDING_WITHIN, high=value * WINDING_WITHIN, log=True)
 
 
 def floors_of(measurements: Sequence[Measurement], signal: str, *, effort: bool) -> list[SignalFloor]:

@@ -26,7 +26,7 @@ from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, TouchEffe
 from taccorl.sim.twin import TwinConfig
 
 MOVES_RAD = 2e-3
-"""A joint whose target moves by more is swept."""
+"""A joint that is commanded to move by more, or moves by more where it is not commanded by position, is swept."""
 SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints)
 
 
@@ -81,7 +81,10 @@ def moves(m: Measurement, signal: str) -> bool:
     and one joint by itself does not know of it."""
     if m.pressed is not None and signal.startswith(f"{m.pressed.arm}_"):
         return False
-    return signal in m.signals and float(np.ptp(m.target[:, m.column(signal)])) > MOVES_RAD
+    if signal not in m.signals:
+        return False
+    positions = m.moved(signal)
+    return bool(np.isfinite(positions).any()) and float(np.nanmax(positions) - np.nanmin(positions)) > MOVES_RAD
 
 
 def of_joints(measurements: Measurements, signals: Sequence[str]) -> Measurements:

@@ -135,17 +135,8 @@ class Axis(Machine):
             if position_target and np.isfinite(motion.measured).any():
                 reported = np.full(m.target.shape, np.nan)
                 reported[:, j] = answer.reported
-                alone = dataclasses.replace(
-                    m,
-                    **{key: getattr(m, key)[:, [j]] for key in ("target", "measured", "velocity", "effort")},
-                    signals=(signal,),
-                    units=(m.units[j],),
-                    target_kinds=(),
-                    load=np.empty(0),
-                    quantum=m.quantum[[j]],
-                )
                 floor = {signal: floors["position"][signal].value}
-                clock[m.name] = tuple(check_against_twin(alone, reported[:, [j]], floor))
+                clock[m.name] = tuple(check_against_twin(m.only([signal]), reported[:, [j]], floor))
         progress("", len(uses), len(uses))
         if not traces:
             raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import numpy as np
+
 from taccorl.alignment.clock_checks import check_against_twin
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements, Use
@@ -93,12 +95,19 @@ class RobotMachine(Machine):
         traces, clock, held = [], {}, set()
         for k, (use, m) in enumerate(uses):
             progress(m.name, k, len(uses))
-            known = [s for s in moving(m) if s in self.robot.config.joints]
-            held |= {s for s in moving(m) if s not in self.robot.config.joints}
+            moved = moving(m.with_position_targets(m.measured))
+            known = [s for s in moved if s in self.robot.config.joints]
+            held |= {s for s in moved if s not in self.robot.config.joints}
             response = replay_joints(self.robot, m, known)
-            traces += [t for t in traces_of(m, use, response, floors) if t.signal in known]
+            positions = m.with_position_targets(np.nan_to_num(response.reported))
+            traces += [
+                t
+                for t in traces_of(positions, use, dataclasses.replace(response, measurement=positions), floors)
+                if t.signal in known
+            ]
             if known:
-                clock[m.name] = tuple(check_against_twin(m, response.reported, levels))
+                commanded = m.with_position_targets(np.zeros(m.target.shape))
+                clock[m.name] = tuple(check_against_twin(commanded, response.reported, levels))
         progress("", len(uses), len(uses))
         if not traces:
             raise TaccorlError(
@@ -139,7 +148,7 @@ class RobotMachine(Machine):
         robot = self.robot
         for a in additions:
             config = robot.config.joints[a.part]
-            numbers = {key: float(a.base[key]) for key in ("kp", "kd", "torque_ff") if key in a.base}
+            numbers = {key: float(value) for key, value in config.law_numbers(a.base).items()}
             new = list(a.effects)
             if "position_age_s" in a.base:
                 numbers["position_age_s"] = config.position_age_s + float(a.base["position_age_s"])

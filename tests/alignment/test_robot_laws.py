@@ -1,0 +1,167 @@
+"""Control laws of a robot file's joints: recordings by this test's own integration (20 µs steps), not by the kernel.
+
+A link of 1 kg whose centre hangs 0.2 m below its hinge: 0.05 kg·m² q̈ = τ(target, q, q̇) − F sign q̇ − 1.962 N·m sin q.
+"""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.measurement import Measurement, TargetKind
+from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.robot_file import Robot, load_robot
+from taccorl.diagnosis.fit import Fit, best_fit, rms, stacked
+from taccorl.diagnosis.joint_problem import JointProblem
+from taccorl.diagnosis.machines.robot import RobotMachine
+from taccorl.diagnosis.search_result import SearchConfig
+from taccorl.errors import SpecError, TaccorlError
+
+RATE_HZ, DT_S, NOISE_RAD = 200, 2e-5, 1e-4
+INERTIA, WEIGHT_NM, FRICTION_NM = 0.05, 9.81 * 0.2, 0.15
+MODEL = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="swing" axis="0 1 0" range="-3 3"/>
+<inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody></mujoco>"""
+FILES = {
+    "impedance": "kp: 20.0, kd: 1.5",
+    "cascade": "kp: 12.0, kd: 1.5",
+    "velocity": "kd: 1.5",
+    "torque": "effort_limit: 30.0",
+    "pwm": "kp: 6.0, supply_v: 12.0, resistance_ohm: 4.0, torque_nm_per_a: 0.8",
+}
+
+
+def torque(law: str, goal: float, q: float, v: float) -> float:
+    """N·m of the motor, law by law; of pwm by Ohm's law with the current as a step between."""
+    if law == "impedance":
+        return 20.0 * (goal - q) - 1.5 * v
+    if law == "cascade":
+        return 1.5 * (12.0 * (goal - q) - v)
+    if law == "velocity":
+        return 1.5 * (goal - v)
+    if law == "torque":
+        return goal
+    volts = 12.0 * min(max(6.0 * (goal - q), -1.0), 1.0)
+    current_a = (volts - 0.8 * v) / 4.0
+    return 0.8 * current_a
+
+
+def recording(law: str, name: str, high_hz: float, seed: int, friction_nm: float = FRICTION_NM) -> Measurement:
+    """8 s of a sweep of about ± 0.4 rad; under torques below the pendulum's 1 Hz, which friction alone damps."""
+    high_hz *= 0.4 if law == "torque" else 1.0
+    time_s = np.arange(8 * RATE_HZ) / RATE_HZ
+    fade = np.clip(np.minimum(time_s - 0.3, 7.5 - time_s) / 0.5, 0, 1)
+    phase = 2 * np.pi * (0.2 * time_s + (high_hz - 0.2) * time_s**2 / 16.0)
+    target = {"velocity": 2.5, "torque": 0.8}.get(law, 0.4) * fade * np.sin(phase)
+    q = v = goal = 0.0
+    steps, rows = round(1 / (RATE_HZ * DT_S)), []
+    slows = DT_S * friction_nm / INERTIA
+    for following in target.tolist():
+        rows.append((q, torque(law, goal, q, v)))
+        goal = following
+        for _ in range(steps):
+            free = v + DT_S * (torque(law, goal, q, v) - WEIGHT_NM * math.sin(q)) / INERTIA
+            v = math.copysign(max(abs(free) - slows, 0.0), free)
+            q += DT_S * v
+    rng, found = np.random.default_rng(seed), np.array(rows)
+    kinds: dict[str, TargetKind] = {"velocity": "velocity", "torque": "torque"}
+    return Measurement(
+        name=name,
+        time_s=time_s,
+        target=target[:, None],
+        measured=found[:, :1] + NOISE_RAD * rng.normal(size=(len(found), 1)),
+        effort=found[:, 1:] + 2e-3 * np.abs(found[:, 1]).max() * rng.normal(size=(len(found), 1)),
+        signals=("swing",),
+        units=("rad",),
+        target_kinds=(kinds.get(law, "position"),),
+    )
+
+
+def robot(folder: Path, drive: str) -> Robot:
+    (folder / "swing.xml").write_text(MODEL)
+    (folder / "robot.yaml").write_text(f"kind: robot\nmodel: swing.xml\njoints:\n  swing: {{{drive}}}\n")
+    return load_robot(folder / "robot.yaml")
+
+
+def fitted(made: Robot, measurements: Measurements, *names: str) -> tuple[JointProblem, Fit, float]:
+    """Problem, fit with the effects ``names``, and its validation error in noise floors."""
+    problem = JointProblem(made, "swing", measurements)
+    faint = {f.name: f.start for name in names for f in problem.candidates[name].frees}
+    model = best_fit(problem, problem.fit, names, [problem.start | faint], 60)
+    return problem, model, rms(stacked(problem, model.values, model.effects, problem.validation))
+
+
+def swept(law: str, friction_nm: float = FRICTION_NM) -> Measurements:
+    return Measurements(
+        (recording(law, "sweep", 1.5, 1, friction_nm),), (recording(law, "other", 1.0, 2, friction_nm),)
+    )
+
+
+@pytest.mark.parametrize("law", FILES)
+def test_friction_hidden_under_each_law_is_recovered_beside_commanded_gains(law: str, tmp_path: Path) -> None:
+    made = robot(tmp_path, f"law: {law}, {FILES[law]}")
+    measurements = swept(law)
+    _, _, without = fitted(made, measurements)
+    _, model, error = fitted(made, measurements, "coulomb_friction")
+    assert error < 0.02 * without and error < 5.0, (without, error)
+    assert model.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_NM, rel=0.005)
+
+
+def test_stall_torque_and_back_emf_of_a_servo_are_found_from_a_wrong_data_sheet(tmp_path: Path) -> None:
+    made = robot(tmp_path, "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.8, torque_nm_per_a: 1.0")
+    _, model, error = fitted(made, swept("pwm"), "coulomb_friction")
+    assert error < 1.5
+    assert model.values["stall_nm"] == pytest.approx(12.0 * 0.8 / 4.0, rel=0.005)
+    assert model.values["back_emf"] == pytest.approx(0.8 * 0.8 / 4.0, rel=0.03)
+    config = made.config.joints["swing"]
+    mended = dataclasses.replace(config, **config.law_numbers(model.values))
+    assert mended.stall_nm == pytest.approx(model.values["stall_nm"])
+    assert mended.back_emf == pytest.approx(model.values["back_emf"])
+
+
+@pytest.mark.parametrize(
+    ("drive", "line", "words"),
+    [
+        ("kp: 20.0", 4, "kd: law impedance needs it; write `kd: …`"),
+        ("law: cascade, kp: 12.0", 4, "kd: law cascade needs it"),
+        ("law: velocity, kp: 12.0, kd: 1.0", 4, "kp: law velocity has none; remove it"),
+        ("law: torque, kd: 1.0", 4, "kd: law torque has none"),
+        ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", 4, "resistance_ohm: law pwm needs it"),
+        ("kp: 20.0, kd: 1.0, supply_v: 12.0", 4, "supply_v: law impedance has none"),
+        ("law: velocity, kd: 1.0, effects: [{effect: integral_action, rate_per_s: 1.0}]", 4, "acts in a position loop"),
+        ("law: pd, kp: 1.0, kd: 1.0", 4, "'pd' is none of 'impedance'"),
+    ],
+)
+def test_numbers_that_a_law_lacks_or_has_none_of_are_refused_with_their_line(
+    drive: str, line: int, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SpecError) as error:
+        robot(tmp_path, drive)
+    assert f"robot.yaml:{line}" in str(error.value) and words in str(error.value), error.value
+
+
+def test_targets_that_a_law_does_not_take_are_refused_with_the_column_to_give(tmp_path: Path) -> None:
+    made = robot(tmp_path, f"law: velocity, {FILES['velocity']}")
+    position = dataclasses.replace(recording("velocity", "a", 1.0, 1), target_kinds=("position",))
+    with pytest.raises(TaccorlError, match=r"swing is commanded by position, its law takes a velocity.*qd_target"):
+        JointProblem(made, "swing", Measurements((position,)))
+
+
+@pytest.mark.parametrize("law", ["velocity", "torque"])
+def test_a_motion_that_is_no_position_command_is_compared_by_what_was_measured(law: str, tmp_path: Path) -> None:
+    machine = RobotMachine(robot(tmp_path, f"law: {law}, {FILES[law]}"), "robot")
+    plain = Measurements((recording(law, "sweep", 1.5, 1, friction_nm=0.0),))
+    assert machine.parts(plain) == ("swing",)
+    trace = machine.compare(plain).of("swing")[0]
+    assert float(np.sqrt(np.mean(trace.residual**2))) < 3 * NOISE_RAD
+    assert float(np.ptp(trace.target)) == pytest.approx(float(np.ptp(trace.position)), rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", FILES)
+def test_the_search_names_the_friction_under_each_law(law: str, tmp_path: Path) -> None:
+    machine = RobotMachine(robot(tmp_path, f"law: {law}, {FILES[law]}"), "robot")
+    found = machine.diagnose("swing", swept(law), search=SearchConfig(max_effects=1)).diagnosis
+    assert found.names and found.names[0] in ("coulomb_friction", "asymmetric_friction")
+    assert machine.diagnose("swing", swept(law, 0.0), search=SearchConfig(max_effects=1)).diagnosis.names == ()
