@@ -12,9 +12,9 @@ import yaml
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
-from taccorl.data.spec import find_spec
 from taccorl.demos.mimicgen import augment as module
 from taccorl.demos.mimicgen.augment import attempt_episode
+from taccorl.demos.mimicgen.spec import mimic_spec_path
 
 WORDS = ("--task=assembly_2", "--episodes=1", "--images=false", "--out=new", "--store=store")
 
@@ -79,7 +79,7 @@ def test_what_never_succeeds_ends_with_a_command_that_shows_a_failure(
     collected: Path, place: Path, said: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_HUNDRED", 1)
-    spec = yaml.safe_load(find_spec("assembly_2").read_text()) | {"gates": {"max_force_n": 0.5}}
+    spec = yaml.safe_load(mimic_spec_path("assembly_2").read_text()) | {"gates": {"max_force_n": 0.5}}
     (place / "strict.yaml").write_text(yaml.safe_dump(spec))
     words = ("--spec=strict.yaml", "--task=assembly_2", "--images=false", "--out=strict", "--store=store")
     code, text = said("augment", f"--source={collected}", *words)

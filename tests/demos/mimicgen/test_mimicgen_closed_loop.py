@@ -24,6 +24,7 @@ from taccorl.demos.mimicgen.spec import (
     SplitNoiseSpec,
     check_task,
     load_mimic_spec,
+    mimic_spec_path,
     with_options,
 )
 from taccorl.demos.recorder import with_simulator
@@ -263,7 +264,7 @@ def test_every_task_is_finished_by_its_expert(task, tmp_path: Path):
 )
 def test_a_mode_that_is_not_there_or_contradicts_is_named_with_its_place(options, said, tmp_path):
     path = tmp_path / "mine.yaml"
-    path.write_text(find_spec("assembly_2").read_text() + f"\ndatagen_config: {{{options}}}\n")
+    path.write_text(mimic_spec_path("assembly_2").read_text() + f"\ndatagen_config: {{{options}}}\n")
     with pytest.raises(SpecError, match=rf"mine\.yaml:\d+: datagen_config .*{said}"):
         load_mimic_spec(path)
 
