@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
@@ -87,6 +88,7 @@ def main(argv: list[str]) -> int:
         print(f"took:    {spent.wall_s / 60:.1f} min, {spent.cpu_s / report['episodes']:.1f} CPU-s for each episode")
     print(f"report:  {page}")
     if plan.rows == "dataset":
+        add_card(out)
         print(f"next:    taccorl view {out} --episode=0")
     else:
         print(f"next:    taccorl execute --source={out} --out={out}_dataset")

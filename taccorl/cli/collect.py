@@ -10,6 +10,7 @@ A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
 from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
@@ -83,6 +84,7 @@ def main(argv: list[str]) -> int:
     print(
         f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {config.origin}"
     )
+    add_card(out)
     print(f"next: taccorl view {out}")
     return 0
 

@@ -16,6 +16,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from taccorl.cli.card import add_card
 from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, TaccorlError
@@ -109,6 +110,8 @@ def main(argv: list[str]) -> int:
     for outcome, count in report["outcomes"].items():
         print(f"           {outcome} {count}")
     print(f"{plan.rows + ':':11s}{out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
+    if plan.rows == "dataset":
+        add_card(out)
     join = "merge --sim=DEMONSTRATIONS --sim" if plan.rows == "dataset" else "execute --source=DEMONSTRATIONS --source"
     print(f"next:      taccorl {join}={out} --out=…, then lerobot-train")
     return 0

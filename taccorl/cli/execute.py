@@ -14,6 +14,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
@@ -73,6 +74,7 @@ def main(argv: list[str]) -> int:
         print(f"dropped: {', '.join(f'{num} {outcome}' for outcome, num in report['dropped'].items())}")
     if seconds:
         print(f"took:    {', '.join(f'{part} {s:.2f} s' for part, s in seconds.items())} for each episode")
+    add_card(config.out)
     if plan.pictures == "cache":
         print(f"frames:  {frames.path}")
         size = "" if resolution is None else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, InTheWayError, RecordingError, TaccorlError, printable
 from taccorl.lineage.destinations import is_free
@@ -253,6 +254,7 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
     print(f"report:  {path}")
     if report["episodes"]:
         print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows)")
+        add_card(config.out)
         print(f"look:    taccorl view {shlex.quote(str(config.out))} --episode=0")
 
 

@@ -9,6 +9,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError
 
@@ -46,6 +47,7 @@ def main(argv: list[str]) -> int:
     print(f"dataset:   {config.out}")
     for name, of in domains.items():
         print(f"{name + ':':11s}{told(of)}")
+    add_card(config.out)
     alone = "" if all(domains.values()) else f" --policy.sim_weight={1 if domains['simulated'] else 0}"
     print(
         f"next:      lerobot-train --policy.type=tactile_pi05 --policy.backbone=tiny --policy.push_to_hub=false{alone} "

@@ -76,6 +76,11 @@ class Dataset:
     def num_episodes(self) -> int:
         return len(self._table)
 
+    @property
+    def instructions(self) -> tuple[str, ...]:
+        """All sentences of ``meta/tasks.parquet``."""
+        return tuple(self._tasks.values())
+
     def num_rows(self, index: int) -> int:
         """Rows of one episode, as ``meta/episodes`` counts them."""
         return int(self._entry(index)["length"])
@@ -121,23 +126,9 @@ class Dataset:
         Raises:
             DatasetError: a row has no frame at its time.
         """
-        video, fps = self.video(index, key), self.spec.fps
+        video = self.video(index, key)
         end = video.num_frames if end is None else end
-        row = first
-        if row >= end:
-            return
-        for time_s, frame in _decode_from(video.path, video.from_s + first / fps):
-            due_s = video.from_s + row / fps
-            if time_s > due_s + TOLERANCE_S:
-                break
-            if time_s > due_s - TOLERANCE_S:
-                yield frame.to_ndarray(format="rgb24")
-                row += 1
-                if row == end:
-                    return
-        raise DatasetError(
-            f"{video.path}, episode {index}: no frame at {video.from_s + row / fps:.4f} s for row {row} of {end}"
-        )
+        yield from video_frames(video, self.spec.fps, first, end, f"{video.path}, episode {index}")
 
     def tasks(self, index: int) -> list[tuple[int, str]]:
         """Instructions of an episode as (first row, text) for each run of rows with one instruction; usually one."""
@@ -522,6 +513,31 @@ def _packet_times(path: Path) -> tuple[np.ndarray, int]:
                 times.append(packet.pts * packet.time_base)
                 corrupt += packet.is_corrupt
     return np.sort(np.array(times, dtype=float)), corrupt
+
+
+def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Generator[np.ndarray, None, None]:
+    """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded) of an episode, one at a time.
+
+    Args:
+        name: of the video, for the message.
+
+    Raises:
+        DatasetError: a row has no frame at its time.
+    """
+    row = first
+    if row >= end:
+        return
+    for time_s, frame in _decode_from(video.path, video.from_s + first / fps):
+        due_s = video.from_s + row / fps
+        if time_s > due_s + TOLERANCE_S:
+            break
+        if time_s > due_s - TOLERANCE_S:
+            yield frame.to_ndarray(format="rgb24")
+            row += 1
+            if row == end:
+                return
+    due_s = video.from_s + row / fps
+    raise DatasetError(f"{name}: no frame at {due_s:.4f} s for row {row} of {end}")
 
 
 def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, av.VideoFrame]]:

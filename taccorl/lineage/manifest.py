@@ -17,6 +17,8 @@ from taccorl.lineage.digest import DigestCache, digest_each, digest_file, digest
 from taccorl.lineage.errors import LineageError
 
 MANIFEST_PLACES = ("manifest.json", "meta/taccorl/manifest.json")  # an artefact; a LeRobot dataset
+CARD = "README.md"
+"""A dataset's card, written after its manifest for readers, and edited by them: no data, and in no digest of an artefact."""
 FORMAT = 1  # under the key "taccorl_manifest": tells our manifest.json from anybody else's
 
 _VERIFIED = ".verified.json"  # beside the manifest
@@ -69,13 +71,14 @@ def write_manifest(folder: Path, place: str, manifest: dict[str, Any]) -> None:
 def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str]:
     """``{relative path: digest}`` of the present files of a source folder or artefact, as far as they count.
 
-    That is every visible file and every file its manifest lists, without the manifest: so an untouched artefact has
-    today the digest that its manifest states.
+    That is every visible file and every file its manifest lists, without the manifest and without a card that the manifest
+    does not list: so an untouched artefact has today the digest that its manifest states.
     """
     place = manifest_place(folder)
     listed: Collection[str] = read_manifest(folder).get("files", {})
     digests = digest_each(folder, cache, also=listed)
-    return {name: digest for name, digest in digests.items() if name != place}
+    beside = {place} if place is None or CARD in listed else {place, CARD}
+    return {name: digest for name, digest in digests.items() if name not in beside}
 
 
 @dataclass(frozen=True)

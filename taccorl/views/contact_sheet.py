@@ -5,6 +5,7 @@ Rows are instants, spread over the episode, one of them where touch is strongest
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from taccorl.data.episode import Episode, Pictures
 from taccorl.views.colors import ARM_COLORS, CONTACT_COLOR, LINE_COLORS, NOISE_COLOR, PAD_COLORS, heat
 from taccorl.views.groups import groups_of, short_name
 from taccorl.views.outputs import save_png
+from taccorl.views.part import part_of
 from taccorl.views.provenance import NO_ORIGIN, outcome
 from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, Pad, contact_gate, pads_of, peak_row
 
@@ -160,14 +162,14 @@ def _marks(title: str, pads: list[Pad]) -> list[tuple[str, float, tuple[int, int
 
 def _draw_head(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout) -> None:
     spec = episode.spec
-    draw.text((MARGIN, 18), episode.name, INK, _font(26))
-    draw.text((MARGIN, 54), f"\u201c{episode.instruction}\u201d   outcome: {outcome(episode)}", INK, _font(17))
+    draw.text((MARGIN, 18), episode.name, INK, font(26))
+    draw.text((MARGIN, 54), f"\u201c{episode.instruction}\u201d   outcome: {outcome(episode)}", INK, font(17))
     facts = f"{episode.num_rows} rows, {episode.num_rows / spec.fps:.2f} s at {spec.fps} fps; {spec.robot_type}; {spec.name}"
-    draw.text((MARGIN, 79), facts, SOFT, _font(15))
+    draw.text((MARGIN, 79), facts, SOFT, font(15))
     text = f"origin: {episode.origin or NO_ORIGIN}"
-    width = draw.textlength(text, _font(17))
+    width = draw.textlength(text, font(17))
     draw.rounded_rectangle((MARGIN, 102, MARGIN + width + 20, 128), 8, fill=ORIGIN_COLOR)
-    draw.text((MARGIN + 10, 105), text, PAPER, _font(17))
+    draw.text((MARGIN + 10, 105), text, PAPER, font(17))
 
 
 def _draw_cells(
@@ -175,14 +177,14 @@ def _draw_cells(
 ) -> None:
     for (n, name), (left, top, right, _) in layout.cells.items():
         if n == 0:
-            draw.text(((left + right) / 2, top - 8), name, INK, _font(15), anchor="ms")
+            draw.text(((left + right) / 2, top - 8), name, INK, font(15), anchor="ms")
     best = peak_row(pads) if pads else None
     for n, row in enumerate(layout.instants):
         top = HEAD_HEIGHT + 34 + n * (CELL_HEIGHT + GAP)
-        draw.text((MARGIN, top + 4), f"{row / episode.spec.fps:.2f} s", INK, _font(20))
-        draw.text((MARGIN, top + 32), f"row {row}", SOFT, _font(15))
+        draw.text((MARGIN, top + 4), f"{row / episode.spec.fps:.2f} s", INK, font(20))
+        draw.text((MARGIN, top + 32), f"row {row}", SOFT, font(15))
         if row == best:
-            draw.text((MARGIN, top + 54), "most touch", CONTACT_COLOR, _font(15))
+            draw.text((MARGIN, top + 54), "most touch", CONTACT_COLOR, font(15))
     shown = dict(_pictures_at(episode, layout.instants))
     for (n, name), (left, top, right, bottom) in layout.cells.items():
         picture = next((p for key, p in shown.get(layout.instants[n], {}).items() if short_name(key) == name), None)
@@ -194,12 +196,16 @@ def _draw_cells(
         image.paste(Image.fromarray(picture).resize(size, method), (left, top))
 
 
-def _pictures_at(episode: Episode, rows: tuple[int, ...]) -> list[tuple[int, Pictures]]:
-    """Decoded in one pass, and no further than the last wanted row."""
+def _pictures_at(episode: Episode, rows: tuple[int, ...]) -> Iterator[tuple[int, Pictures]]:
+    """Of a recording, decoded in one pass, and no further than the last wanted row."""
     if not episode.picture_keys:
-        return []
+        return
+    if set(episode.picture_keys) <= set(episode.videos):
+        for row in rows:
+            yield row, next(part_of(episode, row / episode.spec.fps, (row + 1) / episode.spec.fps).pictures())
+        return
     stream = itertools.islice(enumerate(episode.pictures()), max(rows) + 1)
-    return [(row, pictures) for row, pictures in stream if row in rows]
+    yield from ((row, pictures) for row, pictures in stream if row in rows)
 
 
 def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, pads: list[Pad], layout: Layout) -> None:
@@ -217,16 +223,16 @@ def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, pads: list[Pad], 
     ):
         y = top + (height - 1) * (1 - count / sensor.max_count)
         draw.line((left + 18, y, left + 23, y), INK)
-        draw.text((left + 27, y), text, INK, _font(14), anchor="lm")
+        draw.text((left + 27, y), text, INK, font(14), anchor="lm")
     for n, word in enumerate(("counts", "above", "baseline")):
-        draw.text((left, top + height + 10 + 17 * n), word, SOFT, _font(14))
+        draw.text((left, top + height + 10 + 17 * n), word, SOFT, font(14))
 
 
 def _draw_lane(
     draw: ImageDraw.ImageDraw, episode: Episode, pads: list[Pad], title: str, box: tuple[int, int, int, int]
 ) -> None:
     left, top, right, bottom = box
-    draw.text((left - 10, (top + bottom) / 2), title, INK, _font(14), anchor="rm")
+    draw.text((left - 10, (top + bottom) / 2), title, INK, font(14), anchor="rm")
     if title == "stage":
         rows, names = [row for row, _ in episode.stages], [name for _, name in episode.stages]
         order = list(dict.fromkeys(names))
@@ -236,13 +242,13 @@ def _draw_lane(
         rows = [0, *(np.flatnonzero(np.diff(gate)) + 1)]
         names, colors = ["contact" if gate[r] else "" for r in rows], [GATE_COLORS[bool(gate[r])] for r in rows]
         rule = f"{MIN_ACTIVE_TAXELS} taxel beyond {CONTACT_THRESHOLD}"
-        draw.text((right + 12, (top + bottom) / 2), rule, SOFT, _font(14), anchor="lm")
+        draw.text((right + 12, (top + bottom) / 2), rule, SOFT, font(14), anchor="lm")
     for start, end, name, color in zip(rows, [*rows[1:], episode.num_rows], names, colors, strict=True):
         x0, x1 = (left + (right - left) * r / episode.num_rows for r in (start, end))
         draw.rectangle((x0, top, x1 - 1, bottom), fill=color)
-        if draw.textlength(name, _font(14)) < x1 - x0 - 6:
+        if draw.textlength(name, font(14)) < x1 - x0 - 6:
             ink = PAPER if color == CONTACT_COLOR else INK
-            draw.text((x0 + 5, (top + bottom) / 2), name, ink, _font(14), anchor="lm")
+            draw.text((x0 + 5, (top + bottom) / 2), name, ink, font(14), anchor="lm")
 
 
 def _draw_plot(
@@ -265,7 +271,7 @@ def _draw_plot(
     canvas = np.full((height, width, 3), 255, np.uint8)
     for tick in ticks:
         cv2.line(canvas, (0, round(float(y_of(tick)))), (width, round(float(y_of(tick)))), FAINT, 1)
-        draw.text((left - 8, top + float(y_of(tick))), f"{tick:g}", SOFT, _font(13), anchor="rm")
+        draw.text((left - 8, top + float(y_of(tick))), f"{tick:g}", SOFT, font(13), anchor="rm")
     for _, value, color in marks:
         y = round(float(y_of(value)))
         for x in range(0, width, 10):
@@ -277,7 +283,7 @@ def _draw_plot(
         cv2.polylines(canvas, [fixed], False, line.color, line.width, cv2.LINE_AA, 4)
     image.paste(Image.fromarray(canvas), (left, top))
     draw.rectangle((left, top, right, bottom), outline=FAINT)
-    draw.text((left + 4, top - 5), title, INK, _font(15), anchor="ls")
+    draw.text((left + 4, top - 5), title, INK, font(15), anchor="ls")
     legend = [(line.name, line.color) for line in lines] + [(name, color) for name, _, color in marks]
     _draw_legend(draw, legend, right, top)
 
@@ -292,7 +298,7 @@ def _draw_legend(
     for n, (name, color) in enumerate(entries):
         x, y = left + 12 + (n // rows) * LEGEND_WIDTH / 2, top + 8 + step * (n % rows)
         draw.rectangle((x, y - 2, x + 14, y + 2), fill=color)
-        draw.text((x + 21, y), name, INK, _font(14 if step > 15 else 11), anchor="lm")
+        draw.text((x + 21, y), name, INK, font(14 if step > 15 else 11), anchor="lm")
 
 
 def _draw_time_axis(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout) -> None:
@@ -306,12 +312,12 @@ def _draw_time_axis(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout)
         if tick <= end_s:
             x = left + (right - left) * tick / end_s
             draw.line((x, bottom, x, bottom + 6), INK)
-            draw.text((x, bottom + 9), f"{tick:g}", SOFT, _font(14), anchor="mt")
+            draw.text((x, bottom + 9), f"{tick:g}", SOFT, font(14), anchor="mt")
     draw.text(
         ((left + right) / 2, bottom + 30),
         "time since the first row [s]; dotted: the instants above",
         SOFT,
-        _font(14),
+        font(14),
         "mt",
     )
     for row in layout.instants:
@@ -331,5 +337,5 @@ def nice_ticks(low: float, high: float, most: int = 5) -> list[float]:
     raise ValueError(f"no ticks between {low} and {high}")
 
 
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)  # Pillow's own: the same on every machine

@@ -46,6 +46,8 @@ def test_the_report_tells_what_the_dataset_holds(place: Path) -> None:
     made = simulation["mimicgen"]
     for name, value in made["draw"].items():  # reckoned from the seeds; there as the simulation drew it
         assert by_attempt[made["attempt"]][name] == value
+    card = (place / "new/README.md").read_text()
+    assert "**Origin: MuJoCo twin, not a robot**" in card and f"{told['yield']['attempts']} attempt" in card
     page = (place / "new.augment_report.html").read_text()
     assert "Yield: 1 of " in page
     assert "data:image/png;base64," in page

@@ -61,6 +61,15 @@ def test_every_episode_keeps_its_origin_and_every_row_its_domain(place: Path) ->
     assert [e.num_rows for e in episodes] == [20, 21, 22] and all(e.success for e in episodes)
     assert [set(e.arrays[IS_SIM].ravel().tolist()) for e in episodes] == [{0.0}, {0.0}, {1.0}]
     assert both.spec.features[IS_SIM].range == (0, 1) and "observation.tactile" in both.spec.sensors
+    card = (place / "both/README.md").read_text()
+    for line in (
+        "- surrogate\n- simulated\n",
+        "| surrogate: made up | 2 |",
+        "| MuJoCo twin, not a robot | 1 |",
+        "| given as real: surrogate | 2 |",
+        "| simulated: twin | 1 |",
+    ):
+        assert line in card, line
 
 
 def test_the_same_command_again_does_nothing_and_lineage_tells_what_it_was_made_of(place: Path, said: Any) -> None:
