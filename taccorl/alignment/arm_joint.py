@@ -20,8 +20,8 @@ from taccorl.alignment.rigid_joint import (
     RigidJoint,
     Surroundings,
     moved_by_others,
-    needed_nm,
     resting,
+    torque_along,
 )
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
@@ -140,8 +140,7 @@ class ArmJoint(RigidJoint):
             ).compile()
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
             q = np.column_stack([angles[f"{arm}_{name}"] for name in free])
-            v = np.gradient(q, m.period_s, axis=0)
-            both.append(needed_nm(model, self.signal, q, v, np.gradient(v, m.period_s, axis=0)))
+            both.append(torque_along(model, self.signal, q, m.period_s))
         return both[0] - both[1]
 
 

@@ -74,6 +74,8 @@ class DriveLaw:
     """k_e at the axis or joint [V·s/rad], law pwm; k_t if not given, which it is in SI units."""
     effort_limit: float | None = None
     """N·m at which the drive's torque is clipped."""
+    effort_after_target: bool = False
+    """Whether the logged effort of a row answers the row's own target already; else it was taken before that target acts."""
 
     def check_law(self, owner: str) -> None:
         """
@@ -128,6 +130,7 @@ class DriveLaw:
     def facts(self) -> dict[str, float]:
         """Numbers of ``joint_kernel.Drive`` that the law determines."""
         found: dict[str, float] = {"command": _COMMANDS.get(self.law, POSITION), "midpoint": 1.0}
+        found["effort_after"] = float(self.effort_after_target)
         if self.law == "pwm":
             found |= {"duty_torque": self.stall_nm, "back_emf": self.back_emf}
         if self.effort_limit is not None:

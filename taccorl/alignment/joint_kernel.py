@@ -122,8 +122,10 @@ class Drive(NamedTuple):
     """Torque of the whole supply voltage at rest, V k_t / R: what the controller asks for is clipped to it …"""
     back_emf: float = 0.0
     """… before k_t k_e / R times the speed is lost."""
+    effort_after: float = 0.0
+    """1: the reported torque of a row answers the row's command, 0: it is the one until then."""
     effort_age: float = 0.0
-    """s by which the reported torque is older than the one that acts: a sampled loop holds it."""
+    """s by which the reported torque is older than the one that acts on average: a sampled loop holds it."""
     midpoint: float = 0.0
     """1: steps of second order, 0: those of MuJoCo."""
     # Gear.
@@ -323,14 +325,16 @@ def simulate(
 
         # What can be seen now: the new command has not acted yet.
         until_now = command[n if p.command_delay > 0.0 else max(n - 1, 0)]
-        given, by_position, by_speed = 0.0, 0.0, 0.0
-        if within == 0 or p.load_friction > 0.0:
-            given, by_position, by_speed = _asked(p, until_now, until_now, q, v, integral, supply[row])
-            if p.torque_lag > 0.0:
-                given, by_position, by_speed = torque, 0.0, 0.0
+        given = 0.0
+        if p.load_friction > 0.0:
+            given = torque if p.torque_lag > 0.0 else _asked(p, until_now, until_now, q, v, integral, supply[row])[0]
         if within == 0:
+            by = command[n] if p.effort_after > 0.0 else until_now
+            shown, by_position, by_speed = _asked(p, by, by, q, v, integral, supply[row])
+            if p.torque_lag > 0.0:
+                shown, by_position, by_speed = torque, 0.0, 0.0
             older = p.effort_age * (by_position * v + by_speed * acceleration)
-            effort[row] = strength * (given + older) + lost * acceleration
+            effort[row] = strength * (shown + older) + lost * acceleration
             reported[row] = _reading(p, q)
             if late > 0.0:
                 newer, older = ring[(n - whole) % ring.size], ring[(n - whole - 1) % ring.size]

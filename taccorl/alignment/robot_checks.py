@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.signal import savgol_filter
 
+from taccorl.alignment.effort_time import check_effort_time
 from taccorl.alignment.joint_model import JointModel
 from taccorl.alignment.joint_motion import motion_of
 from taccorl.alignment.measurement import UNITS, Measurement
@@ -34,7 +35,9 @@ def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequenc
     for name in robot.config.joints:
         if name in m.signals:
             wrong = [*_beyond_limits(robot, m, name), *_beyond_effort(robot, m, name)]
-            found += wrong if wrong or name not in moved else _wrong_inertia(robot, whole, name)
+            if name in moved and not wrong:
+                wrong = _wrong_inertia(robot, whole, name) or _wrong_effort_time(robot, whole, name)
+            found += wrong
     return found
 
 
@@ -82,6 +85,14 @@ def _beyond_effort(robot: Robot, m: Measurement, name: str) -> list[Finding]:
         f"{name}.tau in a columns file, or mend `effort_limit:` in {robot.path.name}"
     )
     return [Finding("beyond_effort", "error", name, text, (row, row + 1))]
+
+
+def _wrong_effort_time(robot: Robot, m: Measurement, name: str) -> list[Finding]:
+    """Of gains that are known."""
+    law = robot.config.joints[name]
+    if any(name not in getattr(m, gain) for gain in law.gain_names):
+        return []
+    return check_effort_time(law, m, name, robot.path.name)
 
 
 def _wrong_inertia(robot: Robot, m: Measurement, name: str) -> list[Finding]:

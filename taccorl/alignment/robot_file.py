@@ -44,6 +44,7 @@ from taccorl.alignment.rigid_joint import (
     needed_nm,
     resting,
     rigid_terms,
+    torque_along,
 )
 from taccorl.alignment.robot_model import JointFacts, RobotModel, load_robot_model
 from taccorl.errors import SpecError, TaccorlError, nearest
@@ -253,9 +254,10 @@ class RobotJoint(RigidJoint):
         self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
         self.command_hz = self._config.command_hz or 0.0
         # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
-        # the output that a row shows before its own target acts.
+        # the output that a row shows before its own target acts. After it acts, the output is new.
         loop_s = 0.0 if self._config.loop_hz is None else 1.0 / self._config.loop_hz
-        self.facts = self._config.facts | ({"effort_age": 0.5 * loop_s} if loop_s else {})
+        newer = -1.0 if self._config.effort_after_target else 1.0
+        self.facts = self._config.facts | {"effort_age": 0.5 * newer * loop_s}
         self.position_age_s, self.speed_delay_s = 0.5 * loop_s + self._config.position_age_s, loop_s
 
     @property
@@ -383,6 +385,5 @@ class RobotJoint(RigidJoint):
             q = np.tile(pose, (m.num_rows, 1))
             for name in moving:
                 q[:, model.joint(name).qposadr[0]] = angles[name]
-            v = np.gradient(q, m.period_s, axis=0)
-            both.append(needed_nm(model, self.signal, q, v, np.gradient(v, m.period_s, axis=0)))
+            both.append(torque_along(model, self.signal, q, m.period_s))
         return both[0] - both[1] + constant

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from taccorl.alignment.effort_time import target_share
 from taccorl.alignment.measurement import Measurement, TargetKind
 from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.robot_checks import check_robot
 from taccorl.alignment.robot_file import Robot, load_robot
 from taccorl.diagnosis.fit import Fit, best_fit, rms, stacked
 from taccorl.diagnosis.joint_problem import JointProblem
@@ -47,7 +49,9 @@ def torque(law: str, goal: float, q: float, v: float) -> float:
     return 0.8 * current_a
 
 
-def recording(law: str, name: str, high_hz: float, seed: int, friction_nm: float = FRICTION_NM) -> Measurement:
+def recording(
+    law: str, name: str, high_hz: float, seed: int, friction_nm: float = FRICTION_NM, *, after: bool = False
+) -> Measurement:
     """8 s of a sweep of about ± 0.4 rad; under torques below the pendulum's 1 Hz, which friction alone damps."""
     high_hz *= 0.4 if law == "torque" else 1.0
     time_s = np.arange(8 * RATE_HZ) / RATE_HZ
@@ -58,7 +62,7 @@ def recording(law: str, name: str, high_hz: float, seed: int, friction_nm: float
     steps, rows = round(1 / (RATE_HZ * DT_S)), []
     slows = DT_S * friction_nm / INERTIA
     for following in target.tolist():
-        rows.append((q, torque(law, goal, q, v)))
+        rows.append((q, torque(law, following if after else goal, q, v)))
         goal = following
         for _ in range(steps):
             free = v + DT_S * (torque(law, goal, q, v) - WEIGHT_NM * math.sin(q)) / INERTIA
@@ -118,6 +122,30 @@ def test_stall_torque_and_back_emf_of_a_servo_are_found_from_a_wrong_data_sheet(
     mended = dataclasses.replace(config, **config.law_numbers(model.values))
     assert mended.stall_nm == pytest.approx(model.values["stall_nm"])
     assert mended.back_emf == pytest.approx(model.values["back_emf"])
+
+
+@pytest.mark.parametrize("law", ["impedance", "cascade", "velocity", "torque"])
+def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str, tmp_path: Path) -> None:
+    after = tuple(recording(law, name, hz, 1, after=True) for name, hz in (("sweep", 1.5), ("other", 1.0)))
+    before = recording(law, "sweep", 1.5, 1)
+    plain, declared = (
+        robot(tmp_path, f"law: {law}, {FILES[law]}{more}") for more in ("", ", effort_after_target: true")
+    )
+
+    def checks(made: Robot, m: Measurement) -> list[str]:
+        return [f.text for f in check_robot(made, m, made.joint("swing").whole(m), ["swing"]) if f.severity == "error"]
+
+    assert checks(plain, before) == [] and checks(declared, after[0]) == []
+    assert (
+        len(checks(plain, after[0])) == 1
+        and "Write `effort_after_target: true` for swing" in checks(plain, after[0])[0]
+    )
+    assert "Remove effort_after_target of swing" in checks(declared, before)[0]
+    share, sd = target_share(plain.config.joints["swing"], after[0], "swing") or (0.0, 1.0)
+    assert share == pytest.approx(1.0, abs=0.05) and sd < 0.1
+    measurements = Measurements(after[:1], after[1:])
+    errors = [fitted(made, measurements, "coulomb_friction")[2] for made in (plain, declared)]
+    assert errors[1] < min(5.0, 0.9 * errors[0]), errors
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from scipy.signal import savgol_filter
 
 from taccorl.alignment.axis_file import AxisConfig, axis_digest, axis_text, load_axis
 from taccorl.alignment.clock_checks import check_against_twin
+from taccorl.alignment.effort_time import check_effort_time
 from taccorl.alignment.measurement import UNITS, Measurement
 from taccorl.alignment.measurements import Measurements, Use
 from taccorl.alignment.noise_floor import noise_floor
@@ -64,7 +65,8 @@ class Axis(Machine):
         found = {}
         for m in measurements.all:
             self._check_signal(m)
-            found[m.name] = [*_beyond_limits(self.config, m), *_wrong_inertia(self.config, m)]
+            wrong = [*_beyond_limits(self.config, m), *_wrong_inertia(self.config, m)]
+            found[m.name] = wrong or check_effort_time(self.config, m, self.config.name, f"{self.name}.yaml")
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
