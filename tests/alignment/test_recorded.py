@@ -201,6 +201,7 @@ def test_checks_find_nothing_wrong_with_it(recorded):
     assert found <= {"short", "not_judged"}  # 2 s of motion, and rounding is all the noise it has
 
 
+@pytest.mark.slow
 def test_lost_and_repeated_samples_are_bridged_and_counted(moved, recorded):
     config = dataclasses.replace(NO_LOSS, joint_repeat_probability=0.02)
     m = read_measurements(write(moved, moved.folder / "lossy.mcap", config)).fit[0]

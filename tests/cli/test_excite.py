@@ -66,6 +66,7 @@ def test_a_plan_and_tables_of_targets_that_a_driver_can_send(said: Any, tmp_path
     assert code == 2 and "is there already" in text
 
 
+@pytest.mark.slow
 def test_what_nothing_tells_apart_is_said_with_exit_code_1(said: Any, tmp_path: Path):
     code, text = said(SIGNAL, "--effects=[coulomb_friction,asymmetric_friction]", f"--out={tmp_path / 'plan'}")
     assert code == 1

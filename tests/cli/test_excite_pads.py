@@ -34,6 +34,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> Any:
     return run
 
 
+@pytest.mark.slow
 def test_a_plan_tables_of_targets_and_what_to_say_of_them(said: Any, tmp_path: Path):
     out = tmp_path / "plan"
     code, text = said("--pads=right", RIVALS, f"--out={out}", "--num=2")

@@ -9,7 +9,7 @@ from taccorl.demos.stand_in_messages import JOINT_STATE, ROS2_DEFINITIONS, joint
 TOPICS = [t for topics in (STATE_TOPICS, COMMAND_TOPICS, CAMERA_TOPICS, PAD_TOPICS) for t in topics.values()]
 
 
-@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+@pytest.mark.parametrize("encoding", [pytest.param("json", marks=pytest.mark.slow), "protobuf"])
 def test_content_is_the_same_in_every_encoding(record, plain, encoding):
     usual, other = record(), record(encoding=encoding)
     for topic in (*TOPICS, EPISODE_TOPIC):

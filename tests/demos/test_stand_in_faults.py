@@ -26,6 +26,7 @@ def test_joints_in_degrees_publishes_degrees_and_metres(record):
         assert np.array_equal(faulty.positions(topic)[:, 6], usual.positions(topic)[:, 6])
 
 
+@pytest.mark.slow
 def test_swapped_arms_publish_under_each_others_topics(record):
     truth, faulty = record().truth, record(swap_arms=True)
     for topics, story_values in ((STATE_TOPICS, truth.story.state), (COMMAND_TOPICS, truth.story.command)):
@@ -96,6 +97,7 @@ def test_broken_taxels_read_zero_full_or_one_value(record):
     assert changed == [[0, 0], [3, 3], [5, 20], [11, 31]]
 
 
+@pytest.mark.slow
 def test_swapped_pads_come_under_each_others_topic(record):
     a, b = PAD_TOPICS[PADS[0]], PAD_TOPICS[PADS[3]]
     usual, faulty = record(), record(swap_pads=(PADS[0], PADS[3]))

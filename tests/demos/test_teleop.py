@@ -605,6 +605,7 @@ def test_other_actions_under_the_same_path_are_another_source(tmp_path: Path, si
 # display -----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_without_a_display_the_command_says_so_and_the_way_out(tmp_path: Path) -> None:
     env = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
     command = ["collect", "--task=bench", "--source.type=keyboard", "--images=false", f"--store={tmp_path}/store"]

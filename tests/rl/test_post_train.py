@@ -118,6 +118,7 @@ def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp
     assert rows[0][0]["actor_lr"] != rows[0][1]["actor_lr"]  # adapted, and resumed with it
 
 
+@pytest.mark.slow
 def test_rerun_files_of_rollouts_change_nothing(start: Path, tmp_path: Path) -> None:
     """Two iterations of two decisions of 5 steps, episodes of 12 steps: the first ends in the second iteration."""
     from taccorl.views.episode import save_episode

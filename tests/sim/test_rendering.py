@@ -326,6 +326,7 @@ def test_close_frees_and_another_picture_opens_again(cluttered):
         assert np.array_equal(one.render(datas[2:3]), together[2:3])
 
 
+@pytest.mark.slow
 def test_a_renderer_that_outlives_python_is_left_alone(monkeypatch):
     model, closed = spots(), []
     monkeypatch.setattr(Renderer, "close", lambda self: closed.append(self._gl))

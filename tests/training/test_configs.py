@@ -73,7 +73,15 @@ def test_a_training_file_holds_differences_from_the_defaults_only(name: str, mon
 
 
 @pytest.mark.parametrize(
-    ("task", "steps"), [("assembly_1", 1000), ("assembly_2", 1000), ("puzzle", 3000), ("test_tube", 3000)]
+    ("task", "steps"),
+    [
+        ("assembly_2", 1000),
+        ("test_tube", 3000),
+        *(
+            pytest.param(task, steps, marks=pytest.mark.slow)
+            for task, steps in (("assembly_1", 1000), ("puzzle", 3000))
+        ),
+    ],
 )
 def test_the_papers_co_training_is_the_papers_table(task: str, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     config = lerobot_train(CONFIGS / "cotrain" / f"{task}.yaml", monkeypatch)

@@ -19,7 +19,10 @@ print(DatasetConfig("local/x").video_backend, lerobot_dataset.get_safe_default_v
 
 @pytest.mark.parametrize(
     ("torchcodec", "expected"),
-    [("raise RuntimeError('Could not load libtorchcodec. Likely causes: …')", "pyav"), ("", "torchcodec")],
+    [
+        ("raise RuntimeError('Could not load libtorchcodec. Likely causes: …')", "pyav"),
+        pytest.param("", "torchcodec", marks=pytest.mark.slow),
+    ],
 )
 def test_a_torchcodec_that_cannot_be_loaded_is_left_out_in_silence(
     torchcodec: str, expected: str, tmp_path: Path
