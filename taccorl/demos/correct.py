@@ -13,37 +13,33 @@ import functools
 import json
 import zlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
-import taccorl
-from taccorl.data.dataset import PROVENANCE, episode_record
-from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
-from taccorl.demos.collect import AFTER_S, assemble, in_the_way, outcome_of
+from taccorl.data.dataset import episode_record
+from taccorl.data.spec import DatasetSpec
+from taccorl.demos import attempts
+from taccorl.demos.collect import AFTER_S, outcome_of
 from taccorl.demos.experts import expert_of
 from taccorl.demos.mimicgen.attempt import state_digest
 from taccorl.demos.mimicgen.execution import Demonstration
 from taccorl.demos.mimicgen.spec import GatesSpec
 from taccorl.demos.mimicgen.stored_actions import CORRECTION, write_stored
-from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec
 from taccorl.errors import LostError, TaccorlError, UnreachableError, nearest
 from taccorl.lineage.canonical import canonical
-from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
-from taccorl.lineage.manifest import read_manifest
-from taccorl.lineage.processes import Care, Failed
+from taccorl.lineage.processes import Failed
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
-from taccorl.sim.twin import CONTROL_HZ, TwinConfig
-from taccorl.sim.twin_file import load_twin, twin_text
+from taccorl.sim.twin import CONTROL_HZ
 
 VERSION = 2  # of an episode's correction
 CORRECTIONS_VERSION = 1  # of the dataset
@@ -52,12 +48,9 @@ ROWS = ("dataset", "actions")
 KEPT_OUT = "policy succeeded"
 _WORD = "correct"  # apart from the scenes of other commands with the same seed
 _DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of an episode: ``default_rng([scene seed, which])``
-_CARE = Care(limit_s=600.0, tries=2)
 _STALL_STEPS = CONTROL_HZ  # 1 s
 _STILL = ROBOT.per_action(0.02, 0.001)
 """(A,) [rad, m]: joints and grippers whose range over a second is smaller than this count as still."""
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -75,31 +68,22 @@ class PolicyEpisode:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectionPlan:
+class CorrectionPlan(attempts.AttemptPlan):
     """Settings of a round of corrections: policy, task, scenes, twin."""
 
-    task: str
     policy: str
     """Name of the policy: the checkpoint's folder."""
     policy_digest: str
     episodes: int = 128
     """Scenes in which the policy acts."""
-    difficulty: str = "train"
-    twin: Path | None = None
-    """A twin.yaml; the nominal twin if not given."""
-    randomization: float = 1.0
-    """Share of the paper's reset ranges."""
     episode_length: int | None = None
     """Control steps after which the policy is cut off; None: the task's own limit."""
     takeover: str = "failures"
     """``failures``: episodes in which the policy succeeds by itself are kept out; ``all``: they are corrected, too."""
     rows: str = "dataset"
     """``dataset``; or ``actions``: seeds and actions, which ``taccorl execute`` makes a dataset of, together with others."""
-    images: bool = True
     part_poses: bool = False
     """Rows have the poses of the task's parts (``observation.environment_state``)."""
-    seed: int = 0
-    """Of scenes, takeovers and experts."""
 
     def __post_init__(self) -> None:
         """
@@ -117,12 +101,9 @@ class CorrectionPlan:
             raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, ROWS)}")
         if self.rows == "actions" and self.part_poses:
             raise TaccorlError("--part_poses=true has no effect with --rows=actions: give it to taccorl execute")
-        for name, least in (("episodes", 1), ("seed", 0), ("episode_length", 1)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise TaccorlError(f"--{name}={value}: at least {least}")
-        if not 0 <= self.randomization <= 1:
-            raise TaccorlError(f"--randomization={self.randomization:g}: a share of the paper's reset ranges, 0 … 1")
+        if self.episode_length is not None and self.episode_length < 1:
+            raise TaccorlError(f"--episode_length={self.episode_length}: at least 1")
+        super().__post_init__()
 
     @property
     def scene_seeds(self) -> list[int]:
@@ -134,30 +115,13 @@ class CorrectionPlan:
         state = np.random.SeedSequence(self.seed, spawn_key=key).generate_state(1, np.uint64)
         return int(state[0] >> np.uint64(2))
 
-    def twin_config(self) -> TwinConfig:
-        """The twin to act in."""
-        return load_twin(self.twin) if self.twin else TwinConfig()
-
-    def make(self) -> Simulation:
-        """Make the simulation of this plan."""
-        return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
-
     def contract(self, sim: Simulation) -> DatasetSpec:
         """Data spec of the dataset's rows."""
-        spec = load_dataset_spec(find_spec("taccorl_bimanual"))
-        return with_simulator(spec, sim, pictures=self.images, parts=self.part_poses)
+        return row_spec(sim, pictures=self.images, parts=self.part_poses)
 
     def scene_config(self) -> dict[str, Any]:
         """Settings on which the policy's episodes depend, besides the policy and their seeds; part of the store's key."""
-        return {
-            "task": self.task,
-            "difficulty": self.difficulty,
-            "twin": twin_text(self.twin_config()),
-            "randomization": self.randomization,
-            "episode_length": self.episode_length,
-            "mujoco": mujoco.__version__,
-            "taccorl": taccorl.__version__,
-        }
+        return super().scene_config() | {"episode_length": self.episode_length}
 
     def config(self, k: int) -> dict[str, Any]:
         """Settings on which the correction of episode ``k`` depends, besides the policy's episodes; part of the store's key."""
@@ -170,7 +134,7 @@ class CorrectionPlan:
 def write_policy_episodes(episodes: Sequence[PolicyEpisode], folder: Path) -> None:
     """Write the policy's episodes into ``folder``: episodes.json, and the rows of all episodes one after another."""
     table = [{"seed": e.seed, "outcome": e.outcome, "steps": len(e.actions)} for e in episodes]
-    _dump(folder / "episodes.json", table)
+    attempts.write_json(folder / "episodes.json", table)
     np.save(folder / "actions.npy", np.concatenate([e.actions for e in episodes]))
     np.save(folder / "states.npy", np.concatenate([e.states for e in episodes]))
 
@@ -291,7 +255,7 @@ def correct(
     out: Path,
     store: Store,
     engine: Engine | None = None,
-    progress: Progress = print,
+    progress: attempts.Progress = print,
 ) -> dict[str, Any]:
     """A LeRobot dataset at ``out`` of the expert's rows in the policy's episodes ``acted``; returns the report.
 
@@ -306,22 +270,16 @@ def correct(
     spec = plan.contract(sim)
     sim.close()
 
-    def show(k: int, artefact: Artefact) -> None:
-        entry = _entry(artefact.path)
-        progress(f"episode {k}: {entry['outcome']}{', ' + entry['reason'] if entry['reason'] else ''}")
-
-    made = (engine or LocalEngine()).map(
+    made = attempts.run_attempts(
         functools.partial(run_correction, plan, acted, store),
         range(plan.episodes),
-        on_done=show,
-        name=lambda k: f"episode {k}",
-        care=_CARE,
-        instead=functools.partial(_lost_correction, plan, acted, store),
+        engine or LocalEngine(),
+        said=lambda entry: entry["outcome"] + (f", {entry['reason']}" if entry["reason"] else ""),
+        progress=progress,
+        name="episode",
     )
-    entries = [_entry(artefact.path) for artefact in made]
-    report = correction_report(plan, entries)
-    kept = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["outcome"] == "success"]
-    if not kept:
+    report = correction_report(plan, [entry for _, entry in made])
+    if not (kept := [artefact for artefact, entry in made if attempts.is_success(entry)]):
         raise TaccorlError(
             f"{plan.task}: no episode was corrected, nothing was written to {out}: {report['outcomes']}. More episodes, or "
             "--takeover=all if the policy succeeds by itself"
@@ -329,19 +287,19 @@ def correct(
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
         if plan.rows == "dataset":
-            assemble(spec, report, inputs, folder)
+            attempts.assemble(spec, report, inputs, folder)
         else:
             simulation = plan.config(0) | {"sources": ""}
             gates = {"gates": dataclasses.asdict(GatesSpec())}
             write_stored(folder, simulation, gates, report, [_demonstration(path) for path in inputs], CORRECTION)
 
-    store.run(dataclasses.replace(_stage(plan), fn=write), _dataset_config(plan), kept, destination=out)
+    store.run(_stage(plan).bound(write), _dataset_config(plan), kept, destination=out)
     return report
 
 
 def _demonstration(folder: Path) -> Demonstration:
     """A success as it is stored."""
-    entry = _entry(folder)
+    entry = attempts.read_entry(folder)
     return Demonstration(
         attempt=entry["episode"],
         scene_seed=entry["scene_seed"],
@@ -369,37 +327,30 @@ def check_out(plan: CorrectionPlan, out: Path) -> None:
     Raises:
         InTheWayError: says what is there.
     """
-    manifest = read_manifest(out) if out.is_dir() else None
-    is_ours = manifest and manifest["stage"] == _stage(plan).name and manifest["config"] == _dataset_config(plan)
-    if not is_free(out) and not is_ours:
-        raise in_the_way(out, _stage(plan), plan.task)
+    attempts.check_destination(
+        out, _stage(plan), plan.task, lambda manifest: manifest["config"] == _dataset_config(plan)
+    )
 
 
-def run_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int) -> Artefact:
-    """Episode ``k`` corrected, or found in the store: entry.json, actions.npy; of a success dataset/ and episodes.json, too."""
+def run_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int, end: Failed | None = None) -> Artefact:
+    """Episode ``k`` corrected, or found in the store: entry.json, actions.npy; of a success dataset/ and episodes.json, too.
 
-    def build(config: Any, inputs: list[Path], folder: Path) -> None:
-        _build(plan, k, config, inputs[0], folder)
-
-    return store.run(dataclasses.replace(_CORRECTION, fn=build), plan.config(k), [acted])
-
-
-def _lost_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int, end: Failed) -> Artefact:
-    """Episode ``k`` whose process did not come to an end of its own."""
+    Args:
+        end: how its process ended, if it did not come to an end of its own: that is the outcome then.
+    """
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
-        _write(Correction(end.process, end.reason), read_policy_episode(inputs[0], k), k, folder)
+        if end is None:
+            _build(plan, k, config, inputs[0], folder)
+        else:
+            _write(Correction(end.process, end.reason), read_policy_episode(inputs[0], k), k, folder)
 
-    return store.run(dataclasses.replace(_CORRECTION, fn=build), plan.config(k), [acted])
+    return store.run(_CORRECTION.bound(build), plan.config(k), [acted])
 
 
-def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("this stage is run with its function bound to the plan; it cannot be called directly")
-
-
-_CORRECTION = Stage("correction", _not_yet, VERSION)
-_CORRECTIONS = Stage("corrections", _not_yet, CORRECTIONS_VERSION, manifest=f"{PROVENANCE}/manifest.json")
-_CORRECTION_ACTIONS = Stage("correction_actions", _not_yet, CORRECTIONS_VERSION)
+_CORRECTION = Stage("correction", version=VERSION)
+_CORRECTIONS = Stage("corrections", version=CORRECTIONS_VERSION, manifest=attempts.DATASET_MANIFEST)
+_CORRECTION_ACTIONS = Stage("correction_actions", version=CORRECTIONS_VERSION)
 
 
 def _build(plan: CorrectionPlan, k: int, config: dict[str, Any], acted: Path, folder: Path) -> None:
@@ -420,7 +371,7 @@ def _build(plan: CorrectionPlan, k: int, config: dict[str, Any], acted: Path, fo
         name = f"{plan.task} seed {episode.seed}, from step {done.takeover_step}"
         made = done.recorder.episode(name, config | {"correction": correction})
         write_episodes([made], folder / "dataset")
-        _dump(folder / "episodes.json", [episode_record(made, "")])
+        attempts.write_json(folder / "episodes.json", [episode_record(made, "")])
     _write(done, episode, k, folder, correction)
 
 
@@ -443,7 +394,7 @@ def _write(
         "correction": correction,
     }
     np.save(folder / "actions.npy", done.actions)
-    _dump(folder / "entry.json", entry)
+    attempts.write_json(folder / "entry.json", entry)
 
 
 _made: dict[str, tuple[Simulation, DatasetSpec]] = {}
@@ -478,17 +429,9 @@ def correction_report(plan: CorrectionPlan, entries: Sequence[dict[str, Any]]) -
         "taken_over": len(over),
         "causes": count([e["cause"] for e in over]),
         "outcomes": count([e["outcome"] + (f": {e['reason']}" * (e["outcome"] == "not taken over")) for e in entries]),
-        "episodes": sum(e["outcome"] == "success" for e in entries),
-        "rows": sum(e["rows"] for e in entries if e["outcome"] == "success"),
+        "episodes": attempts.successes(entries),
+        "rows": sum(e["rows"] for e in entries if attempts.is_success(e)),
         "entries": [
             {key: value for key, value in e.items() if key not in ("correction", "last_state")} for e in entries
         ],
     }
-
-
-def _entry(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "entry.json").read_text(encoding="utf-8"))
-
-
-def _dump(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.episode import EXECUTED, Episode, Pictures
-from taccorl.data.spec import DatasetSpec, FeatureSpec
+from taccorl.data.spec import DatasetSpec, FeatureSpec, find_spec, load_dataset_spec
 from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY, POSE_UNITS, part_pose_names, part_poses, posed_bodies
 from taccorl.sim.simulation import Simulation, Watch
@@ -26,17 +26,16 @@ _REACH = (-10.0, 10.0)  # [m] a part that fell off the table is still within it
 PICTURE = "observation.images."
 
 
-def with_simulator(
-    spec: DatasetSpec, sim: Simulation, *, pictures: bool, executed: bool = False, parts: bool = False
-) -> DatasetSpec:
-    """The dataset contract with the simulator's own features: state, seed, subtask of each arm, success; and what was executed,
-    where ``action`` is what was intended.
+def row_spec(sim: Simulation, *, pictures: bool, executed: bool = False, parts: bool = False) -> DatasetSpec:
+    """Data spec of the twin's rows: the robot's features and the simulator's own: state, seed, subtask of each arm, success.
 
     ``sim.state`` has the size of the task's scene, so datasets of different tasks merge only without it.
 
     Args:
+        executed: rows have what was executed, where ``action`` is what was intended.
         parts: rows have the poses of the task's parts (``part_poses``), too.
     """
+    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     own = {"unit": "1", "frame": "simulator", "rate_hz": float(spec.fps)}
     features = {
         key: feature
@@ -74,7 +73,7 @@ class EpisodeRecorder:
 
     sim: Simulation
     spec: DatasetSpec
-    """With the simulator's features: ``with_simulator``."""
+    """``row_spec``."""
     sensor_rng: np.random.Generator | None = None
     """Noise of the pads; None: a noiseless sensor."""
     dense: bool = False

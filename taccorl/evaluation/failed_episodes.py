@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.data.episode import Episode
-from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.rollouts import Rollout
@@ -57,9 +56,7 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
     if scenes.episode_length is not None:
         sim.judge.limit_steps = scenes.episode_length
     sim.reset([row.seed])
-    recorder = EpisodeRecorder(
-        sim, with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=images)
-    )
+    recorder = EpisodeRecorder(sim, row_spec(sim, pictures=images))
     for action in rollout.actions:
         recorder.sensor_rng = np.random.default_rng((row.seed, len(recorder.rows)))  # as the environment's pads
         recorder.step(action)

@@ -1,6 +1,5 @@
 """The policy's part of corrections (``demos/correct.py``): episodes in batches, kept in the store as seeds and actions."""
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,14 +32,10 @@ def policy_episodes(
         "scene_seeds": plan.scene_seeds,
         "num_envs": num_envs,  # the policy's random numbers are drawn for a batch
     }
-    return store.run(dataclasses.replace(_STAGE, fn=build), config, [])
+    return store.run(_STAGE.bound(build), config, [])
 
 
-def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("this stage is run with its function bound to the policy; it cannot be called directly")
-
-
-_STAGE = Stage("policy_episodes", _not_yet, VERSION)
+_STAGE = Stage("policy_episodes", version=VERSION)
 
 
 def _act(plan: CorrectionPlan, actor: Actor, num_envs: int, progress: Progress | None) -> list[PolicyEpisode]:

@@ -1,5 +1,6 @@
 """Stage: a named step of a pipeline. Artefact: its result, or a raw source."""
 
+import dataclasses
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,13 +10,19 @@ from typing import Any
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
 
+Function = Callable[[Any, list[Path], Path], None]
+
+
+def _unbound(config: Any, inputs: list[Path], folder: Path) -> None:
+    raise NotImplementedError("this stage runs with a function of what it works on: Stage.bound")
+
 
 @dataclass(frozen=True)
 class Stage:
     """A named step. Increase ``version`` when its code gives other results: old artefacts are then not used."""
 
     name: str
-    fn: Callable[[Any, list[Path], Path], None]
+    fn: Function = _unbound
     """Reads the config and the inputs, writes files into the folder given last. It may remove and remake the folder."""
     version: int = 1
     manifest: str = MANIFEST_PLACES[0]
@@ -28,6 +35,10 @@ class Stage:
             raise LineageError(
                 f"stage {self.name}: manifest at {self.manifest!r}, but it is only found again at one of {MANIFEST_PLACES}."
             )
+
+    def bound(self, fn: Function) -> "Stage":
+        """The same stage with this function, which knows more than config and inputs: a simulation, say."""
+        return dataclasses.replace(self, fn=fn)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ the rows of these episodes into the memory-mapped arrays. An episode whose frame
 dataset, is copied: demonstrations are rendered once, however often corrections join them.
 """
 
-import dataclasses
 import functools
 import multiprocessing
 import time
@@ -69,7 +68,7 @@ def render_frames(
         )
         seconds.extend(found)
 
-    artefact = store.run(dataclasses.replace(FRAMES, fn=render), FramesConfig(resolution), [store.dataset(root)])
+    artefact = store.run(FRAMES.bound(render), FramesConfig(resolution), [store.dataset(root)])
     return artefact, mean_seconds(seconds)
 
 

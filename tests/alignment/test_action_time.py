@@ -16,8 +16,7 @@ from taccorl.alignment.recorded import signal_names
 from taccorl.data.cutting import open_episodes
 from taccorl.data.episode import Episode
 from taccorl.data.lag_checks import arm_lags
-from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.demos.stand_in import StandInConfig, publish
 from taccorl.demos.stand_in_streams import Streams
 from taccorl.demos.twin_recording import LEAD_S, TwinStory
@@ -55,7 +54,7 @@ class BothWays:
 def both(tmp_path_factory) -> BothWays:
     sim = Simulation(Bench())
     sim.reset([0])
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    spec = row_spec(sim, pictures=False)
     recorder = EpisodeRecorder(sim, spec, np.random.default_rng(0), dense=True)
     home, rng = sim.targets[0].copy(), np.random.default_rng(3)
     phase, frequency_hz = rng.uniform(0, 6.3, (2, 14)), rng.uniform(0.4, 1.1, (2, 14))

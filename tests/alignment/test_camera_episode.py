@@ -10,8 +10,7 @@ from taccorl.alignment.camera import calibrate_camera
 from taccorl.alignment.camera_benchmarks import moving_joints, pose_error
 from taccorl.alignment.camera_episode import camera_frames, stage_rows
 from taccorl.data.episode import Episode
-from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.simulation import Simulation
@@ -28,7 +27,7 @@ def episode() -> Episode:
     config = TwinConfig(effects=[make_effect("camera_pose", **OFFSET, cameras=["front"])])
     sim = Simulation(tasks.get("assembly_1")(), config)
     sim.reset([0])
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=True)
+    spec = row_spec(sim, pictures=True)
     recorder = EpisodeRecorder(sim, spec)
     for row in moving_joints(np.random.default_rng(0), np.arange(120) / 30):
         recorder.step(row)

@@ -23,7 +23,7 @@ from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_recor
 from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import find_spec, load_dataset_spec, load_recording_spec
-from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.demos.stand_in import START_UNIX_NS, StandInConfig, publish, write_cobot_magic_hdf5
 from taccorl.demos.stand_in_streams import Streams
 from taccorl.demos.twin_recording import LEAD_S, TwinStory
@@ -68,7 +68,7 @@ def write(moved: Moved, path: Path, config: StandInConfig, **label: str) -> Path
 def moved(tmp_path_factory) -> Moved:
     sim = Simulation(Bench())
     sim.reset([0])
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    spec = row_spec(sim, pictures=False)
     recorder = EpisodeRecorder(sim, spec, np.random.default_rng(0), dense=True)
     home = sim.targets[0].copy()
     for k in range(round(SECONDS * 30)):

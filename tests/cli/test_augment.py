@@ -146,7 +146,7 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
         (("--task=assembly_2", "--difficulty=hrad"), "did you mean 'hard'?"),
         (("--task=assembly_2", "--twin=no.yaml"), "no.yaml"),
         (("--task=assembly_2", "--engine.workers=0"), "augment: --engine.workers=0: at least one"),
-        (("--task=assembly_2", "--episodes=0"), "--episodes=0: at least one"),
+        (("--task=assembly_2", "--episodes=0"), "--episodes=0: at least 1"),
         (("--task=assembly_2", "--out=store/x", "--store=store"), "lie in one another"),
         (("--task=assembly_2", "--source=nowhere"), "nowhere: no such folder"),
         ((*WORDS[:3], "--out=mine", "--store=store"), "mine is in the way: it is a folder of 1 entries without"),

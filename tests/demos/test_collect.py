@@ -13,9 +13,8 @@ from mcap.reader import make_reader
 
 from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
-from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.collect import Attempt, Plan, Source, attempt, collect, collect_recordings, outcome_of
-from taccorl.demos.recorder import with_simulator
+from taccorl.demos.recorder import row_spec
 from taccorl.demos.stand_in import CAMERA_TOPICS
 from taccorl.demos.twin_recording import LEAD_S, TwinStory
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
@@ -111,8 +110,8 @@ def test_what_is_in_the_way_is_left_alone(collected, capsys):
     [
         ("--task=asembly_1", "assembly_1"),
         ("--difficulty=hart", "hard"),
-        ("--episodes=0", "at least one"),
-        ("--seed=-1", "--seed=-1: seeds are 0, 1, 2"),
+        ("--episodes=0", "--episodes=0: at least 1"),
+        ("--seed=-1", "--seed=-1: at least 0"),
         ("--randomization=-0.1", "from 0 to 1"),
         ("--randomization=1.5", "--randomization=1.5: it is a share"),
         ("--randomization=nan", "from 0 to 1"),
@@ -208,9 +207,7 @@ def test_a_pose_out_of_reach_ends_its_attempt_and_no_other(tmp_path, rows):
     plan = Three(task="assembly_1", source=Stretched(rows=rows), images=False, keep_failures=True)
     if not rows:  # nothing to keep: ended before the first row
         sim = plan.make()
-        recorder = attempt(
-            plan, sim, with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False), 0
-        )
+        recorder = attempt(plan, sim, row_spec(sim, pictures=False), 0)
         assert (recorder.outcome, recorder.rows, recorder.is_kept(plan)) == ("unreachable", [], False)
         return
     report = collect(plan, tmp_path / "x", Store(tmp_path / "store"), lambda _: None)
@@ -228,7 +225,7 @@ def test_a_pose_out_of_reach_ends_its_attempt_and_no_other(tmp_path, rows):
 def told():
     plan = Plan(task="assembly_1", seed=5)
     sim = plan.make()
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    spec = row_spec(sim, pictures=False)
     recorder = attempt(plan, sim, spec, 0, dense=True)
     assert outcome_of(sim) == "success"
     return sim, recorder, TwinStory(sim, recorder.trajectory(), "success")

@@ -428,7 +428,7 @@ def test_another_folder_is_in_the_way(tmp_path: Path) -> None:
 def test_a_dataset_of_other_corrections_is_in_the_way_before_the_policy_acts(tmp_path: Path) -> None:
     store, out = Store(tmp_path / "store"), tmp_path / "out"
     (tmp_path / "in").write_text("x", encoding="utf-8")
-    stage = dataclasses.replace(module._CORRECTIONS, fn=lambda _, inputs, folder: (folder / "x").write_text("x"))
+    stage = module._CORRECTIONS.bound(lambda _, inputs, folder: (folder / "x").write_text("x"))
     store.run(stage, module._dataset_config(plan()), [store.source(tmp_path / "in")], destination=out)
     module.check_out(plan(), out)
     with pytest.raises(InTheWayError, match="out is in the way"):

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.collect import ExpertSource, Plan, attempt, outcome_of
-from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.sim.task import HOLD_S
 from taccorl.sim.twin import CONTROL_HZ
 
@@ -14,7 +13,7 @@ from taccorl.sim.twin import CONTROL_HZ
 def recorded():
     plan = Plan(task="assembly_1", source=ExpertSource(), seed=3)
     sim = plan.make()
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    spec = row_spec(sim, pictures=False)
     recorder = attempt(plan, sim, spec, 0)
     assert outcome_of(sim) == "success"
     return plan, sim, spec, recorder.episode("demo", {"seed": plan.attempt_seed(0)})

@@ -18,12 +18,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, attempt, outcome_of
 from taccorl.demos.experts.scripted import EXACT
 from taccorl.demos.experts.se3 import rotvec
-from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.demos.teleop import GamepadSource, KeyboardSource, LeaderHands, LeaderSource
 from taccorl.demos.teleop_actions import ActionFile, ActionLog, ActionsSource, find_finished, scene_of
 from taccorl.demos.teleop_jog import AXES, COMMAND_KEYS, Command, Gamepad, GlfwGamepad, Jogger, Keyboard, key_map
@@ -303,7 +302,7 @@ def with_script(monkeypatch: pytest.MonkeyPatch, script: Iterable[Sequence[int]]
 
 
 def run(plan: Plan, sim: Simulation, k: int = 0) -> EpisodeRecorder:
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    spec = row_spec(sim, pictures=False)
     return attempt(plan, sim, spec, k)
 
 

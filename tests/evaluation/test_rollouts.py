@@ -196,13 +196,12 @@ def test_a_failure_is_executed_again_bit_for_bit() -> None:
 
 @pytest.mark.slow
 def test_the_expert_succeeds_where_it_is_known_to() -> None:
-    from taccorl.data.spec import find_spec, load_dataset_spec
     from taccorl.demos.collect import ExpertSource, Plan, attempt
-    from taccorl.demos.recorder import with_simulator
+    from taccorl.demos.recorder import row_spec
 
     plan = Plan(task="assembly_1", images=False, source=ExpertSource())
     sim = plan.make()
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    spec = row_spec(sim, pictures=False)
     collected = attempt(plan, sim, spec, 0)
     assert collected.outcome == "success"
     where = scenes(episodes=1, seed=plan.attempt_seed(0), episode_length=None)

@@ -9,8 +9,7 @@ import pytest
 from expert_episode import MIDDLE, SEED, expert_episode
 from gymnasium.utils.env_checker import check_env
 
-from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.demos.recorder import with_simulator
+from taccorl.demos.recorder import row_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.env import TaccorlEnv, env_id
 from taccorl.sim.episode_seeds import episode_seed
@@ -233,10 +232,9 @@ def test_a_twin_without_a_camera_is_refused_only_where_pictures_are_wanted(tmp_p
         TaccorlVectorEnv("bench", twin=path, images="on_request")
     TaccorlEnv("bench", twin=path, images=False).reset(seed=0)
     sim = Simulation(tasks.get("bench")(), load_twin(path))
-    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     with pytest.raises(TaccorlError, match=said):
-        with_simulator(spec, sim, pictures=True)
-    with_simulator(spec, sim, pictures=False)
+        row_spec(sim, pictures=True)
+    row_spec(sim, pictures=False)
 
 
 def test_a_twin_file_is_obeyed(tmp_path: Path) -> None:

@@ -4,8 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.sim.env import TaccorlEnv
 from taccorl.sim.lerobot_env import raw_names
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names, part_poses, posed_bodies
@@ -33,7 +32,7 @@ def test_rows_and_environments_have_the_same_numbers():
     envs = TaccorlVectorEnv("assembly_2", 2, part_poses=True, num_threads=1)
     observation, _ = envs.reset(seed=[5, 6])
     sim = Simulation(tasks.get("assembly_2")())
-    spec = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False, parts=True)
+    spec = row_spec(sim, pictures=False, parts=True)
     assert spec.features[PARTS_KEY].names == part_pose_names(sim.task)
     sim.reset([5])
     recorder, seen = EpisodeRecorder(sim, spec), []

@@ -11,20 +11,16 @@ import functools
 import json
 import shlex
 import traceback
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import mujoco
 import numpy as np
 
-import taccorl
 from taccorl.data.dataset import PROVENANCE, episode_record
 from taccorl.data.episode import Episode
-from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
-from taccorl.demos.collect import REPORT, assemble, in_the_way
+from taccorl.data.spec import DatasetSpec
+from taccorl.demos import attempts
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
 from taccorl.demos.mimicgen.execution import DIFFERS, Demonstration, Execution, execute
 from taccorl.demos.mimicgen.from_dataset import read_sources, simulation_told
@@ -32,20 +28,18 @@ from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, MimicSpec, check_task
 from taccorl.demos.mimicgen.stored_actions import META, MIMICGEN, write_stored
 from taccorl.demos.mimicgen.stratify import ResetSpace, first_attempts, next_round
-from taccorl.demos.recorder import ORIGIN, with_simulator
+from taccorl.demos.recorder import ORIGIN, row_spec
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.canonical import canonical
-from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
-from taccorl.lineage.processes import Care, Failed
+from taccorl.lineage.processes import Failed
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.randomize import Row, draw
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
-from taccorl.sim.twin import CONTROL_HZ, TwinConfig
-from taccorl.sim.twin_file import load_twin, twin_text
+from taccorl.sim.twin import CONTROL_HZ
 
 VERSION = 4  # of an attempt
 ROWS_VERSION = 2  # of a success's rows
@@ -56,9 +50,7 @@ _ROUND = (
 )
 _HOPELESS = 0.05  # of a hundred attempts
 _HUNDRED = 100
-_CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
 
-Progress = Callable[[str], None]
 Rows = Literal["dataset", "actions"]
 
 
@@ -75,19 +67,13 @@ class Made:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AugmentPlan:
-    """Settings of a generation: task, number of episodes, spec, twin, seed."""
+class AugmentPlan(attempts.AttemptPlan):
+    """Settings of a generation: spec, which states the task, number of episodes, twin, seed."""
 
+    task: str = field(init=False)
     spec: MimicSpec
     episodes: int = 200
-    """Successful ones."""
-    difficulty: str = "train"
-    twin: Path | None = None
-    """Where the new episodes happen; the nominal twin if not given. It need not be the sources' twin."""
-    randomization: float = 1.0
-    """Share of the paper's ranges."""
-    images: bool = True
-    seed: int = 0
+    """Successful ones, in the plan's twin, which need not be the sources'."""
     stratify: bool = False
     """Fill the poor boxes of the reset space (``stratify.py``). An attempt does not depend on it, only which are made."""
     rows: Rows = "dataset"
@@ -95,15 +81,13 @@ class AugmentPlan:
     origin: str = field(default=ORIGIN)
 
     def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise TaccorlError(f"--episodes={self.episodes}: at least one")
-        if self.seed < 0:
-            raise TaccorlError(f"--seed={self.seed}: seeds are 0, 1, 2, …")
+        object.__setattr__(self, "task", self.spec.task)
+        super().__post_init__()
         if self.rows not in get_args(Rows):
             raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, get_args(Rows))}")
         if self.stratify and not self.space.rows:
             raise TaccorlError(
-                f"--stratify=true: nothing is randomised at a reset of {self.spec.task}, so no box can have too few episodes"
+                f"--stratify=true: nothing is randomised at a reset of {self.task}, so no box can have too few episodes"
             )
 
     @functools.cached_property
@@ -113,19 +97,15 @@ class AugmentPlan:
 
     @functools.cached_property
     def _rows(self) -> tuple[Row, ...]:
-        return tuple(tasks.get(self.spec.task)(self.difficulty).rows)
+        return tuple(tasks.get(self.task)(self.difficulty).rows)
 
     def scene_seed(self, k: int) -> int:
         """Scene seed of attempt ``k``."""
-        return attempt_seeds(self.seed, self.spec.task, k)[0]
+        return attempt_seeds(self.seed, self.task, k)[0]
 
     def draw(self, k: int) -> dict[str, np.ndarray]:
         """Values that the reset of attempt ``k`` draws at random (poses of parts and others), by name; nothing is simulated."""
         return draw(self._rows, np.random.default_rng(self.scene_seed(k)), self.randomization)
-
-    def twin_config(self) -> TwinConfig:
-        """The twin to generate in."""
-        return load_twin(self.twin) if self.twin else TwinConfig()
 
     @property
     def stage(self) -> Stage:
@@ -133,39 +113,29 @@ class AugmentPlan:
         return _AUGMENTED if self.rows == "dataset" else _ACTIONS
 
     def make(self) -> Simulation:
-        """Make the simulation of this plan."""
-        task = tasks.get(self.spec.task)(self.difficulty)
-        check_task(self.spec, task)
-        return Simulation(task, self.twin_config(), scale=self.randomization)
+        """Make the simulation of this plan, whose task the spec must fit."""
+        sim = super().make()
+        check_task(self.spec, sim.task)
+        return sim
 
     def contract(self, sim: Simulation) -> DatasetSpec:
         """Data spec of a new episode's rows."""
         disturbs = self.spec.datagen_config.disturbance.joint_rad > 0
-        return with_simulator(
-            load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=self.images, executed=disturbs
-        )
+        return row_spec(sim, pictures=self.images, executed=disturbs)
 
     def config(self, k: int) -> dict[str, Any]:
         """Settings on which attempt ``k`` depends, besides the sources; not the number of attempts."""
-        return canonical(
-            {
-                "task": self.spec.task,
-                "spec": dataclasses.asdict(self.spec),
-                "difficulty": self.difficulty,
-                "twin": twin_text(self.twin_config()),
-                "randomization": self.randomization,
-                "images": self.images,
-                "origin": self.origin,
-                "root_seed": self.seed,
-                "attempt": k,
-                "mujoco": mujoco.__version__,
-                "taccorl": taccorl.__version__,
-            }
-        )
+        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, "origin": self.origin}
+        return canonical(self.scene_config() | own | {"root_seed": self.seed, "attempt": k})
 
 
 def augment(
-    plan: AugmentPlan, source: Path, out: Path, store: Store, engine: Engine | None = None, progress: Progress = print
+    plan: AugmentPlan,
+    source: Path,
+    out: Path,
+    store: Store,
+    engine: Engine | None = None,
+    progress: attempts.Progress = print,
 ) -> dict[str, Any]:
     """Generate ``plan.episodes`` successes from those at ``source`` into ``out``, as ``plan.rows`` states; returns the report.
 
@@ -173,66 +143,58 @@ def augment(
         TaccorlError: sources that do not fit or are not as written, something else at ``out``, or hardly any attempt succeeds.
     """
     sources = store.dataset(source)
-    engine, entries, made = engine or LocalEngine(), [], []
+    made: list[Artefact] = []
+    entries: list[attempts.Entry] = []
     # Before anything is sent away: what does not fit is refused here.
     sim = _attempts(plan, sources.path, sources.digest).sim
     spec = plan.contract(sim)
-    fn = functools.partial(run_attempt, plan, sources, store)
-    lost = functools.partial(_lost_attempt, plan, sources, store)
-
-    def told(k: int, artefact: Artefact) -> None:
-        entry = _entry(artefact.path)
-        progress(f"attempt {k}: {entry['outcome']} after {entry['seconds']:.1f} s")
-
-    while (successes := _successes(entries)) < plan.episodes:
+    while (successes := attempts.successes(entries)) < plan.episodes:
         if entries:
             progress(f"{successes} of {plan.episodes} after {len(entries)} attempts")
         if len(entries) >= _HUNDRED and successes < _HOPELESS * len(entries):
-            failed = next(a.path for a, e in zip(made, entries, strict=True) if e["outcome"] != "success")
+            failed = next(a.path for a, e in zip(made, entries, strict=True) if not attempts.is_success(e))
             raise TaccorlError(
-                f"{plan.spec.task}: {successes} of {len(entries)} attempts succeeded, nothing was written to {out}. Failures: "
-                f"{_outcomes(entries)}. Look at one: taccorl view {shlex.quote(str(failed))}"
+                f"{plan.task}: {successes} of {len(entries)} attempts succeeded, nothing was written to {out}. Failures: "
+                f"{attempts.outcomes(entries)}. Look at one: taccorl view {shlex.quote(str(failed))}"
             )
-        for artefact in engine.map(
-            fn, _next_numbers(plan, entries), on_done=told, name=lambda k: f"attempt {k}", care=_CARE, instead=lost
-        ):
-            entry = _entry(artefact.path)
-            entries.append(entry)
+        done = attempts.run_attempts(
+            functools.partial(run_attempt, plan, sources, store),
+            _next_numbers(plan, entries),
+            engine or LocalEngine(),
+            said=lambda entry: f"{entry['outcome']} after {entry['seconds']:.1f} s",
+            progress=progress,
+        )
+        for artefact, entry in done:
             made.append(artefact)
-            successes += entry["outcome"] == "success"
-            if successes == plan.episodes:
+            entries.append(entry)
+            if attempts.successes(entries) == plan.episodes:
                 break
-    kept = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["outcome"] == "success"]
+    kept = [a for a, e in zip(made, entries, strict=True) if attempts.is_success(e)]
     report = _report(plan, entries)
-
-    config = {"task": plan.spec.task, "spec": plan.spec.digest, "attempts": len(entries)}
+    config = {"task": plan.task, "spec": plan.spec.digest, "attempts": len(entries)}
     config |= {"stratify": True} if plan.stratify else {}
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
         if plan.rows == "dataset":
-            assemble(spec, report, inputs, folder)
+            attempts.assemble(spec, report, inputs, folder)
         else:
             common = plan.config(0) | {"sources": sources.digest}
             write_stored(
                 folder, common, dataclasses.asdict(plan.spec), report, [demonstration_of(path) for path in inputs]
             )
 
-    store.run(dataclasses.replace(plan.stage, fn=write), config, kept, destination=out)
+    store.run(plan.stage.bound(write), config, kept, destination=out)
     return report
 
 
 def _next_numbers(plan: AugmentPlan, entries: list[dict[str, Any]]) -> list[int]:
     """Numbers of the attempts to make next, ascending; follows from the ``entries`` of the rounds before alone."""
     if plan.stratify:
-        done = [(entry["attempt"], entry["outcome"] == "success") for entry in entries]
+        done = [(entry["attempt"], attempts.is_success(entry)) for entry in entries]
         return next_round(plan.space, lambda k: plan.space.boxes(plan.draw(k)), plan.episodes, done)
     # Never fewer than are missing, so none of them is in vain but for the few at the end.
-    num = min(max(plan.episodes - _successes(entries), min(_ROUND, plan.episodes // 10)), _HUNDRED)
+    num = min(max(plan.episodes - attempts.successes(entries), min(_ROUND, plan.episodes // 10)), _HUNDRED)
     return list(range(len(entries), len(entries) + num))
-
-
-def _successes(entries: list[dict[str, Any]]) -> int:
-    return sum(entry["outcome"] == "success" for entry in entries)
 
 
 def check_out(plan: AugmentPlan, source: Path, out: Path, store: Store) -> None:
@@ -241,16 +203,14 @@ def check_out(plan: AugmentPlan, source: Path, out: Path, store: Store) -> None:
     Raises:
         InTheWayError: says what is at ``out``.
     """
-    if not is_free(out) and not _may_be_of(plan, store.source(source), out, store):
-        raise in_the_way(out, plan.stage, plan.spec.task)
+    attempts.check_destination(
+        out, plan.stage, plan.task, lambda manifest: _may_be_of(plan, manifest, store.source(source), out, store)
+    )
 
 
-def _may_be_of(plan: AugmentPlan, sources: Artefact, out: Path, store: Store) -> bool:
+def _may_be_of(plan: AugmentPlan, manifest: dict[str, Any], sources: Artefact, out: Path, store: Store) -> bool:
     """Whether what is at ``out`` is made of attempts of this very plan, and of as many successes."""
-    manifest = read_manifest(out)
-    if not manifest or manifest["stage"] != plan.stage.name:
-        return False
-    path = out / (PROVENANCE / REPORT if plan.rows == "dataset" else META)
+    path = out / (PROVENANCE / attempts.REPORT if plan.rows == "dataset" else META)
     if not path.is_file():
         return False
     told = json.loads(path.read_text(encoding="utf-8"))
@@ -258,8 +218,9 @@ def _may_be_of(plan: AugmentPlan, sources: Artefact, out: Path, store: Store) ->
     if told["episodes"] != plan.episodes or ("stratify" in told) != plan.stratify:
         return False
     stage = _ROWS if plan.rows == "dataset" else _ATTEMPT
-    attempts = {store.key(stage, plan.config(entry["attempt"]), [sources]) for entry in told["entries"]}
-    return {entry["key"] for entry in manifest["inputs"]} <= attempts
+    return {entry["key"] for entry in manifest["inputs"]} <= {
+        store.key(stage, plan.config(e["attempt"]), [sources]) for e in told["entries"]
+    }
 
 
 def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> list[Made]:
@@ -281,52 +242,44 @@ def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> li
             if attempt is None:
                 raise TaccorlError(f"{store.root}: attempt {k} is missing; run taccorl augment again to make it again")
             # As in run_attempt: rows count only where the attempt is a success, whatever rows an attempt before it left.
-            wanted = plan.rows == "dataset" and _entry(attempt.path)["outcome"] == "success"
+            wanted = plan.rows == "dataset" and attempts.is_success(attempts.read_entry(attempt.path))
             rows = store.find(_ROWS, plan.config(k), [sources]) if wanted else None
             parts = [attempt.path, *([rows.path] if rows else [])]
-            entry = _entry(parts[-1])
+            entry = attempts.read_entry(parts[-1])
             found.append(Made(attempt.path, entry, sum(read_manifest(part)["seconds"] for part in parts)))
             entries.append(entry)
     return found
 
 
-def run_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int) -> Artefact:
+def run_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int, end: Failed | None = None) -> Artefact:
     """Attempt ``k``, from the store if it has been made: entry.json, actions.npy, where disturbed intended.npy. Of a
-    success, where the plan wants rows, these: entry.json, dataset/, episodes.json."""
+    success, where the plan wants rows, these: entry.json, dataset/, episodes.json.
+
+    Args:
+        end: how its process ended, if it did not come to an end of its own: that is the outcome then.
+    """
+    lost = end and Attempted(k, plan.scene_seed(k), end.process, end.reason)
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
-        _build(plan, sources, k, folder)
+        _write(lost or _run(plan, sources, k), folder)
 
-    attempt = store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
-    if plan.rows == "actions" or _entry(attempt.path)["outcome"] != "success":
+    attempt = store.run(_ATTEMPT.bound(build), plan.config(k), [sources])
+    if plan.rows == "actions" or not attempts.is_success(attempts.read_entry(attempt.path)):
         return attempt
 
     def build_rows(config: Any, inputs: list[Path], folder: Path) -> None:
-        _build_rows(plan, sources, attempt.path, config, folder)
+        if lost:
+            _dump_entry(_entry_of(lost), folder)
+        else:
+            _build_rows(plan, sources, attempt.path, config, folder)
 
     # A function of the sources alone, as the attempt is: its key is known where the attempt is gone.
-    return store.run(dataclasses.replace(_ROWS, fn=build_rows), plan.config(k), [sources])
-
-
-def _lost_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int, end: Failed) -> Artefact:
-    """Attempt ``k`` whose process did not come to an end of its own: what it leaves is how that was."""
-    lost = Attempted(k, plan.scene_seed(k), end.process, end.reason)
-
-    def build(config: Any, inputs: list[Path], folder: Path) -> None:
-        _write(lost, folder)
-
-    def build_rows(config: Any, inputs: list[Path], folder: Path) -> None:
-        _dump_entry(_entry_of(lost), folder)
-
-    attempt = store.run(dataclasses.replace(_ATTEMPT, fn=build), plan.config(k), [sources])
-    if _entry(attempt.path)["outcome"] != "success":
-        return attempt
-    return store.run(dataclasses.replace(_ROWS, fn=build_rows), plan.config(k), [sources])
+    return store.run(_ROWS.bound(build_rows), plan.config(k), [sources])
 
 
 def demonstration_of(folder: Path) -> Demonstration:
     """Read a stored attempt as a demonstration."""
-    entry, intended = _entry(folder), folder / "intended.npy"
+    entry, intended = attempts.read_entry(folder), folder / "intended.npy"
     return Demonstration(
         attempt=entry["attempt"],
         scene_seed=entry["scene_seed"],
@@ -349,13 +302,13 @@ def attempt_episode(folder: Path) -> Episode:
     Raises:
         TaccorlError: it broke before its first action.
     """
-    config, entry, stored = _config(folder), _entry(folder), demonstration_of(folder)
+    config, entry, stored = _config(folder), attempts.read_entry(folder), demonstration_of(folder)
     if not len(stored.actions):
         raise TaccorlError(
             f"{folder}: attempt {entry['attempt']} has no actions to show: {entry['outcome']}: {entry['reason']}"
         )
-    sim, contract = simulation_told(config), load_dataset_spec(find_spec("taccorl_bimanual"))
-    spec = with_simulator(contract, sim, pictures=config["images"], executed=stored.intended is not None)
+    sim = simulation_told(config)
+    spec = row_spec(sim, pictures=config["images"], executed=stored.intended is not None)
     recorder = execute(sim, stored, spec, GatesSpec(**config["spec"]["gates"])).recorder
     told = {key: value for key, value in config.items() if key != "spec"} | {"mimicgen": entry["provenance"]}
     ended = f"{entry['outcome']}: {entry['reason']}" if entry["reason"] else entry["outcome"]
@@ -370,31 +323,23 @@ def _config(folder: Path) -> dict[str, Any]:
     return manifest["config"]
 
 
-def _entry(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "entry.json").read_text(encoding="utf-8"))
+_ATTEMPT = Stage("mimicgen", version=VERSION)
+_ROWS = Stage("mimicgen_rows", version=ROWS_VERSION)
+_AUGMENTED = Stage("augmented", version=AUGMENTED_VERSION, manifest=attempts.DATASET_MANIFEST)
+_ACTIONS = Stage("actions", version=ACTIONS_VERSION)
 
 
-def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("this stage is run with its function bound to the attempts; it cannot be called directly")
-
-
-_ATTEMPT = Stage("mimicgen", _not_yet, VERSION)
-_ROWS = Stage("mimicgen_rows", _not_yet, ROWS_VERSION)
-_AUGMENTED = Stage("augmented", _not_yet, AUGMENTED_VERSION, manifest=f"{PROVENANCE}/manifest.json")
-_ACTIONS = Stage("actions", _not_yet, ACTIONS_VERSION)
-
-
-def _build(plan: AugmentPlan, sources: Artefact, k: int, folder: Path) -> None:
+def _run(plan: AugmentPlan, sources: Artefact, k: int) -> Attempted:
     try:
-        done = _attempts(plan, sources.path, sources.digest).run(k)
+        return _attempts(plan, sources.path, sources.digest).run(k)
     except Exception as error:  # one attempt must not end a run of hundreds; it is counted, with where it broke
-        done = Attempted(k, -1, "error", _where(error))
-    _write(done, folder)
+        return Attempted(k, -1, "error", _where(error))
 
 
 def _build_rows(plan: AugmentPlan, sources: Artefact, attempt: Path, config: dict[str, Any], folder: Path) -> None:
     """Of a success."""
-    sim, stored, entry = _attempts(plan, sources.path, sources.digest).sim, demonstration_of(attempt), _entry(attempt)
+    sim = _attempts(plan, sources.path, sources.digest).sim
+    stored, entry = demonstration_of(attempt), attempts.read_entry(attempt)
     try:
         done = execute(sim, stored, plan.contract(sim), plan.spec.gates)
         entry |= {"outcome": done.outcome, "reason": done.reason}
@@ -463,25 +408,21 @@ def _attempts(plan: AugmentPlan, path: Path, digest: str) -> Attempts:
     return _made[key]
 
 
-def _outcomes(entries: list[dict[str, Any]]) -> dict[str, int]:
-    return dict(sorted(Counter(e["outcome"] for e in entries).items()))
-
-
 def _report(plan: AugmentPlan, entries: list[dict[str, Any]]) -> dict[str, Any]:
     report = {
-        "task": plan.spec.task,
+        "task": plan.task,
         "origin": plan.origin,
         "attempts": len(entries),
-        "outcomes": _outcomes(entries),
-        "episodes": _successes(entries),
-        "rows": sum(e["rows"] for e in entries if e["outcome"] == "success"),
+        "outcomes": attempts.outcomes(entries),
+        "episodes": attempts.successes(entries),
+        "rows": sum(e["rows"] for e in entries if attempts.is_success(e)),
         "entries": [{k: v for k, v in e.items() if k not in ("provenance", "last_state")} for e in entries],
     }
     if plan.stratify:
         first = entries[: first_attempts(plan.episodes)]
         report["stratify"] = {
             "first_attempts": len(first),
-            "first_successes": _successes(first),
+            "first_successes": attempts.successes(first),
             "passed_over": entries[-1]["attempt"] + 1 - len(entries),
         }
     return report

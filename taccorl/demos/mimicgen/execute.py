@@ -5,13 +5,11 @@ differ in the last bit (``execution.py``). The numbers are the same whatever bec
 later into the cache of training frames (``taccorl.training.rendered_frames``), or left out.
 """
 
-import dataclasses
 import functools
 import itertools
 import json
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -20,16 +18,14 @@ import mujoco
 import numpy as np
 
 import taccorl
-from taccorl.data.dataset import PROVENANCE
-from taccorl.data.spec import DatasetSpec, find_spec, load_dataset_spec
-from taccorl.demos.collect import assemble, in_the_way
+from taccorl.data.spec import DatasetSpec
+from taccorl.demos import attempts
 from taccorl.demos.mimicgen.augment import write_execution
 from taccorl.demos.mimicgen.execution import execute
 from taccorl.demos.mimicgen.from_dataset import simulation_told
 from taccorl.demos.mimicgen.stored_actions import StoredActions, read_stored
-from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import DatasetError, TaccorlError, nearest
-from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Artefact, Stage
@@ -75,8 +71,7 @@ class ExecutePlan:
         Args:
             executed: what was executed beside the action: if the arms were disturbed in one of the sources.
         """
-        spec = load_dataset_spec(find_spec("taccorl_bimanual"))
-        return with_simulator(spec, sim, pictures=pictures, executed=executed, parts=self.part_poses)
+        return row_spec(sim, pictures=pictures, executed=executed, parts=self.part_poses)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -90,7 +85,7 @@ class ExecutePlan:
 
 
 def execute_stored(
-    plan: ExecutePlan, out: Path, store: Store, engine: Engine | None = None, progress: Callable[[str], None] = print
+    plan: ExecutePlan, out: Path, store: Store, engine: Engine | None = None, progress: attempts.Progress = print
 ) -> tuple[dict[str, Any], dict[str, float]]:
     """Publish a LeRobot dataset at ``out``; returns its report and the mean seconds of each part of the executions made now.
 
@@ -107,8 +102,9 @@ def execute_stored(
         for source, stored in zip(sources, found, strict=True)
         for i in range(len(stored.demonstrations))
     ]
-    if not is_free(out) and not _may_be_of(plan, items, out, store):
-        raise in_the_way(out, _DATASET, found[0].meta["task"])
+    attempts.check_destination(
+        out, _DATASET, found[0].meta["task"], lambda manifest: _may_be_of(plan, items, manifest, store)
+    )
     sim = _simulation(found[0])
     spec = plan.contract(sim, pictures=plan.pictures != "none", executed=executed)
     # Touch is compiled once here and found by the workers; else each of them compiles it, a minute on sixteen cores.
@@ -120,8 +116,8 @@ def execute_stored(
         on_done=lambda item, _: progress(f"{item}: executed"),
         name=str,
     )
-    entries = [json.loads((each.artefact.path / "entry.json").read_text(encoding="utf-8")) for each in made]
-    kept = [each.artefact for each, entry in zip(made, entries, strict=True) if entry["outcome"] == "success"]
+    entries = [attempts.read_entry(each.artefact.path) for each in made]
+    kept = [each.artefact for each, entry in zip(made, entries, strict=True) if attempts.is_success(entry)]
     for item, entry in zip(items, entries, strict=True):
         entry["source"] = str(item.source.path)
     report = _report(found[0], entries)
@@ -136,11 +132,11 @@ def execute_stored(
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
         from taccorl.data.lerobot_format import declare_pictures
 
-        assemble(spec, report, inputs, folder)
+        attempts.assemble(spec, report, inputs, folder)
         if plan.pictures == "cache":
             declare_pictures(folder, spec)
 
-    store.run(dataclasses.replace(_DATASET, fn=write), _dataset_config(plan), kept, destination=out)
+    store.run(_DATASET.bound(write), _dataset_config(plan), kept, destination=out)
     return report, mean_seconds([each.seconds for each in made])
 
 
@@ -190,27 +186,18 @@ def _first_difference(one: str, other: str) -> tuple[str, str]:
     return next(((a.strip()[:80], b.strip()[:80]) for a, b in lines if a != b), (one, other))
 
 
-def _may_be_of(plan: ExecutePlan, items: Sequence["_Item"], out: Path, store: Store) -> bool:
-    """Whether the dataset at ``out`` is made of executions of this very plan."""
-    manifest = read_manifest(out)
-    if not manifest or manifest["stage"] != _DATASET.name or manifest["config"] != _dataset_config(plan):
-        return False
+def _may_be_of(plan: ExecutePlan, items: Sequence["_Item"], manifest: dict[str, Any], store: Store) -> bool:
+    """Whether a dataset with that manifest is made of executions of this very plan."""
     keys = {store.key(_EXECUTION, item.config(plan), [item.source]) for item in items}
-    return {entry["key"] for entry in manifest["inputs"]} <= keys
+    return manifest["config"] == _dataset_config(plan) and {entry["key"] for entry in manifest["inputs"]} <= keys
 
 
 def _dataset_config(plan: ExecutePlan) -> dict[str, Any]:
     return {"pictures": plan.pictures} | ({"part_poses": True} if plan.part_poses else {})
 
 
-def _not_yet(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError(
-        "this stage is run with its function bound to the demonstrations; it cannot be called directly"
-    )
-
-
-_EXECUTION = Stage("execution", _not_yet, 2)
-_DATASET = Stage(DATASET_STAGE, _not_yet, 1, manifest=f"{PROVENANCE}/manifest.json")
+_EXECUTION = Stage("execution", version=2)
+_DATASET = Stage(DATASET_STAGE, manifest=attempts.DATASET_MANIFEST)
 
 
 @dataclass(frozen=True)
@@ -252,17 +239,17 @@ def _run(plan: ExecutePlan, store: Store, item: _Item) -> Executed:
         found = (done.recorder.physics_s, done.recorder.touch_s, written_s)
         seconds.update(zip(_SECONDS, found, strict=True))
 
-    return Executed(store.run(dataclasses.replace(_EXECUTION, fn=build), item.config(plan), [item.source]), seconds)
+    return Executed(store.run(_EXECUTION.bound(build), item.config(plan), [item.source]), seconds)
 
 
 def _report(stored: StoredActions, entries: list[dict[str, Any]]) -> dict[str, Any]:
-    kept = [e for e in entries if e["outcome"] == "success"]
+    kept = [e for e in entries if attempts.is_success(e)]
     return {
         "task": stored.meta["task"],
         "origin": stored.meta["origin"],
         "demonstrations": len(entries),
         "differs": sum(e["differs"] for e in entries),
-        "dropped": dict(sorted(Counter(e["outcome"] for e in entries if e["outcome"] != "success").items())),
+        "dropped": attempts.outcomes([e for e in entries if not attempts.is_success(e)]),
         "episodes": len(kept),
         "rows": sum(e["rows"] for e in kept),
         "entries": entries,

@@ -55,7 +55,7 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
 
     Args:
         sim: of the task, difficulty, twin and randomisation that the demonstration was made in.
-        rows: what a row holds (``with_simulator``).
+        rows: what a row holds (``row_spec``).
         gates: what an execution that differs must keep.
     """
     seed, intended = demonstration.scene_seed, demonstration.intended

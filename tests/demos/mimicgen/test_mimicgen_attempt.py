@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
-from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.collect import Plan
 from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.kinematics import ArmKinematics
@@ -23,7 +22,7 @@ from taccorl.demos.mimicgen.rest import RestOffset
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, load_mimic_spec, with_options
 from taccorl.demos.mimicgen.touching import Touching
-from taccorl.demos.recorder import EpisodeRecorder, with_simulator
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import DatasetError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
@@ -37,7 +36,7 @@ def sim():
 
 @pytest.fixture(scope="module")
 def rows_spec(sim):
-    return with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    return row_spec(sim, pictures=False)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from ideal_hands import BOX, HZ, TOUCH_ROW, demonstration, mimic_spec, pose, scene
 
-from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.demos.collect import Plan, collect
 from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import ScriptedExpert
@@ -27,7 +26,7 @@ from taccorl.demos.mimicgen.spec import (
     mimic_spec_path,
     with_options,
 )
-from taccorl.demos.recorder import with_simulator
+from taccorl.demos.recorder import row_spec
 from taccorl.errors import SpecError, TaccorlError
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
@@ -222,7 +221,7 @@ def test_it_is_bit_identical_in_another_simulation_whatever_ran_before(pools, fe
 
 @pytest.mark.slow
 def test_a_success_is_executed_again_from_its_actions(sim, felt):
-    rows = with_simulator(load_dataset_spec(find_spec("taccorl_bimanual")), sim, pictures=False)
+    rows = row_spec(sim, pictures=False)
     stored = Demonstration(
         attempt=felt.k, scene_seed=felt.scene_seed, actions=felt.actions, intended=None, last_state=felt.last_state
     )

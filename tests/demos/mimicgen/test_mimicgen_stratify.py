@@ -124,7 +124,7 @@ def test_attempts_that_were_passed_over_are_not_looked_for(tmp_path):
     made, entries = [], []
     for _ in range(2):  # the first two, then a round of four out of sixteen
         for k in module._next_numbers(some, entries):
-            made.append(module._lost_attempt(some, sources, store, k, Failed("x", process="crashed")).path)
+            made.append(module.run_attempt(some, sources, store, k, Failed("x", process="crashed")).path)
             entries.append(json.loads((made[-1] / "entry.json").read_text()))
     found = [entry["attempt"] for entry in entries]
     assert found[:2] == [0, 1]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
-from taccorl.demos.collect import REPORT
+from taccorl.demos.attempts import REPORT
 from taccorl.demos.mimicgen import augment as module
 from taccorl.demos.mimicgen.augment import AugmentPlan, augment, made_attempts
 from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored

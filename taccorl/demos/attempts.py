@@ -1,0 +1,180 @@
+"""Numbered attempts in the twin, common to collect, augment, correct and execute: plan → attempt → store → report → dataset.
+
+An attempt is an artefact of the store with an ``entry.json``, which states its outcome and its number of rows. A success also has
+dataset/ and episodes.json, or the actions from which its rows can be made. Only successes are published.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+import taccorl
+from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json
+from taccorl.data.spec import DatasetSpec
+from taccorl.errors import InTheWayError, TaccorlError
+from taccorl.lineage.destinations import is_free
+from taccorl.lineage.engines import Engine
+from taccorl.lineage.manifest import read_manifest
+from taccorl.lineage.processes import Care
+from taccorl.lineage.stage import Artefact, Stage
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.task import tasks
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import load_twin, twin_text
+
+REPORT = "collect_report.json"
+DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
+_CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
+
+Entry = dict[str, Any]
+"""Content of an ``entry.json``."""
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttemptPlan:
+    """Settings of every plan of attempts: task, twin, scenes."""
+
+    task: str
+    episodes: int
+    difficulty: str = "train"
+    twin: Path | None = None
+    """A twin.yaml; the nominal twin if not given."""
+    randomization: float = 1.0
+    """Share of the paper's reset ranges: 0 is the nominal scene."""
+    images: bool = True
+    seed: int = 0
+    """Of all attempts."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: a number is out of its range.
+        """
+        for name, least in (("episodes", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
+        if not 0 <= self.randomization <= 1:
+            raise TaccorlError(
+                f"--randomization={self.randomization:g}: it is a share of the paper's reset ranges, from 0 to 1"
+            )
+
+    def twin_config(self) -> TwinConfig:
+        """The twin of the attempts."""
+        return load_twin(self.twin) if self.twin else TwinConfig()
+
+    def make(self) -> Simulation:
+        """Make the simulation of this plan.
+
+        Raises:
+            TaccorlError: unknown task or difficulty, with the near name.
+        """
+        return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
+
+    def scene_config(self) -> dict[str, Any]:
+        """Settings on which scenes and physics depend, besides seeds; part of the store's keys."""
+        return {
+            "task": self.task,
+            "difficulty": self.difficulty,
+            "twin": twin_text(self.twin_config()),
+            "randomization": self.randomization,
+            "mujoco": mujoco.__version__,
+            "taccorl": taccorl.__version__,
+        }
+
+
+def run_attempts(
+    run: Callable[..., Artefact],
+    numbers: Sequence[int],
+    engine: Engine,
+    *,
+    said: Callable[[Entry], str],
+    progress: Progress,
+    name: str = "attempt",
+) -> list[tuple[Artefact, Entry]]:
+    """Run attempts on an engine, or find them in the store; artefacts and entries in the order of ``numbers``.
+
+    Args:
+        run: makes the attempt of a number; pickled for worker processes. Of an attempt whose process died twice or did not end,
+            it is called here with the number and how that was.
+        said: what progress states of an entry.
+    """
+    made = engine.map(
+        run,
+        numbers,
+        on_done=lambda k, artefact: progress(f"{name} {k}: {said(read_entry(artefact.path))}"),
+        name=lambda k: f"{name} {k}",
+        care=_CARE,
+        instead=run,
+    )
+    return [(artefact, read_entry(artefact.path)) for artefact in made]
+
+
+def is_success(entry: Entry) -> bool:
+    """Whether an entry is that of a success."""
+    return entry["outcome"] == "success"
+
+
+def successes(entries: Sequence[Entry]) -> int:
+    """Number of successes."""
+    return sum(map(is_success, entries))
+
+
+def outcomes(entries: Sequence[Entry]) -> dict[str, int]:
+    """Outcome → how often, in alphabetical order."""
+    return dict(sorted(Counter(entry["outcome"] for entry in entries).items()))
+
+
+def read_entry(folder: Path) -> Entry:
+    """Read the ``entry.json`` of an attempt."""
+    return json.loads((folder / "entry.json").read_text(encoding="utf-8"))
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file with one key a line."""
+    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def check_destination(out: Path, stage: Stage, task: str, may_be_ours: Callable[[dict[str, Any]], bool]) -> None:
+    """Fail early if ``out`` is occupied: hours of attempts would end at the store's refusal.
+
+    Args:
+        may_be_ours: whether a dataset of this stage with that manifest is the one that is to be made.
+
+    Raises:
+        InTheWayError: states what is at ``out``.
+    """
+    if is_free(out):
+        return
+    manifest = read_manifest(out) if out.is_dir() else {}
+    if manifest and manifest["stage"] == stage.name and may_be_ours(manifest):
+        return
+    if manifest:
+        held = (
+            f"holds {manifest['stage']} v{manifest['stage_version']}, key {manifest['key']}, made {manifest['created']}"
+        )
+    else:
+        kind = f"a folder of {sum(1 for _ in out.rglob('*'))} entries" if out.is_dir() else "a file"
+        held = f"is {kind} without a taccorl manifest"
+    raise InTheWayError(
+        f"{out} is in the way: it {held}; this run makes {stage.name} v{stage.version} of {task}. "
+        "Nothing was touched: give another destination, or move that one away yourself."
+    )
+
+
+def assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], folder: Path) -> None:
+    """Kept attempts, each dataset/ with episodes.json, merged at ``folder``, with their provenance in meta/taccorl/."""
+    from taccorl.data.lerobot_format import merge
+
+    merge([shard / "dataset" for shard in shards], folder)
+    meta = folder / PROVENANCE
+    meta.mkdir(parents=True, exist_ok=True)
+    records = [record for shard in shards for record in json.loads((shard / "episodes.json").read_text())]
+    write_json(meta / "episodes.json", records)
+    write_json(meta / REPORT, report)
+    write_json(meta / "dataset_spec.json", dataset_spec_to_json(spec))
