@@ -79,7 +79,11 @@ def _joint(facts: JointFacts) -> list[str]:
         lines += [f"    effort_limit: {limit:.6g}   # {torque}; torques beyond are clipped"]
     else:
         lines += [f"    # effort_limit: 10.0       # {torque}; the model names none"]
-    lines += ["    # command_hz: 1000.0       # where the drive receives targets faster than they are logged"]
+    lines += [
+        "    # loop_hz: 1000.0          # of the drive's control loop, where it is known",
+        "    # command_hz: 1000.0       # where the drive receives targets faster than they are logged",
+        "    # effort_after_target: true   # where the effort of a row answers the row's own target already",
+    ]
     effects = []
     if facts.damping > 0:
         effects.append(f"{{effect: viscous_friction, damping_nms_per_rad: {facts.damping:.6g}}}")

@@ -15,6 +15,7 @@ from taccorl.diagnosis.joints import (
     add_effect,
     diagnose_joint,
     moves,
+    of_joints,
     set_numbers,
     swept_joints,
 )
@@ -55,6 +56,23 @@ def finding() -> JointFinding:
 
 
 # which joints ----------------------------------------------------------------------------------------------------------
+
+
+def test_recordings_of_other_joints_are_left_out():
+    own, other, both = (
+        still("own", left_joint5=0.1),
+        still("other", left_joint2=0.1),
+        still("both", left_joint2=0.1, left_joint5=0.1),
+    )
+    kept = of_joints(Measurements((own, other), (both,), (other,)), ["left_joint5"])
+    assert (kept.fit, kept.validation, kept.test) == ((own,), (both,), ())
+
+
+def test_a_joint_is_moved_by_what_was_measured_where_its_targets_are_no_positions():
+    pushed = dataclasses.replace(still("pushed"), target_kinds=("torque",) * 14)
+    assert not moves(pushed, SIGNAL)
+    pushed.measured[25:, ROBOT.action_names.index(SIGNAL)] = 0.1
+    assert moves(pushed, SIGNAL)
 
 
 def test_a_joint_is_swept_if_a_fit_recording_commands_it_to_move():
