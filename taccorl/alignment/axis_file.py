@@ -31,7 +31,7 @@ import yaml
 
 from taccorl.alignment.drive_law import DriveLaw
 from taccorl.alignment.measurement import Measurement, TargetKind
-from taccorl.alignment.rigid_joint import Gains, Rigid, RigidJoint, Surroundings
+from taccorl.alignment.rigid_joint import NEED_ROTOR, Gains, Rigid, RigidJoint, Surroundings
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
@@ -65,6 +65,8 @@ class AxisConfig(DriveLaw):
     unit: Literal["rad", "m"]
     inertia: float
     """kg·m²."""
+    rotor_inertia: float = 0.0
+    """Share of ``inertia`` on the motor's side of the gear [kg·m²]; without it neither play nor compliance is looked for."""
     weight_sin: float = 0.0
     """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
     weight_cos: float = 0.0
@@ -76,9 +78,14 @@ class AxisConfig(DriveLaw):
     """Of the arm that holds the payload, unless a recording states another one: a uniform rod as long as the lever."""
     hangs_at_rad: float = 0.0
     """Angle at which that payload hangs straight down."""
+    loop_hz: float | None = None
+    """Rate of the drive's control loop, where it is known: its output is held for a period, its speed is a difference."""
     command_hz: float | None = None
     """Rate at which the drive receives targets, where they are logged more slowly: a replay joins the rows by straight
-    lines of such steps. If not given, rows slower than 150 Hz are joined so, if targets are positions; others are held."""
+    lines of such steps. If not given, a target is held until the next one comes."""
+    target_late_s: float = 0.0
+    """How long after the time of its row a target acts, transport and reading of the position included; ``diagnose`` fits up to
+    3 ms of it, more is an effect."""
     limits: tuple[float, float] | None = None
     """Lowest and highest position [rad]."""
     force_unit_n: float | None = None
@@ -89,9 +96,15 @@ class AxisConfig(DriveLaw):
     effects: tuple[EffectEntry, ...] = ()
 
     def __post_init__(self) -> None:
-        check_numbers("axis", self, positive=("inertia",), not_negative=("lever_m", "arm_kg"))
+        check_numbers("axis", self, positive=("inertia",))
+        check_numbers("axis", self, not_negative=("lever_m", "arm_kg", "rotor_inertia", "target_late_s"))
+        if self.rotor_inertia > self.inertia:
+            raise TaccorlError(
+                f"axis.rotor_inertia: {self.rotor_inertia:g} is more than inertia, {self.inertia:g}, of which it is a "
+                "part; mend one"
+            )
         check_numbers("axis", self, finite=("weight_sin", "weight_cos", "hangs_at_rad"))
-        optional = ("command_hz", "force_unit_n", "length_unit_m")
+        optional = ("loop_hz", "command_hz", "force_unit_n", "length_unit_m")
         check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
         self.check_law("axis")
         if self.limits is not None and not self.limits[0] < self.limits[1]:
@@ -121,13 +134,17 @@ class AxisConfig(DriveLaw):
             return None
         own = scaled(name, self.scale)
         numbers: dict[str, Any] = {p.name: p.typical for p in own.parameters()}
-        return own if own(**numbers).drive() else None
+        return own if own(**numbers).drive() and (self.rotor_inertia or name not in NEED_ROTOR) else None
 
     def made(self) -> list[Effect]:
         """The effects of the file."""
         found = []
         for entry in self.effects:
             cls = self.effect_class(entry.name)
+            if cls is None and entry.name in NEED_ROTOR and not self.rotor_inertia:
+                raise TaccorlError(
+                    f"effects: {entry.name} needs the part of inertia that is the motor's: write `rotor_inertia: …`"
+                )
             if cls is None:
                 raise TaccorlError(f"effects: {entry.name} cannot act on an axis; remove it")
             for key in entry.values:
@@ -141,8 +158,11 @@ class AxisConfig(DriveLaw):
 
     def with_numbers(self, base: Mapping[str, float]) -> "AxisConfig":
         """With fitted numbers, which are called as in ``AxisProblem``."""
-        new = {name: base[name] for name in ("inertia", "weight_sin", "weight_cos") if name in base}
+        same = ("inertia", "weight_sin", "weight_cos", "target_late_s")
+        new = {name: base[name] for name in same if name in base}
         new |= self.law_numbers(base)
+        if "inertia" in new:
+            new["rotor_inertia"] = new["inertia"] * min(self.rotor_inertia / self.inertia, 1.0)
         return dataclasses.replace(self, **{name: float(value) for name, value in new.items()})
 
     def with_effects(self, found: Sequence[Effect]) -> "AxisConfig":
@@ -246,6 +266,7 @@ class DrivenAxis(RigidJoint):
 
     config: AxisConfig
     follows_line: ClassVar[bool] = True
+    keeps_times: ClassVar[bool] = True
 
     @property
     def signal(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -261,10 +282,19 @@ class DrivenAxis(RigidJoint):
 
     @property
     def command_hz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """A target that is no position is held until the next one."""
-        if self.config.command_hz is not None:
-            return self.config.command_hz
-        return 150.0 if self.config.target_kind == "position" else 0.0
+        return self.config.command_hz or 0.0
+
+    @property
+    def position_age_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 0.5 / self.config.loop_hz if self.config.loop_hz else 0.0
+
+    @property
+    def target_late_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.config.target_late_s
+
+    @property
+    def speed_delay_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 1.0 / self.config.loop_hz if self.config.loop_hz and self.config.kd else 0.0
 
     @property
     def target_kind(self) -> TargetKind:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -272,7 +302,10 @@ class DrivenAxis(RigidJoint):
 
     @property
     def facts(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.facts
+        """Numbers of ``joint_kernel.Drive`` that the file knows."""
+        # What a row shows before its target acts is half a period older than what acts on average.
+        c = self.config
+        return c.facts | ({"effort_age": 0.5 / c.loop_hz} if c.loop_hz and not c.effort_after_target else {})
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         return self.config.gain_scales(self.signal, m)
@@ -284,7 +317,7 @@ class DrivenAxis(RigidJoint):
         c = self.config
         weight = motion.moment_kgm * GRAVITY_M_PER_S2  # m l g sin(q − q₀)
         sine, cosine = weight * math.cos(c.hangs_at_rad), -weight * math.sin(c.hangs_at_rad)
-        return Rigid(c.inertia + motion.mounted_kgm2, 0.0, c.weight_sin + sine, c.weight_cos + cosine)
+        return Rigid(c.inertia + motion.mounted_kgm2, c.rotor_inertia, c.weight_sin + sine, c.weight_cos + cosine)
 
     def surroundings(self, m: Measurement) -> Surroundings:
         """The known external force, with the sign of what must be held against it, what is mounted, and the motor's supply.
@@ -305,7 +338,9 @@ class DrivenAxis(RigidJoint):
             )
         return Surroundings(
             coupling_nm=-m.known_load(name),
+            torque_ff_nm=m.torque_ff[:, m.column(name)] if m.torque_ff.size else None,
             supply=c.supply(name, m),
+            on=m.enabled[:, m.column(name)] if m.enabled.size else None,
             payload_kg=payload,
             payload_at_known=True,
             moment_kgm=payload * lever + 0.5 * arm * lever,

@@ -181,17 +181,18 @@ class DriveLaw:
         product = scales["kd"] if self.law == "cascade" and signal in m.kd else 1.0
         return scales["kp"] * product, scales["kd"]
 
-    def supply(self, signal: str, m: Measurement) -> np.ndarray:
-        """(T,) voltage over that of the file; NaN while the motor is off.
+    def supply(self, signal: str, m: Measurement) -> np.ndarray | None:
+        """(T,) voltage over that of the file; None if the recording has none. What the motor gets from a row on is what the next
+        row reads: the current that its target draws makes the supply sag.
 
         Raises:
             TaccorlError: a voltage that the law has no use for.
         """
-        j, share = m.column(signal), np.ones(m.num_rows)
-        if m.supply_v.size and np.isfinite(m.supply_v[:, j]).any():
-            if self.supply_v is None:
-                raise TaccorlError(
-                    f"{m.name}: a supply voltage of {signal} is stated, and law {self.law} has no use for it; remove it"
-                )
-            share = np.nan_to_num(m.supply_v[:, j] / self.supply_v, nan=1.0)
-        return np.where(m.enabled[:, j] == 0.0, np.nan, share) if m.enabled.size else share
+        volts = m.supply_v[:, m.column(signal)] if m.supply_v.size else np.full(m.num_rows, np.nan)
+        if not np.isfinite(volts).any():
+            return None
+        if self.supply_v is None:
+            raise TaccorlError(
+                f"{m.name}: a supply voltage of {signal} is stated, and law {self.law} has no use for it; remove it"
+            )
+        return np.nan_to_num(np.append(volts[1:], volts[-1]) / self.supply_v, nan=1.0)

@@ -52,6 +52,8 @@ def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, flo
     """r and its standard error; None where the recording cannot tell."""
     j = m.column(signal)
     q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
+    if m.torque_ff.size:
+        effort = effort - m.torque_ff[:, j]
     window = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
     if (
         law.law == "pwm"

@@ -4,8 +4,9 @@ Row k of the grid is at t_0 + k / rate.
 
     target      of the row that came last, at most half a period after row k: held between rows. Across lost rows a command
                 that changes with every row is on the straight line (the drive received what was streamed); any other is held.
-    measured    on the straight line between two rows that are at most 1.5 periods apart; NaN in gaps. Nothing is interpolated
-                across a gap.
+    measured    on the cubic through the four rows around, or the straight line between two, that are at most 1.5 periods apart;
+                NaN in gaps. Nothing is interpolated across a gap.
+    command_s   when the row's target came: an axis is simulated with its targets at their own times.
 
 Jitter above ``MOST_JITTER`` of a period, a gap longer than ``LONGEST_GAP_S``, or more than ``MOST_LOST`` of the rows lost: the
 table stays as it is, the checks say why, and what needs even time refuses it.
@@ -52,6 +53,7 @@ def even_rows(m: Measurement) -> Measurement:
     grid = start_s + np.arange(round((m.time_s[-1] - start_s) / period) + 1) * period
     columns = {name: _between(grid, m.time_s, getattr(m, name), period) for name in ("measured", "velocity", "effort")}
     target = _commands(grid, m.time_s, m.target, period)
+    command_s = _commands(grid, m.time_s, m.time_s[:, None], period)[:, 0] - grid[0]
     columns |= {name: _commands(grid, m.time_s, getattr(m, name), period) for name in m.extra_columns}
     if m.enabled.size:
         columns["enabled"] = np.where(columns["enabled"] < 0.5, 0.0, 1.0)
@@ -68,7 +70,9 @@ def even_rows(m: Measurement) -> Measurement:
         "avoid it"
     )
     finding = Finding("resampled", "warning", "time", text)
-    return dataclasses.replace(m, time_s=grid - grid[0], target=target, **columns, findings=(*m.findings, finding))
+    return dataclasses.replace(
+        m, time_s=grid - grid[0], target=target, command_s=command_s, **columns, findings=(*m.findings, finding)
+    )
 
 
 def _grid(time_s: np.ndarray) -> tuple[float, float]:
@@ -96,12 +100,31 @@ def _commands(grid: np.ndarray, time_s: np.ndarray, target: np.ndarray, period: 
 
 
 def _between(grid: np.ndarray, time_s: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
-    """(G, J) of (T, J) on straight lines between rows that are near each other; NaN elsewhere."""
+    """(G, J) of (T, J) between rows that are near each other; NaN elsewhere."""
     after = np.clip(np.searchsorted(time_s, grid, side="left"), 1, len(time_s) - 1)
     before = after - 1
     width = time_s[after] - time_s[before]
     share = np.clip((grid - time_s[before]) / width, 0.0, 1.0)
     line = values[before] + share[:, None] * (values[after] - values[before])
+    near = np.diff(time_s) <= GAP * period
+    around = (before >= 1) & (after <= len(time_s) - 2)
+    k = before[around]
+    whole = near[k - 1] & near[k] & near[k + 1]
+    around[around] = whole
+    line[around] = _cubic(grid[around], time_s, values, k[whole])
     nearer = np.where(share < 0.5, before, after)
     exact = np.abs(grid - time_s[nearer]) < AT_ROW * period
     return np.where((width <= GAP * period)[:, None], line, np.where(exact[:, None], values[nearer], np.nan))
+
+
+def _cubic(at: np.ndarray, time_s: np.ndarray, values: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """(G, J) at times ``at`` on the cubics through rows ``before`` − 1 to ``before`` + 2 (Lagrange). A line errs by a h² / 8,
+    which is an encoder's step where a pendulum swings: 1.2 mrad at 100 rad/s² and 100 Hz."""
+    rows = before[:, None] + np.arange(-1, 3)
+    t = time_s[rows]
+    found = np.zeros((len(at), values.shape[1]))
+    for k in range(4):
+        others = [j for j in range(4) if j != k]
+        weight = np.prod([(at - t[:, j]) / (t[:, k] - t[:, j]) for j in others], axis=0)
+        found += weight[:, None] * values[rows[:, k]]
+    return found

@@ -168,7 +168,8 @@ def _arriving(drive: Drive, sent: np.ndarray, hold: int, step_s: float) -> np.nd
         commands[k * hold : (k + 1) * hold] = at + ahead
     if drive.command_delay <= 0.0:
         return commands
-    late = max(drive.command_delay / step_s, 1.0)  # MuJoCo reads its history before it stores: one step at least
+    # MuJoCo reads its history before it stores: one step at least.
+    late = max(drive.command_delay / step_s, 0.0 if drive.midpoint > 0.0 else 1.0)
     whole = math.floor(late)
     share = late - whole
     arriving = np.empty_like(commands)
@@ -197,16 +198,14 @@ def _limit(p: Drive, torque: float, v: float) -> float:
 
 @numba.njit(cache=True)
 def _asked(
-    p: Drive, command: float, before: float, q: float, v: float, integral: float, supply: float
+    p: Drive, command: float, before: float, q: float, v: float, integral: float, supply: float, on: float, added: float
 ) -> tuple[float, float, float]:
     """The controller's torque, and how far it counts as a spring and a damper. ``before`` is the command until now: whether the
-    error lies within the dead band is known from it. ``supply`` is as in ``simulate``."""
-    if math.isnan(supply):
-        return 0.0, 0.0, 0.0
+    error lies within the dead band is known from it. ``supply``, ``on`` and ``added`` are as in ``simulate``."""
     if p.command == TORQUE:
-        return command + p.torque_ff, 0.0, 0.0
+        return on * (command + p.torque_ff + added), 0.0, 0.0
     if p.command == VELOCITY:
-        return p.kd * (command - v) + p.torque_ff, 0.0, p.kd
+        return on * (p.kd * (command - v) + p.torque_ff + added), 0.0, on * p.kd
     seen = q + p.encoder_bias
     slope = p.encoder_scale * (1.0 + p.encoder_wave * math.cos(seen + p.encoder_wave_phase))
     angle = p.encoder_scale * (seen + p.encoder_wave * math.sin(seen + p.encoder_wave_phase))
@@ -217,13 +216,13 @@ def _asked(
             error, stiffness = 0.0, 0.0
         else:
             error -= math.copysign(p.deadband, before - angle)
-    asked = p.kp * (error + p.integral_rate * integral) - damping * v + p.torque_ff
+    asked = p.kp * (error + p.integral_rate * integral) - damping * v + p.torque_ff + added
     if abs(asked) > p.duty_torque:
         asked, stiffness, damping = math.copysign(p.duty_torque, asked), 0.0, 0.0
     asked, stiffness, damping = supply * asked, supply * stiffness, supply * damping
     if p.back_emf != 0.0:
         asked, damping = asked - p.back_emf * v, damping + p.back_emf
-    return asked, stiffness, damping
+    return on * asked, on * stiffness, on * damping
 
 
 @numba.njit(cache=True)
@@ -239,6 +238,8 @@ def simulate(
     sent: np.ndarray,
     coupling: np.ndarray,
     supply: np.ndarray,
+    on: np.ndarray,
+    added: np.ndarray,
     start: float,
     hold: int,
     parts: int,
@@ -249,7 +250,9 @@ def simulate(
     Args:
         sent: (R · parts,) targets [rad], each held for ``hold`` physics steps.
         coupling: (R,) torque [N·m] that must be held against the other joints' motion, linear in between.
-        supply: (R,) voltage that a position controller gets, over the one that its gains are for; NaN while the motor is off.
+        supply: (R · parts,) voltage that a position controller gets, over the one that its gains are for.
+        on: (R · parts,) share of the time for which the motor is on.
+        added: (R · parts,) torque [N·m] that the controller adds to its law.
         start: angle [rad] that the encoder reports at rest.
         parts: targets a row.
 
@@ -300,7 +303,7 @@ def simulate(
             if p.compliance == 0.0:  # the soft end of the play
                 gear -= load * _LIMIT_SOFTNESS * gear_mobility / _LIMIT_STIFFNESS
     integral = 0.0
-    torque = _asked(p, command[0], command[0], q, v, integral, supply[0])[0]
+    torque = _asked(p, command[0], command[0], q, v, integral, supply[0], on[0], added[0])[0]
     missing = weight + coupling[0] + p.spring_stiffness * (q - p.spring_rest) + p.coulomb * p.asymmetry
     missing -= p.torque_scale * (torque + carried) + p.cogging_torque * math.sin(
         p.cogging_periods * q + p.cogging_phase
@@ -324,13 +327,17 @@ def simulate(
             load += (within + 1.0 - ahead) / (hold * parts) * (coupling[row + 1] - coupling[row])
 
         # What can be seen now: the new command has not acted yet.
-        until_now = command[n if p.command_delay > 0.0 else max(n - 1, 0)]
+        until_now = command[n if p.command_delay > 0.0 and p.midpoint == 0.0 else max(n - 1, 0)]
+        part = n // hold
         given = 0.0
         if p.load_friction > 0.0:
-            given = torque if p.torque_lag > 0.0 else _asked(p, until_now, until_now, q, v, integral, supply[row])[0]
+            given = torque
+            if p.torque_lag <= 0.0:
+                given = _asked(p, until_now, until_now, q, v, integral, supply[part], on[part], added[part])[0]
         if within == 0:
             by = command[n] if p.effort_after > 0.0 else until_now
-            shown, by_position, by_speed = _asked(p, by, by, q, v, integral, supply[row])
+            seen = part if p.effort_after > 0.0 else max(part - 1, 0)
+            shown, by_position, by_speed = _asked(p, by, by, q, v, integral, supply[part], on[part], added[seen])
             if p.torque_lag > 0.0:
                 shown, by_position, by_speed = torque, 0.0, 0.0
             older = p.effort_age * (by_position * v + by_speed * acceleration)
@@ -343,7 +350,9 @@ def simulate(
             ring[n % ring.size] = _reading(p, q)
 
         # The drive.
-        asked, stiffness, damping = _asked(p, command[n], until_now, q, v, integral, supply[row])
+        asked, stiffness, damping = _asked(
+            p, command[n], until_now, q, v, integral, supply[n // hold], on[n // hold], added[n // hold]
+        )
         if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
             asked, damping = asked + early * stiffness * v, damping - early * stiffness
         gain = newest_share * strength

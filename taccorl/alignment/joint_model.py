@@ -50,6 +50,15 @@ class PayloadLever(NamedTuple):
 AT_ITS_PLACE = PayloadLever()
 
 
+class _Sent(NamedTuple):
+    """What a drive gets in each part of a row, (T · parts,) each; ``joint_kernel.simulate`` says what."""
+
+    target: np.ndarray
+    supply: np.ndarray
+    on: np.ndarray
+    added: np.ndarray
+
+
 @dataclass(frozen=True)
 class JointResponse:
     """What the joint did, row by row with the recording."""
@@ -131,7 +140,7 @@ class JointModel:
         known = {k: v for k, v in known.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
         numbers = _combined([*timing, ("the drive", known), *of_effects])
         if numbers is None or any(drive is None for _, drive in drives):
-            return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent, parts, hold))
+            return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent.target, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
         drive = Drive(*scaled, **self._body(motion, bodies)._asdict())
         drive = drive._replace(**numbers)
@@ -141,8 +150,9 @@ class JointModel:
             gravity_cos=drive.gravity_cos + weight * lever.cos_m,
         )
         drive = Drive(*(float(x) for x in drive))
-        supply = np.ones(len(motion.coupling_nm)) if motion.supply is None else motion.supply
-        reported, effort = simulate(drive, sent, motion.coupling_nm, supply, motion.start, hold, parts, step_s)
+        reported, effort = simulate(
+            drive, sent.target, motion.coupling_nm, *sent[1:], motion.start, hold, parts, step_s
+        )
         if self.joint.effort_holds_weight:
             effort = effort + drive.gravity_carried * self.carried_nm(motion, reported)
         return JointResponse(reported, effort)
@@ -175,8 +185,8 @@ class JointModel:
             self._rigid[key] = self.joint.rigid(motion, bodies)
         return self._rigid[key]
 
-    def _sent(self, motion: JointMotion) -> tuple[np.ndarray, int, int, float]:
-        """Targets as the machine sends them: (T · parts,), parts, physics steps for each, and the step [s]."""
+    def _sent(self, motion: JointMotion) -> "tuple[_Sent, int, int, float]":
+        """What the machine sends, parts a row, physics steps for each part, and the step [s]."""
         step_s = self.joint.timestep_s(motion.rate_hz)
         steps = 1.0 / (motion.rate_hz * step_s)
         if abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
@@ -184,19 +194,60 @@ class JointModel:
                 f"{motion.name}: {motion.rate_hz:g} Hz is {steps:.3f} physics steps of {step_s * 1e3:.3f} ms a "
                 f"row; bring it to {1 / (max(1, round(steps)) * step_s):g} Hz first (Measurement.resampled)"
             )
-        received = max(1, math.ceil(self.joint.command_hz / motion.rate_hz))
-        parts = received
+        target, ones = motion.target, np.ones(len(motion.target))
+        sent = _Sent(
+            target,
+            ones if motion.supply is None else motion.supply,
+            ones if motion.on is None else motion.on,
+            0.0 * ones if motion.torque_ff_nm is None else motion.torque_ff_nm,
+        )
+        parts = received = max(1, math.ceil(self.joint.command_hz / motion.rate_hz))
+        if self.joint.follows_line:
+            late_s = self.joint.target_late_s
+            if late_s > 0.0 or motion.command_s is not None:
+                parts = round(steps)
+            parts = min(parts, round(steps))
         while round(steps) % parts:
             parts -= 1
-        if received == 1 or (parts == 1 and not self.joint.follows_line):
-            return motion.target, 1, round(steps), step_s
-        following = np.append(motion.target[1:], motion.target[-1])
-        share = np.arange(1, parts + 1) / parts
         if self.joint.follows_line:
-            # The mean of what is held in each part: targets may be held for less than a physics step.
-            share -= 0.5 / parts + 0.5 / received
-        sent = motion.target[:, None] + share * (following - motion.target)[:, None]
-        return sent.ravel(), parts, round(steps) // parts, step_s
+            if parts > 1 or received > 1:
+                sent = self._in_time(motion, sent, received, parts)
+        elif parts > 1:
+            following = np.append(target[1:], target[-1])
+            share = np.arange(1, parts + 1) / parts
+            target = (target[:, None] + share * (following - target)[:, None]).ravel()
+            sent = _Sent(target, *(np.repeat(values, parts) for values in sent[1:]))
+        return sent, parts, round(steps) // parts, step_s
+
+    def _in_time(self, motion: JointMotion, sent: "_Sent", received: int, parts: int) -> "_Sent":
+        """What is sent at its own times: the mean of each part while the motor is on, of values that are held until the next
+        comes; of targets that are received faster than they are logged the mean of the line between them."""
+        # In rows: the clock of ``time_s`` and the rate may differ by a millionth.
+        rows = len(motion.target)
+        late = self.joint.target_late_s * motion.rate_hz
+        came = (
+            np.arange(rows) if motion.command_s is None else motion.command_s * (rows - 1) / motion.time_s[-1]
+        ) + late
+        edges = np.arange(rows * parts + 1) / parts
+        last = np.maximum(np.searchsorted(came, edges, side="right") - 1, 0)
+        whole, since = np.diff(came), edges - came[last]
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            if (values == values[0]).all():
+                return np.full(rows * parts, values[0])
+            before = np.concatenate([[0.0], np.cumsum(values[:-1] * whole)])
+            return np.diff(before[last] + values[last] * since) * parts
+
+        on = mean(sent.on)
+        target, supply = (
+            np.where(on > 1e-9, mean(values * sent.on) / np.maximum(on, 1e-9), values[0])
+            for values in (sent.target, sent.supply)
+        )
+        found = _Sent(target, supply, on, np.repeat(sent.added, parts))
+        if received > 1:
+            middle = 0.5 * (edges[1:] + edges[:-1]) - 0.5 / received
+            found = found._replace(target=np.interp(middle, came, sent.target))
+        return found
 
 
 def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, float] | None:

@@ -46,8 +46,14 @@ class JointMotion:
     kd_known: bool = False
     payload_kg: float = 0.0
     """Known mass in the gripper."""
+    torque_ff_nm: np.ndarray | None = None
+    """(T,) known torque that the controller adds to its law; None: none."""
     supply: np.ndarray | None = None
-    """(T,) voltage of the motor over the one of its file, NaN while the motor is off; None: 1."""
+    """(T,) voltage of the motor over the one of its file; None: 1."""
+    command_s: np.ndarray | None = None
+    """(T,) when each target came, on the clock of ``time_s``; None: with its row."""
+    on: np.ndarray | None = None
+    """(T,) 0 while the motor is off, else 1; None: 1."""
     moment_kgm: float = 0.0
     """Σ m l of what the recording mounts on an axis,"""
     mounted_kgm2: float = 0.0
@@ -104,7 +110,10 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         measured=measured,
         effort=m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan),
         coupling_nm=rest.coupling_nm,
+        torque_ff_nm=rest.torque_ff_nm,
         supply=rest.supply,
+        on=rest.on,
+        command_s=m.command_s if m.command_s.size and joint is not None and joint.keeps_times else None,
         start=resting(m, j),
         pose=rest.pose,
         kp_scale=kp_scale,

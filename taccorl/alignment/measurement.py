@@ -71,10 +71,14 @@ class Measurement:
     """(T, J) N·m, N as the driver reports it; NaN where it does not. PiPER firmware may report another scale."""
     load: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) N·m, N: external torque that is known to push the joint, positive where it drives it forwards; empty if none is."""
+    torque_ff: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) N·m, N that the controller is known to have added to its law; part of ``effort``; empty if none is."""
     supply_v: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) V that feeds the motor; NaN where it was not recorded; empty if it never was."""
     enabled: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) 0 while the motor is off, else 1; empty if it is never off."""
+    command_s: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T,) when each row's targets came, on the clock of ``time_s``; empty where they came with their rows."""
     signals: tuple[str, ...] = ROBOT.action_names
     units: tuple[str, ...] = ROBOT_UNITS
     """Of positions, one per signal: rad or m."""
@@ -141,8 +145,8 @@ class Measurement:
 
     @property
     def extra_columns(self) -> list[str]:
-        """Of ``load``, ``supply_v`` and ``enabled`` those that it has."""
-        return [name for name in ("load", "supply_v", "enabled") if getattr(self, name).size]
+        """Of ``load``, ``torque_ff``, ``supply_v`` and ``enabled`` those that it has."""
+        return [name for name in ("load", "torque_ff", "supply_v", "enabled") if getattr(self, name).size]
 
     @property
     def num_rows(self) -> int:
@@ -181,6 +185,8 @@ class Measurement:
         j = self.column(signal)
         if self.known_load(signal).any():
             return "a known load; remove the column"
+        if self.torque_ff.size and self.torque_ff[:, j].any():
+            return "a torque_ff of its own in each row; remove the column"
         if self.supply_v.size and np.isfinite(self.supply_v[:, j]).any():
             return "a supply voltage; remove supply_v"
         if self.enabled.size and not self.enabled[:, j].all():
@@ -233,7 +239,7 @@ class Measurement:
         }
         if self.enabled.size:
             columns["enabled"] = np.where(columns["enabled"] < 0.5, 0.0, 1.0)
-        return dataclasses.replace(self, time_s=time_s, **columns)
+        return dataclasses.replace(self, time_s=time_s, command_s=np.empty(0), **columns)
 
     def on_robot(self, rest: np.ndarray) -> "Measurement":
         """All signals of the robot in the order of actions: those that it lacks stay at ``rest`` (J,) and were not measured.
@@ -267,6 +273,7 @@ class Measurement:
             **arrays,
             quantum=quantum,
             load=np.empty(0),
+            torque_ff=np.empty(0),
             supply_v=np.empty(0),
             enabled=np.empty(0),
             signals=ROBOT.action_names,

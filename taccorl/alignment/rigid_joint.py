@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 Position = tuple[float, float, float]
 AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 """m, in link 6's frame: the middle between the pads, where the PiPER's gripper holds its payload."""
+NEED_ROTOR = ("backlash", "joint_compliance")
+"""Effects in a gear, which need the inertia on the motor's side of it."""
 _START_S = 0.1  # of a rest at the start is averaged
 STILL = 0.01
 """rad, m: another joint that moves less counts as held."""
@@ -63,8 +65,12 @@ class Surroundings:
 
     coupling_nm: np.ndarray
     """(T,) torque that the joint must hold against the measured motion of the others."""
+    torque_ff_nm: np.ndarray | None = None
+    """(T,) known torque that the controller adds to its law; None: none."""
     supply: np.ndarray | None = None
-    """(T,) voltage of the motor over the one of its file, NaN while the motor is off; None: 1."""
+    """(T,) voltage of the motor over the one of its file; None: 1."""
+    on: np.ndarray | None = None
+    """(T,) 0 while the motor is off, else 1; None: 1."""
     moment_kgm: float = 0.0
     """Σ m l of what the recording mounts on an axis, with the arm that holds it;"""
     mounted_kgm2: float = 0.0
@@ -102,6 +108,10 @@ class RigidJoint(ABC):
 
     follows_line: ClassVar[bool] = False
     """Whether targets between the rows are those of the line at their own time; else those of the next time, as in a replay."""
+    keeps_times: ClassVar[bool] = False
+    """Whether targets of rows that jittered act when they came; else with their rows."""
+    target_late_s: float = 0.0
+    """After that."""
 
     gain_names: tuple[str, ...] = ("kp", "kd")
     """Gains that a recording can state and a fit can find."""

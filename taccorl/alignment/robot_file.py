@@ -36,6 +36,7 @@ import yaml
 from taccorl.alignment.drive_law import DriveLaw
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.rigid_joint import (
+    NEED_ROTOR,
     Gains,
     Rigid,
     RigidJoint,
@@ -60,8 +61,6 @@ TODO = "TODO"
 _GIVES = ("target", "position", "velocity", "acceleration", "effort", "load")
 """What the model of one joint knows (``Effect.needs``)."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
-_NEED_ROTOR = ("backlash", "joint_compliance")
-"""Effects in a gear, which need the inertia on the motor's side of it."""
 _HEADER = "# A robot: taccorl/alignment/robot_file.py says what may stand here.\n"
 
 
@@ -194,7 +193,7 @@ def load_robot(path: Path) -> Robot:
                 raise document.error(
                     key, f"{effect.name} acts in a position loop, and law {joint.law} has none; remove it"
                 )
-            if effect.name in _NEED_ROTOR and joint.armature == 0.0:
+            if effect.name in NEED_ROTOR and joint.armature == 0.0:
                 raise document.error(
                     key, f"{effect.name} needs the inertia of the motor: write rotor_inertia (kg·m²) and gear of {name}"
                 )
@@ -234,7 +233,7 @@ def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool) -> bool:
     """
     if "joint" not in cls.kinds() or not cls.works_with((*_GIVES, *["weight"] * weight)):
         return False
-    if cls.name in _NEED_ROTOR and not rotor:
+    if cls.name in NEED_ROTOR and not rotor:
         return False
     typical = {p.name: p.typical for p in cls.parameters()}
     return bool(make_effect(cls.name, **typical).drive())
@@ -301,7 +300,11 @@ class RobotJoint(RigidJoint):
             if name in m.signals:
                 pose[model.joint(name).qposadr[0]] = resting(m, m.column(name))
         coupling = self._coupling(m, pose) - m.known_load(self.signal)
-        return Surroundings(coupling_nm=coupling, pose=pose, supply=self._config.supply(self.signal, m))
+        j = m.column(self.signal)
+        on, added = (values[:, j] if values.size else None for values in (m.enabled, m.torque_ff))
+        return Surroundings(
+            coupling_nm=coupling, pose=pose, supply=self._config.supply(self.signal, m), on=on, torque_ff_nm=added
+        )
 
     def whole(self, m: Measurement) -> Measurement:
         """With all joints of the model, and with the file's gains where they are commanded and the recording states none.
@@ -339,7 +342,7 @@ class RobotJoint(RigidJoint):
         if m.signals == names:
             return m
         kinds = tuple(m.target_kind(name) if name in m.signals else "position" for name in names)
-        absent = {"load": 0.0, "supply_v": np.nan, "enabled": 1.0}
+        absent = {"load": 0.0, "torque_ff": 0.0, "supply_v": np.nan, "enabled": 1.0}
         arrays: dict[str, np.ndarray] = {
             name: np.full((m.num_rows, len(names)), absent.get(name, np.nan))
             for name in ("measured", "velocity", "effort", *m.extra_columns)

@@ -3,8 +3,8 @@
 Without a columns file the table speaks our own language: ``t`` [s], and for every signal ``left_joint5.q`` [rad, m],
 ``left_joint5.q_target``, and where recorded ``left_joint5.qd`` [rad/s, m/s], ``left_joint5.tau`` [N·m, N] and
 ``left_joint5.load`` [N·m, N], an external torque that is known to push the joint, positive forwards. An axis by itself may have
-``servo.supply`` [V] and ``servo.enabled``, 0 while its motor is off. Other names and units are written down in a columns file; no
-unit is ever guessed::
+``servo.torque_ff`` [N·m, N], which its controller adds to the law, ``servo.supply`` [V] and ``servo.enabled``, 0 while its motor
+is off. Other names and units are written down in a columns file; no unit is ever guessed::
 
     time: {column: stamp, unit: ms}
     signals:
@@ -14,7 +14,7 @@ unit is ever guessed::
         qd:       {column: speed_5, unit: rpm}
         tau:      {column: current_5, unit: Nm, factor: 0.000082}    # mA, 0.082 Nm/A; a factor of -1 mends a sign
         supply:   {column: volts_5, unit: V, factor: 0.1}            # of ``kind: axis`` only
-        enabled:  {column: torque_enable_5, unit: "1"}
+        enabled:  {column: torque_enable_5, unit: "1", if_missing: 1}   # of a file that lacks the column
 """
 
 import csv
@@ -60,7 +60,7 @@ EFFORT |= {"kgcm": ("rad", 0.0980665), "N": ("m", 1.0), "kN": ("m", 1e3), "mN": 
 constant is somebody's guess until it is written down as a column in N·m."""
 _CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT, "load": EFFORT}
 _CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
-_CONVERSIONS |= {"supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
+_CONVERSIONS |= {"torque_ff": EFFORT, "supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
 TARGETS = ("q_target", "qd_target", "tau_target")
 """Exactly one of them commands a signal."""
 _KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
@@ -74,6 +74,8 @@ class Column:
     unit: str
     factor: float = 1.0
     """The column's numbers times this are in ``unit``: turns of a tick, N·m of a mA, −1 for a sign."""
+    if_missing: float | None = None
+    """The column's number throughout a file that lacks it; without it such a file is refused."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +96,8 @@ class SignalColumns:
     """Effort of the motor."""
     load: Column | None = None
     """Known external torque, positive where it drives the joint forwards."""
+    torque_ff: Column | None = None
+    """Torque that the controller adds to its law."""
     supply: Column | None = None
     """Voltage of the motor's supply."""
     enabled: Column | None = None
@@ -209,8 +213,7 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
         if key not in _CONVERSIONS or not name:
             own = [f"{n}.{key}" for n in known for key in _CONVERSIONS]
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r} is not NAME.q, .qd, .tau, .load, .supply, .enabled, .q_target, .qd_target or "
-                f".tau_target; " + nearest(column, own)
+                f"{path}: column {k + 1} {column!r} is not NAME.{', .'.join(_CONVERSIONS)}; {nearest(column, own)}"
             )
         if name not in known:
             raise RecordingError(
@@ -242,7 +245,7 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
         "m": {"q": "m", "q_target": "m", "qd": "m/s", "tau": "N", "load": "N", "qd_target": "m/s", "tau_target": "N"},
     }
     for keys in units.values():
-        keys |= {"supply": "V", "enabled": "1"}
+        keys |= {"torque_ff": keys["tau"], "supply": "V", "enabled": "1"}
     signals = {
         name: SignalColumns(
             **{key: Column(column=f"{name}.{key}", unit=units[known[name]][key]) for key in parts[name]}
@@ -266,14 +269,16 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     """
     path = Path(path)
     header, columns = read_columns(
-        path, lambda header: _wanted(spec or own_spec(path, header, signal_units)), spec.separator if spec else "comma"
+        path,
+        lambda header: _wanted(spec or own_spec(path, header, signal_units), header),
+        spec.separator if spec else "comma",
     )
     spec = spec or own_spec(path, header, signal_units)
     time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
     if len(time_s) < 2:
         raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
     shape = (len(time_s), len(spec.signals))
-    nothing = {"load": 0.0, "enabled": 1.0}
+    nothing = {"load": 0.0, "torque_ff": 0.0, "enabled": 1.0}
     values = {key: np.full(shape, nothing.get(key, np.nan)) for key in _CONVERSIONS}
     units = []
     kinds: list[TargetKind] = []
@@ -282,8 +287,9 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         for key, column in _columns_of(signal):
             if key in TARGETS:
                 kinds.append(_KINDS[key])
+            read = columns[column.column] if column.column in columns else np.full(len(time_s), column.if_missing)
             values["q_target" if key in TARGETS else key][:, j] = (
-                columns[column.column] * column.factor * _CONVERSIONS[key][column.unit][1]
+                read * column.factor * _CONVERSIONS[key][column.unit][1]
             )
     between = ~np.isin(values["enabled"], (0.0, 1.0))
     if between.any():
@@ -309,6 +315,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         velocity=values["qd"][rows],
         effort=values["tau"][rows],
         load=extra("load"),
+        torque_ff=extra("torque_ff"),
         supply_v=extra("supply"),
         enabled=extra("enabled"),
         signals=tuple(spec.signals),
@@ -323,8 +330,9 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     return even_rows(found)
 
 
-def _wanted(spec: TableSpec) -> list[str]:
-    return [spec.time.column, *(c.column for s in spec.signals.values() for _, c in _columns_of(s))]
+def _wanted(spec: TableSpec, header: list[str]) -> list[str]:
+    columns = [spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s))]
+    return [c.column for c in columns if c.if_missing is None or c.column in header]
 
 
 def read_columns(

@@ -3,7 +3,8 @@ needs them. An axis is a slide on a bench, a motor with a mass, a servo with a p
 
 Inertia and a constant torque are fitted, and the weight where the file states one. So are the gains, within ``GAINS_WITHIN`` of
 those commanded, where the effort was recorded, which identifies them: a few per cent of them outweigh the friction of a fast
-drive. Of law ``pwm`` the stall torque and the back-EMF are, within ``WINDING_WITHIN``: data sheets are no better.
+drive. Of law ``pwm`` the stall torque and the back-EMF are, within ``WINDING_WITHIN``: data sheets are no better. How late a
+target acts is fitted up to ``TIMING_S``: a cycle of the drive's loop is of no interest, and shows.
 """
 
 import dataclasses
@@ -18,6 +19,7 @@ from taccorl.alignment.joint_motion import motion_of
 from taccorl.alignment.measurement import Measurement
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.noise_floor import noise_floor
+from taccorl.diagnosis.identifiable import TIMING_S
 from taccorl.diagnosis.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
@@ -49,6 +51,10 @@ class AxisProblem:
         self.effort = all(m.has_effort()[m.column(axis.name)] for m in everything)
         kinds = ("position", "effort") if self.effort else ("position",)
         self.floors = [noise_floor(everything, kind)[axis.name] for kind in kinds]
+        self.floor_values = np.array([f.value for f in self.floors])
+        if self.effort and self.floors[0].lower_bound and axis.law in ("impedance", "cascade"):
+            # Without repeats an encoder's resolution is no floor: the loop answers an error of the force by one of the position.
+            self.floor_values[0] = max(self.floor_values[0], self.floor_values[1] / axis.loop_gains.kp)
         self.fit, self.validation, self.test = (
             [self._recording(m) for m in side]
             for side in (measurements.fit, measurements.validation, measurements.test)
@@ -115,6 +121,9 @@ class AxisProblem:
             within, numbers = GAINS_WITHIN, {"kp": axis.loop_gains.kp, "kd": axis.loop_gains.kd}
         else:
             within, numbers = 1.0, {}
+        if axis.target_kind == "position":
+            high = max(TIMING_S, axis.target_late_s)
+            found.append(Free(name="target_late_s", unit="s", start=axis.target_late_s, low=0.0, high=high, scale=1e-4))
         units = {"stall_nm": "N·m", "kp": "N·m/rad"}
         found += [
             Free(
@@ -138,7 +147,7 @@ class AxisProblem:
             name=m.name,
             time_s=motion.time_s,
             measured=np.column_stack(columns),
-            floor=np.array([f.value for f in self.floors]),
+            floor=self.floor_values,
             channels=channels[: 1 + self.effort],
             data=motion,
         )

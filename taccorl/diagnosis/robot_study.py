@@ -88,10 +88,10 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
     lines = [
         "| what | asked | measured |",
         "|---|---|---|",
-        _share("one hidden effect: exact", "≥ 80 %", hidden, is_exact),
-        _share("… named", "≥ 95 %", hidden, is_named),
-        *(_share(f"… {name}: exact", "", [r for r in hidden if r["robot"] == name], is_exact) for name in ROBOTS),
-        _share("nothing hidden: silent", "≥ 98 %", clean, lambda r: r["added"] is None),
+        share_row("one hidden effect: exact", "≥ 80 %", hidden, is_exact),
+        share_row("… named", "≥ 95 %", hidden, is_named),
+        *(share_row(f"… {name}: exact", "", [r for r in hidden if r["robot"] == name], is_exact) for name in ROBOTS),
+        share_row("nothing hidden: silent", "≥ 98 %", clean, lambda r: r["added"] is None),
         f"| hidden, and too weak to show (below {MATERIAL_FLOORS} noise floors) | | "
         f"{sum(bool(r['hidden']) for r in rows) - len(hidden)} |",
         f"| CPU-s a diagnosis, median / 90th percentile | ≤ 15 | {median(cpu):.1f} / {cpu[int(0.9 * (len(cpu) - 1))]:.1f} |",
@@ -106,7 +106,7 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _share(what: str, asked: str, rows: Sequence[dict[str, Any]], good: Callable[[dict[str, Any]], bool]) -> str:
+def share_row(what: str, asked: str, rows: Sequence[dict[str, Any]], good: Callable[[dict[str, Any]], bool]) -> str:
     if not rows:
         return f"| {what} | {asked} | no case |"
     right, num = sum(map(good, rows)), len(rows)

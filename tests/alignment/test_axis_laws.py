@@ -95,7 +95,8 @@ def test_a_torque_accelerates_and_none_lets_the_axis_coast():
 
 
 def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_recorded():
-    """Off from 0.5 to 0.9 s: no duty, no back-EMF. Else the supply falls from 12 to 8 V: duty · 8 / 12, back-EMF as before."""
+    """Off from 0.5 to 0.9 s: no duty, no back-EMF. Else the supply falls from 12 to 8 V: duty · 8 / 12, back-EMF as before.
+    A row reads what its motor got until then."""
     rows = np.arange(400)
     target, off = np.where(rows < 10, 0.0, 0.8), (rows >= 100) & (rows < 180)
     volts = np.where(rows < 50, 12.0, 8.0)
@@ -110,7 +111,9 @@ def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_reco
             v += DT_S * (torque - weight * math.sin(q)) / inertia
             q += DT_S * v
     m = dataclasses.replace(
-        recording(target, payload_kg=0.3), supply_v=volts[:, None], enabled=np.where(off, 0.0, 1.0)[:, None]
+        recording(target, payload_kg=0.3),
+        supply_v=np.append(12.0, volts[:-1])[:, None],
+        enabled=np.where(off, 0.0, 1.0)[:, None],
     )
     assert np.abs(answer(SERVO, m).reported - np.array(truth)).max() < 5e-4
     assert answer(SERVO, m).effort[off] == pytest.approx(np.zeros(80))
@@ -119,6 +122,36 @@ def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_reco
     ):
         torque_axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")
         answer(torque_axis, dataclasses.replace(m, target_kinds=("torque",), payload_kg={}))
+
+
+def test_targets_act_at_their_own_times_and_late_by_what_the_file_states():
+    """J q̈ = τ from rest: 0.01 N·m from 0.1037 s on give τ t² / 2 J. The row is at 0.1 s; its target came
+    2.2 ms later, and the file states 1.5 ms."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque", target_late_s=1.5e-3)
+    time_s = np.arange(200) / RATE_HZ
+    target = np.where(time_s < 0.0999, 0.0, 0.01)
+    m = dataclasses.replace(recording(target, "torque"), command_s=time_s + 2.2e-3)
+    truth = 0.5 * 0.5 * np.clip(time_s - 0.1037, 0.0, None) ** 2
+    np.testing.assert_allclose(answer(axis, m).reported, truth, atol=2e-7)
+
+
+def test_a_torque_that_the_controller_adds_moves_the_axis_and_is_in_its_effort():
+    """J = 0.02: 0.01 N·m from 0.5 s on beside a velocity loop whose target is 0: q̇ → 0.01 / 0.2 rad/s, and no effort is left."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
+    m = recording(np.zeros(200), "velocity")
+    added = np.where(np.arange(200) < 100, 0.0, 0.01)[:, None]
+    found = answer(axis, dataclasses.replace(m, torque_ff=added))
+    assert np.diff(found.reported)[-1] * RATE_HZ == pytest.approx(0.05, rel=0.02)
+    assert found.effort[101] == pytest.approx(0.01, rel=0.06) and abs(found.effort[-1]) < 2e-4
+
+
+def test_the_effort_of_a_row_is_before_its_target_or_after_it_as_the_file_says():
+    """At rest 18 N·m/rad times a step of 0.01 rad: 0.18 N·m in the step's row, or in the next."""
+    m = recording(np.where(np.arange(50) < 20, 0.0, 0.01))
+    before, after = (
+        answer(dataclasses.replace(SERVO, effort_after_target=own), m).effort[19:21] for own in (False, True)
+    )
+    assert before == pytest.approx([0.0, 0.0]) and after == pytest.approx([0.0, 0.18])
 
 
 def test_a_recording_s_own_lever_and_arm_are_those_of_its_pendulum():

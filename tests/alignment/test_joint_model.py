@@ -319,7 +319,18 @@ def test_a_joint_starts_in_balance() -> None:
         {"stribeck_torque": 4.0, "stribeck_share": 0.5, "encoder_scale": 1.05, "encoder_wave": 0.01},
     ):
         start = 0.3 if "integral_rate" in change else 0.29  # an integral has had for ever to take the error away
-        reported, _ = simulate(drive._replace(**change), target, np.zeros(400), np.ones(400), start, 6, 1, STEP_S)
+        reported, _ = simulate(
+            drive._replace(**change),
+            target,
+            np.zeros(400),
+            np.ones(400),
+            np.ones(400),
+            np.zeros(400),
+            start,
+            6,
+            1,
+            STEP_S,
+        )
         assert reported[0] == pytest.approx(start, abs=1e-12)
         assert np.ptp(reported) < 2e-5, change  # dry friction creeps at 6 µrad/s
 

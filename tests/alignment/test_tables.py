@@ -182,6 +182,12 @@ def test_supply_and_enabled_of_an_axis_are_read_and_a_robot_refuses_them(tmp_pat
     with pytest.raises(RecordingError, match=r"swing\.csv: row 2: servo\.enabled is 0\.5; write 0"):
         path.write_text("stamp,pos,goal,volts,torque\n0,2048,2048,74,1\n10,2148,2248,73,0.5\n20,2248,2248,72,0\n")
         read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    path.write_text("stamp,pos,goal,volts\n0,2048,2048,74\n10,2148,2248,73\n20,2248,2248,72\n")
+    with pytest.raises(RecordingError, match="no column 'torque'"):
+        read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    columns = (tmp_path / "columns.yaml").read_text().replace('unit: "1"', 'unit: "1", if_missing: 1')
+    (tmp_path / "columns.yaml").write_text(columns)
+    np.testing.assert_array_equal(read_table(path, load_table_spec(tmp_path / "columns.yaml")).enabled, np.ones((3, 1)))
     for change, message in (
         ({}, "left_joint5 has a supply voltage"),
         ({"supply_v": np.empty(0)}, r"left_joint5 has a motor that is off at 0\.020 s"),
