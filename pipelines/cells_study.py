@@ -49,7 +49,8 @@ Saturation, threshold, drift and temperature have the same equation in the gener
 Readings at the converter's ends are left out: with ends at 400 (250) counts the gain of 20 clean sensors is then off by 0.02 %
 (0.07 %) in the median and by 0.2 % (0.2 %) at most; kept in the fit they put it off by 44 % (68 %) in the median.
 
-Command: `python -m pipelines.cells_study`. Machine: {platform.processor() or platform.machine()}, {os.cpu_count()} cores.
+Command: `python -m pipelines.cells_study`. Machine: {platform.processor() or platform.machine()}, {os.cpu_count()} cores,
+{WORKERS} at a time, threads of linear algebra: {os.environ.get("OMP_NUM_THREADS", "as many as cores")}.
 
 | what | asked | measured |
 |---|---|---|
