@@ -49,7 +49,7 @@ def test_the_expert_completes_what_a_policy_of_a_batch_began(tmp_path: Path) -> 
     its = plan(episodes=2)
     found = policy_episodes(its, lambda: StandIn(wobble), 2, Store(tmp_path))
     sim = its.make()
-    done = [correct_episode(its, sim, its.rows(sim), read_policy_episode(found.path, k)) for k in range(2)]
+    done = [correct_episode(its, sim, its.contract(sim), read_policy_episode(found.path, k)) for k in range(2)]
     assert [one.outcome for one in done] == ["success", "success"]
     assert [one.cause for one in done] == ["drawn before the grasp"] * 2
     sim.close()
