@@ -216,9 +216,10 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
                 f"{path}: column {k + 1} {column!r} is not NAME.{', .'.join(_CONVERSIONS)}; {nearest(column, own)}"
             )
         if name not in known:
+            whose = "the robot" if signal_units is None else "the machine of the file"
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r}: the robot has no {name!r}; {nearest(name, known)}. "
-                "Signals of other machines need their machine's file (--twin) or a columns file, which state their units"
+                f"{path}: column {k + 1} {column!r}: {whose} has no {name!r}; {nearest(name, known)}. "
+                "Signals of other machines need their own file (--twin) or a columns file, which state their units"
             )
         parts.setdefault(name, set()).add(key)
     for name, keys in parts.items():

@@ -34,7 +34,9 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 MOVED = {"rad": 0.02, "m": 0.002}
-"""A command that stays within this has not moved its joint."""
+"""A command that stays within this has not moved its joint,"""
+MOVED_STEPS = 100.0
+"""unless it is so many times what its encoder resolves: ± 1 mm on a stage. Of machines other than the PiPER."""
 TOO_SHORT_S, SHORT_S = 1.0, 3.0
 """Of motion. The paper sweeps each joint for 10 s."""
 DEAD_SHARE = 0.05
@@ -225,7 +227,20 @@ def check_values(m: Measurement) -> list[Finding]:
 
 def _moves(m: Measurement) -> list[bool]:
     spans = [np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in m.target.T]
-    return [bool(span > MOVED[unit]) for span, unit in zip(spans, m.units, strict=True)]
+    return [bool(span > least_motion(m, name)) for span, name in zip(spans, m.signals, strict=True)]
+
+
+def least_motion(m: Measurement, name: str) -> float:
+    """rad, m: a signal that moves by less has not moved."""
+    j = m.column(name)
+    usual = MOVED[m.units[j]]
+    if name in ROBOT.action_names:
+        return usual
+    # Noise of the readings from their fourth differences, in which slow motion is nothing.
+    q = m.measured[np.isfinite(m.measured[:, j]), j]
+    noise = 1.4826 * float(np.median(np.abs(np.diff(q, 4)))) / np.sqrt(70.0) if len(q) > 20 else 0.0
+    resolved = max(float(m.quantum[j]), noise)
+    return min(usual, MOVED_STEPS * resolved) if resolved > 0.0 else usual
 
 
 def _motion_s(m: Measurement) -> float:
@@ -238,7 +253,7 @@ def _no_motion(m: Measurement, name: str) -> Finding:
     j = m.column(name)
     unit = m.units[j]
     text = (
-        f"{name} is never commanded to move (by {np.ptp(m.target[:, j]):.4f} {unit}, it takes {MOVED[unit]:g}): "
+        f"{name} is never commanded to move (by {np.ptp(m.target[:, j]):.2g} {unit}, it takes {least_motion(m, name):.2g}): "
         "nothing about it can be learnt here; record a sweep of it"
     )
     return Finding("no_motion", "error", name, text)
@@ -248,9 +263,10 @@ def check_motion(m: Measurement, joints: Sequence[str] = ()) -> list[Finding]:
     """Joints that do not move, do not answer, or stop answering."""
     moves = _moves(m)
     if not any(moves):
+        few, more = list(zip(m.signals, m.units, strict=True))[:2], " …" * (len(m.signals) > 2)
         text = (
-            f"no command moves by more than {MOVED['rad']:g} rad or {MOVED['m']:g} m in {m.time_s[-1]:.1f} s: "
-            "record a sweep"
+            f"no command moves ({', '.join(f'{n} by less than {least_motion(m, n):.2g} {u}' for n, u in few)}{more}) in "
+            f"{m.time_s[-1]:.1f} s: record a sweep"
         )
         return [Finding("no_motion", "error", "", text)]
     findings = [_no_motion(m, name) for name in joints if not moves[m.column(name)]]

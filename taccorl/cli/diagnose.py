@@ -145,7 +145,7 @@ def print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors |
     from rich.text import Text
 
     from taccorl.cli.tables import console
-    from taccorl.diagnosis.evidence_words import evidence_words
+    from taccorl.diagnosis.evidence_words import evidence_words, unit_words
 
     out, d = console(), finding.diagnosis
     out.print(Text(f"\n{finding.part}", "bold"))
@@ -175,7 +175,9 @@ def print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors |
             table.add_column(head, justify="left" if left else "right", overflow="fold")
         for e in found.evidence[:6]:
             mark = "→" if e.name == found.added else "=" if e.name in found.ties else ""
-            numbers = ", ".join(f"{k.split('.', 1)[1]} {v:.3g}" for k, v in e.values.items())
+            numbers = ", ".join(
+                f"{k.split('.', 1)[1]} {v:.3g}{unit_words(e.units.get(k, '1'))}" for k, v in e.values.items()
+            )
             trouble = "; ".join(
                 w for w in (e.verdict, e.trouble, f"at bound: {', '.join(e.at_bound)}" * bool(e.at_bound)) if w
             )

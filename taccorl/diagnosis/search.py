@@ -515,6 +515,7 @@ class _Row:
             at_bound=tuple(name for name in self.model.at_bound if name.startswith(own)),
             trouble=self.model.trouble,
             verdict=verdict,
+            units={f.name: f.unit for f in self.model.frees if f.name.startswith(own)},
         )
 
 

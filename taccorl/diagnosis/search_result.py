@@ -1,5 +1,6 @@
 """Criteria by which the search accepts an effect, and the result that it hands to verdicts and reports."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -104,6 +105,8 @@ class Evidence:
     trouble: str
     verdict: str
     """In words: accepted, tied with, too little, no more than chance …"""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Of ``values``: of a slide N and m."""
 
 
 @dataclass(frozen=True, kw_only=True)

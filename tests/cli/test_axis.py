@@ -1,6 +1,7 @@
 """An axis by itself as a user types it: compare, diagnose, add-effect, compare. Simulated by this test, not a real drive."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,7 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path,
     code, text = said("diagnose", bench / "bench", f"--twin={drive}", f"--out={tmp_path / 'found'}", FEW)
     assert code in (0, 1) and "slide lacks coulomb_friction" in text, text
     assert "_joint" not in text and "PiPER" not in text
+    assert re.search(r"torque_nm [\d.]+ N\b", text) and "N·m" not in text
     assert f"next: taccorl add-effect coulomb_friction --twin={drive}" in text
     page = (tmp_path / "found" / "report.html").read_text()
     assert page.count("<img") >= 5 and "slide" in page
@@ -178,3 +180,28 @@ def test_columns_with_a_factor_mend_sign_and_unit(bench: Path, said: Any, tmp_pa
     (tmp_path / "bench" / "measurements.yaml").write_text("columns: columns.yaml\n")
     code, text = said("compare", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
     assert code == 0 and "slide effort" in text
+
+
+def test_a_stage_that_moves_by_a_millimetre_is_compared_and_one_that_stands_is_not(said: Any, tmp_path: Path):
+    """± 0.9 mm are 9000 of the noise's 0.2 µm; 9 µm are 45."""
+    (tmp_path / "drive.yaml").write_text(FILE)
+    for name, amplitude_m in (("small", 0.9e-3), ("still", 4.5e-6)):
+        (tmp_path / name).mkdir()
+        time_s = np.arange(4 * RATE_HZ) / RATE_HZ
+        target = amplitude_m * np.sin(2 * np.pi * 0.6 * np.clip(time_s - 0.3, 0.0, 3.0))
+        q = np.concatenate([np.zeros(13), target[:-13]]) + 2e-7 * np.random.default_rng(1).standard_normal(len(time_s))
+        lines = [f"{t:.4f},{x:.9f},{goal:.9f}" for t, x, goal in zip(time_s, q, target, strict=True)]
+        (tmp_path / name / "one.csv").write_text("\n".join(["t,slide.q,slide.q_target", *lines]) + "\n")
+        code, text = said(
+            "compare", tmp_path / name, f"--twin={tmp_path / 'drive.yaml'}", f"--out={tmp_path / name}_out"
+        )
+        assert ("no_motion" in text) == (name == "still"), text
+        assert code == 0 if name == "small" else "slide by less than 2e-05 m" in text
+
+
+def test_a_column_of_another_name_is_not_blamed_on_a_robot(bench: Path, said: Any, tmp_path: Path):
+    (tmp_path / "bench").mkdir()
+    table = (bench / "bench" / "one.csv").read_text().replace("slide.", "slid.")
+    (tmp_path / "bench" / "one.csv").write_text(table)
+    code, text = said("compare", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
+    assert code == 2 and "has no 'slid'; did you mean 'slide'" in text and "robot" not in text

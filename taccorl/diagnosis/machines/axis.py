@@ -15,7 +15,7 @@ from taccorl.alignment.effort_time import check_effort_time
 from taccorl.alignment.measurement import UNITS, Measurement
 from taccorl.alignment.measurements import Measurements, Use
 from taccorl.alignment.noise_floor import noise_floor
-from taccorl.alignment.telemetry_checks import MOVED
+from taccorl.alignment.telemetry_checks import least_motion
 from taccorl.alignment.touch_motion import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.axis_problem import AxisProblem, axis_motion, simulated
@@ -73,15 +73,12 @@ class Axis(Machine):
         name = self.config.name
         for m in measurements.fit:
             self._check_signal(m)
-            if np.nanmax(m.measured[:, m.column(name)]) - np.nanmin(m.measured[:, m.column(name)]) > self._moved:
+            if np.nanmax(m.measured[:, m.column(name)]) - np.nanmin(m.measured[:, m.column(name)]) > least_motion(
+                m, name
+            ):
                 return (name,)
-        raise TaccorlError(
-            f"no fit recording moves {name} by more than {self._moved:.2g} {self.config.unit}; record motions"
-        )
-
-    @property
-    def _moved(self) -> float:
-        return MOVED[self.config.unit]
+        least = max(least_motion(m, name) for m in measurements.fit)
+        raise TaccorlError(f"no fit recording moves {name} by more than {least:.2g} {self.config.unit}; record motions")
 
     def _check_signal(self, m: Measurement) -> None:
         if self.config.name not in m.signals:
