@@ -61,6 +61,8 @@ class JointFinding:
     @property
     def numbers(self) -> str:
         """Where the always fitted numbers are from."""
+        if "stall_nm" in self.diagnosis.base:
+            return "gains as the file states them, stall torque and back-EMF fitted"
         return "commanded gains" if self.commanded else "gains fitted (not stated by the recordings)"
 
     @property
