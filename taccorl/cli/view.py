@@ -81,14 +81,12 @@ def main(argv: list[str]) -> int:
 
         whole = stack.enter_context(_opened(config.path, config.episode, config.spec, "--spec"))
         shown = episode = part_of(whole, config.start_s, config.end_s)
-        _note_codecs(config, episode)
         if config.against is not None:
             from taccorl.views.pair import Pair
 
             other = stack.enter_context(_other(config, config.against, whole))
-            other = part_of(other, config.start_s, config.end_s)
-            _note_codecs(config, other)
-            shown = Pair(episode, other, cast("Align", config.align))
+            shown = Pair(episode, part_of(other, config.start_s, config.end_s), cast("Align", config.align))
+        _note_codecs(config, shown)
         wrote = _write(config, shown)
         if config.serve:
             _serve(shown)
@@ -180,11 +178,14 @@ def _opened(path: Path, number: int, spec: str | None, option: str) -> Iterator[
         yield episodes[number]
 
 
-def _note_codecs(config: ViewConfig, episode: "Episode") -> None:
+def _note_codecs(config: ViewConfig, shown: "Shown") -> None:
+    from taccorl.data.episode import Episode
     from taccorl.views.video import codec_of
     from taccorl.views.viewer import can_decode
 
-    codecs = sorted(c for c in {codec_of(video) for video in episode.videos.values()} if not can_decode(c))
+    episodes = (shown,) if isinstance(shown, Episode) else shown.episodes
+    videos = [video for episode in episodes for video in episode.videos.values()]
+    codecs = sorted(c for c in {codec_of(video) for video in videos} if not can_decode(c))
     if config.save is not None and codecs:
         print(
             f"note: the Rerun program needs ffmpeg for {', '.join(codecs)} video and finds none: saved as JPEG pictures"
