@@ -1,0 +1,174 @@
+"""600 recordings with random damage, 150 of each format: each ends in an outcome in plain words. If a row differs from that of
+the intact recording, the report names damage, or it says that the format cannot show it.
+
+Damage is a flipped bit, a changed byte, zeros or noise, a cut, bytes lost or put in; places are drawn from a seed.
+"""
+
+import dataclasses
+import json
+import random
+import shutil
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from taccorl.data.cutting import BrokenPicture, Cutter
+from taccorl.data.episode import Episode
+from taccorl.data.ingest import find_jobs, ingest_one
+from taccorl.data.recording import find_sources, opened
+from taccorl.data.spec import RecordingSpec, load_recording_spec
+from taccorl.demos.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
+from taccorl.errors import TaccorlError
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
+NUM_EACH = 150
+STAND_IN = StandInConfig(duration_s=2.5, seed=5, camera_size=(48, 64), chunk_size_bytes=64 * 1024)
+OUTCOMES = {"written", "split", "quarantined", "refused"}
+
+
+def bag_of(mcap: Path, folder: Path) -> Path:
+    """The same messages in an SQLite bag."""
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as bag, mcap.open("rb") as file:
+        connections: dict[int, Any] = {}
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            if channel.id not in connections:
+                connections[channel.id] = bag.add_connection(
+                    channel.topic, schema.name, msgdef=schema.data.decode(), rihs01="RIHS01_" + "0" * 64
+                )
+            bag.write(connections[channel.id], message.log_time, message.data)
+    return next(folder.glob("*.db3"))
+
+
+def damaged(data: bytes, rng: random.Random) -> tuple[str, bytes]:
+    """What was done, and the result."""
+    kind = rng.choice(["bit", "byte", "zeros", "noise", "cut", "lost", "put in"])
+    at, size = rng.randrange(len(data)), rng.choice([16, 512, 4096])
+    if kind == "bit":
+        changed = data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
+    elif kind == "byte":
+        changed = data[:at] + bytes([data[at] ^ rng.randrange(1, 256)]) + data[at + 1 :]
+    elif kind in ("zeros", "noise"):
+        size = min(size, len(data) - at)
+        changed = data[:at] + (bytes(size) if kind == "zeros" else rng.randbytes(size)) + data[at + size :]
+    else:
+        changed = {
+            "cut": data[:at],
+            "lost": data[:at] + data[at + size :],
+            "put in": data[:at] + rng.randbytes(size) + data[at:],
+        }[kind]
+    return f"{kind} at {at} of {len(data)}, size {size}", changed
+
+
+def rows_of(episodes: list[Episode]) -> dict[int, tuple[bytes, ...]]:
+    """Time of a row [ns] → its numbers and pictures."""
+    found = {}
+    for episode in episodes:
+        pictures = list(episode.pictures()) if episode.picture_keys else [{}] * episode.num_rows
+        for row, shown in enumerate(pictures):
+            numbers = (array[row].tobytes() for array in episode.arrays.values())
+            time_ns = episode.start_ns + round(row * 1e9 / episode.spec.fps)
+            found[time_ns] = (*numbers, *(picture.tobytes() for picture in shown.values()))
+    return found
+
+
+def rows_read(base: "Base") -> dict[int, tuple[bytes, ...]]:
+    """As ``taccorl ingest`` reads them: a broken picture is left out."""
+    ((_, source),) = find_sources(base.path, reader=base.spec.reader)
+    with opened(source, base.spec) as recording:
+        cutter = Cutter(recording)
+        try:
+            return rows_of(cutter.cut().episodes)
+        except BrokenPicture:
+            cutter.drop_broken_pictures()
+            return rows_of(cutter.cut().episodes)
+
+
+@dataclasses.dataclass(frozen=True)
+class Base:
+    """An intact recording, and the files of it that are damaged."""
+
+    path: Path
+    spec: RecordingSpec
+    files: tuple[Path, ...]
+
+    def entry(self, store: Path) -> dict[str, Any]:
+        jobs = find_jobs([self.path], self.spec, "spec", store, dry_run=True)
+        entries = [ingest_one(job) for job in jobs]
+        return {**entries[0], "all": entries}
+
+
+def made(kind: str, folder: Path, dataset: Path) -> Base:
+    if kind == "hdf5":
+        write_cobot_magic_hdf5(folder / "base.hdf5", STAND_IN)
+        return Base(folder / "base.hdf5", load_recording_spec("cobot_magic_hdf5"), (folder / "base.hdf5",))
+    if kind == "lerobot":
+        root = Path(shutil.copytree(dataset, folder / "base", ignore=shutil.ignore_patterns(".*", "README.md")))
+        files = tuple(p for p in sorted(root.rglob("*")) if p.is_file() and "taccorl" not in p.parts)
+        return Base(root, load_recording_spec("taccorl_lerobot"), files)
+    write_mcap(folder / "base.mcap", STAND_IN)
+    spec = load_recording_spec("piper_flexitac_mcap")
+    if kind == "mcap":
+        return Base(folder / "base.mcap", spec, (folder / "base.mcap",))
+    file = bag_of(folder / "base.mcap", folder / "bag")
+    return Base(file, dataclasses.replace(spec, reader="db3"), (file,))
+
+
+def wrong(base: Base, entry: dict[str, Any], intact: dict[int, tuple[bytes, ...]]) -> str:
+    """What is not right about the outcome of a damaged recording; empty if all is."""
+    for one in entry["all"]:
+        if one["outcome"] not in OUTCOMES or not (one["reason"] or one["outcome"] == "written"):
+            return f"outcome {one['outcome']!r}, reason {one['reason']!r}"
+        if "traceback" in one:
+            return one["traceback"][-600:]
+    if not any(one["outcome"] in ("written", "split") for one in entry["all"]):
+        return ""
+    if base.spec.reader == "lerobot":  # its entries state that nothing protects their rows
+        return (
+            ""
+            if all(one["unprotected"] for one in entry["all"] if one["outcome"] == "written")
+            else "not called unprotected"
+        )
+    shown = rows_read(base)
+    changed = sum(intact[t] != row for t, row in shown.items() if t in intact)
+    told = entry["outcome"] != "written" or any(
+        f["severity"] != "note" for e in entry["episodes"] for f in e["findings"]
+    )
+    if changed and not (told or entry["unprotected"]):
+        return f"{changed} rows differ, and nothing says so"
+    return ""
+
+
+@pytest.mark.parametrize("kind", ["mcap", "db3", "hdf5", "lerobot"])
+def test_random_damage_ends_in_the_right_outcome(kind: str, dataset: Path, tmp_path: Path) -> None:
+    base = made(kind, tmp_path, dataset)
+    clean = base.entry(tmp_path / "store")
+    assert {one["outcome"] for one in clean["all"]} == {"written"}, clean["reason"]
+    intact: dict[int, tuple[bytes, ...]] = {}
+    if kind != "lerobot":
+        intact = rows_read(base)
+        assert len(intact) > 45
+    contents = {path: path.read_bytes() for path in base.files}
+    rng, failed, outcomes = random.Random(f"{kind} 1"), [], Counter[str]()
+    for _ in range(NUM_EACH):
+        path = rng.choice(base.files)
+        what, changed = damaged(contents[path], rng)
+        path.write_bytes(changed)
+        try:
+            entry = base.entry(tmp_path / "store")
+            fault = wrong(base, entry, intact)
+            outcomes.update(one["outcome"] for one in entry["all"])
+        except TaccorlError as error:  # no recording was found: said in one line
+            fault, entry = "" if str(error) else "no words", {}
+            outcomes["not found"] += 1
+        if path.read_bytes() != changed:
+            fault = "the file was written to"
+        if fault:
+            failed.append(f"{path.name}: {what}: {fault}")
+        path.write_bytes(contents[path])
+    print(kind, json.dumps(outcomes))
+    assert not failed, "\n".join(failed)
