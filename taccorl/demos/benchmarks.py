@@ -215,14 +215,14 @@ def corruption() -> Iterator[Row]:
 
 @benchmark("kill")
 def kill() -> Iterator[Row]:
-    """kill -9 at 20 random moments, each followed by a second run: tests/end_to_end/test_interrupted_ingest.py."""
-    passed, total = _pytest("tests/end_to_end/test_interrupted_ingest.py", "-m", "slow")
+    """kill -9 at 30 random moments of each of three commands, then a second run: tests/end_to_end/test_interrupted.py."""
+    passed, total = _pytest("tests/end_to_end/test_interrupted.py", "-m", "slow")
     yield Row(
-        name="20 of 20 byte-identical after kill -9 and rerun",
+        name="ingest, merge and augment byte-identical after kill -9 and rerun",
         value=100 * passed / total,
         unit="%",
         goal="≥ 100",
-        n=20,
+        n=90,
         spread=0.0,
     )
 

@@ -44,8 +44,9 @@ def write_card(root: Path) -> Path | None:
         DatasetError: no LeRobot dataset, or not a whole one.
         OSError: the folder cannot be written.
     """
-    path = root / CARD
+    path, temp = root / CARD, root / PICTURES / CARD
     if os.path.lexists(path):
+        temp.unlink(missing_ok=True)  # of a run that died
         return None
     dataset = Dataset(root)
     pictures = dict(_pictures(dataset))
@@ -53,7 +54,6 @@ def write_card(root: Path) -> Path | None:
     (root / PICTURES).mkdir(exist_ok=True)
     for name, image in pictures.items():
         image.save(root / name, optimize=True, quality=85)
-    temp = root / PICTURES / f"{CARD}.{os.getpid()}"
     try:
         temp.write_text(text, encoding="utf-8")
         os.link(temp, path)  # unlike a rename, never over a file that came meanwhile
