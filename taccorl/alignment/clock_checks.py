@@ -7,6 +7,7 @@
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,9 +122,9 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
         worst = max(unclear, key=lambda t: t.fit.rms / floor[t.signal])
         step = max(_least_step(m, floor[t.signal]) for t in unclear)
         why = (
-            f"{listed([t.signal for t in unclear])} answer unlike a lag (it leaves "
+            f"{listed([t.signal for t in unclear])} do not answer their targets as a delay and a lag would (which leave "
             f"{worst.fit.rms / floor[worst.signal]:.0f} noise floors at {worst.signal}), so that motion does not show it. "
-            "Nothing is held up. To have it judged, add a recording in which each of them rests for "
+            "The command goes on. To have it judged, add a recording in which each of them rests for "
             f"{2 * REST_S:g} s and its target then jumps by {step:.2g} {m.units[m.column(worst.signal)]} or more, twice: the row "
             "in which it first moves shows an offset"
         )
@@ -131,7 +132,9 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
     return findings
 
 
-def check_against_twin(m: Measurement, reported: np.ndarray, floor: dict[str, float]) -> list[Finding]:
+def check_against_twin(
+    m: Measurement, reported: np.ndarray, floor: dict[str, float], uncertain: Collection[str] = ()
+) -> list[Finding]:
     """Rows by which the measurement lies beside the twin's replay of its commands.
 
     A shift is reported only where it can be told from other gains (both are fitted together) and from a missing effect (little
@@ -139,6 +142,8 @@ def check_against_twin(m: Measurement, reported: np.ndarray, floor: dict[str, fl
 
     Args:
         reported: (T, J) the twin's positions, row by row with ``m.target``.
+        uncertain: signals of drives whose numbers (gains, k_t, back-EMF) diagnose fits because nobody knows them. Wrong ones
+            shift the twin, too, so that a lead of theirs is a warning.
     """
     findings = []
     period_s = m.period_s
@@ -160,10 +165,13 @@ def check_against_twin(m: Measurement, reported: np.ndarray, floor: dict[str, fl
             where = f"{abs(shift_s) * 1e3:.1f} ± {sd_s * 1e3:.1f} ms ({abs(shift_s) / period_s:.1f} rows)"
             if shift_s < 0:
                 text = (
-                    f"{name}: the measurement leads the twin's replay by {where}: positions stamped too early or commands too "
-                    f"late, or paired one row off. {_earlier_targets(m, -shift_s)}"
+                    f"{name}: the measurement leads the twin's replay by {where}: "
+                    + ("the drive's numbers in the file are off (diagnose fits them), or " if name in uncertain else "")
+                    + f"positions stamped too early or commands too late, or paired one row off. {_earlier_targets(m, -shift_s)}"
                 )
-                if -shift_s < HALF_ROW_MOST * period_s:
+                if name in uncertain:
+                    text += " only if the lead remains with the numbers that were fitted"
+                elif -shift_s < HALF_ROW_MOST * period_s:
                     text += (
                         ". Half a row is also what a drive shows that receives targets faster than they are logged: state that "
                         "rate as `command_hz` in the file of your robot or axis"
@@ -172,9 +180,10 @@ def check_against_twin(m: Measurement, reported: np.ndarray, floor: dict[str, fl
                 text = (
                     f"{name}: the measurement comes {where} after the twin's replay: a real delay (effects "
                     "command_delay, sensor_delay), or a clock offset; positions cannot tell which. Compare the "
-                    "clocks, or record effort too"
+                    f"clocks{'' if m.has_effort()[j] else ', or record effort too'}"
                 )
-            findings.append(Finding("shifted_from_twin", "error" if shift_s < 0 else "warning", name, text))
+            blocks = shift_s < 0 and name not in uncertain
+            findings.append(Finding("shifted_from_twin", "error" if blocks else "warning", name, text))
     return findings
 
 
@@ -246,8 +255,8 @@ def _late(t: CommandTiming, m: Measurement) -> Finding:
         "late_answer",
         "note",
         t.signal,
-        f"{t.signal} answers {_ms(t.fit)} ({t.fit.delay_s / m.period_s:.1f} rows) later than a lag of "
-        f"{t.fit.time_constant_s * 1e3:.0f} ms: a real delay or a clock offset, which positions cannot tell apart. "
+        f"{t.signal} answers its target after a delay of {_ms(t.fit)} ({t.fit.delay_s / m.period_s:.1f} rows), then with a lag "
+        f"of {t.fit.time_constant_s * 1e3:.0f} ms: a real delay or a clock offset, which positions cannot tell apart. "
         "If the clocks are known to agree, it is a delay (effects command_delay, sensor_delay); else compare them "
         "or log both by one clock",
     )

@@ -69,8 +69,8 @@ class JointConfig(DriveLaw):
     """The drive of one joint. Units are those of a hinge; of a sliding joint N for N·m, m for rad, kg for kg·m²."""
 
     gains: Literal["commanded", "fitted"] = "commanded"
-    """Whether kp and kd are what the controller runs, or only where a fit starts. Of law pwm stall torque and back-EMF are
-    fitted instead, with either."""
+    """Whether kp and kd are what the controller runs, or only where a fit starts. Of law pwm they are the servo's own, and stall
+    torque and back-EMF are fitted."""
     rotor_inertia: float = 0.0
     """kg·m² of the motor's rotor, on the motor's side of the gear."""
     gear: float = 1.0
@@ -89,6 +89,16 @@ class JointConfig(DriveLaw):
         optional = ("loop_hz", "command_hz")
         check_numbers("joint", self, positive=[name for name in optional if getattr(self, name) is not None])
         self.check_law("joint")
+        if self.law == "pwm" and self.gains == "fitted":
+            raise TaccorlError(
+                "joint.gains: of law pwm stall torque and back-EMF are fitted, not kp and kd; "
+                "write those that the servo has, and `gains: commanded`"
+            )
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether ``diagnose`` fits numbers of the law, because nobody knows them."""
+        return self.law == "pwm" or self.gains == "fitted"
 
     @property
     def armature(self) -> float:

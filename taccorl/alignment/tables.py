@@ -13,7 +13,7 @@ is off. Other names and units are written down in a columns file; no unit is eve
         q_target: {column: cmd_5, unit: deg}
         qd:       {column: speed_5, unit: rpm}
         tau:      {column: current_5, unit: Nm, factor: 0.000082}    # mA, 0.082 Nm/A; a factor of -1 mends a sign
-        supply:   {column: volts_5, unit: V, factor: 0.1}            # of ``kind: axis`` only
+        supply:   {column: volts_5, unit: V, factor: 0.1}            # of an axis or robot file with law pwm
         enabled:  {column: torque_enable_5, unit: "1", if_missing: 1}   # of a file that lacks the column
 """
 
@@ -218,7 +218,7 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
         if name not in known:
             whose = "the robot" if signal_units is None else "the machine of the file"
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r}: {whose} has no {name!r}; {nearest(name, known)}. "
+                f"{path}: column {k + 1} {column!r}: {whose} has no {name!r} ({nearest(name, known)}). "
                 "Signals of other machines need their own file (--twin) or a columns file, which state their units"
             )
         parts.setdefault(name, set()).add(key)

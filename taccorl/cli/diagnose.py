@@ -163,11 +163,11 @@ def print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors |
         out.print(f"  {finding.remark}", highlight=False, soft_wrap=True)
     hardly = [_why_invisible(finding, name) for name in finding.can_tell.invisible if name not in d.names]
     if hardly:
-        text = f"  of a typical strength these recordings would not show: {_some(hardly)}"
+        text = f"  these recordings would not show, at a typical strength: {_some(hardly)}"
         out.print(Text(text, "dim"), soft_wrap=True)
-    pairs = [f"{a} from {b}" for a, b, _ in finding.can_tell.pairs]
+    pairs = [f"{a} and {b}" for a, b, _ in finding.can_tell.pairs]
     if pairs:
-        out.print(Text(f"  nor tell at once: {_some(pairs)}", "dim"), soft_wrap=True)
+        out.print(Text(f"  look alike in these recordings: {_some(pairs)}", "dim"), soft_wrap=True)
     for number, found in enumerate(d.rounds, 1):
         table = Table(box=None, pad_edge=False)
         for head in ("", f"round {number}: effect", "with", "validation error", "gain", "÷ s.e.", "evidence", ""):

@@ -119,11 +119,18 @@ def _other(config: ViewConfig, path: Path, episode: "Episode") -> Iterator["Epis
 
 def _replayed(twin: Path, episode: "Episode") -> "Episode":
     """The actions of ``episode`` in that twin. What it touches is not in its scene, so touch is left out."""
+    from taccorl.robots import ROBOT
     from taccorl.sim.bench import Bench
     from taccorl.sim.replay import replay_episode
     from taccorl.sim.simulation import Simulation
     from taccorl.sim.twin_file import load_twin
 
+    shape = episode.arrays["action"].shape if "action" in episode.arrays else None
+    if shape is None or shape[1:] != ROBOT.action_low.shape:
+        raise TaccorlError(
+            f"--against={twin}: a twin.yaml is one of two PiPER arms, with {ROBOT.num_actions} targets a row; {episode.name} has "
+            f"{'no action' if shape is None else f'{shape[1]}'}. Give another episode instead"
+        )
     sim = Simulation(Bench(), load_twin(twin))
     sim.reset([0])
     done = replay_episode(sim, episode)

@@ -103,7 +103,11 @@ def _check_touch(episode: Episode, key: str, joints_fit: bool) -> list[Finding]:
     findings = check_pads(episode, key, pads)
     grippers = read_grippers(episode) if joints_fit else None
     if grippers is None:
-        why = "no gripper in m in both state and action" if joints_fit else "joints or command are wrong"
+        why = (
+            "state and action have no number in m that is named `gripper`"
+            if joints_fit
+            else "joints or command are wrong"
+        )
         return [*findings, not_judged(key, "touch against grippers", why)]
     return findings + check_touch_and_grip(episode, key, pads, grippers)
 

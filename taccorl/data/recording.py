@@ -452,8 +452,11 @@ class _Loader:
         if marker and not self.log[marker]:
             missing.append(marker)
         if missing:
+            lost = next((str(d) for d in self.reader.damage), "")
             hint = (
-                "; ".join(f"{t}: {nearest(t, present)}" for t in missing[:3]) if present else "the file names no topics"
+                "; ".join(f"{t}: {nearest(t, present)}" for t in missing[:3])
+                if present
+                else lost or "the file names no topics"
             )
             raise RecordingError(
                 f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint})"

@@ -171,12 +171,13 @@ def _ratio_name(name: str, p: Parameter | None) -> str:
 
 
 def _plain(fit: Fit, frees: Iterable[Free]) -> list[Identified]:
+    """All but those whose interval is the whole range in which they were fitted: these are not determined."""
     intervals = fit.intervals()
     return [
-        Identified(
-            name=f.name, value=fit.values[f.name], low=intervals[f.name][0], high=intervals[f.name][1], unit=f.unit
-        )
+        Identified(name=f.name, value=fit.values[f.name], low=low, high=high, unit=f.unit)
         for f in frees
+        for low, high in [intervals[f.name]]
+        if low > f.low or high < f.high
     ]
 
 

@@ -77,7 +77,7 @@ def verdict(
 
 def refitted_words(d: Diagnosis) -> str:
     """Label of the refit without effects: it changes the gains of a joint, and other numbers of pads and axes."""
-    return "gains refitted" if "kp" in d.base else "always fitted numbers refitted"
+    return "gains refitted" if "kp" in d.base else "with the numbers refitted that every fit adjusts"
 
 
 def added(d: Diagnosis) -> tuple[str, ...]:

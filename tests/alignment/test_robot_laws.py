@@ -159,6 +159,11 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
         ("law: torque, kd: 1.0", 4, "kd: law torque has none"),
         ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", 4, "resistance_ohm: law pwm needs it"),
         ("kp: 20.0, kd: 1.0, supply_v: 12.0", 4, "supply_v: law impedance has none"),
+        (
+            "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.0, torque_nm_per_a: 1.0, gains: fitted",
+            4,
+            "write those that the servo has, and `gains: commanded`",
+        ),
         ("law: velocity, kd: 1.0, effects: [{effect: integral_action, rate_per_s: 1.0}]", 4, "acts in a position loop"),
         ("law: pd, kp: 1.0, kd: 1.0", 4, "'pd' is none of 'impedance'"),
     ],

@@ -137,7 +137,7 @@ def test_where_nothing_can_be_known_it_says_so():
     m = shifted(sweep(2, friction_nm=3.0, joints=[4, 5]), 1)
     findings = check_clock(m, floors(m))
     assert [f.check for f in findings] == ["not_judged"]
-    assert "an offset of one row (5.0 ms) not judged: left_joint5, left_joint6 answer unlike a lag" in findings[0].text
+    assert "an offset of one row (5.0 ms) not judged: left_joint5, left_joint6 do not answer" in findings[0].text
     # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.
     least = 8 * max(floors(m)[s] for s in ("left_joint5", "left_joint6")) * 0.12 / 0.005
     assert f"jumps by {least:.2g} rad or more" in findings[0].text
@@ -200,6 +200,15 @@ def test_one_row_off_the_twin_is_found_even_when_its_gains_are_wrong(clean):
         rows_off = [float(f.text.split(" rows)")[0].split("(")[-1]) for f in findings]
         assert rows_off == pytest.approx([1.0] * 12, abs=0.21)
     assert check_against_twin(clean, slower, floors(clean)) == []
+
+
+def test_a_lead_is_a_warning_where_the_drive_s_numbers_are_uncertain(clean):
+    early = shifted(clean, 1)
+    twin = answer(clean.target, damping=1.3)[: early.num_rows]
+    one, *others = [clean.signals[j] for j in ARMS_JOINTS]
+    findings = check_against_twin(early, twin, floors(early), uncertain=[one])
+    assert {f.feature: f.severity for f in findings} == dict.fromkeys(others, "error") | {one: "warning"}
+    assert [f.feature for f in findings if "numbers in the file" in f.text] == [one]
 
 
 def test_a_missing_effect_keeps_the_shift_from_the_twin_unjudged(clean):

@@ -204,4 +204,4 @@ def test_a_column_of_another_name_is_not_blamed_on_a_robot(bench: Path, said: An
     table = (bench / "bench" / "one.csv").read_text().replace("slide.", "slid.")
     (tmp_path / "bench" / "one.csv").write_text(table)
     code, text = said("compare", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
-    assert code == 2 and "has no 'slid'; did you mean 'slide'" in text and "robot" not in text
+    assert code == 2 and "has no 'slid' (did you mean 'slide'" in text and "robot" not in text

@@ -228,3 +228,16 @@ def test_every_torque_stiffness_damping_and_mass_of_a_joint_is_marked_as_over_kp
     assert effects.get("payload").parameters()[0].over == "kp"
     assert effects.get("gravity_mismatch").parameters()[0].over == "kp"
     assert dataclasses.replace(effects.get("coulomb_friction").parameters()[0], over="").over == ""
+
+
+def test_a_number_that_nothing_but_its_bounds_holds_is_not_identified():
+    """Of 1/3 … 3 times 1.5 the residuals say nothing: a slope a million times less than that of the first."""
+    frees = [
+        Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0),
+        Free(name="stall_nm", unit="N·m", start=1.5, low=0.5, high=4.5, log=True),
+    ]
+    slopes = np.random.default_rng(1).standard_normal((4000, 2)) * [1.0, 1e-6]
+    found = identifiable_numbers(
+        made_fit(frees, {"torque_ff": 0.5, "stall_nm": 1.5}, slopes), commanded=True, effort=False
+    )
+    assert [n.name for n in found] == ["torque_ff"]

@@ -148,6 +148,21 @@ def test_its_episode_is_drawn_with_its_own_pads(dataset: Path, tmp_path: Path) -
     assert main(["view", str(dataset), f"--save={tmp_path / 'x.rrd'}"]) == 0
 
 
+def test_what_the_twin_or_a_cut_file_has_nothing_for_is_said(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "twin.yaml").write_text("effects: []\n")
+    words = [str(dataset), f"--against={tmp_path / 'twin.yaml'}", f"--save={tmp_path / 'x.rrd'}"]
+    assert main(["view", *words]) == 2
+    said = capsys.readouterr().err
+    assert "two PiPER arms, with 14 targets a row" in said and "has 6" in said
+    (tmp_path / "cut.mcap").write_bytes((dataset.parent / "squeeze.mcap").read_bytes()[:3000])
+    spec = dataset.parent / "mine.yaml"
+    where = [f"--out={tmp_path / 'out'}", f"--store={tmp_path / 'store'}"]
+    assert main(["ingest", str(tmp_path / "cut.mcap"), f"--spec={spec}", *where]) == 1
+    assert "cut.mcap bytes" in capsys.readouterr().out  # where it is damaged, not that it names no topics
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_tactile_policy_is_trained_on_it_and_gives_its_actions(dataset: Path, tmp_path: Path) -> None:

@@ -135,7 +135,8 @@ class Axis(Machine):
                 reported = np.full(m.target.shape, np.nan)
                 reported[:, j] = answer.reported
                 floor = {signal: floors["position"][signal].value}
-                clock[m.name] = tuple(check_against_twin(m.only([signal]), reported[:, [j]], floor))
+                uncertain = [signal] if self.config.law == "pwm" else []
+                clock[m.name] = tuple(check_against_twin(m.only([signal]), reported[:, [j]], floor, uncertain))
         progress("", len(uses), len(uses))
         if not traces:
             raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")

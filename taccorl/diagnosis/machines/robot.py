@@ -107,7 +107,8 @@ class RobotMachine(Machine):
             ]
             if known:
                 commanded = m.with_position_targets(np.zeros(m.target.shape))
-                clock[m.name] = tuple(check_against_twin(commanded, response.reported, levels))
+                uncertain = [s for s in known if self.robot.config.joints[s].is_uncertain]
+                clock[m.name] = tuple(check_against_twin(commanded, response.reported, levels, uncertain))
         progress("", len(uses), len(uses))
         if not traces:
             raise TaccorlError(

@@ -30,7 +30,10 @@ class AsymmetricFriction(JointEffect):
         "Dry friction that is greater one way than the other, as of worm gears, seals, or a gear worn on one flank."
     )
     at_a_policy: ClassVar = "The arm stops short of its targets by different amounts from either side."
-    to_record: ClassVar = "A slow triangle over the range, with efforts: they alone tell the constant part from T_ref."
+    to_record: ClassVar = (
+        "A slow triangle over the range, with efforts: they alone tell the constant part from a constant torque of the drive "
+        "(T_ref)."
+    )
     near_twins: ClassVar = {
         "coulomb_friction": "From angles alone, T_ref fitted, it is identical by algebra: pick either; efforts can tell.",
         "torque_ff": "Its part a F is a constant torque; only efforts tell it from the controller's own.",
