@@ -10,7 +10,8 @@ Other names and units are written down in a columns file::
     cells:
       thumb: {reading: {column: adc3, unit: count}}
 
-The load of row k acted at the time of row k. A table with uneven rows comes to an even grid by straight lines between its rows.
+The load of row k acted at the time of row k, and follows a straight line to the next. A table with uneven rows
+comes to an even grid by straight lines between its rows.
 """
 
 import dataclasses

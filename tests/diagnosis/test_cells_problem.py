@@ -89,6 +89,39 @@ def test_effects_of_pads_act_on_a_cell_by_their_equations_after_20_s_under_10_n(
     np.testing.assert_array_equal(own, responses(config(), m, [effect]))  # in the file, or added to it
 
 
+def test_a_lag_follows_a_load_on_straight_lines_between_rows():
+    """ṙ = (f − r) / T under f = a t from rest: r = a (t − T (1 − exp(−t / T)))."""
+    lag_s, t = 0.06, np.arange(101) / RATE_HZ
+    m = press(20.0 * t)  # 10 a second in the unit reading
+    exact = 10.0 * (t - lag_s * (1 - np.exp(-t / lag_s)))
+    seen = responses(config(), m, [make_cells_effect("touch_lag", time_constant_s=lag_s)])[:, 0]
+    # A held load would be half a row early, 0.05; four steps a row err by Δt² / (192 T) = 9 µs.
+    np.testing.assert_allclose(seen, exact, atol=10.0 * 10e-6)
+
+
+def test_the_interval_of_a_lag_contains_the_lag_of_a_sensor_simulated_at_10_khz():
+    rng, lag_s, fine_s = np.random.default_rng(1), 0.06, 1e-4
+
+    def one(peak_n: float, name: str) -> CellMeasurement:
+        t = np.arange(0.0, 20.0, fine_s)
+        load = np.interp(t % 5.0, [0, 1, 1.2, 3, 3.15, 5], [0, 0, peak_n, peak_n, 0, 0])
+        lagged = np.zeros_like(load)
+        for k in range(1, len(load)):
+            middle = 0.5 * (load[k - 1] + load[k])
+            lagged[k] = lagged[k - 1] + (middle - lagged[k - 1]) * -np.expm1(-fine_s / lag_s)
+        rows = slice(0, None, round(1 / RATE_HZ / fine_s))
+        counts = np.round(20 + 60 * lagged[rows] + rng.normal(0, 1, len(lagged[rows])))
+        return press(load[rows] + rng.normal(0, 0.003, len(counts)), counts, name=name)
+
+    measurements = Measurements(tuple(one(p, f"press {p}") for p in (6.0, 12.0)), (one(9.0, "press 9"),), ())
+    problem = CellsProblem(config(), measurements)
+    d = diagnose(problem, problem.fit, problem.validation, (), start=problem.start)
+    assert d.names == ("touch_lag",)
+    low, high = (d.effects[0].interval or {})["time_constant_s"]
+    assert low <= lag_s <= high, (low, high)
+    assert high - low < 2e-3
+
+
 def test_temperature_changes_gain_and_zero_about_20_degrees():
     effect = make_cells_effect("taxel_temperature", gain_per_k=0.01, zero_per_k=0.05)
     m = press(np.full(3, 10.0), temperature_c=np.array([20.0, 30.0, 10.0]))

@@ -22,6 +22,7 @@ class TaxelHysteresis(RememberingEffect):
     name: ClassVar = "taxel_hysteresis"
     layer: ClassVar = "material"
     windows: ClassVar = True
+    holds_scan: ClassVar = False
     equation: ClassVar = "(1 − h) f ≤ r ≤ (1 + h) f, carried along at its ends"
     in_words: ClassVar = (
         "At the same depth a taxel reads more on the way out than on the way in, however slowly: rubber and foils "

@@ -21,6 +21,7 @@ class TouchDelay(RememberingEffect):
 
     name: ClassVar = "touch_delay"
     layer: ClassVar = "taxel"
+    holds_scan: ClassVar = False
     windows: ClassVar = True
     equation: ClassVar = "r(t) = f(t − d)"
     in_words: ClassVar = (

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,6 +16,9 @@ class RememberingEffect(TouchEffect):
     Thousands of calls for a recording become one (``taccorl.alignment.touch_model``), by the same code as in the simulation. An
     effect with a memory that is not of this class works as well, scan by scan.
     """
+
+    holds_scan: ClassVar[bool] = True
+    """Its input is held since the scan before; false where the path between scans changes nothing, or follows a line."""
 
     @abstractmethod
     def scans(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
