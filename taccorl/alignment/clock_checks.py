@@ -40,6 +40,8 @@ REST_S = 0.25
 EXCHANGED = 0.7
 """Columns of target and position are exchanged if the lag, fitted from position to target, leaves less than this share of what it
 leaves from target to position."""
+ROUGHER = 3.0
+"""… or, where neither fit decides, if the column given as the target has so many times the noise of the other."""
 USUAL_TAU_S = 0.12
 """The slowest joint of the paper (Fig. "Per-joint controller SysID"): what a step moves in its first row is at least
 step · period / τ."""
@@ -207,12 +209,28 @@ def _lead(signal: str, lead_s: float, m: Measurement, how: str) -> Finding:
 
 
 def _exchanged(m: Measurement, t: CommandTiming) -> bool:
-    """Whether the target follows the position as a joint follows its target, and the position does not follow the target so."""
+    """Whether the target follows the position as a joint follows its target, and the position does not follow the target so.
+
+    The lead is taken off before the lag is fitted from target to position. Where no direction leaves less than an offset of one
+    row would and much less than the other (a resonant joint), the rougher column is the measured one.
+    """
     even, j = m.resampled(m.rate_hz), m.column(t.signal)
-    if not np.isfinite(even.measured[:, j]).all():
+    target, measured = even.target[:, j], even.measured[:, j]
+    lead = math.ceil(-t.lag_s / even.period_s)
+    if not np.isfinite(measured).all():
         return False
-    turned = fit_first_order(even.measured[:, j], even.target[:, j], even.period_s)
-    return turned.rms < EXCHANGED * t.fit.rms and turned.delay_s > -LEAD_ROWS * m.period_s
+    turned = fit_first_order(measured, target, even.period_s)
+    forward = fit_first_order(target[lead:], measured[:-lead], even.period_s)
+    if turned.rms < min(turned.row_rms, EXCHANGED * forward.rms):
+        return turned.delay_s > -LEAD_ROWS * m.period_s
+    if forward.rms < min(forward.row_rms, EXCHANGED * turned.rms):
+        return False
+    return _roughness(target) > ROUGHER * _roughness(measured)
+
+
+def _roughness(values: np.ndarray) -> float:
+    """Standard deviation of white noise with the same median of fourth differences, whose variance is 70 times the noise's."""
+    return float(1.4826 * np.median(np.abs(np.diff(values, n=4))) / math.sqrt(70))
 
 
 def _exchange(signal: str, lead_s: float, m: Measurement) -> Finding:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from taccorl.alignment.clock_checks import check_clock
 from taccorl.alignment.effort_time import target_share
 from taccorl.alignment.measurement import Measurement, TargetKind
 from taccorl.alignment.measurements import Measurements
@@ -191,6 +192,18 @@ def test_a_motion_that_is_no_position_command_is_compared_by_what_was_measured(l
     trace = machine.compare(plain).of("swing")[0]
     assert float(np.sqrt(np.mean(trace.residual**2))) < 3 * NOISE_RAD
     assert float(np.ptp(trace.target)) == pytest.approx(float(np.ptp(trace.position)), rel=0.05)
+
+
+@pytest.mark.parametrize("law", ["impedance", "cascade", "pwm"])
+def test_exchanged_columns_of_target_and_position_are_told_from_early_stamps(law: str) -> None:
+    m = recording(law, "sweep", 1.5, 1)
+    exchanged = dataclasses.replace(m, target=m.measured, measured=m.target)
+    early = dataclasses.replace(m, measured=np.roll(m.measured, -40, axis=0))  # 0.2 s; it rests at both ends
+    ways_out = ("swing.q the column that swing.q_target has", "target_rows_late")
+    for one, expected in ((m, ()), (exchanged, ways_out[:1]), (early, ways_out[1:])):
+        one = dataclasses.replace(one, source=Path("sweep.csv"))
+        said = [f.text for f in check_clock(one, {"swing": NOISE_RAD}) if f.check == "measured_before_command"]
+        assert len(said) == len(expected) and all(word in text for word, text in zip(expected, said, strict=True)), said
 
 
 @pytest.mark.slow
