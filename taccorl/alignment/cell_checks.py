@@ -1,5 +1,6 @@
 """What is wrong with recordings of a sensor of cells, each with the line to write or what to record instead."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -43,7 +44,14 @@ def check_cells(
     found = {m.name: [*m.findings, *_of_recording(config, m)] for m in measurements}
     together = [m for m in measurements if m.name in fit_names]
     if together:
-        found[together[0].name] += _of_all(config, together)
+        first, *others = together
+        wrong = _of_all(config, together)
+        found[first.name] += wrong
+        for m in others:
+            found[m.name] += [
+                dataclasses.replace(f, text=f"{f.feature}: all fit recordings together, see {first.name}")
+                for f in wrong
+            ]
     return found
 
 
@@ -72,8 +80,8 @@ def _of_recording(config: CellsConfig, m: CellMeasurement) -> list[Finding]:
         k = int(np.argmax(over.any(axis=0)))
         own, name = m.measured[:, k], m.signals[k]
         text = (
-            f"readings are {own.min():.4g} … {own.max():.4g} {config.reading.unit}, beyond lowest {config.low:g} … highest "
-            f"{config.high:g} of the cells file; correct these, or the unit"
+            f"{name}: readings are {own.min():.4g} … {own.max():.4g} {config.reading.unit}, beyond lowest {config.low:g} … "
+            f"highest {config.high:g} of the cells file; correct these, or the unit"
         )
         found.append(Finding("beyond_ends", "error", name, text))
     return found
@@ -106,7 +114,7 @@ def _of_all(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> lis
         loaded = load[:, k] > LOADED * rated
         if loaded.any() and np.mean(~inside[loaded, k]) > MOST_CUT:
             text = (
-                f"{np.mean(~inside[loaded, k]):.0%} of the loaded rows are at an end of the converter ({config.low:g} … "
+                f"{name}: {np.mean(~inside[loaded, k]):.0%} of the loaded rows are at an end of the converter ({config.low:g} … "
                 f"{config.high:g} {config.reading.unit}): press less, take a smaller resistor in the divider, or correct lowest "
                 "and highest of the cells file"
             )
@@ -115,12 +123,12 @@ def _of_all(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> lis
         use = inside[:, k]
         if use.sum() < 3 or np.ptp(load[use, k]) == 0 or np.ptp(reading[use, k]) == 0:
             if loaded.any():
-                text = "the reading never changes under load: a broken wire, or the column of another channel"
+                text = f"{name}: the reading never changes under load: a broken wire, or the column of another channel"
                 found.append(Finding("no_reading", "error", name, text))
             continue
         if config.sign * np.corrcoef(load[use, k], reading[use, k])[0, 1] < WRONG_WAY:
             way, write = ("rises", "false") if config.reading.falls else ("falls", "true")
-            text = f"the reading {way} under load; write `falls: {write}` below `reading:` in the cells file"
+            text = f"{name}: the reading {way} under load; write `falls: {write}` below `reading:` in the cells file"
             found.append(Finding("wrong_sign", "error", name, text))
     return found
 

@@ -76,8 +76,8 @@ def main(argv: list[str]) -> int:
     """0: compared; 1: the measurements have errors, nothing was compared."""
     config = parse(CompareConfig, argv, positional="measurements")
     _check_outputs(config)
-    from taccorl.alignment.telemetry_checks import accepted, check_names
-    from taccorl.cli.measured import checked, clock_is_off, print_findings, unused_accepts
+    from taccorl.alignment.telemetry_checks import check_names
+    from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_findings, unused_accepts
     from taccorl.diagnosis.machine import load_machine
 
     check_names(config.accept)
@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
     if findings is None:
         return 1
     comparisons = _compared(config, twins, measurements)
-    late = {name: accepted(found, config.accept) for name, found in comparisons[0].clock.items() if found}
+    late = of_replays(comparisons[0], findings, config.accept)
     unused_accepts(config.accept, findings, late)
     print_findings({f"replay of {name}": found for name, found in late.items()})
     if clock_is_off(late, len(measurements.all)):
@@ -99,6 +99,8 @@ def main(argv: list[str]) -> int:
         )
         return 1
     score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
+    for line in far_off(comparisons[-1]):
+        print(line)
     _write(config, comparisons, findings, late, twins, argv)
     return 0
 

@@ -75,8 +75,8 @@ def main(argv: list[str]) -> int:
     from taccorl.diagnosis.report import check_folder
 
     check_folder(config.out, config.measurements)
-    from taccorl.alignment.telemetry_checks import accepted, check_names
-    from taccorl.cli.measured import checked, clock_is_off, print_findings, unused_accepts
+    from taccorl.alignment.telemetry_checks import check_names
+    from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_findings, unused_accepts
     from taccorl.diagnosis.joints import of_joints
     from taccorl.diagnosis.machine import load_machine
     from taccorl.sim.effects import effects
@@ -95,7 +95,7 @@ def main(argv: list[str]) -> int:
         return 1
     parts = machine.select(machine.parts(measurements), config.joints, config.pads)
     before = machine.compare(measurements)
-    late = {name: accepted(found, config.accept) for name, found in before.clock.items() if found}
+    late = of_replays(before, findings, config.accept)
     unused_accepts(config.accept, findings, late)
     print_findings({f"replay of {name}": found for name, found in late.items()})
     if clock_is_off(late, len(measurements.all)):
@@ -103,6 +103,8 @@ def main(argv: list[str]) -> int:
             "not diagnosed: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"
         )
         return 1
+    for line in far_off(before):
+        print(line)
     found = _diagnosed(config, machine, parts, measurements)
     mended, disagree = machine.mended(found)
     said = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}

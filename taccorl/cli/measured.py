@@ -9,8 +9,12 @@ if TYPE_CHECKING:
     from taccorl.alignment.measurement import Measurement
     from taccorl.alignment.measurements import Measurements
     from taccorl.data.finding import Finding
+    from taccorl.diagnosis.comparison import Comparison, Score
     from taccorl.diagnosis.machine import Machine
     from taccorl.sim.twin import TwinConfig
+
+FAR_OFF = 0.3
+"""Share of a motion's RMS about its mean."""
 
 
 def twin_of(path: Path | None) -> "TwinConfig":
@@ -57,6 +61,48 @@ def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) ->
     for name in dict.fromkeys(accept):
         if name not in checks:
             print(f"--accept={name}: no recording has that finding; leave it out")
+
+
+def of_replays(
+    comparison: "Comparison", findings: dict[str, list["Finding"]], accept: Sequence[str]
+) -> dict[str, list["Finding"]]:
+    """What the replays say about clocks, recording by recording; a shift is a warning where the pose is unknown.
+
+    Args:
+        findings: of the checks before; ``pose_unknown`` names an arm, or nothing for all joints.
+        accept: checks whose errors become warnings.
+    """
+    from taccorl.alignment.telemetry_checks import accepted
+
+    late = {}
+    for name, clock in comparison.clock.items():
+        unknown = [f.feature.removesuffix(" arm") for f in findings.get(name, []) if f.check == "pose_unknown"]
+        if clock:
+            late[name] = [
+                dataclasses.replace(
+                    f,
+                    severity="warning",
+                    text=f"{f.text}. A wrong pose shifts the replay, too: mend pose_unknown first",
+                )
+                if f.severity == "error" and any(f.feature.startswith(arm) for arm in unknown)
+                else f
+                for f in accepted(clock, accept)
+            ]
+    return late
+
+
+def far_off(comparison: "Comparison") -> list[str]:
+    """One line for each signal whose replay leaves more than ``FAR_OFF`` of the measured motion in some recordings."""
+    worst: dict[str, Score] = {}
+    for s in comparison.scores():
+        if s.kind == "position" and s.nrmse > max(FAR_OFF, worst[s.signal].nrmse if s.signal in worst else 0.0):
+            worst[s.signal] = s
+    return [
+        f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}). A wrong "
+        "number is more likely than a missing effect: check unit or factor of its columns, kp and kd (per rad, not per "
+        "degree), inertia, and of law pwm supply_v, resistance_ohm and torque_nm_per_a"
+        for s in worst.values()
+    ]
 
 
 def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:

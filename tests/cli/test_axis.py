@@ -170,6 +170,15 @@ def test_an_effort_of_the_wrong_sign_is_refused_with_the_line_to_write(bench: Pa
     assert code == 1 and "`factor: -1`" in text
 
 
+def test_gains_per_degree_are_suspected_before_an_effect(bench: Path, said: Any, tmp_path: Path):
+    """kp 57.3 times too small lags by kd / kp = 2.9 s behind a sine of 0.6 Hz: nearly all of the motion is left."""
+    (tmp_path / "degrees.yaml").write_text(FILE.replace(f"kp: {KP}", f"kp: {KP / 57.3}"))
+    code, text = said("compare", bench / "bench", f"--twin={tmp_path / 'degrees.yaml'}")
+    off = re.findall(r"slide: the replay is off by (\d+)%.*kp", text)
+    assert code == 0 and len(off) == 1 and 60 < int(off[0]) < 140, text
+    assert "off by" not in said("compare", bench / "bench", f"--twin={bench / 'drive.yaml'}")[1]
+
+
 def test_columns_with_a_factor_mend_sign_and_unit(bench: Path, said: Any, tmp_path: Path):
     (tmp_path / "bench").mkdir()
     write(tmp_path / "bench" / "one.csv", 0.1, 0.6, 1, effort=-1e3)

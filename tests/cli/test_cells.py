@@ -157,20 +157,20 @@ def held(values: np.ndarray, rows: int) -> np.ndarray:
     [
         (
             {"thumb__reading": 900 - 40 * LOAD_N},
-            "wrong_sign: the reading falls under load; write `falls: true` below `reading:`",
+            "wrong_sign: thumb: the reading falls under load; write `falls: true` below `reading:`",
         ),
         ({"force_n": np.full(len(T_S), 8.0)}, "constant_load"),
         ({"force_n": LOAD_N + 3.0}, "no_rest: less than 0.5 s without load (below 0.4 N)"),
         ({"force_n": LOAD_N * 1000}, "load_unit: the load reaches 1.8e+04 N, 900 times the rated 20 N"),
         (
             {"thumb__reading": np.where(LOAD_N > 0.5, 1023, 20)},
-            "saturated: 100% of the loaded rows are at an end",
+            "saturated: thumb: 100% of the loaded rows are at an end",
         ),
         (
             {"thumb__reading": 200 * LOAD_N + 20},
-            "beyond_ends: readings are 20 … 3620 count, beyond lowest 0 … highest 1023",
+            "beyond_ends: thumb: readings are 20 … 3620 count, beyond lowest 0 … highest 1023",
         ),
-        ({"thumb__reading": np.full(len(T_S), 20.0)}, "no_reading: the reading never changes under load"),
+        ({"thumb__reading": np.full(len(T_S), 20.0)}, "no_reading: thumb: the reading never changes under load"),
         ({"force_n": held(LOAD_N + 0.01 * np.sin(17 * T_S), 10)}, "load_held: the load changes every 10 rows only"),
     ],
 )
@@ -192,6 +192,16 @@ def test_another_rate_than_the_file_says_is_an_error_and_can_be_accepted(tmp_pat
     assert code == 1
     assert "other_rate: 100 rows a second; write `rate_hz: 100`" in " ".join(shown.split())
     assert said("compare", "presses", "--twin=taxel.yaml", "--accept=other_rate")[0] == 0
+
+
+def test_the_cell_at_fault_is_named_and_no_fit_recording_is_called_sound(tmp_path: Path, said) -> None:
+    (tmp_path / "taxel.yaml").write_text(SENSOR.replace("[thumb]", "[thumb, index]"))
+    for name in ("one.csv", "two.csv"):
+        table(tmp_path / "presses", name, index__reading=np.full(len(T_S), 7.0))
+    code, shown = said("compare", "presses", "--twin=taxel.yaml")
+    lines = [line for line in shown.splitlines() if "no_reading" in line]
+    assert code == 1 and len(lines) == 2 and all("index" in line and "thumb" not in line for line in lines), shown
+    assert not any(line.startswith("ok") for line in shown.splitlines())
 
 
 def test_missing_and_unknown_columns_are_named(tmp_path: Path, said) -> None:

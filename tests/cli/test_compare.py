@@ -9,6 +9,9 @@ from typing import Any
 import pytest
 
 from taccorl.cli.main import main
+from taccorl.cli.measured import of_replays
+from taccorl.data.finding import Finding
+from taccorl.diagnosis.comparison import Comparison
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
 
@@ -138,3 +141,13 @@ def test_somebody_else_s_page_is_left_alone(folder: Path, said: Any, tmp_path: P
     code, text = said(folder / "sweeps", f"--out={tmp_path}")
     assert code == 2 and "not a report of ours" in text
     assert (tmp_path / "report.html").read_text() == "mine"
+
+
+def test_a_shift_of_a_joint_whose_pose_is_unknown_is_a_warning():
+    shift = Finding("shifted_from_twin", "error", "left_joint2", "leads")
+    other = dataclasses.replace(shift, feature="right_joint2")
+    comparison = Comparison(twin="", effects=(), traces=(), split={}, clock={"a": (shift, other), "b": (shift,)})
+    for feature, expected in (("", ["warning", "warning"]), ("left arm", ["warning", "error"])):
+        late = of_replays(comparison, {"a": [Finding("pose_unknown", "warning", feature, "lacks")]}, [])
+        assert [f.severity for f in late["a"]] == expected and late["b"][0].severity == "error"
+        assert "pose_unknown" in late["a"][0].text
