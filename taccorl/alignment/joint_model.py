@@ -25,6 +25,8 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
 
 GRAVITY_M_PER_S2 = 9.81
+SAME_RATE = 0.02
+"""Targets that are received faster than they are logged by less than this share come once a row: stamps are rounded."""
 _ADDITIVE = {
     "added_inertia",
     "viscous",
@@ -201,7 +203,7 @@ class JointModel:
             ones if motion.on is None else motion.on,
             0.0 * ones if motion.torque_ff_nm is None else motion.torque_ff_nm,
         )
-        parts = received = max(1, math.ceil(self.joint.command_hz / motion.rate_hz))
+        parts = received = max(1, math.ceil(self.joint.command_hz / motion.rate_hz - SAME_RATE))
         if self.joint.follows_line:
             late_s = self.joint.target_late_s
             if late_s > 0.0 or motion.command_s is not None:

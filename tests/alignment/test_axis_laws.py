@@ -178,3 +178,13 @@ def test_a_gain_s_register_is_worth_its_factor():
 def test_a_target_that_the_law_does_not_take_is_refused():
     with pytest.raises(TaccorlError, match=r"servo is commanded by velocity, its law takes a position; .*q_target"):
         answer(SERVO, recording(np.zeros(50), "velocity"))
+
+
+def test_targets_of_the_rate_of_the_rows_are_held_although_stamps_are_rounded():
+    """60 Hz with stamps of 0.1 ms: 239 steps in 3.9834 s are 59.999 Hz, and command_hz 60 is no faster than that."""
+    target = 0.2 * np.sin(2 * np.pi * np.arange(240) / 60)
+    m = dataclasses.replace(recording(target), time_s=np.linspace(0.0, 3.9834, 240))
+    assert 59.9 < m.rate_hz < 60.0
+    held, stated, faster = (answer(dataclasses.replace(SERVO, command_hz=hz), m).reported for hz in (None, 60.0, 120.0))
+    np.testing.assert_array_equal(held, stated)
+    assert np.abs(faster - held).max() > 1e-3
