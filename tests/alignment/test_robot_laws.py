@@ -207,6 +207,16 @@ def test_exchanged_columns_of_target_and_position_are_told_from_early_stamps(law
 
 
 @pytest.mark.slow
+def test_a_servo_that_clips_its_duty_under_law_impedance_is_suspected_to_be_one(tmp_path: Path) -> None:
+    """kp V k_t / R = 6 · 2.4 N·m/rad and k_t k_e / R = 0.16 N·m·s/rad below a clip at 1/6 rad, which 30 % of the rows exceed."""
+    recorded = Measurements((recording("pwm", "sweep", 3.0, 1),), (recording("pwm", "other", 2.1, 2),))
+    assert np.mean(np.abs(recorded.fit[0].target - recorded.fit[0].measured) > 1 / 6) > 0.2
+    machine = RobotMachine(robot(tmp_path, "kp: 14.4, kd: 0.16"), "robot")
+    found = machine.diagnose("swing", recorded, search=SearchConfig(max_effects=1)).diagnosis
+    assert any("swing" in remark and "law: pwm" in remark for remark in found.remarks), found.remarks
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("law", FILES)
 def test_the_search_names_the_friction_under_each_law(law: str, tmp_path: Path) -> None:
     machine = RobotMachine(robot(tmp_path, f"law: {law}, {FILES[law]}"), "robot")

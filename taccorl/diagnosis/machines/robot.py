@@ -133,7 +133,16 @@ class RobotMachine(Machine):
         search: SearchConfig | None = None,
         without: Sequence[str] = (),
     ) -> Finding:
-        return diagnose_joint(self.robot, part, measurements, gains=gains, search=search, without=without)
+        found = diagnose_joint(self.robot, part, measurements, gains=gains, search=search, without=without)
+        if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
+            return found
+        text = (
+            f"{part} has law impedance in {self.robot.path.name}. A drive that sets its motor's voltage, as a hobby servo's, shows a "
+            "torque-speed limit where its duty is clipped: if it is one, write `law: pwm` with supply_v, resistance_ohm and "
+            "torque_nm_per_a instead of the effect"
+        )
+        diagnosis = dataclasses.replace(found.diagnosis, remarks=(*found.diagnosis.remarks, text))
+        return dataclasses.replace(found, diagnosis=diagnosis)
 
     # effects ---------------------------------------------------------------------------------------------------------
 
