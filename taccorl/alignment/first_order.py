@@ -11,6 +11,7 @@ Letters in shapes: T rows.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,6 +24,8 @@ COMMAND_HZ = 150.0
 TAU_S = (1e-3, 2.0)
 """Time constants that are looked for."""
 LEAST_ROWS = 20
+MOST_ROWS = 5000
+"""Of more rows than that, an even selection decides where the fit of all of them begins."""
 DELAY_ROWS, DELAY_S = 8.0, 0.15
 """Delays that are looked for: from so many rows too early to so many seconds late."""
 
@@ -56,18 +59,21 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
     answer = _Answer(target - target[0], period_s)
     wanted = measured[rows] - measured[rows].mean()
 
-    def residual(x: np.ndarray) -> np.ndarray:
-        shape = answer.at(rows, math.exp(x[0]), x[1])
-        shape = shape - shape.mean()
+    def residual(x: np.ndarray, every: int = 1) -> np.ndarray:
+        shape, wanted = answer.at(rows[::every], math.exp(x[0]), x[1]), measured[rows[::every]]
+        shape, wanted = shape - shape.mean(), wanted - wanted.mean()
         power = float(shape @ shape)
         return wanted - (float(shape @ wanted) / power if power > 0 else 0.0) * shape
 
     low = np.array([math.log(TAU_S[0]), -DELAY_ROWS])
     high = np.array([math.log(TAU_S[1]), DELAY_S / period_s])
-    starts = [
-        least_squares(residual, (math.log(tau), 0.0), bounds=(low, high), x_scale=(0.1, 0.5)) for tau in (0.03, 0.1)
-    ]
-    best = min(starts, key=lambda fit: fit.cost)
+
+    def fit(start: np.ndarray, every: int) -> Any:
+        return least_squares(residual, start, bounds=(low, high), x_scale=(0.1, 0.5), args=(every,))
+
+    every = math.ceil(len(rows) / MOST_ROWS)
+    best = min((fit(np.array([math.log(tau), 0.0]), every) for tau in (0.03, 0.1)), key=lambda found: found.cost)
+    best = fit(best.x, 1) if every > 1 else best
     spread = _spread(best.fun, best.jac)
     shape = answer.at(rows, math.exp(best.x[0]), best.x[1])
     shape = shape - shape.mean()

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
+from scipy.signal import lfilter
 
 from taccorl.alignment.clock_checks import check_against_twin, check_clock
 from taccorl.alignment.first_order import fit_first_order
@@ -162,6 +163,17 @@ def test_first_order_fit_recovers_lag_and_delay_within_its_interval():
         assert fit.gain == pytest.approx(0.98, abs=1e-3)
         hits.append(abs(fit.delay_s - 0.0037) < 3 * fit.delay_sd_s)
     assert np.mean(hits) >= 0.9
+
+
+def test_of_many_rows_an_even_selection_begins_the_fit_and_all_of_them_end_it():
+    """25 s at 1 kHz, τ = 50 ms exactly for held targets, 12 rows late, noise of 10 µm."""
+    keep, time_s = math.exp(-1e-3 / 0.05), np.arange(25_000) / 1000
+    target = 0.1 * np.sin(0.5 * time_s**1.5)
+    answers = lfilter([0.0, 1 - keep], [1, -keep], np.concatenate([np.zeros(12), target[:-12]]))
+    fit = fit_first_order(target, answers + 1e-5 * np.random.default_rng(0).standard_normal(25_000), 1e-3)
+    assert fit.time_constant_s == pytest.approx(0.05, rel=1e-3)
+    assert abs(fit.delay_s - 0.012) < 3 * fit.delay_sd_s < 1e-4
+    assert fit.rms == pytest.approx(1e-5, rel=0.02)
 
 
 def test_rows_of_a_dataset_are_read_as_commands_that_moved_on():
