@@ -137,7 +137,7 @@ class RobotMachine(Machine):
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
         text = (
-            f"{part} has law impedance in {self.robot.path.name}. A drive that sets its motor's voltage, as a hobby servo's, shows a "
+            f"{part} has law impedance in {self.robot.path.name}. A drive that sets its motor's voltage (a hobby servo's) has a "
             "torque-speed limit where its duty is clipped: if it is one, write `law: pwm` with supply_v, resistance_ohm and "
             "torque_nm_per_a instead of the effect"
         )
