@@ -1,6 +1,7 @@
 """What the verbs that look at measurements share: the twin they start from, and the checks before anything is concluded."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,12 +10,16 @@ if TYPE_CHECKING:
     from taccorl.alignment.measurement import Measurement
     from taccorl.alignment.measurements import Measurements
     from taccorl.data.finding import Finding
-    from taccorl.diagnosis.comparison import Comparison, Score
+    from taccorl.diagnosis.comparison import Comparison
     from taccorl.diagnosis.machine import Machine
     from taccorl.sim.twin import TwinConfig
 
 FAR_OFF = 0.3
 """Share of a motion's RMS about its mean."""
+AS_FAR_AS_TARGET = 0.8
+"""A simulated servo with 1000 times the supply, or kp 57 times too large or small, leaves 0.9 to 6 of it; with its own numbers and
+friction hidden 0.34."""
+FEWEST_FLOORS = 10.0
 
 
 def twin_of(path: Path | None) -> "TwinConfig":
@@ -92,17 +97,30 @@ def of_replays(
 
 
 def far_off(comparison: "Comparison") -> list[str]:
-    """One line for each signal whose replay leaves more than ``FAR_OFF`` of the measured motion in some recordings."""
-    worst: dict[str, Score] = {}
+    """One line for each signal whose replay explains hardly anything: it leaves more than ``FAR_OFF`` of the measured motion, or
+    ``AS_FAR_AS_TARGET`` of what the target by itself leaves, in the recordings of one use."""
+    import numpy as np
+
+    lines: dict[str, str] = {}
     for s in comparison.scores():
-        if s.kind == "position" and s.nrmse > max(FAR_OFF, worst[s.signal].nrmse if s.signal in worst else 0.0):
-            worst[s.signal] = s
-    return [
-        f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}). A wrong "
-        "number is more likely than a missing effect: check unit or factor of its columns, kp and kd (per rad, not per "
-        "degree), inertia, and of law pwm supply_v, resistance_ohm and torque_nm_per_a"
-        for s in worst.values()
-    ]
+        if s.kind != "position" or s.ratio < FEWEST_FLOORS:
+            continue
+        traces = comparison.of(s.signal, "position", s.use)
+        of_target = math.sqrt(np.nansum([np.nansum(np.square(t.measured - t.target)) for t in traces]) / max(s.n, 1))
+        # A drive that takes no position has the replay in place of a target.
+        has_target = not any(np.array_equal(t.target, t.replayed, equal_nan=True) for t in traces)
+        if s.nrmse > FAR_OFF or (has_target and s.rmse > AS_FAR_AS_TARGET * of_target):
+            of = (
+                f", {s.rmse / of_target:.0%} of what the target by itself is off"
+                if has_target and of_target > 0
+                else ""
+            )
+            lines[s.signal] = (
+                f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}){of}. A "
+                "wrong number is more likely than a missing effect: check unit or factor of its columns, kp and kd (per rad, not per "
+                "degree), inertia, and of law pwm supply_v, resistance_ohm and torque_nm_per_a"
+            )
+    return list(lines.values())
 
 
 def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:

@@ -17,6 +17,7 @@ from taccorl.alignment.measurement import Measurement, TargetKind
 from taccorl.alignment.measurements import Measurements
 from taccorl.alignment.robot_checks import check_robot
 from taccorl.alignment.robot_file import Robot, load_robot
+from taccorl.cli.measured import far_off
 from taccorl.diagnosis.fit import Fit, best_fit, rms, stacked
 from taccorl.diagnosis.joint_problem import JointProblem
 from taccorl.diagnosis.machines.robot import RobotMachine
@@ -204,6 +205,23 @@ def test_exchanged_columns_of_target_and_position_are_told_from_early_stamps(law
         one = dataclasses.replace(one, source=Path("sweep.csv"))
         said = [f.text for f in check_clock(one, {"swing": NOISE_RAD}) if f.check == "measured_before_command"]
         assert len(said) == len(expected) and all(word in text for word, text in zip(expected, said, strict=True)), said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("", "", False),
+        ("supply_v: 12.0", "supply_v: 12000.0", True),
+        ("kp: 6.0", "kp: 343.8", True),
+        ("kp: 6.0", "kp: 0.105", True),
+    ],
+)
+def test_millivolts_and_gains_per_degree_are_suspected_and_hidden_friction_is_not(
+    old: str, new: str, expected: bool, tmp_path: Path
+) -> None:
+    made = robot(tmp_path, f"law: pwm, {FILES['pwm'].replace(old, new)}")
+    lines = far_off(RobotMachine(made, "robot").compare(Measurements((recording("pwm", "sweep", 1.5, 1),))))
+    assert len(lines) == expected and all("swing" in line and "supply_v" in line for line in lines), lines
 
 
 @pytest.mark.slow
