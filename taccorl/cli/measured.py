@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 FAR_OFF = 0.3
 """Share of a motion's RMS about its mean."""
 AS_FAR_AS_TARGET = 0.8
-"""A simulated servo with 1000 times the supply, or kp 57 times too large or small, leaves 0.9 to 6 of it; with its own numbers and
-friction hidden 0.34."""
+"""A simulated servo with 1000 times the supply, or kp 57 times too large or small, leaves 0.9 to 6 of it; with its own numbers
+and friction hidden 0.34."""
 FEWEST_FLOORS = 10.0
+"""Noise floors: a replay that is nearer explains enough."""
 
 
 def twin_of(path: Path | None) -> "TwinConfig":
@@ -117,8 +118,8 @@ def far_off(comparison: "Comparison") -> list[str]:
             )
             lines[s.signal] = (
                 f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}){of}. A "
-                "wrong number is more likely than a missing effect: check unit or factor of its columns, kp and kd (per rad, not per "
-                "degree), inertia, and of law pwm supply_v, resistance_ohm and torque_nm_per_a"
+                "wrong number is more likely than a missing effect: check unit or factor of its columns, kp and kd (per rad, "
+                "not per degree), inertia, and of law pwm supply_v, resistance_ohm and torque_nm_per_a"
             )
     return list(lines.values())
 
