@@ -133,7 +133,7 @@ def test_wrong_columns_files_are_named_by_line(tmp_path, change, message):
         ("time,left_joint5.q,left_joint5.q_target", "no column 't'"),
         ("t,left_joint5.q", "column 'left_joint5.q_target' is missing; left_joint5 has q"),
         ("t,left_joint5.pos", "column 2 'left_joint5.pos' is not NAME.q"),
-        ("t,left_joint7.q,left_joint7.q_target", "the robot has no 'left_joint7'; did you mean 'left_joint"),
+        ("t,left_joint7.q,left_joint7.q_target", "the robot has no 'left_joint7' .did you mean 'left_joint"),
         ("t", "it holds times and no signal"),
     ],
 )
