@@ -44,7 +44,8 @@ LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4
 STEP_SHARE = 0.05
 """Of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
 WINDING_WITHIN = 3.0
-"""Factor to both sides within which stall torque and back-EMF of law pwm are fitted: data sheets are no better."""
+"""Stall torque and back-EMF of law pwm are fitted from the file's value divided by this to that times this: data sheets are
+no better."""
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
 _KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque"}
 _OF_POSITION_LOOPS = ("integral_action", "error_deadband", "velocity_feedforward")

@@ -87,7 +87,7 @@ def removed(row: dict[str, Any]) -> float:
 
 
 def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """The table's lines, failures by name."""
+    """Lines of the table in Markdown, and below it one line for each failed case."""
     hidden = [r for r in rows if r["hidden"] and r["fitted"] >= MATERIAL_FLOORS]
     by_load = [r for r in hidden if r["hidden"] == "load_friction"]
     others = [r for r in hidden if r["hidden"] != "load_friction"]

@@ -81,7 +81,7 @@ def is_named(row: dict[str, Any]) -> bool:
 
 
 def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """The table's lines, failures by name."""
+    """Lines of the table in Markdown, and below it one line for each failed case."""
     hidden = [r for r in rows if r["hidden"] and r["fitted"] >= MATERIAL_FLOORS]
     clean = [r for r in rows if not r["hidden"]]
     cpu = sorted(r["cpu_s"] for r in rows)

@@ -276,7 +276,7 @@ def _read(dataset: Dataset, name: str, default: Any) -> Any:
 
 
 def _pictures(dataset: Dataset) -> Iterator[tuple[str, Image.Image]]:
-    """File below the dataset → picture."""
+    """Path relative to the dataset's folder → picture."""
     sheet, _ = draw_sheet(dataset.episode(0))
     if sheet.width > SHEET_WIDTH_PX:
         sheet = sheet.resize(

@@ -108,7 +108,7 @@ def elements_of(episode: Episode) -> Iterator[tuple[Curve, str, int]]:
 
 
 def cameras_of(episode: Episode) -> list[str]:
-    """Short names of its cameras."""
+    """Names of the episode's cameras without ``observation.images.``."""
     return [short_name(key) for key in episode.picture_keys]
 
 

@@ -64,7 +64,7 @@ class Servo:
     torque_nm_per_a: float = field(init=False)
     emf_v_s_per_rad: float = field(init=False)
     dry_nm: float = field(init=False)
-    """Dry friction that its user knows of; none where other friction is hidden."""
+    """Dry friction that the servo's file states, too. Servos with another kind of friction hidden have none."""
     arm_kg_per_m: float = field(init=False)
     rate_hz: int = field(init=False)
     """At which the script would like to run."""
