@@ -124,7 +124,8 @@ def _kinds(hint: Any) -> tuple[Any, ...]:
 
 
 def _print_help(config_class: type, hints: dict[str, Any], positional: str | None, prog: str | None) -> None:
-    """The verb's own words, then draccus's list of options. ``{tasks}`` in a field's text: the names of all tasks with parts."""
+    """Print the docstring of the verb's module, then draccus's list of options. ``{tasks}`` in a field's docstring is replaced by
+    the names of all tasks that have parts."""
     from draccus.argparsing import ArgumentParser
 
     module, required = sys.modules[config_class.__module__], _required(config_class)

@@ -1,4 +1,4 @@
-"""Is the search right on a hobby servo that swings a pendulum? Servos of ``surrogate.pendulum``, one effect hidden or none.
+"""How often is the search right on hobby servos (simulated by ``surrogate.pendulum``) that hide one effect or none?
 
 ``python -m taccorl.diagnosis.pendulum_study rows.jsonl`` runs the cases that the file lacks and counts all. Each servo is
 recorded with five loads at three gains into tables, which are read as a user's are. Exact: the hidden effect is the one that

@@ -62,7 +62,7 @@ class SearchConfig:
     near_best: float = 1.3
     """times the best."""
     steps: int = 30
-    """Of a refit to the end."""
+    """Most steps of the least-squares solver in such a refit."""
     last_steps: int = 100
     """Of the last refit of what was found, with finer slopes."""
 

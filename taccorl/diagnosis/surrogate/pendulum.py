@@ -38,7 +38,8 @@ USES = ("fit", "validation", "fit", "test", "fit")
 """Of the loads' recordings."""
 GRAVITY = 9.81
 DISTURBANCE_SHARE = 2e-3
-"""Of the torque of motor and load that the gear passes on: a coloured disturbance (50 ms) that no model has."""
+"""RMS of a random torque (correlated over 50 ms), as a share of the torque that the gear passes on. No model of the search has
+it."""
 KINDS: Mapping[str, tuple[float, float]] = {
     "load_friction": (0.05, 0.2),
     "coulomb_friction": (0.01, 0.05),
@@ -46,8 +47,9 @@ KINDS: Mapping[str, tuple[float, float]] = {
     "backlash": (0.015, 0.05),
     "motor": (1.3, 1.8),
 }
-"""What is hidden → range of its strength: μ; N·m; N·m, and as much again at rest; rad of play; factor to both sides by which the
-file's k_t and k_e are wrong, which is no effect but a number that is always fitted."""
+"""What is hidden → range of its strength. load_friction: share of the load; coulomb_friction [N·m]; stribeck_friction: N·m while
+moving, twice that at rest; backlash: play [rad]; motor: factor by which the servo file's k_t and k_e are too large or too small.
+The last is no effect: every fit adjusts these numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
