@@ -10,8 +10,8 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 from pipelines.diagnosis_page import replace_section
-from taccorl.diagnosis.cells_study import ASKED, FIRST_SEED, CellsRow, run_cells, table
-from taccorl.diagnosis.surrogate.cells import HIDDEN
+from taccorl.diagnosis.studies.cells import ASKED, FIRST_SEED, CellsRow, run_cells, table
+from taccorl.surrogate.cells import HIDDEN
 
 SENSORS, CLEAN, WORKERS = 5, 20, 2
 TITLE = "Sensors of cells"
@@ -38,7 +38,7 @@ def write(rows: list[CellsRow]) -> tuple[float, float]:
     others = [r for r in rows if r.hidden and r.hidden not in ASKED and r.material]
     clean = [r for r in rows if not r.hidden]
     exact, silent = sum(r.exact for r in asked) / len(asked), sum(r.exact for r in clean) / len(clean)
-    text = f"""**Every sensor is simulated.** The generator (`taccorl/diagnosis/surrogate/cells.py`) has equations of its own at
+    text = f"""**Every sensor is simulated.** The generator (`taccorl/surrogate/cells.py`) has equations of its own at
 1 kHz: Boltzmann's superposition for logarithmic creep, Bouc–Wen for hysteresis, two springs and dampers for creep. The load has
 the noise of a load cell, stamps jitter, readings are rounded to counts, half of the sensors have noise that is correlated over
 0.1 s. Three fit recordings (one of them repeated), two for validation, one for the test. Material: the validation error is at

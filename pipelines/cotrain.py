@@ -23,8 +23,8 @@ from taccorl.cli.parse import parse
 from taccorl.demos.mimicgen.coverage import Share
 from taccorl.errors import TaccorlError
 from taccorl.sim.twin_file import save_twin
+from taccorl.surrogate.twin import ORIGIN, draw_surrogate_twin
 from taccorl.training.lerobot_commands import FIRST_SEED, Scoring, Training
-from taccorl.training.surrogate_twin import ORIGIN, draw_surrogate_twin
 
 RECORDING_SPEC = "piper_flexitac_mcap"
 SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")

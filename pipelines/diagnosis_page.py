@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from taccorl.diagnosis.figures_evidence import confusion_matrix, detection_curves, half_detected
-from taccorl.diagnosis.study import (
+from taccorl.diagnosis.report.figures_evidence import confusion_matrix, detection_curves, half_detected
+from taccorl.diagnosis.studies.joints_and_pads import (
     AT_FLOOR,
     MATERIAL,
     drop_said,

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from taccorl.diagnosis.compare import compare
-from taccorl.diagnosis.figures import joint_response
-from taccorl.diagnosis.joints import diagnose_joint
+from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.machines.piper import PiperTwin
-from taccorl.diagnosis.surrogate.cases import draw_case
-from taccorl.diagnosis.surrogate.recordings import recordings
+from taccorl.diagnosis.problems.joints import diagnose_joint
+from taccorl.diagnosis.report.figures import joint_response
+from taccorl.surrogate.cases import draw_case
+from taccorl.surrogate.recordings import recordings
 
 PICTURE = Path("docs/mended_twin.png")
 SHOWN = "held_triangle"

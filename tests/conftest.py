@@ -36,7 +36,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two 4 s stand-in recordings, three cameras at 240×320."""
-    from taccorl.demos.stand_in import StandInConfig, write_mcap
+    from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap
 
     def make(folder: Path) -> None:
         for k in range(2):

@@ -15,12 +15,15 @@ from statistics import median
 import mujoco
 import numpy as np
 
-from taccorl.alignment import arm_bench, camera_benchmarks  # noqa: F401, registers its rows
-from taccorl.alignment.controller import PAPER_BOUNDS, REFERENCE, identify_controller
-from taccorl.alignment.joint_model import Gains, JointModel
-from taccorl.alignment.joint_motion import JointMotion, joint_motion
-from taccorl.alignment.measurement import Measurement
-from taccorl.alignment.sweep_range import SWEEP_HZ, SWEEP_S
+from taccorl.alignment import camera_benchmarks  # noqa: F401, registers its rows
+from taccorl.alignment.controller import arm_bench
+from taccorl.alignment.controller.identification import PAPER_BOUNDS, REFERENCE, identify_controller
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.joint_recording import joint_motion
+from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.motions import SWEEP_HZ, SWEEP_S
 from taccorl.benchmark import Row, against_reference, benchmark, spread
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
@@ -34,7 +37,7 @@ RATE_HZ = 200.0
 
 
 def sweep(signal: str, config: TwinConfig) -> tuple[JointMotion, np.ndarray]:
-    """Simulated recording of the sweep of ``sweep_range`` by MuJoCo, with the gains of ``config``.
+    """Simulated recording of the sweep of ``measurements.motions`` by MuJoCo, with the gains of ``config``.
 
     Returns:
         the motion, and (T,) what MuJoCo says without noise.

@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from taccorl.alignment.camera import CameraFrames, KnownPoint, calibrate_camera, pnp
-from taccorl.alignment.camera_fit import pixels_of, seen_from
-from taccorl.alignment.camera_interval import JOINT_RAD, SHAPE_M
-from taccorl.alignment.camera_light import camera_light
-from taccorl.alignment.camera_timing import camera_latency
-from taccorl.alignment.camera_view import TwinView, as_offset
+from taccorl.alignment.camera.calibration import CameraFrames, KnownPoint, calibrate_camera, pnp
+from taccorl.alignment.camera.fit import pixels_of, seen_from
+from taccorl.alignment.camera.interval import JOINT_RAD, SHAPE_M
+from taccorl.alignment.camera.light import camera_light
+from taccorl.alignment.camera.timing import camera_latency
+from taccorl.alignment.camera.view import TwinView, as_offset
 from taccorl.benchmark import Row, benchmark, cpu_s, spread
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.camera_exposure import blurred, toned

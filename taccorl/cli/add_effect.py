@@ -16,7 +16,7 @@ from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
-    from taccorl.diagnosis.machine import Addition, Machine
+    from taccorl.diagnosis.machines.machine import Addition, Machine
     from taccorl.sim.effects.effect import Effect
 
 
@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
     """0: written."""
     config = parse(AddEffectConfig, argv, positional="effect", prog="taccorl add-effect")
     out = _place(config)
-    from taccorl.diagnosis.machine import load_machine
+    from taccorl.diagnosis.machines.load import load_machine
 
     machine = load_machine(config.twin)
     by_hand = config.values
@@ -80,7 +80,7 @@ def _place(config: AddEffectConfig) -> Path:
 
 def _diagnosed(config: AddEffectConfig, machine: "Machine") -> list["Addition"]:
     """What the diagnosis of this machine says, part by part."""
-    from taccorl.diagnosis.report import NUMBERS
+    from taccorl.diagnosis.report.report import NUMBERS
 
     path = config.diagnosis / NUMBERS
     if not path.is_file():
@@ -121,7 +121,7 @@ def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) 
     Raises:
         TaccorlError: the diagnosis refused it, or did not keep its numbers.
     """
-    from taccorl.diagnosis.machine import Addition
+    from taccorl.diagnosis.machines.machine import Addition
 
     kept = [e for e in diagnosis["effects"] if e["effect"] == name or e["effect"] in diagnosis["present"]]
     if name in [e["effect"] for e in kept] and len(diagnosis["effects"]) - len(diagnosis["present"]) == 1:
@@ -148,7 +148,7 @@ def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) 
 
 
 def _say(addition: "Addition", effect: "Effect") -> None:
-    from taccorl.diagnosis.evidence_words import unit_words
+    from taccorl.diagnosis.report.evidence_words import unit_words
 
     numbers = [f"{p.name} {getattr(effect, p.name):.4g}{unit_words(p.unit)}" for p in effect.parameters()]
     print(f"{addition.part}: {effect.name} {', '.join(numbers)}")

@@ -20,11 +20,11 @@ from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
 
 if TYPE_CHECKING:
-    from taccorl.alignment.measurements import Measurements
-    from taccorl.alignment.touch_motion import PressedObject
+    from taccorl.alignment.measurements.folder import Measurements
+    from taccorl.alignment.measurements.pressed import PressedObject
     from taccorl.data.finding import Finding
-    from taccorl.diagnosis.comparison import Comparison, Score
-    from taccorl.diagnosis.machine import Machine
+    from taccorl.diagnosis.comparison.result import Comparison, Score
+    from taccorl.diagnosis.machines.machine import Machine
 
 
 @dataclass(kw_only=True)
@@ -76,9 +76,9 @@ def main(argv: list[str]) -> int:
     """0: compared; 1: the measurements have errors, nothing was compared."""
     config = parse(CompareConfig, argv, positional="measurements")
     _check_outputs(config)
-    from taccorl.alignment.telemetry_checks import check_names
+    from taccorl.alignment.checks.telemetry import check_names
     from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_findings, unused_accepts
-    from taccorl.diagnosis.machine import load_machine
+    from taccorl.diagnosis.machines.load import load_machine
 
     check_names(config.accept)
 
@@ -108,7 +108,7 @@ def main(argv: list[str]) -> int:
 def _check_outputs(config: CompareConfig) -> None:
     """Before any work is done: is there a place for what was asked for?"""
     if config.out is not None:
-        from taccorl.diagnosis.report import check_folder
+        from taccorl.diagnosis.report.write import check_folder
 
         check_folder(config.out, config.measurements)
     if config.rerun is not None:
@@ -121,7 +121,7 @@ def _check_outputs(config: CompareConfig) -> None:
 
 def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "Measurements") -> list["Comparison"]:
     from taccorl.cli.tables import Bars
-    from taccorl.diagnosis.comparison import only
+    from taccorl.diagnosis.comparison.result import only
 
     pressed = _pressed(config.pressed)
     found = []
@@ -140,7 +140,7 @@ def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "
 
 
 def _pressed(config: PressedConfig) -> "PressedObject | None":
-    from taccorl.alignment.touch_motion import indenter
+    from taccorl.alignment.measurements.pressed import indenter
 
     if config.shape == "nothing":
         return None
@@ -161,9 +161,9 @@ def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> 
     from rich.text import Text
 
     from taccorl.cli.tables import console
-    from taccorl.diagnosis.comparison import origin_words, shown
-    from taccorl.diagnosis.localise import heat_map, worst_regime
-    from taccorl.diagnosis.localise_touch import touch_heat_map
+    from taccorl.diagnosis.comparison.localise import heat_map, worst_regime
+    from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
+    from taccorl.diagnosis.comparison.result import origin_words, shown
 
     cells = [*heat_map(comparison, "position"), *heat_map(comparison, "effort"), *touch_heat_map(comparison.touches)]
     scores = [*comparison.scores(), *comparison.pad_scores()]
@@ -203,8 +203,8 @@ def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> 
 def _error_cells(s: "Score") -> list:
     from rich.text import Text
 
-    from taccorl.diagnosis.comparison import shown
-    from taccorl.diagnosis.search_result import SearchConfig
+    from taccorl.diagnosis.comparison.result import shown
+    from taccorl.diagnosis.search.result import SearchConfig
 
     return [shown(s.rmse, s.unit), Text(f"{s.ratio:.3g}", "green" if s.ratio <= SearchConfig().stop_at else "yellow")]
 
@@ -219,7 +219,8 @@ def _write(
 ) -> None:
     first, after = comparisons[0], comparisons[1] if len(comparisons) > 1 else None
     if config.out is not None:
-        from taccorl.diagnosis.report import Report, write_report
+        from taccorl.diagnosis.report.report import Report
+        from taccorl.diagnosis.report.write import write_report
 
         provenance = {"command": shlex.join(["taccorl", "compare", *argv])}
         for twin in twins:

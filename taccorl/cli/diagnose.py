@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING, Literal
 from taccorl.cli.parse import parse
 
 if TYPE_CHECKING:
-    from taccorl.alignment.measurements import Measurements
-    from taccorl.diagnosis.comparison import Comparison
-    from taccorl.diagnosis.machine import Finding, Machine
-    from taccorl.diagnosis.regimes import RegimeErrors
-    from taccorl.diagnosis.report import Report
-    from taccorl.diagnosis.verdict import Verdict
+    from taccorl.alignment.measurements.folder import Measurements
+    from taccorl.diagnosis.comparison.regimes import RegimeErrors
+    from taccorl.diagnosis.comparison.result import Comparison
+    from taccorl.diagnosis.machines.machine import Finding, Machine
+    from taccorl.diagnosis.report.report import Report
+    from taccorl.diagnosis.report.verdict import Verdict
 
 
 COLORS = {"high": "green", "moderate": "yellow", "low": "red"}
@@ -72,13 +72,13 @@ class DiagnoseConfig:
 def main(argv: list[str]) -> int:
     """0: diagnosed, and what remains is at the noise floor; 1: something else remains, or the measurements have errors."""
     config = parse(DiagnoseConfig, argv, positional="measurements")
-    from taccorl.diagnosis.report import check_folder
+    from taccorl.diagnosis.report.write import check_folder
 
     check_folder(config.out, config.measurements)
-    from taccorl.alignment.telemetry_checks import check_names
+    from taccorl.alignment.checks.telemetry import check_names
     from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_findings, unused_accepts
-    from taccorl.diagnosis.joints import of_joints
-    from taccorl.diagnosis.machine import load_machine
+    from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.diagnosis.problems.joints import of_joints
     from taccorl.sim.effects import effects
 
     check_names(config.accept)
@@ -123,8 +123,8 @@ def _diagnosed(
     config: DiagnoseConfig, machine: "Machine", parts: Sequence[str], measurements: "Measurements"
 ) -> "list[Finding]":
     from taccorl.cli.tables import Bars
-    from taccorl.diagnosis.machine import diagnose_parts
-    from taccorl.diagnosis.search_result import SearchConfig
+    from taccorl.diagnosis.machines.machine import diagnose_parts
+    from taccorl.diagnosis.search.result import SearchConfig
 
     search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
     with Bars(len(parts)) as bars:
@@ -147,7 +147,7 @@ def print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors |
     from rich.text import Text
 
     from taccorl.cli.tables import console
-    from taccorl.diagnosis.evidence_words import evidence_words, unit_words
+    from taccorl.diagnosis.report.evidence_words import evidence_words, unit_words
 
     out, d = console(), finding.diagnosis
     out.print(Text(f"\n{finding.part}", "bold"))
@@ -219,7 +219,7 @@ def _why_invisible(finding: "Finding", name: str) -> str:
 
 def details(finding: "Finding") -> list[str]:
     """The numbers behind the verdict: errors, identified and absolute numbers, near-twins, what does as well."""
-    from taccorl.diagnosis.evidence_words import to_record, unit_words
+    from taccorl.diagnosis.report.evidence_words import to_record, unit_words
 
     d = finding.diagnosis
     errors = d.errors["fitted"]["validation"], d.errors["after"]["validation"]
@@ -285,7 +285,7 @@ def _report(
     findings: dict,
 ) -> "Report":
     """With the comparisons that show what refitted numbers removed, and what effects did."""
-    from taccorl.diagnosis.report import Report
+    from taccorl.diagnosis.report.report import Report
 
     refitted = machine.refitted(found)
     options = [f"--measurements={config.measurements}"]
@@ -312,7 +312,7 @@ def _report(
 def _write(
     config: DiagnoseConfig, report: "Report", found: "Sequence[Finding]", machine: "Machine", mended: "Machine"
 ) -> None:
-    from taccorl.diagnosis.report import write_report
+    from taccorl.diagnosis.report.write import write_report
 
     written = write_report(report, config.out)
     again = f" (replaced the report of {written.replaced})" if written.replaced else ""

@@ -24,9 +24,9 @@ from taccorl.lineage.destinations import is_free
 if TYPE_CHECKING:
     import numpy as np
 
-    from taccorl.alignment.measurements import Measurements
-    from taccorl.diagnosis.excitation import Plan, PlannedMotion
-    from taccorl.diagnosis.presses import PlannedPress
+    from taccorl.alignment.measurements.folder import Measurements
+    from taccorl.diagnosis.experiment_design.excitation import Plan, PlannedMotion
+    from taccorl.diagnosis.experiment_design.presses import PlannedPress
     from taccorl.sim.twin import TwinConfig
 
 
@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
     part = _part(config)
     if not is_free(config.out):
         raise TaccorlError(f"{config.out}: is there already; give another --out, or remove it")
-    from taccorl.alignment.measurements import read_measurements
+    from taccorl.alignment.measurements.folder import read_measurements
     from taccorl.cli.measured import twin_of
 
     twin = twin_of(config.twin)
@@ -81,7 +81,7 @@ def main(argv: list[str]) -> int:
 
 def _part(config: ExciteConfig) -> str:
     """``left_joint5`` or ``left pads``."""
-    from taccorl.diagnosis.motions import joint_number
+    from taccorl.alignment.measurements.motions import joint_number
     from taccorl.errors import nearest
     from taccorl.robots import ROBOT
 
@@ -108,10 +108,10 @@ def _motions(
     fitted: dict[str, dict[str, float]],
     measurements: "Measurements | None",
 ) -> "Plan[PlannedMotion]":
-    from taccorl.alignment.noise_floor import noise_floor
-    from taccorl.diagnosis.excitation import plan, rest_pose
-    from taccorl.diagnosis.motions import LIBRARY
-    from taccorl.diagnosis.replays import BENCH_REST
+    from taccorl.alignment.measurements.motions import LIBRARY
+    from taccorl.alignment.measurements.noise_floor import noise_floor
+    from taccorl.diagnosis.comparison.replays import BENCH_REST
+    from taccorl.diagnosis.experiment_design.excitation import plan, rest_pose
 
     floor_rad = config.floor_rad
     if measurements is not None:
@@ -140,7 +140,7 @@ def _presses(
     fitted: dict[str, dict[str, float]],
     measurements: "Measurements | None",
 ) -> "Plan[PlannedPress]":
-    from taccorl.diagnosis.presses import LIBRARY, plan_presses
+    from taccorl.diagnosis.experiment_design.presses import LIBRARY, plan_presses
 
     with _counted(len(LIBRARY)) as done:
         return plan_presses(twin, arm, rivals, measurements=measurements, fitted=fitted, done=done)
@@ -160,7 +160,7 @@ def _rivals(config: ExciteConfig, part: str) -> tuple[list[str], dict[str, dict[
     """Effects to tell apart, and the numbers that a diagnosis fitted with each."""
     import json
 
-    from taccorl.diagnosis.report import NUMBERS
+    from taccorl.diagnosis.report.report import NUMBERS
     from taccorl.sim.effects import effects
 
     path = config.diagnosis / NUMBERS
@@ -199,7 +199,7 @@ def _table(found: "Plan[PlannedMotion]") -> None:
 
 
 def _press_table(found: "Plan[PlannedPress]") -> None:
-    from taccorl.diagnosis.touch_problem import FRAMES_A_ROW
+    from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW
 
     rows = [
         (
@@ -224,7 +224,7 @@ def _show(found: "Plan", floor: str, heads: Sequence[str], rows: Sequence[Sequen
     from rich.table import Table
 
     from taccorl.cli.tables import console
-    from taccorl.diagnosis.excitation import SAME, TELLS
+    from taccorl.diagnosis.experiment_design.excitation import SAME, TELLS
 
     pairs = list(found.planned[0].discrimination) if found.planned else []
     table = Table(box=None, pad_edge=False)
@@ -248,7 +248,7 @@ def _show(found: "Plan", floor: str, heads: Sequence[str], rows: Sequence[Sequen
 
 def _one_way(found: "Plan", pair: str, rows: Sequence[Sequence[str]]) -> str:
     """What tells the two apart if it is one of them that is true."""
-    from taccorl.diagnosis.excitation import TELLS
+    from taccorl.diagnosis.experiment_design.excitation import TELLS
 
     words = ""
     for k, truth in enumerate(pair.split(" | ")):
@@ -261,7 +261,7 @@ def _one_way(found: "Plan", pair: str, rows: Sequence[Sequence[str]]) -> str:
 
 
 def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
-    from taccorl.diagnosis.motions import RATE_HZ
+    from taccorl.alignment.measurements.motions import RATE_HZ
 
     config.out.mkdir(parents=True, exist_ok=True)
     entries = []
@@ -293,7 +293,7 @@ def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
 
 
 def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
-    from taccorl.diagnosis.motions import RATE_HZ
+    from taccorl.alignment.measurements.motions import RATE_HZ
 
     config.out.mkdir(parents=True, exist_ok=True)
     gripper = f"{config.pads}_gripper"
@@ -329,7 +329,7 @@ def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
 
 def _write_table(path: Path, columns: "dict[str, np.ndarray]") -> None:
     """``t`` [s] and the columns at 200 Hz, to the micrometre or microrad."""
-    from taccorl.diagnosis.motions import RATE_HZ
+    from taccorl.alignment.measurements.motions import RATE_HZ
 
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)

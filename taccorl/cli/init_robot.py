@@ -28,8 +28,8 @@ def main(argv: list[str]) -> int:
     out = config.out or config.model.with_name(f"{config.model.stem}_robot.yaml")
     if out.exists():
         raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
-    from taccorl.alignment.robot_draft import robot_draft
-    from taccorl.alignment.robot_file import TODO
+    from taccorl.alignment.machines.robot_draft import robot_draft
+    from taccorl.alignment.machines.robot_file import TODO
 
     text, robot = robot_draft(config.model, out)
     try:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from taccorl.alignment.measurement import Measurement
-    from taccorl.alignment.measurements import Measurements
+    from taccorl.alignment.measurements.folder import Measurements
+    from taccorl.alignment.measurements.measurement import Measurement
     from taccorl.data.finding import Finding
-    from taccorl.diagnosis.comparison import Comparison
-    from taccorl.diagnosis.machine import Machine
+    from taccorl.diagnosis.comparison.result import Comparison
+    from taccorl.diagnosis.machines.machine import Machine
     from taccorl.sim.twin import TwinConfig
 
 FAR_OFF = 0.3
@@ -40,7 +40,7 @@ def checked(
     Args:
         accept: checks whose errors become warnings.
     """
-    from taccorl.alignment.telemetry_checks import accepted, check_measurements
+    from taccorl.alignment.checks.telemetry import accepted, check_measurements
 
     found = check_measurements(measurements.all, accept=accept) if machine.of_joints else {}
     timed = all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
@@ -78,7 +78,7 @@ def of_replays(
         findings: of the checks before; ``pose_unknown`` names an arm, or nothing for all joints.
         accept: checks whose errors become warnings.
     """
-    from taccorl.alignment.telemetry_checks import accepted
+    from taccorl.alignment.checks.telemetry import accepted
 
     late = {}
     for name, clock in comparison.clock.items():

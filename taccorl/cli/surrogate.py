@@ -46,7 +46,7 @@ class SurrogateConfig:
 def main(argv: list[str]) -> int:
     """0: written."""
     config = parse(SurrogateConfig, argv, positional=None)
-    from taccorl.diagnosis.surrogate.writing import SWEEPS, TWIN, reveal
+    from taccorl.surrogate.writing import SWEEPS, TWIN, reveal
 
     if config.reveal is not None:
         print(json.dumps(reveal(config.reveal), indent=2, ensure_ascii=False))
@@ -67,7 +67,7 @@ def main(argv: list[str]) -> int:
 
 
 def _cells(config: SurrogateConfig, secret: int, out: Path) -> int:
-    from taccorl.diagnosis.surrogate.cells import HIDDEN, PRESSES, SENSOR, draw_cells, write_cells
+    from taccorl.surrogate.cells import HIDDEN, PRESSES, SENSOR, draw_cells, write_cells
 
     plain = SurrogateConfig()
     others = [
@@ -87,8 +87,8 @@ def _cells(config: SurrogateConfig, secret: int, out: Path) -> int:
 
 
 def _sweeps(config: SurrogateConfig, secret: int, out: Path) -> str:
-    from taccorl.diagnosis.surrogate.cases import draw_case, draw_secret
-    from taccorl.diagnosis.surrogate.writing import write_recordings
+    from taccorl.surrogate.cases import draw_case, draw_secret
+    from taccorl.surrogate.writing import write_recordings
 
     case = draw_case(
         draw_secret(secret) if config.effects is None else config.effects,
@@ -102,8 +102,8 @@ def _sweeps(config: SurrogateConfig, secret: int, out: Path) -> str:
 
 
 def _presses(config: SurrogateConfig, secret: int, out: Path) -> str:
-    from taccorl.diagnosis.surrogate.touch import draw_touch_case
-    from taccorl.diagnosis.surrogate.writing import draw_touch_secret, write_touch_recordings
+    from taccorl.surrogate.touch import draw_touch_case
+    from taccorl.surrogate.writing import draw_touch_secret, write_touch_recordings
 
     plain = SurrogateConfig()
     of_joints = [name for name in ("signal", "gains_known", "design") if getattr(config, name) != getattr(plain, name)]

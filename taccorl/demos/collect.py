@@ -23,7 +23,6 @@ from taccorl.demos import attempts
 from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec
-from taccorl.demos.twin_recording import write_twin_mcap
 from taccorl.errors import TaccorlError, UnreachableError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.destinations import is_free
@@ -31,6 +30,7 @@ from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.surrogate.twin_recording import write_twin_mcap
 
 ATTEMPT_VERSION = 3
 COLLECTION_VERSION = 2

@@ -7,11 +7,11 @@ from multiprocessing import get_context
 from statistics import median
 
 from taccorl.benchmark import Row, against_reference, benchmark, spread
-from taccorl.diagnosis.cells_study import ASKED, FIRST_SEED, run_cells
-from taccorl.diagnosis.study import Job, run, run_touch
-from taccorl.diagnosis.surrogate.cases import draw_case
-from taccorl.diagnosis.surrogate.recordings import recordings
+from taccorl.diagnosis.studies.cells import ASKED, FIRST_SEED, run_cells
+from taccorl.diagnosis.studies.joints_and_pads import Job, run, run_touch
 from taccorl.robots import ROBOT
+from taccorl.surrogate.cases import draw_case
+from taccorl.surrogate.recordings import recordings
 
 HIDDEN = ("coulomb_friction", "backlash", "command_delay", "gravity_mismatch", "cogging")
 
@@ -86,8 +86,8 @@ def cells() -> Iterator[Row]:
 
 @benchmark("robots")
 def robots() -> Iterator[Row]:
-    """One joint of robots that are not the PiPER, by their robot files; the whole study is ``taccorl.diagnosis.robot_study``."""
-    from taccorl.diagnosis import robot_study
+    """One joint of robots that are not the PiPER, by their robot files; the whole study is ``diagnosis.studies.robots``."""
+    from taccorl.diagnosis.studies import robots as robot_study
 
     rows = [robot_study.run(job) for job in robot_study.jobs()[:6]]
     hidden = [r for r in rows if r["hidden"] and r["fitted"] >= robot_study.MATERIAL_FLOORS]
@@ -108,8 +108,8 @@ def robots() -> Iterator[Row]:
 
 def _one_of_an_arm(job: tuple[str, int]) -> float:
     """Diagnose one joint; seconds that its recordings took."""
-    from taccorl.diagnosis.joint_problem import JointProblem
-    from taccorl.diagnosis.search import diagnose
+    from taccorl.diagnosis.problems.joint_problem import JointProblem
+    from taccorl.diagnosis.search.search import diagnose
 
     signal, seed = job
     before = time.perf_counter()

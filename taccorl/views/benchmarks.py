@@ -18,7 +18,7 @@ def one_episode() -> Iterator[Row]:
     """Cost to check a stand-in episode of 720 rows and to write it for Rerun."""
     from taccorl.data.checks import check_episode
     from taccorl.data.cutting import open_episodes
-    from taccorl.demos.stand_in import StandInConfig, write_mcap
+    from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap
     from taccorl.views.episode import save_episode
 
     with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:

@@ -18,7 +18,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from taccorl.diagnosis.comparison import Comparison, TouchTrace, Trace, shown, shown_unit
+from taccorl.diagnosis.comparison.result import Comparison, TouchTrace, Trace, shown, shown_unit
 from taccorl.views.colors import GROUND_COLOR, HEATMAP, NOISE_COLOR
 from taccorl.views.outputs import check_free, replacing
 from taccorl.views.rrd import recording_to

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 import taccorl
-from taccorl.diagnosis.report_html import figure, note, table
-from taccorl.diagnosis.report_page import STYLE
+from taccorl.diagnosis.report.html import figure, note, table
+from taccorl.diagnosis.report.page import STYLE
 from taccorl.evaluation.episodes import EpisodeRow, summaries
 from taccorl.evaluation.failed_episodes import FailedEpisode
 from taccorl.evaluation.preflight import Check

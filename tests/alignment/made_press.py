@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from taccorl.alignment.measurement import Measurement, Touch
-from taccorl.alignment.touch_motion import PressedObject, indenter
+from taccorl.alignment.measurements.measurement import Measurement, Touch
+from taccorl.alignment.measurements.pressed import PressedObject, indenter
 
 RADIUS_M = 0.012
 GAIN_COUNT, BASELINE = 75.0, 20

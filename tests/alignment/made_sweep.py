@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.robots import ROBOT
 
 RATE_HZ = 200

@@ -4,11 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from taccorl.alignment import arm_bench
-from taccorl.alignment.arm_bench import of_joint
-from taccorl.alignment.joint_model import Gains, JointModel, JointResponse
-from taccorl.alignment.joint_motion import JointMotion, joint_motion
-from taccorl.alignment.measurement import Measurement
+from taccorl.alignment.controller import arm_bench
+from taccorl.alignment.controller.arm_bench import of_joint
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.joint_recording import joint_motion
+from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.robots import ROBOT
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects.effect import Effect

@@ -1,23 +1,20 @@
 """``taccorl add-effect`` as a user types it, with a diagnosis of sweeps that the twin itself made (not a robot's)."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from imagined_motions import QUICK_AGAIN, QUICK_CHIRP, QUICK_VALIDATION, recorded
+from simulated_sweeps import write_folder
 
-from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.cli.main import main
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin
-
-sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
-from imagined_motions import QUICK_AGAIN, QUICK_CHIRP, QUICK_VALIDATION, recorded
-from simulated_sweeps import write_folder
 
 SIGNAL = "left_joint4"  # the paper's J3
 TRUTH_NM = 0.8

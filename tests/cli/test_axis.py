@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taccorl.alignment.axis_file import load_axis
+from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.cli.main import main
 from taccorl.sim.effects import effects
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from taccorl.alignment.cells import cells_text, load_cells
-from taccorl.diagnosis.surrogate.cells import draw_cells, write_cells
+from taccorl.alignment.machines.cells_file import cells_text, load_cells
+from taccorl.surrogate.cells import draw_cells, write_cells
 
 SENSOR = """\
 kind: cells

@@ -2,21 +2,18 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.cli.main import main
 from taccorl.cli.measured import of_replays
 from taccorl.data.finding import Finding
-from taccorl.diagnosis.comparison import Comparison
+from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
-
-sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
-from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 
 @pytest.fixture(scope="module")

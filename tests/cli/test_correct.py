@@ -1,15 +1,12 @@
 """``taccorl correct`` as a user types it."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from taccorl.data.dataset import Dataset
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "evaluation"))
 
 
 @pytest.mark.parametrize(

@@ -2,25 +2,22 @@
 
 import csv
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from simulated_sweeps import write_folder
 
-from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.cli.main import main
-from taccorl.diagnosis.motions import AGAIN, CHIRP, VALIDATION
-from taccorl.diagnosis.surrogate.cases import draw_case
-from taccorl.diagnosis.surrogate.recordings import record
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.twin_file import load_twin, save_twin
-
-sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
-from simulated_sweeps import write_folder
+from taccorl.surrogate.cases import draw_case
+from taccorl.surrogate.recordings import record
 
 SIGNAL = "left_joint4"
 TRUTH_NM = 0.0286331  # of this surrogate; `taccorl surrogate --reveal` prints it

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 import yaml
 
-from taccorl.alignment.measurements import INDEX
+from taccorl.alignment.measurements.folder import INDEX
 from taccorl.cli.main import main
-from taccorl.diagnosis.surrogate import touch
 from taccorl.sim.effects import effects
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin_file import load_twin
+from taccorl.surrogate import touch
 
 DEPTHS = touch._presses((3e-4, 6e-4, 1e-3), (0.12, 0.5), 0.4, 2.5, 2.0)
 FIT = touch.Press(name="press", knots=DEPTHS, x_m=0.001, z_m=0.003)

@@ -1,7 +1,6 @@
 """``taccorl evaluate`` as a user types it."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +8,6 @@ import pytest
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import read_rows
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "evaluation"))
 
 EXPERT = ("evaluate", "--policy.type=expert", "--task=assembly_1", "--images=false")
 SHORT = ("--episodes=2", "--episode_length=4")

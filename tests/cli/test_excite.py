@@ -2,23 +2,20 @@
 
 import csv
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-
-from taccorl.alignment.measurements import Measurements, read_measurements
-from taccorl.cli.main import main
-from taccorl.diagnosis.motions import AGAIN, CHIRP, RATE_HZ, SPEED_RAD_PER_S
-from taccorl.robots import ROBOT
-from taccorl.sim.twin import TwinConfig
-
-sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
 from imagined_motions import NOISE_RAD, SIGNAL, recorded
 from simulated_sweeps import write_folder
+
+from taccorl.alignment.measurements.folder import Measurements, read_measurements
+from taccorl.alignment.measurements.motions import AGAIN, CHIRP, RATE_HZ, SPEED_RAD_PER_S
+from taccorl.cli.main import main
+from taccorl.robots import ROBOT
+from taccorl.sim.twin import TwinConfig
 
 RIVALS = "--effects=[command_lag,torque_fade]"
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-from taccorl.alignment.measurements import PressedNote
+from taccorl.alignment.measurements.folder import PressedNote
 from taccorl.cli.main import main
-from taccorl.diagnosis import presses
+from taccorl.diagnosis.experiment_design import presses
 
 RIVALS = "--effects=[touch_delay,touch_lag]"
 OF_NAME = {p.name: p for p in presses.LIBRARY}

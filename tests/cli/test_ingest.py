@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from taccorl.cli.main import main
-from taccorl.demos.stand_in import PAD_TOPICS, StandInConfig, write_cobot_magic_hdf5, write_mcap
+from taccorl.surrogate.stand_in.files import PAD_TOPICS, StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 SPEC = "--spec=piper_flexitac_mcap"
 BAGS = Path("/work/shared/data/bags")

@@ -13,8 +13,6 @@ import pytest
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "training"))
-
 IS_SIM = "observation.is_sim"
 WORDS = ("--real=surrogate", "--sim=twin", "--out=both", "--store=store")
 

@@ -16,7 +16,8 @@ from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Unfit, open_episode
 from taccorl.data.episode import Episode
 from taccorl.data.recording import find_sources, opened
 from taccorl.data.spec import RecordingSpec, load_recording_spec
-from taccorl.demos.stand_in import (
+from taccorl.errors import RecordingError
+from taccorl.surrogate.stand_in.files import (
     CAMERA_TOPICS,
     COMMAND_TOPICS,
     EPISODE_TOPIC,
@@ -28,7 +29,6 @@ from taccorl.demos.stand_in import (
     read_frame_id,
     write_mcap,
 )
-from taccorl.errors import RecordingError
 
 FPS = 30
 STATE, ACTION, TOUCH, WINDOW = "observation.state", "action", "observation.tactile", "observation.tactile_window"

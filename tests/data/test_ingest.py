@@ -23,9 +23,9 @@ from taccorl.data import ingest as ingest_module
 from taccorl.data import lerobot_format
 from taccorl.data.cutting import Cutter, open_episodes
 from taccorl.data.dataset import Dataset
-from taccorl.demos.stand_in import CAMERA_TOPICS, StandInConfig, read_frame_id, write_mcap
 from taccorl.errors import DatasetError
 from taccorl.lineage.store import Store
+from taccorl.surrogate.stand_in.files import CAMERA_TOPICS, StandInConfig, read_frame_id, write_mcap
 
 pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")  # its other threads only wait
 FRONT = CAMERA_TOPICS["front"]

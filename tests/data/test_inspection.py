@@ -10,7 +10,8 @@ import pytest
 from taccorl.data.draft import draft_specs
 from taccorl.data.inspection import Inventory, TopicSummary, inspect_source
 from taccorl.data.recording import Source, TopicType, find_sources
-from taccorl.demos.stand_in import (
+from taccorl.errors import RecordingError
+from taccorl.surrogate.stand_in.files import (
     CAMERA_TOPICS,
     COMMAND_TOPICS,
     PAD_TOPICS,
@@ -19,7 +20,6 @@ from taccorl.demos.stand_in import (
     write_cobot_magic_hdf5,
     write_mcap,
 )
-from taccorl.errors import RecordingError
 
 FRONT = CAMERA_TOPICS["front"]
 

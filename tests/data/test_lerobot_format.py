@@ -30,9 +30,9 @@ from taccorl.data.lerobot_format import (
     write_episodes,
 )
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
-from taccorl.demos.stand_in import read_frame_id
-from taccorl.demos.stand_in_frame_id import draw_frame_id
 from taccorl.errors import DatasetError, RecordingError
+from taccorl.surrogate.stand_in.files import read_frame_id
+from taccorl.surrogate.stand_in.frame_id import draw_frame_id
 
 CAMERA, TOUCH = "observation.images.front", "observation.tactile"
 SPEC = f"""

@@ -15,10 +15,10 @@ from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
 from taccorl.demos.collect import Attempt, Plan, Source, attempt, collect, collect_recordings, outcome_of
 from taccorl.demos.recorder import row_spec
-from taccorl.demos.stand_in import CAMERA_TOPICS
-from taccorl.demos.twin_recording import LEAD_S, TwinStory
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
 from taccorl.lineage.store import Store
+from taccorl.surrogate.stand_in.files import CAMERA_TOPICS
+from taccorl.surrogate.twin_recording import LEAD_S, TwinStory
 
 ARGUMENTS = ("--task=assembly_1", "--episodes=1", "--images=false", "--seed=5")
 

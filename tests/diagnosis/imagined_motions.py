@@ -4,10 +4,11 @@ import dataclasses
 
 import numpy as np
 
-from taccorl.alignment.joint_model import JointModel, joint_motion
-from taccorl.alignment.measurement import Measurement
-from taccorl.diagnosis.excitation import imagined, rest_pose, room_of
-from taccorl.diagnosis.motions import RATE_HZ, Motion, Room, chirp
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_recording import joint_motion
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.motions import RATE_HZ, Motion, Room, chirp
+from taccorl.diagnosis.experiment_design.excitation import imagined, rest_pose, room_of
 from taccorl.sim.twin import TwinConfig
 
 SIGNAL = "left_joint5"

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from taccorl.diagnosis.problem import Candidate, Free, Recording, candidate
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, candidate
 from taccorl.sim.effects.effect import Effect, parameter
 
 RATE_HZ = 200.0

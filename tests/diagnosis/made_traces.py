@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.alignment.noise_floor import Estimate, SignalFloor
-from taccorl.diagnosis.comparison import Comparison, Trace
+from taccorl.alignment.measurements.noise_floor import Estimate, SignalFloor
+from taccorl.diagnosis.comparison.result import Comparison, Trace
 
 RATE_HZ = 200.0
 FLOOR_RAD = 2e-4

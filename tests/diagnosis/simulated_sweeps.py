@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from taccorl.alignment.measurement import Measurement
-from taccorl.alignment.measurements import Measurements
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import make_effect

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 BIN = Path(sys.executable).parent
-sys.path.insert(0, str(Path(__file__).parents[1] / "training"))
 
 
 def run(*words: str) -> str:

@@ -1,13 +1,10 @@
 """A checkpoint of tactile_pi05 at its smallest, as lerobot-train leaves one: random weights, statistics near the home pose."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
 from taccorl.robots import ROBOT
 from taccorl.sim.spaces import IMAGE_KEYS
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "policies"))
 
 
 def write_checkpoint(folder: Path, **changes: Any) -> Path:

@@ -1,13 +1,9 @@
 """Policies as small as these are slower with more threads than with one; tests/policies/ and others hold shared makers."""
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import torch
-
-sys.path[:0] = [str(Path(__file__).parents[1] / name) for name in ("policies", "evaluation", "training")]
 
 
 @pytest.fixture(scope="package", autouse=True)

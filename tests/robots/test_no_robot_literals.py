@@ -14,9 +14,9 @@ ROOT = Path(taccorl.__file__).parents[1]
 FOLDERS = ("taccorl", "pipelines")
 ROBOTS = "taccorl/robots/"
 ALLOWED = {
-    ("taccorl/demos/stand_in_backdrop.py", "14"),  # a step of a colour
-    ("taccorl/demos/twin_recording.py", "7 *"),  # a stride through noise
-    ("taccorl/diagnosis/along.py", "14"),  # bins
+    ("taccorl/surrogate/stand_in/backdrop.py", "14"),  # a step of a colour
+    ("taccorl/surrogate/twin_recording.py", "7 *"),  # a stride through noise
+    ("taccorl/diagnosis/comparison/along.py", "14"),  # bins
     ("taccorl/sim/part_poses.py", "* 6"),  # numbers of a rotation
     # data lies below robots: it takes arms from the prefixes of a data spec's names.
     ("taccorl/data/arms.py", "('left', 'right')"),

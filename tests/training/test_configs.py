@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import yaml
 
-from taccorl.alignment.axis_file import load_axis
+from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.cli.parse import parse
 from taccorl.cli.post_train import PostTrainConfig
 from taccorl.sim.twin_file import load_twin

@@ -1,18 +1,15 @@
 """A comparison as an .rrd file, read back with Rerun's own reader: its lines are the comparison's numbers."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from made_traces import FLOOR_RAD, ORIGIN, comparison, swing, trace
 from rerun.experimental import RrdReader
 
-from taccorl.diagnosis.comparison import Comparison, TouchTrace
+from taccorl.diagnosis.comparison.result import Comparison, TouchTrace
 from taccorl.views.compare_view import MOST_ROWS, comparison_blueprint, save_comparison
 from taccorl.views.outputs import OutputError
-
-sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
-from made_traces import FLOOR_RAD, ORIGIN, comparison, swing, trace
 
 _, POSITION = swing(seconds=3.0)
 LEFT = np.where(np.gradient(POSITION) >= 0, 2e-3, -2e-3)

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from taccorl.demos import stand_in_robot
 from taccorl.robots import ROBOT
+from taccorl.surrogate.stand_in import kinematics as stand_in_robot
 from taccorl.views.colors import heat
 from taccorl.views.figure import (
     BASE_POS_WORLD,

@@ -1,4 +1,4 @@
-"""One driven axis as a machine: ``kind: axis`` (``taccorl.alignment.axis_file``)."""
+"""One driven axis as a machine: ``kind: axis`` (``taccorl.alignment.machines.axis_file``)."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -9,18 +9,18 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from scipy.signal import savgol_filter
 
-from taccorl.alignment.axis_file import AxisConfig, axis_digest, axis_text, load_axis
-from taccorl.alignment.clock_checks import check_against_twin
-from taccorl.alignment.effort_time import check_effort_time
-from taccorl.alignment.measurement import UNITS, Measurement
-from taccorl.alignment.measurements import Measurements, Use
-from taccorl.alignment.noise_floor import noise_floor
-from taccorl.alignment.telemetry_checks import least_motion
-from taccorl.alignment.touch_motion import PressedObject
+from taccorl.alignment.checks.clock import check_against_twin
+from taccorl.alignment.checks.effort_time import check_effort_time
+from taccorl.alignment.checks.telemetry import least_motion
+from taccorl.alignment.machines.axis_file import AxisConfig, axis_digest, axis_text, load_axis
+from taccorl.alignment.measurements.folder import Measurements, Use
+from taccorl.alignment.measurements.measurement import UNITS, Measurement
+from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.diagnosis.axis_problem import AxisProblem, axis_motion, simulated
-from taccorl.diagnosis.comparison import USES, Comparison, Kind, Trace
-from taccorl.diagnosis.machine import Addition, GainsAre, Machine, machines
+from taccorl.diagnosis.comparison.result import USES, Comparison, Kind, Trace
+from taccorl.diagnosis.machines.machine import Addition, GainsAre, Machine, machines
+from taccorl.diagnosis.problems.axis_problem import AxisProblem, axis_motion, simulated
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin_file import write_whole

@@ -1,4 +1,4 @@
-"""A sensor of cells as a machine, described by a cells file (``taccorl.alignment.cells``). It is its own only part."""
+"""A sensor of cells as a machine, described by a cells file (``alignment.machines.cells_file``). It is its own only part."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -8,25 +8,19 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from taccorl.alignment.cell_checks import LOADED, check_cells
-from taccorl.alignment.cell_model import calibrated, of_file, readings, responses, thinned
-from taccorl.alignment.cell_tables import CellMeasurement, load_cell_columns, read_cell_table
-from taccorl.alignment.cells import (
-    CellsConfig,
-    cells_digest,
-    load_cells,
-    make_cells_effect,
-    save_cells,
-)
-from taccorl.alignment.measurements import Measurements, read_measurements
-from taccorl.alignment.noise_floor import repeat_pairs
-from taccorl.alignment.touch_motion import PressedObject
+from taccorl.alignment.checks.cells import LOADED, check_cells
+from taccorl.alignment.machines.cell_model import calibrated, of_file, readings, responses, thinned
+from taccorl.alignment.machines.cell_tables import CellMeasurement, load_cell_columns, read_cell_table
+from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
+from taccorl.alignment.measurements.folder import Measurements, read_measurements
+from taccorl.alignment.measurements.noise_floor import repeat_pairs
+from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.diagnosis.cells_problem import CellsProblem, prepared_all, reading_floor
-from taccorl.diagnosis.comparison import USES, Comparison, TouchTrace
-from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine, machines, solved
-from taccorl.diagnosis.problem import chosen
-from taccorl.diagnosis.search_result import Diagnosis, Evidence, SearchConfig
+from taccorl.diagnosis.comparison.result import USES, Comparison, TouchTrace
+from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, machines, solved
+from taccorl.diagnosis.problems.cells_problem import CellsProblem, prepared_all, reading_floor
+from taccorl.diagnosis.search.problem import chosen
+from taccorl.diagnosis.search.result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect

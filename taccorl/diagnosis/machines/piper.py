@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from taccorl.alignment.measurement import Measurement, unit_of
-from taccorl.alignment.measurements import Measurements
-from taccorl.alignment.touch_motion import PressedObject
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement, unit_of
+from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.diagnosis import joints, pads
-from taccorl.diagnosis.compare import compare
-from taccorl.diagnosis.comparison import Comparison
-from taccorl.diagnosis.joint_problem import selectors
-from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine
-from taccorl.diagnosis.search_result import SearchConfig
+from taccorl.diagnosis.comparison.compare import compare
+from taccorl.diagnosis.comparison.result import Comparison
+from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine
+from taccorl.diagnosis.problems import joints, pads
+from taccorl.diagnosis.problems.joint_problem import selectors
+from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect

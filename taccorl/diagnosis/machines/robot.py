@@ -1,4 +1,4 @@
-"""Any robot as a machine: ``kind: robot`` (``taccorl.alignment.robot_file``). Its parts are its joints, by the model's names."""
+"""Any robot as a machine: ``kind: robot`` (``alignment.machines.robot_file``). Its parts are its joints, by the model's names."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -8,20 +8,20 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from taccorl.alignment.clock_checks import check_against_twin
-from taccorl.alignment.measurement import Measurement
-from taccorl.alignment.measurements import Measurements, Use
-from taccorl.alignment.noise_floor import SignalFloor, noise_floor
-from taccorl.alignment.robot_checks import check_robot
-from taccorl.alignment.robot_file import Robot, load_robot
-from taccorl.alignment.touch_motion import PressedObject
+from taccorl.alignment.checks.clock import check_against_twin
+from taccorl.alignment.checks.robot import check_robot
+from taccorl.alignment.machines.robot_file import Robot, load_robot
+from taccorl.alignment.measurements.folder import Measurements, Use
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
+from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.diagnosis.compare import moving, traces_of
-from taccorl.diagnosis.comparison import USES, Comparison, Kind
-from taccorl.diagnosis.joints import diagnose_joint, moves
-from taccorl.diagnosis.machine import Addition, Finding, GainsAre, Machine, machines
-from taccorl.diagnosis.replays import replay_joints
-from taccorl.diagnosis.search_result import SearchConfig
+from taccorl.diagnosis.comparison.compare import moving, traces_of
+from taccorl.diagnosis.comparison.replays import replay_joints
+from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
+from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, machines
+from taccorl.diagnosis.problems.joints import diagnose_joint, moves
+from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect

@@ -142,7 +142,7 @@ class TactilePI05Config(PI05Config):
     """λ_f: a reading above this is contact."""
     noise_threshold: float = 0.0
     """λ_noise: readings up to this count as nothing, in training and in use (paper, App. B.2: background noise of both domains is
-    suppressed by one threshold). In normalised readings: what taccorl.alignment.touch measures in counts, times the gain.
+    suppressed by one threshold). In normalised readings: what alignment.touch.calibration measures in counts, times the gain.
     0: readings as they are; of the twin alone there is one kind of noise."""
     contact_min_active: int = MIN_ACTIVE
     """m: taxels of one reading that have to be above it."""

@@ -38,7 +38,7 @@ class CameraPose(CameraEffect):
     )
     at_a_policy: ClassVar = "It reaches beside the part by as much as the picture has moved."
     to_record: ClassVar = (
-        "A dozen pictures of arms at rest in poses that differ; taccorl.alignment.camera fits it to them."
+        "A dozen pictures of arms at rest in poses that differ; taccorl.alignment.camera.calibration fits it to them."
     )
     near_twins: ClassVar = {
         "camera_latency": (

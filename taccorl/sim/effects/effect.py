@@ -93,7 +93,7 @@ class Parameter:
     source: str
     over: Literal["", "kp"] = ""
     """``kp``: a torque, stiffness, damping, inertia or mass. Positions alone identify only (value − absent) / K_p of it
-    (``taccorl.diagnosis.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""
+    (``diagnosis.search.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""
 
 
 def parameter(
@@ -225,7 +225,7 @@ class Effect:
         return [{strength.name: v} for v in values if strength.low <= v <= strength.high]
 
     def drive(self) -> dict[str, float] | None:
-        """Parameters of the effect in the one-joint model of ``taccorl.alignment.joint_kernel``, under the names used there.
+        """Parameters of the effect in the one-joint model of ``alignment.controller.joint_kernel``, under the names used there.
 
         None: only MuJoCo knows it, and identification runs MuJoCo. Empty: it changes bodies only, and inertia and weight are
         read from the compiled model.

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 
-from taccorl.alignment.effect_checks import check_effect
+from taccorl.alignment.checks.effects import check_effect
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import JointEffect, parameter
 
@@ -59,7 +59,7 @@ class {cls}(JointEffect):
     )
 
     def drive(self) -> dict[str, float]:
-        """Its numbers in the model of one joint (taccorl/alignment/joint_kernel.py, Drive): compare and diagnose use them on any
+        """Its numbers in the model of one joint (``Drive`` of joint_kernel.py): compare and diagnose use them on any
         joint of any robot, and on an axis."""
         return {{"spring_stiffness": self.stiffness_nm_per_rad, "spring_rest": 0.0}}
 
@@ -73,7 +73,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from taccorl.alignment.effect_checks import check_effect
+from taccorl.alignment.checks.effects import check_effect
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
 

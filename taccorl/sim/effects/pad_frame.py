@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class PadFrameEffect(TouchEffect):
     """Base of effects that move the frame of a pad's taxels in the finger, and of the pad's box as far as it moves along.
 
-    The twin's model is edited; the matched contact replay (``taccorl.alignment.touch_model``), which has no model, asks for
+    The twin's model is edited; the matched contact replay (``taccorl.alignment.touch.model``), which has no model, asks for
     ``offset_pad_m`` and looks the depths up there.
     """
 

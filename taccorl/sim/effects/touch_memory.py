@@ -13,7 +13,7 @@ from taccorl.sim.effects.effect import Memory, TouchEffect
 class RememberingEffect(TouchEffect):
     """Base of touch effects with memory: they compute a whole sequence of scans at once; one scan is a sequence of length 1.
 
-    Thousands of calls for a recording become one (``taccorl.alignment.touch_model``), by the same code as in the simulation. An
+    Thousands of calls for a recording become one (``taccorl.alignment.touch.model``), by the same code as in the simulation. An
     effect with a memory that is not of this class works as well, scan by scan.
     """
 

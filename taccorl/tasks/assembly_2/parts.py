@@ -32,7 +32,7 @@ def open_cradle(name: str = "cradle", clearance_m: float = CLEARANCE_M) -> Part:
     """U-shaped cradle 36 mm wide and 34 mm deep, open at +y, then 30 mm of solid tail, 160 g. Origin in the mouth, z into it.
 
     A closed socket holds a plug by the couple between its floor and its roof from 8 mm on. Without the roof the plug stays
-    only if its centre of mass is inside (tests/sim/test_parts.py).
+    only if its centre of mass is inside (tests/tasks/test_parts.py).
     """
     check_clearance(name, clearance_m)
     inner, outer, end = 0.010 + clearance_m, 0.018, 0.034

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from taccorl.alignment.dataset_rows import read_dataset
+from taccorl.alignment.measurements.dataset_rows import read_dataset
 from taccorl.data.dataset import Dataset
 from taccorl.demos.mimicgen.attempt import Attempts, state_digest
 from taccorl.demos.mimicgen.augment import AugmentPlan, attempt_episode, augment, made_attempts

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from press_bench import perform, start
 
-from taccorl.alignment.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.joint_kernel import Drive, simulate
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
@@ -93,7 +93,7 @@ def test_an_absent_effect_leaves_the_run_bit_identical(name: str) -> None:
             np.testing.assert_array_equal(seen[kind], values, err_msg=f"{name} {variant}: {kind}")
 
 
-# What cameras show fades out in test_camera_effects.py; a run has no temperature: tests/diagnosis/test_cells_problem.py.
+# What cameras show fades out in test_camera_effects.py; a run has no temperature: tests/diagnosis/problems/test_cells_problem.py.
 @pytest.mark.parametrize("name", [p for p in ONE_OF_FOUR if shows_in_a_run(str(p.values[0]))])
 def test_an_effect_fades_out_towards_its_absent_value(name: str) -> None:
     check_fades_out(effects.get(name))

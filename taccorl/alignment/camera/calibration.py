@@ -1,0 +1,327 @@
+"""Camera calibration: move the twin's camera until its arms match those in the pictures (paper App. B.3).
+
+From the joints that were reported with some pictures, the arms' outlines are drawn at the pose that is believed now and laid over
+the edges of the pictures (``edges``); what they are apart, across the edges, is brought down by least squares
+(``fit``), and the outlines are drawn anew, from coarse pictures to fine ones. Only the arms are used: joint angles say
+nothing about the table and the parts. It works for a fixed camera and for one on a wrist, whose pose is relative to the
+link that carries it.
+
+The start is the twin's own mount, within about 3° and 30 mm along each axis; or points of the arms that somebody found in the
+pictures, by PnP, from anywhere. Intrinsics are taken as they are in the twin: give it the camera_info of your own camera.
+
+Letters in shapes: F frames.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from taccorl.alignment.camera.fit import (
+    Level,
+    Solution,
+    distances,
+    levels,
+    match,
+    outlines,
+    pixels_of,
+    seen_from,
+    solve,
+)
+from taccorl.alignment.camera.interval import Covariance, covariance
+from taccorl.alignment.camera.overlay import overlay
+from taccorl.alignment.camera.view import TwinView, as_offset
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.cameras import CameraConfig
+from taccorl.sim.twin import TwinConfig
+
+FEWEST_FRAMES = 4
+FEWEST_POINTS = 6  # known ones: three more than PnP needs
+_HOLD_OUT = 4  # one frame in so many is kept out of the fit
+_FEWEST_OUTLINES = 60  # points a frame: less is a fingertip
+_REACH_PX = 6.0  # a held-out outline without an edge within this counts as this far off
+_FOUND, _FAR = 0.5, 3.0  # of a fit that may be believed: share of held-out outlines with an edge, mean distance [px]
+_ONE_POSE_RAD = 0.02  # joints that move less in all frames show one pose
+_VAGUE = 10.0  # times ``WANTED``, 3° or 40 mm: wider than the errors that calibration is to find
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraFrames:
+    """Pictures of one camera, and what the joints reported when they were taken.
+
+    Raises:
+        TaccorlError: shapes that do not fit each other.
+    """
+
+    pictures: np.ndarray
+    """(F, rows, columns, 3) uint8 RGB: as recorded, or letterboxed by ingest."""
+    joints: np.ndarray
+    """(F, 14) rad, m: in the order of actions."""
+    stages: dict[str, int] = field(default_factory=dict)
+    """"initial", "grasp", "insertion" → number of the frame; kept out of the fit, shown in the overlays."""
+    name: str = "pictures"
+    """For people: the episode they are of."""
+    origin: str = ""
+    """What made them, e.g. "surrogate …"."""
+
+    def __post_init__(self) -> None:
+        if self.pictures.ndim != 4 or self.pictures.shape[-1] != 3 or self.pictures.dtype != np.uint8:
+            raise TaccorlError(
+                f"{self.name}: pictures are {self.pictures.dtype} {self.pictures.shape}; wanted are uint8 (F, rows, "
+                "columns, 3), all of one size"
+            )
+        if self.joints.shape != (len(self.pictures), ROBOT.num_actions) or not np.isfinite(self.joints).all():
+            raise TaccorlError(
+                f"{self.name}: joints are {self.joints.shape} for {len(self.pictures)} pictures; wanted are as many rows of "
+                f"{ROBOT.num_actions} finite numbers [rad, m], in the order of actions"
+            )
+        if any(not 0 <= frame < len(self.pictures) for frame in self.stages.values()):
+            raise TaccorlError(
+                f"{self.name}: stages {self.stages} name frames that are not there (0 … {len(self.joints) - 1})"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownPoint:
+    """A point of an arm or of the bench that was found in a picture, by hand or from a marker."""
+
+    frame: int
+    """Number of the picture."""
+    body: str
+    """MuJoCo body that it belongs to; "world" for the bench."""
+    position_m: tuple[float, float, float]
+    """In the body's frame."""
+    pixel: tuple[float, float]
+    """(u, v) in the picture as given, bars included; (0, 0) is the middle of its top left pixel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraFit:
+    """Result of a calibration. Poses (6,) are relative to the nominal mount, as ``CameraOffset``: rotation vector [rad],
+    shift [m]."""
+
+    camera: CameraConfig
+    """The twin's camera with its new offset, for ``save_twin``; the old one where ``problems`` is not empty."""
+    start: np.ndarray
+    """(6,) where the twin had it."""
+    offset: np.ndarray
+    """(6,) the estimate."""
+    half_width: np.ndarray
+    """(6,) of its 95 % interval: noise of the edges, shapes and joint zeros of the twin; infinite where nothing fixes it."""
+    noise_half_width: np.ndarray
+    """(6,) from the noise alone: how well the same pictures would give it again."""
+    correlation: np.ndarray
+    """(6, 6)."""
+    before_px: float
+    """Mean distance of the outlines from the pictures' edges in held-out frames, across the edges, in pixels of the pictures."""
+    after_px: float
+    found_before: float
+    """Share of the held-out outlines that have an edge of like direction within 6 px."""
+    found_after: float
+    known_before_px: float
+    """RMS reprojection error of the known points of held-out frames; NaN without any."""
+    known_after_px: float
+    problems: tuple[str, ...]
+    """Why this is no calibration: not converged, not identifiable. Empty if it is one."""
+    overlays: dict[str, np.ndarray]
+    """Stage → picture as in the paper: picture, twin, outlines before and after; (rows, columns, 3) uint8 RGB."""
+    num_frames: int
+    num_held_out: int
+    name: str
+    origin: str
+
+    @property
+    def converged(self) -> bool:
+        return not self.problems
+
+    @property
+    def change(self) -> tuple[float, float]:
+        """Change from the twin's camera: rotation [rad] and translation [m]."""
+        start, end = (Rotation.from_rotvec(x[:3]) for x in (self.start, self.offset))
+        return float((start.inv() * end).magnitude()), float(np.linalg.norm(self.offset[3:] - self.start[3:]))
+
+    def twin(self, config: TwinConfig) -> TwinConfig:
+        """``config`` with this camera. The offset contains the whole change, so effects that moved only this camera are removed.
+
+        Raises:
+            TaccorlError: this is no calibration, or one effect moves this camera and others.
+        """
+        if self.problems:
+            raise TaccorlError(f"camera {self.camera.name}: {'; '.join(self.problems)}. The twin keeps its camera")
+        kept = []
+        for effect in config.effects:
+            if effect.name != "camera_pose" or self.camera.name not in effect.acts_on():
+                kept.append(effect)
+            elif len(effect.acts_on()) > 1:
+                raise TaccorlError(
+                    f"camera {self.camera.name}: one camera_pose moves {', '.join(effect.acts_on())}; give each its own entry"
+                )
+        cameras = [self.camera if camera.name == self.camera.name else camera for camera in config.cameras]
+        return dataclasses.replace(config, cameras=cameras, effects=kept)
+
+
+def calibrate_camera(
+    frames: CameraFrames, config: TwinConfig, camera: str, known: Sequence[KnownPoint] = ()
+) -> CameraFit:
+    """Fit the pose of the twin's ``camera`` so that its arms match those in the pictures.
+
+    Every fourth frame and the stages are kept out of the fit, for the figures and overlays before and after.
+
+    Args:
+        known: at least ``FEWEST_POINTS`` points that start it by PnP; without them it starts at the twin's mount. Those of
+            held-out frames are only used to judge it.
+
+    Raises:
+        TaccorlError: no such camera, too few frames or points, pictures of another stream, no arm in view.
+    """
+    if len(frames.joints) < FEWEST_FRAMES:
+        raise TaccorlError(
+            f"{frames.name}: {len(frames.joints)} frames; a calibration needs at least {FEWEST_FRAMES}, with the arms in poses "
+            "that differ: three to fit and one to judge it. Eight and more are good"
+        )
+    with TwinView(config, camera, frames.pictures.shape[1:3]) as view:
+        inside = view.inside(frames.pictures)
+        held = _held_out(frames)
+        start = view.start if not known else pnp(view, frames.joints, [p for p in known if not held[p.frame]])
+        fit, test = (levels(list(inside[rows]), view.intrinsics) for rows in (~held, held))
+        solution = _solved(view, frames, held, fit, start, search=not known)
+        sure = covariance(view, frames.joints[~held], fit[-1], solution)
+        before, after = (_judge(view, frames.joints[held], pose, test[-1]) for pose in (view.start, solution.offset))
+        errors = [
+            _reprojection(view, frames.joints, [p for p in known if held[p.frame]], x)
+            for x in (view.start, solution.offset)
+        ]
+        problems = _problems(frames, solution, sure, before, after)
+        shown = {
+            stage: overlay(view, inside[k], frames.joints[k], view.start, solution.offset, frames.origin)
+            for stage, k in frames.stages.items()
+        }
+        return CameraFit(
+            camera=view.camera if problems else dataclasses.replace(view.camera, offset=as_offset(solution.offset)),
+            start=view.start,
+            offset=solution.offset,
+            half_width=sure.half_width if sure else np.full(6, np.inf),
+            noise_half_width=1.96 * np.sqrt(np.diag(sure.noise)) if sure else np.full(6, np.inf),
+            correlation=sure.correlation if sure else np.full((6, 6), np.nan),
+            before_px=before[0],
+            after_px=after[0],
+            found_before=before[1],
+            found_after=after[1],
+            known_before_px=errors[0],
+            known_after_px=errors[1],
+            problems=problems,
+            overlays=shown,
+            num_frames=int((~held).sum()),
+            num_held_out=int(held.sum()),
+            name=frames.name,
+            origin=frames.origin,
+        )
+
+
+def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.ndarray:
+    """Pose (6,) from known points and their pixels (OpenCV: SQPNP, then Levenberg–Marquardt).
+
+    Raises:
+        TaccorlError: too few of them, or no pose explains them.
+    """
+    if len(known) < FEWEST_POINTS:
+        raise TaccorlError(
+            f"camera {view.camera.name}: {len(known)} known points in frames that are fitted; give at least {FEWEST_POINTS}, of "
+            "several bodies, or none"
+        )
+    points = np.array([view.in_mount(joints[p.frame], p.body, np.array(p.position_m)) for p in known])
+    pixels = np.array([p.pixel for p in known]) - [view.window.left, view.window.top]
+    at = view.intrinsics
+    matrix = np.array([[at.fx_px, 0, at.cx_px], [0, at.fy_px, at.cy_px], [0, 0, 1]])
+    good, turned, moved = cv2.solvePnP(points, pixels, matrix, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    if not good or not np.isfinite(turned).all():
+        raise TaccorlError(
+            f"camera {view.camera.name}: no pose sees the {len(known)} known points where they were found"
+        )
+    turned, moved = cv2.solvePnPRefineLM(points, pixels, matrix, np.zeros(4), turned, moved)
+    turn = cv2.Rodrigues(turned)[0]  # of the optical frame, y down and z ahead
+    return view.offset_of((-turn.T @ moved).ravel(), turn.T @ np.diag([1.0, -1.0, -1.0]))
+
+
+def _held_out(frames: CameraFrames) -> np.ndarray:
+    held = np.zeros(len(frames.joints), dtype=bool)
+    held[_HOLD_OUT - 1 :: _HOLD_OUT] = True
+    spare = len(held) - FEWEST_FRAMES + 1  # three frames are fitted, whatever else
+    for frame in frames.stages.values():
+        held[frame] = held[frame] or held.sum() < spare
+    return held
+
+
+def _solved(
+    view: TwinView, frames: CameraFrames, held: np.ndarray, fit: Sequence[Level], start: np.ndarray, *, search: bool
+) -> Solution:
+    drawn = outlines(view, frames.joints[~held], start, view.intrinsics)
+    if len(drawn.points) < _FEWEST_OUTLINES * (~held).sum():
+        raise TaccorlError(
+            f"camera {view.camera.name}: from where the twin has it, the arms are hardly in view in {frames.name}: "
+            f"{len(drawn.points)} points of their outlines in {(~held).sum()} frames. Record the arms in the middle of the "
+            "picture, correct the camera's mount in the twin by hand, or give known points"
+        )
+    return solve(view, frames.joints[~held], fit, start, search=search)
+
+
+def _judge(view: TwinView, joints: np.ndarray, offset: np.ndarray, level: Level) -> tuple[float, float]:
+    """Mean distance of the outlines at a pose from the edges [px of the pictures], and the share that has an edge at all."""
+    drawn = outlines(view, joints, offset, level.intrinsics)
+    if not len(drawn.points):
+        return _REACH_PX, 0.0
+    scale = level.intrinsics.rows / view.window.rows
+    seen = seen_from(view, offset, drawn.points)
+    matches = match(drawn, seen, level, _REACH_PX * scale)
+    apart = np.abs(distances(seen, matches, level.intrinsics)) / scale
+    return float((apart.sum() + _REACH_PX * (~matches.found).sum()) / len(seen)), float(matches.found.mean())
+
+
+def _reprojection(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint], offset: np.ndarray) -> float:
+    """RMS [px] of the known points at a pose (6,)."""
+    if not known:
+        return float("nan")
+    points = np.array([view.in_mount(joints[p.frame], p.body, np.array(p.position_m)) for p in known])
+    pixels = pixels_of(seen_from(view, offset, points), view.intrinsics) + np.array([view.window.left, view.window.top])
+    return float(np.sqrt(np.mean(np.sum((pixels - [p.pixel for p in known]) ** 2, axis=1))))
+
+
+def _problems(
+    frames: CameraFrames,
+    solution: Solution,
+    sure: Covariance | None,
+    before: tuple[float, float],
+    after: tuple[float, float],
+) -> tuple[str, ...]:
+    found = []
+    if after[1] < _FOUND or after[0] > _FAR:
+        found.append(
+            f"not converged: in held-out frames {after[1]:.0%} of the outlines have an edge beside them, {after[0]:.1f} px "
+            "away in the mean: the arms are not in the pictures, or not where the joints say, or the start is too far off. "
+            "Look at an overlay; check that pictures and joints are of the same instants; give known points"
+        )
+    elif after[0] > before[0] + 0.1:
+        found.append(
+            f"not converged: held-out frames fit worse than before ({before[0]:.2f} → {after[0]:.2f} px); record more poses"
+        )
+    if sure is None:
+        return (
+            *found,
+            "not identifiable: the outlines in view do not fix all six numbers; record poses with more of the arms",
+        )
+    if (np.abs(solution.last_change) > sure.half_width).any():
+        found.append("not converged: the last render still moved it by more than its interval")
+    width, direction = sure.worst()
+    spread = float(np.ptp(frames.joints, axis=0).max())
+    if spread < _ONE_POSE_RAD:
+        found.append(
+            f"not identifiable: all {len(frames.joints)} frames show one pose, so no error of the twin averages out and none is "
+            f"held out; worst known: {direction}. Record poses that differ"
+        )
+    elif width > _VAGUE:
+        found.append(f"not identifiable: {direction} can hardly be told; record poses that differ more")
+    return tuple(found)

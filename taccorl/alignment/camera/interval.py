@@ -1,0 +1,130 @@
+"""Uncertainty of a fitted camera pose, from noise of the edges and from errors of the twin's shapes and joint zeros.
+
+Noise: residuals of one body's outline in one frame go together, so these groups are what is independent (a sandwich estimate).
+Beyond it, however many pictures there are, each body may have another shape than the twin's, by ``SHAPE_M``, and each joint may
+report ``JOINT_RAD`` beside the truth; both stay the same in all frames. Carried through the least squares they say what a set
+of poses can tell: frames that are all alike average nothing.
+
+Letters in shapes: M matched points, J joints of both arms.
+"""
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from taccorl.alignment.camera.fit import Level, Solution, distances, moved, seen_from, slopes, space_slopes, weights
+from taccorl.alignment.camera.view import TwinView
+from taccorl.robots import ROBOT
+
+AXES = ("turn about right", "turn about up", "turn about back", "shift right", "shift up", "shift back")
+"""The six numbers of a pose: rotation vector [rad] about, and shift [m] along the nominal camera's x, y, z."""
+SHAPE_M = 0.001
+"""Standard deviation, along each axis, of a body's outline off the twin's. A choice: covers and fingers differ by so much."""
+JOINT_RAD = 0.002
+"""Standard deviation of a joint's zero. A choice: 1 mm at half a metre."""
+WANTED = np.r_[np.full(3, np.deg2rad(0.3)), np.full(3, 0.004)]
+"""How well each is to be known: 0.3°, 4 mm. Only ratios to it are compared between angles and lengths."""
+_SHARE = 0.35  # of the longest component: an axis that has less is not named
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance of a fitted pose (6,)."""
+
+    noise: np.ndarray
+    """(6, 6) from the scatter of the edges."""
+    twin: np.ndarray
+    """(6, 6) from shapes and joint zeros that may be wrong."""
+
+    @property
+    def total(self) -> np.ndarray:
+        """Total covariance (6, 6)."""
+        return self.noise + self.twin
+
+    @property
+    def half_width(self) -> np.ndarray:
+        """Half widths (6,) of the 95 % intervals."""
+        return 1.96 * np.sqrt(np.diag(self.total))
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Correlation matrix (6, 6)."""
+        deviation = np.sqrt(np.diag(self.total))
+        return self.total / np.outer(deviation, deviation)
+
+    def worst(self) -> tuple[float, str]:
+        """Least certain direction: half of its 95 % interval as a multiple of ``WANTED``, and its components."""
+        values, vectors = np.linalg.eigh(self.total / np.outer(WANTED, WANTED))
+        along = vectors[:, -1] / vectors[np.argmax(np.abs(vectors[:, -1])), -1]
+        named = [k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= _SHARE]
+        width = 1.96 * float(np.sqrt(values[-1]))
+        return width, " together with ".join(f"{AXES[k]} (±{_in_words(float(self.half_width[k]), k)})" for k in named)
+
+
+def _in_words(value: float, axis: int) -> str:
+    return f"{math.degrees(value):.2f}°" if axis < 3 else f"{1e3 * value:.1f} mm"
+
+
+def covariance(view: TwinView, joints: np.ndarray, level: Level, solution: Solution) -> Covariance | None:
+    """Covariance of ``solution`` from the frames with joints (F, 14); None if the edges do not determine all six numbers."""
+    seen = seen_from(view, solution.offset, solution.outlines.points)
+    found = solution.matches.found
+    apart = distances(seen, solution.matches, level.intrinsics)
+    jacobian = slopes(seen, solution.matches, level.intrinsics)
+    weighted = weights(apart)[:, None] * jacobian
+    information = weighted.T @ jacobian
+    if np.linalg.cond(information * np.outer(WANTED, WANTED)) > 1e10:
+        return None
+    frames, bodies = solution.outlines.frames[found], solution.outlines.bodies[found]
+    groups = np.unique(np.stack([frames, bodies], axis=1), axis=0, return_inverse=True)[1].ravel()
+    scores = np.zeros((groups.max() + 1, 6))
+    np.add.at(scores, groups, weighted * apart[:, None])
+    by_point = space_slopes(seen, solution.matches, level.intrinsics)
+    shifts = _shifts(view, joints, solution.offset, seen[found], frames, bodies)
+    twin = np.stack([weighted.T @ (by_point * shift).sum(1) for shift in shifts])  # (sources, 6)
+    few = len(scores) / max(len(scores) - 6, 1)
+    # From a step in the camera's own frame to the pose's numbers.
+    bend = np.stack([moved(solution.offset, step) - solution.offset for step in 1e-6 * np.eye(6)], axis=1) / 1e-6
+    spread = bend @ np.linalg.inv(information)
+    return Covariance(noise=few * spread @ scores.T @ scores @ spread.T, twin=spread @ twin.T @ twin @ spread.T)
+
+
+def _shifts(
+    view: TwinView, joints: np.ndarray, offset: np.ndarray, seen: np.ndarray, frames: np.ndarray, bodies: np.ndarray
+) -> list[np.ndarray]:
+    """How points ``seen`` (M, 3) of ``bodies`` (M,) in ``frames`` (M,) would move in the camera's frame [m], each
+    source of error one standard deviation off: three axes of each body, then each joint."""
+    model, data = view.model, view.data
+    mount = model.body(view.camera.body).id
+    position, turn = view.pose(offset)
+    owners = np.unique(bodies)
+    found = np.zeros((3 * len(owners) + len(ROBOT.arms) * len(ROBOT.joints), len(seen), 3))
+    names = [f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints]
+    for frame, row in enumerate(joints):
+        view.place(row)
+        mounted = Rotation.from_matrix(data.xmat[mount].reshape(3, 3))
+        world_from_camera = mounted.as_matrix() @ turn
+        eye = data.xpos[mount] + mounted.apply(position)
+        for k, body in enumerate(owners):
+            mine = (frames == frame) & (bodies == body)
+            axes = data.xmat[body].reshape(3, 3).T @ world_from_camera
+            found[3 * k : 3 * k + 3, mine] = SHAPE_M * axes[:, None]
+        here = frames == frame
+        world = seen[here] @ world_from_camera.T + eye
+        for j, name in enumerate(names):
+            joint = model.joint(name).id
+            carried = np.array([_carries(model, joint, int(body)) for body in range(model.nbody)], float)
+            lever = np.cross(data.xaxis[joint], world - data.xanchor[joint])
+            relative = carried[bodies[here]] - carried[mount]  # a camera on the arm moves along
+            found[3 * len(owners) + j, here] = JOINT_RAD * (lever * relative[:, None]) @ world_from_camera
+    return list(found)
+
+
+def _carries(model: mujoco.MjModel, joint: int, body: int) -> bool:
+    """Whether a body is the joint's own or further out."""
+    while body > 0 and body != model.jnt_bodyid[joint]:
+        body = int(model.body_parentid[body])
+    return body > 0

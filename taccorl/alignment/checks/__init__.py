@@ -1,0 +1,1 @@
+"""Checks of measurements before the twin is blamed: clocks, time stamps, wiring, ranges, repeats."""

@@ -1,0 +1,318 @@
+"""Check that command and measurement are on one clock, to less than a row.
+
+* No joint moves before it is commanded: a measurement that **leads** its command has wrong time stamps, whatever the physics.
+* A measurement that comes **late** may have a late clock or a real delay. Positions alone do not tell the one from the other.
+* Within one row (5 ms) this shows in the first movement after a step, or where the joint is a lag as ``first_order`` has it.
+  Where it is not, an offset of a row looks like a missing effect; the finding says that it was not judged.
+"""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.alignment.checks.first_order import FirstOrder, delay_between, fit_first_order
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.tables import is_table
+from taccorl.data.finding import Finding, listed, not_judged
+from taccorl.data.lag_checks import LAG_SURE, find_lag
+from taccorl.errors import TaccorlError
+
+MOVING = 0.02
+"""rad (a tenth of it in m): a joint that is commanded further than this tells about time."""
+SURE = 4.0
+"""Standard deviations beyond which an offset is one."""
+HALF_ROW_MOST = 0.75
+"""Rows: a lead below this may come from targets that are held in the replay and were not by the drive."""
+LEAD_ROWS = 0.3
+"""A lead of less could be the fit's own error."""
+LATE_ROWS = 1.2
+"""Second poles (inertia over K_d) count as delay: up to 5.7 ms at the twin's joints 2 and 3, so less than this is expected."""
+FITTING = 3.0
+"""The lag describes a joint if it leaves less than so many noise floors …"""
+FITTING_ROWS = 0.05
+"""… or less than this share of what an offset of one row would leave: it can shift the delay by a sixth of a row at most."""
+STEP_FLOORS = 8.0
+"""A step is judged if the joint's first row of movement is so many noise floors."""
+REST_S = 0.25
+"""All commands must have rested so long before a step."""
+EXCHANGED = 0.7
+"""Columns of target and position are exchanged if the lag, fitted from position to target, leaves less than this share of what it
+leaves from target to position."""
+ROUGHER = 3.0
+"""… or, where neither fit decides, if the column given as the target has so many times the noise of the other."""
+USUAL_TAU_S = 0.12
+"""The slowest joint of the paper (Fig. "Per-joint controller SysID"): what a step moves in its first row is at least
+step · period / τ."""
+
+
+@dataclass(frozen=True)
+class CommandTiming:
+    """Timing of one joint's response to its command."""
+
+    signal: str
+    lag_s: float
+    """By correlation: what the controller and all delays take together; NaN where velocities hardly correlate (steps)."""
+    fit: FirstOrder
+    described: bool
+    """The lag describes the joint, so that its delay means something."""
+
+
+def command_timing(m: Measurement, floor: dict[str, float]) -> list[CommandTiming]:
+    """Timing of every joint that moves enough.
+
+    Args:
+        floor: signal → noise floor (rad, m).
+    """
+    even = m.resampled(m.rate_hz)
+    found = []
+    for j in moving_signals(even):
+        name = even.signals[j]
+        scale, fps = _scale(even, j), max(1, round(even.rate_hz))
+        lag = find_lag(even.target[:, [j]] * scale, even.measured[:, [j]] * scale, fps)
+        try:
+            fit = fit_first_order(even.target[:, j], even.measured[:, j], even.period_s)
+        except TaccorlError:
+            continue
+        described = fit.rms < max(FITTING * floor[name], FITTING_ROWS * fit.row_rms)
+        lag_s = lag.lag_s if lag.correlation >= LAG_SURE else math.nan
+        found.append(CommandTiming(name, lag_s, fit, described))
+    return found
+
+
+def moving_signals(m: Measurement) -> list[int]:
+    """Numbers of the signals whose command and whose measurement move enough to correlate."""
+    scale = np.array([_scale(m, j) for j in range(len(m.signals))])
+    moves = (np.ptp(m.target, axis=0) * scale > MOVING) & (np.nan_to_num(_span(m.measured)) * scale > MOVING / 4)
+    return [int(j) for j in np.flatnonzero(moves)]
+
+
+def _scale(m: Measurement, j: int) -> float:
+    return 10.0 if m.units[j] == "m" else 1.0
+
+
+def _span(values: np.ndarray) -> np.ndarray:
+    return np.array([np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in values.T])
+
+
+def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
+    """Leads, late answers, arms on different clocks, and what could not be judged."""
+    stepped = _early_steps(m, floor)
+    findings = [_lead_at_step(m, name, rows) for name, rows in stepped.items()]
+    timings = command_timing(m, floor)
+    if not timings:
+        return findings or [not_judged("", "clock of command and measurement", "no joint moves enough to tell")]
+    led = set(stepped)
+    for t in timings:
+        if t.signal in led:
+            continue
+        if t.lag_s < -0.5 * m.period_s and _exchanged(m, t):
+            led.add(t.signal)
+            findings.append(_exchange(t.signal, -t.lag_s, m))
+        elif t.lag_s < -0.5 * m.period_s:
+            led.add(t.signal)
+            findings.append(_lead(t.signal, -t.lag_s, m, "its movement correlates best with a later command"))
+        elif t.described and t.fit.delay_s + SURE * t.fit.delay_sd_s < -LEAD_ROWS * m.period_s:
+            led.add(t.signal)
+            how = f"lag {t.fit.time_constant_s * 1e3:.1f} ms, delay {_ms(t.fit)}"
+            findings.append(_lead(t.signal, -t.fit.delay_s, m, how))
+    late = [t for t in timings if t.signal not in led and t.described and _is_late(t.fit, m.period_s)]
+    findings += [_late(t, m) for t in late]
+    unclear = [t for t in timings if t.signal not in led and not t.described]
+    if unclear:
+        worst = max(unclear, key=lambda t: t.fit.rms / floor[t.signal])
+        step = max(_least_step(m, floor[t.signal]) for t in unclear)
+        why = (
+            f"{listed([t.signal for t in unclear])} do not answer their targets as a delay and a lag would (which leave "
+            f"{worst.fit.rms / floor[worst.signal]:.0f} noise floors at {worst.signal}), so that motion does not show it. "
+            "The command goes on. To have it judged, add a recording in which each of them rests for "
+            f"{2 * REST_S:g} s and its target then jumps by {step:.2g} {m.units[m.column(worst.signal)]} or more, twice: the row "
+            "in which it first moves shows an offset"
+        )
+        findings.append(not_judged(worst.signal, f"an offset of one row ({m.period_s * 1e3:.1f} ms)", why))
+    return findings
+
+
+def check_against_twin(
+    m: Measurement, reported: np.ndarray, floor: dict[str, float], uncertain: Collection[str] = ()
+) -> list[Finding]:
+    """Rows by which the measurement lies beside the twin's replay of its commands.
+
+    A shift is reported only where it can be told from other gains (both are fitted together) and from a missing effect (little
+    must be left).
+
+    Args:
+        reported: (T, J) the twin's positions, row by row with ``m.target``.
+        uncertain: signals of drives whose numbers (gains, k_t, back-EMF) diagnose fits because nobody knows them. Wrong ones
+            shift the twin, too, so that a lead of theirs is a warning.
+    """
+    findings = []
+    period_s = m.period_s
+    for j in moving_signals(m):
+        name = m.signals[j]
+        try:
+            shift = delay_between(m.target[:, j], m.measured[:, j], reported[:, j], period_s)
+        except TaccorlError as error:
+            findings.append(not_judged(name, "its offset in time from the twin", str(error)))
+            continue
+        shift_s, sd_s = shift.delay_s, shift.delay_sd_s
+        if shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
+            why = (
+                f"{shift.rms / floor[name]:.0f} noise floors are left that neither a shift nor other gains explain; look for the "
+                "missing effect first"
+            )
+            findings.append(not_judged(name, "its offset in time from the twin", why))
+        elif abs(shift_s) > SURE * sd_s and abs(shift_s) > (LEAD_ROWS if shift_s < 0 else 0.5) * period_s:
+            where = f"{abs(shift_s) * 1e3:.1f} ± {sd_s * 1e3:.1f} ms ({abs(shift_s) / period_s:.1f} rows)"
+            if shift_s < 0:
+                text = (
+                    f"{name}: the measurement leads the twin's replay by {where}: "
+                    + ("the drive's numbers in the file are off (diagnose fits them), or " if name in uncertain else "")
+                    + f"positions stamped too early or commands too late, or paired one row off. {_earlier_targets(m, -shift_s)}"
+                )
+                if name in uncertain:
+                    text += " only if the lead remains with the numbers that were fitted"
+                elif -shift_s < HALF_ROW_MOST * period_s:
+                    text += (
+                        ". Half a row is also what a drive shows that receives targets faster than they are logged: state that "
+                        "rate as `command_hz` in the file of your robot or axis"
+                    )
+            else:
+                text = (
+                    f"{name}: the measurement comes {where} after the twin's replay: a real delay (effects "
+                    "command_delay, sensor_delay), or a clock offset; positions cannot tell which. Compare the "
+                    f"clocks{'' if m.has_effort()[j] else ', or record effort too'}"
+                )
+            blocks = shift_s < 0 and name not in uncertain
+            findings.append(Finding("shifted_from_twin", "error" if blocks else "warning", name, text))
+    return findings
+
+
+def _is_late(fit: FirstOrder, period_s: float) -> bool:
+    return fit.delay_s - SURE * fit.delay_sd_s > LATE_ROWS * period_s
+
+
+def _ms(fit: FirstOrder) -> str:
+    return f"{fit.delay_s * 1e3:.2f} ± {fit.delay_sd_s * 1e3:.2f} ms"
+
+
+def _lead(signal: str, lead_s: float, m: Measurement, how: str) -> Finding:
+    return Finding(
+        "measured_before_command",
+        "error",
+        signal,
+        f"{signal} answers {lead_s * 1e3:.1f} ms ({lead_s / m.period_s:.1f} rows) before its command ({how}), all "
+        f"through {m.time_s[-1] - m.time_s[0]:.1f} s: stamps of commands are late or those of positions early. "
+        f"{_earlier_targets(m, lead_s)}, or log both by one clock",
+    )
+
+
+def _exchanged(m: Measurement, t: CommandTiming) -> bool:
+    """Whether the target follows the position as a joint follows its target, and the position does not follow the target so.
+
+    The lead is taken off before the lag is fitted from target to position. Where no direction leaves less than an offset of one
+    row would and much less than the other (a resonant joint), the rougher column is the measured one.
+    """
+    even, j = m.resampled(m.rate_hz), m.column(t.signal)
+    target, measured = even.target[:, j], even.measured[:, j]
+    lead = math.ceil(-t.lag_s / even.period_s)
+    if not np.isfinite(measured).all():
+        return False
+    turned = fit_first_order(measured, target, even.period_s)
+    forward = fit_first_order(target[lead:], measured[:-lead], even.period_s)
+    if turned.rms < min(turned.row_rms, EXCHANGED * forward.rms):
+        return turned.delay_s > -LEAD_ROWS * m.period_s
+    if forward.rms < min(forward.row_rms, EXCHANGED * turned.rms):
+        return False
+    return _roughness(target) > ROUGHER * _roughness(measured)
+
+
+def _roughness(values: np.ndarray) -> float:
+    """Standard deviation of white noise with the same median of fourth differences, whose variance is 70 times the noise's."""
+    return float(1.4826 * np.median(np.abs(np.diff(values, n=4))) / math.sqrt(70))
+
+
+def _exchange(signal: str, lead_s: float, m: Measurement) -> Finding:
+    where = (
+        f"give {signal}.q the column that {signal}.q_target has now, and the other way round, in a columns file"
+        if is_table(m)
+        else f"exchange the channels of state and command of {signal} in the recording spec"
+    )
+    return Finding(
+        "measured_before_command",
+        "error",
+        signal,
+        f"{signal}: the target follows the measured position by {lead_s * 1e3:.1f} ms, as a joint follows its target, over "
+        f"{m.time_s[-1] - m.time_s[0]:.1f} s: the two are exchanged; {where}",
+    )
+
+
+def _earlier_targets(m: Measurement, lead_s: float) -> str:
+    """What mends positions that are ``lead_s`` ahead of their targets. The joint's own lag hides a part of an offset: rows are
+    rounded up."""
+    if is_table(m):
+        return f"Write `target_rows_late: {math.ceil(lead_s / m.period_s)}` (or more) into the columns file"
+    return "Set `latency_s` of the state's channel in the recording spec"
+
+
+def _lead_at_step(m: Measurement, signal: str, rows: list[int]) -> Finding:
+    at = rows[0]
+    return Finding(
+        "measured_before_command",
+        "error",
+        signal,
+        f"{signal} has moved at row {at} ({m.time_s[at]:.3f} s), where its step is only commanded ({len(rows)} such "
+        f"steps): one row or more too early. {_earlier_targets(m, m.period_s)}, or log both by one clock",
+        (at, at + 1),
+    )
+
+
+def _late(t: CommandTiming, m: Measurement) -> Finding:
+    return Finding(
+        "late_answer",
+        "note",
+        t.signal,
+        f"{t.signal} answers its target after a delay of {_ms(t.fit)} ({t.fit.delay_s / m.period_s:.1f} rows), then with a lag "
+        f"of {t.fit.time_constant_s * 1e3:.0f} ms: a real delay or a clock offset, which positions cannot tell apart. "
+        "If the clocks are known to agree, it is a delay (effects command_delay, sensor_delay); else compare them "
+        "or log both by one clock",
+    )
+
+
+def _early_steps(m: Measurement, floor: dict[str, float]) -> dict[str, list[int]]:
+    """Signal → rows of its steps from rest at which it has moved already, where that is at least half of its steps."""
+    before, settle = round(REST_S / m.period_s), 5
+    changes = np.diff(m.target, axis=0)
+    still = np.all(np.abs(changes) < 1e-6, axis=1)
+    found: dict[str, list[int]] = {}
+    for j in moving_signals(m):
+        least = _least_step(m, floor[m.signals[j]])
+        steps = [
+            k + 1 for k in np.flatnonzero(np.abs(changes[:, j]) > least) if k >= before and still[k - before : k].all()
+        ]
+        early = [
+            k
+            for k in steps
+            if _moved(m.measured[k - before : k + 1, j], settle, changes[k - 1, j], floor[m.signals[j]])
+        ]
+        if early and len(early) >= len(steps) / 2:
+            found[m.signals[j]] = early
+    return found
+
+
+def _least_step(m: Measurement, floor: float) -> float:
+    """rad, m: what a step from rest must be for its first row of movement to be seen."""
+    return STEP_FLOORS * floor * USUAL_TAU_S / m.period_s
+
+
+def _moved(values: np.ndarray, settle: int, step: float, floor: float) -> bool:
+    """Whether the last of ``values`` has gone in the step's direction, from the line through those well before it."""
+    past = np.arange(len(values) - 1 - settle)
+    rest = values[: len(past)]
+    if not np.isfinite(values).all() or len(past) < 5:
+        return False
+    line = np.polynomial.polynomial.polyfit(past, rest, 1)
+    noise = max(floor, float(np.std(rest - np.polynomial.polynomial.polyval(past, line))))
+    gone = (values[-1] - np.polynomial.polynomial.polyval(len(values) - 1, line)) * np.sign(step)
+    return bool(gone > (SURE + 1) * 1.5 * noise)

@@ -1,0 +1,91 @@
+"""Was a row's effort taken before its target acts, or after? Both are usual, and they differ by what the target moves in one row.
+
+    τ_k − K_p (q*_(k−1) − q_k) = r K_p (q*_k − q*_(k−1)) − a q̇_k + b q̈_k + S sin q_k + C cos q_k + c
+
+r is 0 for an effort from before and 1 for one from after; a is the damping, b an age of position or velocity, S and C carried
+weight. Least squares find it whatever moves the joint: friction and inertia are in no controller. On the simulated robots of
+``docs/robot_study.jsonl`` with efforts r is within 0.3 of 0 in all recordings where the law is the file's.
+"""
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from taccorl.alignment.controller.drive_law import DriveLaw
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.data.finding import Finding
+
+NEAR = 0.3
+"""r is that near to 0 or to 1, …"""
+SURE = 0.1
+"""… with a standard error of at most this; else nothing is said. A drive that receives targets faster than they are logged is
+in between."""
+CLIPPED = 0.98
+"""Of the effort limit: rows beyond say nothing of the target."""
+SMOOTH_S = 0.05
+"""Window of the quadratic whose slope is the velocity."""
+
+
+def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> list[Finding]:
+    """Error if a recording's efforts were taken on the other side of the target than ``law`` says.
+
+    Args:
+        file: name of the file that states the law.
+    """
+    found = target_share(law, m, signal)
+    if found is None:
+        return []
+    share, sd = found
+    after = abs(share - 1.0) < NEAR
+    if sd > SURE or after == law.effort_after_target or not (after or abs(share) < NEAR):
+        return []
+    way = "answers the row's own target already" if after else "was taken before the row's target acts"
+    line = f"Write `effort_after_target: true` for {signal}" if after else f"Remove effort_after_target of {signal}"
+    text = (
+        f"effort of {signal} {way} (it holds {share:.2f} ± {sd:.2f} of what the target moves in one row), and {file} says "
+        f"otherwise. {line} in {file}. If its driver is sure of the instant, a velocity feedforward in the drive looks like this "
+        "and can be accepted"
+    )
+    return [Finding("effort_time", "error", signal, text)]
+
+
+def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
+    """r and its standard error; None where the recording cannot tell."""
+    j = m.column(signal)
+    q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
+    if m.torque_ff.size:
+        effort = effort - m.torque_ff[:, j]
+    window = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
+    if (
+        law.law == "pwm"
+        or not m.has_effort()[j]
+        or not np.isfinite([q, effort, target]).all()
+        or m.num_rows < 4 * window
+    ):
+        return None
+    kp, kd, _ = law.loop_gains
+    kp_scale, kd_scale = law.gain_scales(signal, m)
+    gain = {"position": kp * kp_scale, "velocity": kd * kd_scale, "torque": 1.0}[law.target_kind]
+    v, a = np.gradient(q, m.period_s)[1:], savgol_filter(q, window, 2, deriv=2, delta=m.period_s)[1:]
+    moved, angle = gain * np.diff(target), q[1:]
+    left = effort[1:] - gain * target[:-1] + (gain * angle if law.target_kind == "position" else 0.0)
+    columns = np.column_stack([moved, v, a, np.sin(angle), np.cos(angle), np.ones_like(v)])
+    rows = np.ones(len(v), dtype=bool)
+    if law.effort_limit is not None:
+        rows = np.abs(effort[1:]) < CLIPPED * law.effort_limit
+    if m.enabled.size:
+        rows &= m.enabled[1:, j] != 0.0
+    columns, left = columns[rows], left[rows]
+    scale = np.linalg.norm(columns, axis=0)
+    if len(columns) < 4 * window or scale[0] == 0.0:
+        return None
+    scale[scale == 0] = 1.0
+    square = (columns / scale).T @ (columns / scale)
+    # The velocity is noisy, and would count for too little: its noise, from fourth differences of positions, is taken off.
+    noise = 1.4826 * float(np.median(np.abs(np.diff(q, 4)))) / np.sqrt(70.0)
+    square[1, 1] -= len(columns) * 0.5 * (noise / m.period_s) ** 2 / scale[1] ** 2
+    inverse = np.linalg.pinv(square)
+    solution = inverse @ (columns / scale).T @ left
+    left = left - columns / scale @ solution
+    alike = float(np.clip(left[1:] @ left[:-1] / max(left @ left, 1e-300), 0.0, 0.98))
+    variance = inverse[0, 0] * float(left @ left) / len(left) * (1 + alike) / (1 - alike)
+    return float(solution[0] / scale[0]), float(np.sqrt(variance) / scale[0])

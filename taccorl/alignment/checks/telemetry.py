@@ -1,0 +1,450 @@
+"""Is a measurement fit to blame the twin with? Checked before any effect is.
+
+    error    time_backwards, time_unit, not_finite, lost_samples, too_short, no_motion, dead_channel, frozen_channel,
+             saturated_channel, unit, reversed, swapped_joints, swapped_arms, measured_before_command
+    warning  dropped_rows, jitter, low_rate, row_times, out_of_order, not_at_rest, start_offset, blocked, short, dead_effort,
+             velocity_unit, no_baseline, dropped_commands, does_not_repeat, same_commands, sticking_joint, resampled
+    note     late_answer, effort_limit, not_judged, same_motion
+
+An error that a user has looked into can be accepted by its name: it stays in the report as a warning. Every finding names joint,
+value and place, and what to record or change. The parts are here (values, motion, start), in ``time_stamps``, ``wiring``
+(which joint follows which command, units), ``clock`` (offsets in time) and ``unrepeated`` (recordings of one motion).
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from taccorl.alignment.checks.cells import ERRORS as CELL_ERRORS
+from taccorl.alignment.checks.clock import check_clock
+from taccorl.alignment.checks.range_end import stood_at_stop
+from taccorl.alignment.checks.time_stamps import check_time
+from taccorl.alignment.checks.unrepeated import check_repeatability
+from taccorl.alignment.checks.wiring import check_wiring
+from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.alignment.measurements.repeats import Overlay, overlay
+from taccorl.data.finding import Finding, listed
+from taccorl.data.timing import runs
+from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+
+MOVED = {"rad": 0.02, "m": 0.002}
+"""A command that stays within this has not moved its joint,"""
+MOVED_STEPS = 100.0
+"""unless it is so many times what its encoder resolves: ± 1 mm on a stage. Of machines other than the PiPER."""
+TOO_SHORT_S, SHORT_S = 1.0, 3.0
+"""Of motion. The paper sweeps each joint for 10 s."""
+DEAD_SHARE = 0.05
+"""A joint that goes less than this share of its command's way does not answer."""
+FROZEN_S = 0.3
+"""Readings bit-identical for so long …"""
+FROZEN_MOVE = 0.05
+"""… while the command goes so far (rad)."""
+BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
+"""Standing at its furthest reading so long while it is commanded so much further."""
+START_S, START_ROWS = 0.15, (8, 30)
+"""How fast a joint is at row 0 is read off so many seconds, within so many rows."""
+START_SPEED = {"rad": 0.03, "m": 0.003}
+"""Per second: a twin that starts at rest is off by this times 0.1 s, 3 mrad."""
+START_OFFSET_RAD = 0.1
+"""Further from its resting command the joint is not held by it. The paper's feed-forward torque moves it by
+11 mrad at most."""
+AT_LIMIT_SHARE = 0.01
+"""Of the rows with exactly the largest effort: more than chance."""
+_ORDER = ("error", "warning", "note")
+STICK_STEPS = 4.0
+"""A joint that sticks moves on by no more than so many of its usual steps between rows, or of its encoder's; a driver that
+repeated old values jumps to where the joint has gone meanwhile."""
+DIFFERENT = 3.0
+"""Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""
+ERRORS = (
+    "time_backwards", "time_unit", "not_finite", "lost_samples", "too_short", "no_motion", "dead_channel", "frozen_channel",
+    "saturated_channel", "unit", "reversed", "swapped_joints", "swapped_arms", "measured_before_command", "shifted_from_twin",
+    "beyond_limits", "wrong_inertia", "reversed_effort", "effort_time",
+    *CELL_ERRORS,
+)  # fmt: skip
+"""Checks that can end in an error, and so be accepted."""
+_NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")
+"""With these nothing else can be judged."""
+
+
+def check_names(accept: Sequence[str]) -> None:
+    """
+    Raises:
+        TaccorlError: a name that is no check's.
+    """
+    for name in accept:
+        if name not in ERRORS:
+            raise TaccorlError(f"--accept={name}: no check of that name ends in an error; {nearest(name, ERRORS)}")
+
+
+def accepted(findings: Sequence[Finding], accept: Sequence[str]) -> list[Finding]:
+    """``findings`` with errors of the checks ``accept`` turned into warnings that say so."""
+    return [
+        dataclasses.replace(f, severity="warning", text=f"{f.text}. An error, accepted by --accept={f.check}")
+        if f.severity == "error" and f.check in accept
+        else f
+        for f in findings
+    ]
+
+
+def check_measurement(
+    m: Measurement,
+    joints: Sequence[str] = (),
+    floor: dict[str, float] | None = None,
+    accept: Sequence[str] = (),
+) -> list[Finding]:
+    """All findings on one measurement, worst first.
+
+    Args:
+        joints: signals that are to be fitted; each must move.
+        floor: signal → noise floor of positions (rad, m); estimated from this measurement alone by default.
+        accept: names of checks whose errors are known and become warnings.
+    """
+    for name in joints:
+        if name not in m.signals:
+            raise TaccorlError(f"{m.name}: no signal {name!r} to check; {nearest(name, m.signals)}")
+    findings = accepted([*m.findings, *check_time(m), *check_values(m)], accept)
+    if not any(f.check in _NO_MORE for f in findings):
+        findings += accepted(check_effort(m), accept)
+        followed = [s for s in m.signals if m.target_kind(s) == "position"]  # a velocity or a torque is not followed
+        if followed:
+            m = m.only(followed)
+            findings += accepted(check_motion(m, joints) + check_start(m) + check_wiring(m), accept)
+            if not any(f.severity == "error" and f.check != "lost_samples" for f in findings):
+                findings += accepted(check_clock(m, floor or _own_floor(m)), accept)
+    return sorted(findings, key=lambda f: _ORDER.index(f.severity))
+
+
+def check_measurements(
+    measurements: Sequence[Measurement], joints: Sequence[str] = (), accept: Sequence[str] = ()
+) -> dict[str, list[Finding]]:
+    """Name → findings, for several; joints need to move in one of them. Says where one repeats another untold."""
+    found = {m.name: check_measurement(m, accept=accept) for m in measurements}
+    moved = {name for m in measurements for name, far in zip(m.signals, _moves(m), strict=True) if far}
+    for m in measurements[:1]:
+        found[m.name] += [_no_motion(m, name) for name in joints if name not in moved]
+    for a, b in itertools.combinations([m for m in measurements if not _broken(found[m.name])], 2):
+        told = b.name in (a.name, a.repeat_of) or a.name == b.repeat_of or (a.repeat_of and a.repeat_of == b.repeat_of)
+        if not told:
+            try:
+                found[b.name].append(_same_commands(a, b, overlay(a, b)))
+            except TaccorlError:
+                continue  # other commands
+    sound = [m for m in measurements if not _broken(found[m.name])]
+    for name, findings in (check_repeatability(sound) if sound else {}).items():
+        found[name] += findings
+    return found
+
+
+def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
+    """What to write into the index of two recordings that were given the same commands."""
+    floors = [_own_floor(a), _own_floor(b)]
+    ratios = {}
+    for j, name in enumerate(a.signals):
+        difference = laid.difference["position"][:, j]
+        noise = math.sqrt(sum(floor[name] ** 2 for floor in floors))
+        if np.isfinite(difference).any() and math.isfinite(noise):
+            ratios[name] = (float(np.sqrt(np.nanmean(difference**2))), noise)
+    worst = max(ratios, key=lambda name: ratios[name][0] / ratios[name][1], default="")
+    if not worst or ratios[worst][0] <= DIFFERENT * ratios[worst][1]:
+        text = (
+            f"{b.name} was given the same commands as {a.name}: say `repeat_of: {a.name}`, and the noise floor comes "
+            "from both"
+        )
+        return Finding("same_motion", "note", "", text)
+    rms, noise = ratios[worst]
+    arm = next((arm for arm in ROBOT.arms if worst.startswith(arm)), ROBOT.arms[0])
+    text = (
+        f"{b.name} was given the same commands as {a.name}, but {worst} moved differently: by {rms:.2g} "
+        f"{a.units[a.column(worst)]} (RMS), {rms / noise:.0f} times what noise allows. Had it other gains? Write `{b.name}: "
+        f"{{gain_scale: {{{worst}: 2.0}}}}` with their factor, or kp and kd, under `recordings:` in measurements.yaml. Did it "
+        f"hold something? Write `payload_kg: {{{arm}: 0.5}}`. Only if nothing was changed and the robot does not repeat, write "
+        f"`repeat_of: {a.name}`"
+    )
+    return Finding("same_commands", "warning", worst, text)
+
+
+def _own_floor(m: Measurement) -> dict[str, float]:
+    """Signal → noise floor from this measurement alone; nothing is known of one that was not measured."""
+    known = noise_floor([dataclasses.replace(m, repeat_of=None)])
+    return {name: known[name].value if name in known else math.inf for name in m.signals}
+
+
+def _broken(findings: list[Finding]) -> bool:
+    return any(f.severity == "error" for f in findings)
+
+
+def _place(m: Measurement, first: int, end: int) -> str:
+    last = min(end, m.num_rows - 1)
+    return f"rows {first} to {end - 1} ({m.time_s[first]:.3f} to {m.time_s[last]:.3f} s)"
+
+
+# values and motion -----------------------------------------------------------------------------------------------------
+
+
+def check_values(m: Measurement) -> list[Finding]:
+    """Numbers everywhere, and enough of them."""
+    findings = []
+    for name, values in zip(m.signals, m.target.T, strict=True):
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            text = (
+                f"{name}: its target is no number in {len(bad)} rows, first at row {bad[0]} ({m.time_s[bad[0]]:.3f} "
+                "s); cut them out"
+            )
+            findings.append(Finding("not_finite", "error", name, text, (int(bad[0]), int(bad[-1]) + 1)))
+    known = np.asarray(np.isfinite(m.measured))
+    compared = np.asarray(known.any(axis=0))  # a signal that was never measured is not compared
+    holes = runs(np.asarray(~known[:, compared].all(axis=1)))
+    if holes:
+        first, end = max(holes, key=lambda r: r[1] - r[0])
+        some = [n for n, c in zip(m.signals, compared, strict=True) if c]
+        names = [n for n, c in zip(m.signals, known[first:end].T, strict=True) if not c.all() and n in some]
+        text = (
+            f"{listed(names)}: nothing was measured in {_place(m, first, end)}, {len(holes)} such holes: no row "
+            "there can be compared. Record again with less load on the logger, or cut the recording there"
+        )
+        # Short gaps of a table were judged where it was brought to an even grid.
+        even = any(f.check == "resampled" for f in m.findings)
+        if not even or (end - first) * m.period_s > LONGEST_GAP_S:
+            findings.append(Finding("lost_samples", "error", names[0], text, (first, end)))
+    seconds = _motion_s(m)
+    if seconds < SHORT_S and any(_moves(m)):
+        check, severity = ("too_short", "error") if seconds < TOO_SHORT_S else ("short", "warning")
+        text = (
+            f"{seconds:.2f} s of motion in {m.num_rows} rows: three parameters of a joint want 10 s that sweep it "
+            "from slow to fast"
+        )
+        findings.append(Finding(check, severity, "", text))
+    return findings
+
+
+def _moves(m: Measurement) -> list[bool]:
+    spans = [np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in m.target.T]
+    return [bool(span > least_motion(m, name)) for span, name in zip(spans, m.signals, strict=True)]
+
+
+def least_motion(m: Measurement, name: str) -> float:
+    """rad, m: a signal that moves by less has not moved."""
+    j = m.column(name)
+    usual = MOVED[m.units[j]]
+    if name in ROBOT.action_names:
+        return usual
+    # Noise of the readings from their fourth differences, in which slow motion is nothing.
+    q = m.measured[np.isfinite(m.measured[:, j]), j]
+    noise = 1.4826 * float(np.median(np.abs(np.diff(q, 4)))) / np.sqrt(70.0) if len(q) > 20 else 0.0
+    resolved = max(float(m.quantum[j]), noise)
+    return min(usual, MOVED_STEPS * resolved) if resolved > 0.0 else usual
+
+
+def _motion_s(m: Measurement) -> float:
+    """From the first change of a command to the last."""
+    changed = np.flatnonzero(np.any(np.diff(m.target, axis=0) != 0, axis=1))
+    return float(m.time_s[changed[-1] + 1] - m.time_s[changed[0]]) if len(changed) else 0.0
+
+
+def _no_motion(m: Measurement, name: str) -> Finding:
+    j = m.column(name)
+    unit = m.units[j]
+    text = (
+        f"{name} is never commanded to move (by {np.ptp(m.target[:, j]):.2g} {unit}, it takes {least_motion(m, name):.2g}): "
+        "nothing about it can be learnt here; record a sweep of it"
+    )
+    return Finding("no_motion", "error", name, text)
+
+
+def check_motion(m: Measurement, joints: Sequence[str] = ()) -> list[Finding]:
+    """Joints that do not move, do not answer, or stop answering."""
+    moves = _moves(m)
+    if not any(moves):
+        few, more = list(zip(m.signals, m.units, strict=True))[:2], " …" * (len(m.signals) > 2)
+        text = (
+            f"no command moves ({', '.join(f'{n} by less than {least_motion(m, n):.2g} {u}' for n, u in few)}{more}) in "
+            f"{m.time_s[-1]:.1f} s: record a sweep"
+        )
+        return [Finding("no_motion", "error", "", text)]
+    findings = [_no_motion(m, name) for name in joints if not moves[m.column(name)]]
+    for j in np.flatnonzero(moves):
+        name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
+        known = measured[np.isfinite(measured)]
+        if len(known) and np.ptp(known) < DEAD_SHARE * np.ptp(target):
+            still = "the same number all the time" if np.ptp(known) == 0 else f"within {np.ptp(known):.2g} {m.units[j]}"
+            text = (
+                f"{name} stays {still} while its command goes {np.ptp(target):.3f} {m.units[j]} over "
+                f"{m.time_s[-1]:.1f} s: motor off, brake on, or its driver repeats one value; look at `taccorl "
+                "view` of the recording and record again"
+            )
+            findings.append(Finding("dead_channel", "error", name, text))
+        elif m.units[j] == "rad":  # a gripper stands still on what it holds
+            findings += _check_stuck(m, int(j))
+    return findings
+
+
+def _check_stuck(m: Measurement, j: int) -> list[Finding]:
+    name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
+    same = np.concatenate([[False], np.diff(measured) == 0])
+    for first, end in sorted(runs(same), key=lambda r: r[0] - r[1]):
+        rows = (first - 1, end)
+        held_s = m.time_s[end - 1] - m.time_s[first - 1]
+        if held_s < FROZEN_S or np.ptp(target[rows[0] : rows[1]]) < FROZEN_MOVE:
+            continue
+        if (sign := _stop_side(m, j, rows)) is not None:
+            return [_blocked(m, j, sign, rows)]
+        if (jump := _moves_on(m, j, rows)) is not None:
+            text = (
+                f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command goes "
+                f"{np.ptp(target[rows[0] : rows[1]]):.3f}, {_place(m, *rows)}; its readings stay within one step of its encoder "
+                f"({m.quantum[j]:.2g} {m.units[j]}) and go on from there ({jump:.2g} to the next row): it sticks, as dry "
+                "friction does (effects coulomb_friction, stribeck_friction), or something held it. If its driver repeated "
+                "old values, cut this out"
+            )
+            return [Finding("sticking_joint", "warning", name, text, rows)]
+        edge = measured[first] in (np.nanmax(measured), np.nanmin(measured))
+        check = "saturated_channel" if edge else "frozen_channel"
+        why = (
+            "its furthest reading: the end of the encoder's or the message's range"
+            if edge
+            else "its driver repeats old values, or the bus was silent"
+        )
+        text = (
+            f"{name} reads {measured[first]:.4f} {m.units[j]} without change for {held_s:.2f} s while its command "
+            f"goes {np.ptp(target[rows[0] : rows[1]]):.3f}, {_place(m, *rows)}: {why}. Record again within its "
+            "range, or cut this out"
+        )
+        return [Finding(check, "error", name, text, rows)]
+    for sign in (1.0, -1.0):
+        furthest = np.nanmax(sign * measured)
+        at_stop = (sign * measured > furthest - 0.1 * BLOCKED_RAD) & (sign * target > furthest + BLOCKED_RAD)
+        for first, end in runs(at_stop):
+            if m.time_s[end - 1] - m.time_s[first] >= BLOCKED_S:
+                return [_blocked(m, j, sign, (first, end))]
+    return []
+
+
+def _blocked(m: Measurement, j: int, sign: float, rows: tuple[int, int]) -> Finding:
+    """Warning that a joint stays at the end of its measured range although its command lies beyond that end.
+
+    Args:
+        sign: +1 for the upper end, −1 for the lower end.
+        rows: first row, and last row + 1, in which it does.
+    """
+    first, end = rows
+    furthest = float(np.nanmax(sign * m.measured[:, j]))
+    text = (
+        f"{m.signals[j]} stands at {sign * furthest:.3f} {m.units[j]} for {m.time_s[end - 1] - m.time_s[first]:.2f} s although "
+        f"it is commanded {np.max(sign * m.target[first:end, j]) - furthest:.3f} further, {_place(m, first, end)}: a stop or "
+        "something in its way (effect end_stop), or the motor's limit (effect torque_saturation); sweep within its range if "
+        "that is not what you measure"
+    )
+    return Finding("blocked", "warning", m.signals[j], text, rows)
+
+
+def _stop_side(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
+    """+1 or −1 if the joint stood at a stop at that end of its range; None if it did not, or that is not known."""
+    first, end = rows
+    measured, target = m.measured[:, j], m.target[:, j]
+    near = 0.1 * BLOCKED_RAD
+    for sign in (1.0, -1.0):
+        at_end = sign * measured[first] > np.nanmax(sign * measured) - near
+        beyond = np.max(sign * (target[first:end] - measured[first])) > BLOCKED_RAD
+        if at_end and beyond and stood_at_stop(target, measured, m.period_s, rows, sign, near):
+            return sign
+    return None
+
+
+def _moves_on(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
+    """Step to the row after a hold if the joint itself stood still: its encoder's step hides its noise, and it neither jumps
+    after the hold nor stands at an end of its range that its command is beyond. None otherwise."""
+    first, end = rows
+    measured, target, quantum = m.measured[:, j], m.target[:, j], float(m.quantum[j])
+    if quantum <= 0 or end >= m.num_rows or not np.isfinite(measured[end]):
+        return None
+    steps = np.abs(np.diff(measured[np.isfinite(measured)]))
+    moving = steps[steps > 0.5 * quantum]
+    still = np.diff(target) == 0
+    noisy = still & (np.abs(np.diff(measured)) > 1.5 * quantum)
+    if len(moving) == 0 or (still.any() and noisy.sum() > 0.05 * still.sum()):
+        return None
+    jump = abs(float(measured[end] - measured[end - 1]))
+    if jump > STICK_STEPS * max(quantum, float(np.median(moving))):
+        return None
+    for sign in (1.0, -1.0):
+        at_end = sign * measured[first] >= np.nanmax(sign * measured)
+        if at_end and (sign * (target[first:end] - measured[first]) > -quantum).all():
+            return None
+    return jump
+
+
+def check_start(m: Measurement) -> list[Finding]:
+    """The twin starts at rest where the robot was: was it at rest, and near its command?"""
+    rows = min(max(START_ROWS[0], round(START_S / m.period_s)), START_ROWS[1])
+    findings = []
+    if m.num_rows <= rows:
+        return findings
+    past = m.time_s[:rows] - m.time_s[0]
+    for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
+        measured, target = m.measured[:rows, j], m.target[:rows, j]
+        if not (np.isfinite(measured).all() and np.isfinite(target).all()):
+            continue
+        speed, sd = _speed_at_start(past, measured)
+        # The second part: what the answer to a command that begins at once looks like in a parabola.
+        allowed = START_SPEED[unit] + 0.25 * float(np.ptp(target)) / past[-1]
+        if speed > allowed + 5 * sd:
+            text = (
+                f"{name} moves at {speed:.3f} ± {sd:.3f} {unit}/s at row 0 (0.000 s), the twin starts at rest: "
+                "begin the recording a second before the motion"
+            )
+            findings.append(Finding("not_at_rest", "warning", name, text, (0, rows)))
+        off = float(measured[0] - target[0])
+        if unit == "rad" and abs(off) > START_OFFSET_RAD and np.ptp(target) < 1e-3 and speed <= allowed:
+            text = (
+                f"{name} stands {off:+.3f} rad from its command at row 0 (0.000 s) and stays there: switched off, "
+                "blocked, or a zero point that differs between the two; record with the motor on"
+            )
+            findings.append(Finding("start_offset", "warning", name, text, (0, rows)))
+    return findings
+
+
+def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, float]:
+    """(speed at row 0, its standard deviation), from a parabola; from a cubic where the parabola does not do."""
+    for order in (3, 2):
+        design = np.vander(past_s, order + 1, increasing=True)
+        solution = np.linalg.lstsq(design, measured, rcond=None)[0]
+        left = measured - design @ solution
+        covariance = float(left @ left) / max(len(left) - order - 1, 1) * np.linalg.inv(design.T @ design)
+        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        if abs(solution[-1]) > 5 * sd[-1]:
+            break
+    return abs(float(solution[1])), float(sd[1])
+
+
+def check_effort(m: Measurement) -> list[Finding]:
+    """Effort that says nothing, or stops at a limit."""
+    findings = []
+    recorded = m.has_effort()
+    for j in np.flatnonzero(np.array(_moves(m)) & recorded):
+        name, effort = m.signals[j], m.effort[:, j]
+        known = effort[np.isfinite(effort)]
+        largest = float(np.abs(known).max())
+        if np.ptp(known) == 0:
+            text = (
+                f"{name}: its effort reads {known[0]:.3g} all the time while it moves: not measured; it is of no "
+                "use for a fit"
+            )
+            findings.append(Finding("dead_effort", "warning", name, text))
+            continue
+        at = np.flatnonzero(np.abs(effort) == largest)
+        if len(at) > max(3, AT_LIMIT_SHARE * len(known)):
+            text = (
+                f"{name}: its effort is exactly ±{largest:.3g} in {len(at)} rows, first at row {at[0]} "
+                f"({m.time_s[at[0]]:.2f} s): the drive's limit (effect torque_saturation) or the end of the "
+                "report's range"
+            )
+            findings.append(Finding("effort_limit", "note", name, text, (int(at[0]), int(at[-1]) + 1)))
+    return findings

@@ -1,0 +1,216 @@
+"""Check that every joint follows its own command, with the right sign and unit.
+
+    follows[i, j]   correlation of the velocity of measured i with that of command j behind a lag of 0.1 s
+    gain[j]         how far measured j goes for each radian (metre) that command j goes, behind the same lag
+
+Letters in shapes: T rows, J signals.
+"""
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import lfilter
+
+from taccorl.alignment.checks.clock import moving_signals
+from taccorl.alignment.measurements.measurement import Measurement, other_arm
+from taccorl.alignment.measurements.tables import is_table
+from taccorl.data.finding import Finding, listed
+from taccorl.robots import ROBOT
+
+USUAL_LAG_S = 0.1
+FOLLOWS, FOLLOWS_NOT = 0.8, 0.5
+"""Correlation of a joint that follows a command; below the second it does not."""
+REVERSED = -0.6
+ALIKE = 0.02
+"""Correlations that differ by less do not choose between two joints."""
+GAIN = (0.2, 5.0)
+"""Beyond this no controller and no physics takes a joint."""
+BEYOND = {"rad": 0.5, "m": 0.05}
+"""Beyond the robot's limits by more than this is not a place where it can be."""
+SMOOTH_S = 0.03
+KNOWN_FACTORS = {
+    57.2958: "in degrees where it should be in rad",
+    1 / 57.2958: "in rad where the command is in degrees",
+    1000.0: "in mm or mrad where it should be in m or rad",
+    0.001: "in m or rad where the command is in mm or mrad",
+}
+VELOCITY_FACTORS = {
+    57.2958: "deg/s",
+    9.5493: "rpm",
+    1000.0: "mm/s or mrad/s",
+    0.159155: "revolutions/s",
+    -1.0: "the other sign",
+}
+VELOCITY_GAIN = (0.8, 1.25)
+
+
+def _unit_way_out(m: Measurement, *columns: str) -> str:
+    """Line to write where a number is in another unit."""
+    if is_table(m):
+        return f"Write the `unit:` of {' and '.join(columns)} in a columns file"
+    return "State `scale` of the channel in the recording spec"
+
+
+def check_wiring(m: Measurement) -> list[Finding]:
+    """Find swapped joints and arms, reversed signs, and wrong units."""
+    found = _check_range(m)
+    even = m.resampled(m.rate_hz)
+    commanded = [
+        j for j in range(len(m.signals)) if np.ptp(even.target[:, j]) * (10 if m.units[j] == "m" else 1) > 0.02
+    ]
+    if not commanded:
+        return found
+    out_of_range = {f.feature for f in found}
+    lagged = _lagged(even.target, even.period_s)
+    follows = _follows(even, lagged, commanded)
+    swapped: dict[str, str] = {}
+    for j in commanded:
+        own = follows[j, j]
+        if not own < FOLLOWS_NOT:  # NaN: it does not move; another check says so
+            if np.isfinite(own):
+                continue
+            own = 0.0
+        other = _follower(m, follows, j)
+        if other is not None:
+            swapped[m.signals[j]] = m.signals[other]
+        elif own < REVERSED:
+            found.append(_reversed(m, j, own))
+    found += _swaps(m, swapped)
+    for j in moving_signals(even):
+        if m.signals[j] not in out_of_range and follows[j, j] > FOLLOWS_NOT:
+            found += _check_gain(m, even, lagged, j)
+            found += _check_velocity(m, even, j)
+    return found
+
+
+def _lagged(target: np.ndarray, period_s: float) -> np.ndarray:
+    keep = np.exp(-period_s / USUAL_LAG_S)
+    start = target[0]
+    return start + lfilter([1 - keep], [1, -keep], target - start, axis=0)
+
+
+def _velocity(values: np.ndarray, period_s: float) -> np.ndarray:
+    filled = np.where(np.isfinite(values), values, np.nanmean(values, axis=0) if np.isfinite(values).any() else 0.0)
+    return uniform_filter1d(np.gradient(filled, period_s, axis=0), max(3, round(SMOOTH_S / period_s)), axis=0)
+
+
+def _follows(m: Measurement, lagged: np.ndarray, commanded: list[int]) -> np.ndarray:
+    """(J, J) correlation of measured i with command j; NaN where one of them rests."""
+    v_measured, v_command = _velocity(m.measured, m.period_s), _velocity(lagged, m.period_s)
+    found = np.full((len(m.signals),) * 2, np.nan)
+    span = np.ptp(np.nan_to_num(m.measured), axis=0)
+    for i in range(len(m.signals)):
+        for j in commanded:
+            if span[i] < 0.05 * np.ptp(lagged[:, j]) or v_measured[:, i].std() == 0 or v_command[:, j].std() == 0:
+                continue
+            found[i, j] = np.corrcoef(v_measured[:, i], v_command[:, j])[0, 1]
+    return found
+
+
+def _follower(m: Measurement, follows: np.ndarray, j: int) -> int | None:
+    """Another joint that follows command j and not its own; of several alike the other arm's same joint."""
+    free = [i for i in range(len(m.signals)) if i != j and not follows[i, i] > FOLLOWS]
+    free = [i for i in free if follows[i, j] > FOLLOWS]
+    if not free:
+        return None
+    best = max(follows[i, j] for i in free)
+    alike = [i for i in free if follows[i, j] > best - ALIKE]
+    twin = [i for i in alike if m.signals[i] == other_arm(m.signals[j])]
+    return (twin or alike)[0]
+
+
+def _reversed(m: Measurement, j: int, own: float) -> Finding:
+    name = m.signals[j]
+    sign = (
+        f"write `factor: -1` for {name}.q or {name}.q_target in a columns file"
+        if is_table(m)
+        else "put a minus into `scale` of its channel in the recording spec"
+    )
+    return Finding(
+        "reversed",
+        "error",
+        m.signals[j],
+        f"{m.signals[j]} moves against its command (correlation {own:.2f} over {m.time_s[-1]:.1f} s): the sign of "
+        f"one of the two is turned; {sign}, or mend the logger",
+    )
+
+
+def _swaps(m: Measurement, swapped: dict[str, str]) -> list[Finding]:
+    if not swapped:
+        return []
+    across = [name for name, other in swapped.items() if other == other_arm(name)]
+    if len(across) == len(swapped) and len(across) > 1:
+        text = (
+            f"{listed(across)} follow the other arm's commands over {m.time_s[-1]:.1f} s: left and right are "
+            "exchanged in either positions or commands (CAN adapters or topics swapped); mend "
+            f"{'the columns file' if is_table(m) else '`channels` in the recording spec'}"
+        )
+        return [Finding("swapped_arms", "error", across[0], text)]
+    return [
+        Finding(
+            "swapped_joints",
+            "error",
+            name,
+            f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are "
+            f"exchanged; pick elements by name, and mend the {'columns file' if is_table(m) else 'recording spec'}",
+        )
+        for name, other in swapped.items()
+    ]
+
+
+def _check_range(m: Measurement) -> list[Finding]:
+    """Positions where the robot cannot be: another unit."""
+    findings = []
+    for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
+        if name not in ROBOT.action_names:
+            continue
+        k = ROBOT.action_names.index(name)
+        for what, values in (("measured", m.measured[:, j]), ("commanded", m.target[:, j])):
+            beyond = np.nan_to_num(np.maximum(values - ROBOT.action_high[k], ROBOT.action_low[k] - values))
+            row = int(np.argmax(beyond))
+            if beyond[row] > BEYOND[unit]:
+                other = "degrees" if unit == "rad" else "mm"
+                text = (
+                    f"{name} is {what} at {values[row]:.4g} {unit} at row {row} ({m.time_s[row]:.2f} s), its limits "
+                    f"are [{ROBOT.action_low[k]:.3g}, {ROBOT.action_high[k]:.3g}]: in {other}? "
+                    f"{_unit_way_out(m, f'{name}.q', f'{name}.q_target')}"
+                )
+                findings.append(Finding("unit", "error", name, text, (row, row + 1)))
+                break
+    return findings
+
+
+def _check_gain(m: Measurement, even: Measurement, lagged: np.ndarray, j: int) -> list[Finding]:
+    rows = np.isfinite(even.measured[:, j])
+    x, y = lagged[rows, j] - lagged[rows, j].mean(), even.measured[rows, j] - even.measured[rows, j].mean()
+    gain = float(x @ y / (x @ x))
+    if GAIN[0] < gain < GAIN[1]:
+        return []
+    factor = min(KNOWN_FACTORS, key=lambda f: abs(np.log(max(gain, 1e-9) / f)))
+    near = abs(np.log(max(gain, 1e-9) / factor)) < 1.0
+    text = (
+        f"{m.signals[j]} goes {gain:.3g} times as far as its command over {m.time_s[-1]:.1f} s: "
+        f"{KNOWN_FACTORS[factor] if near else 'in another unit'}? "
+        f"{_unit_way_out(m, f'{m.signals[j]}.q', f'{m.signals[j]}.q_target')}"
+    )
+    return [Finding("unit", "error", m.signals[j], text)]
+
+
+def _check_velocity(m: Measurement, even: Measurement, j: int) -> list[Finding]:
+    """The reported velocity against the slope of the position."""
+    reported = even.velocity[:, j]
+    rows = np.isfinite(reported) & np.isfinite(even.measured[:, j])
+    if not rows.any() or np.ptp(reported[rows]) == 0:
+        return []
+    slope = _velocity(even.measured[:, [j]], even.period_s)[rows, 0]
+    seen = uniform_filter1d(reported[rows], max(3, round(SMOOTH_S / even.period_s)))
+    if abs(np.corrcoef(slope, seen)[0, 1]) < FOLLOWS:
+        return []  # smoothed by the driver, or too noisy to say
+    gain = float(slope @ seen / (slope @ slope))
+    if VELOCITY_GAIN[0] < gain < VELOCITY_GAIN[1]:
+        return []
+    near = [text for f, text in VELOCITY_FACTORS.items() if abs(gain / f - 1) < 0.2]
+    text = (
+        f"{m.signals[j]}: its reported velocity is {gain:.3g} times the slope of its position"
+        f"{f' ({near[0]}?)' if near else ''}. {_unit_way_out(m, f'{m.signals[j]}.qd')}, or leave it out"
+    )
+    return [Finding("velocity_unit", "warning", m.signals[j], text)]

@@ -1,0 +1,1 @@
+"""Controller identification (paper App. B.1) and the one-joint model that it runs thousands of times."""

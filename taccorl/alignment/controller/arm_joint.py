@@ -1,0 +1,149 @@
+"""One joint of the PiPER's twin, as the one-joint model sees it: its arm compiled with the other joints held.
+
+Letters in shapes: T rows.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from taccorl.alignment.controller import arm_bench
+from taccorl.alignment.controller.arm_bench import of_joint, split_signal
+from taccorl.alignment.controller.joint_motion import AT_TCP, JointMotion
+from taccorl.alignment.controller.rigid_joint import (
+    Gains,
+    Rigid,
+    RigidJoint,
+    Surroundings,
+    moved_by_others,
+    resting,
+    torque_along,
+)
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
+from taccorl.sim.twin import TwinConfig
+
+BENCH_REST = np.concatenate([[*Bench.home_rad[arm], 0.0] for arm in ROBOT.arms])
+"""(14,) positions [rad, m] of joints and grippers that a table lacks."""
+
+
+class HasJoints(Protocol):
+    """A machine whose joints the one-joint model knows."""
+
+    def joint(self, signal: str) -> RigidJoint:
+        """
+        Raises:
+            TaccorlError: it has no such joint.
+        """
+        ...
+
+
+def joint_of(machine: TwinConfig | HasJoints, signal: str) -> RigidJoint:
+    """One joint of the PiPER's twin, or of another machine.
+
+    Raises:
+        TaccorlError: no such joint, or a gripper of the PiPER.
+    """
+    return ArmJoint(machine, signal) if isinstance(machine, TwinConfig) else machine.joint(signal)
+
+
+class ArmJoint(RigidJoint):
+    """A joint of the twin ``config``; its own effects are those of the config that act on it.
+
+    Raises:
+        TaccorlError: no such joint, or a gripper.
+    """
+
+    def __init__(self, config: TwinConfig, signal: str) -> None:
+        arm, joint = split_signal(signal)
+        k = ROBOT.joints.index(joint)
+        control = config.controller_of(arm)
+        self.signal, self._config = signal, config
+        self.gains = Gains(control.kp_nm_per_rad[k], control.kd_nms_per_rad[k], control.torque_ff_nm[k])
+        self._own = of_joint(config.effects, signal)
+
+    def timestep_s(self, rate_hz: float) -> float:
+        return self._config.physics.timestep_s
+
+    def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        return arm_bench.rigid(self._config, self.signal, motion.pose, motion.payload_kg, bodies, motion.payload_at_m)
+
+    def surroundings(self, m: Measurement) -> Surroundings:
+        arm, _ = split_signal(self.signal)
+        names = ROBOT.action_names[ROBOT.arm_slice(arm)]
+        pose = np.array([resting(m, m.column(name)) if name in m.signals else 0.0 for name in names])
+        known = Surroundings(
+            coupling_nm=np.zeros(m.num_rows),
+            pose=pose,
+            payload_kg=m.payload_kg.get(arm, 0.0),
+            payload_at_m=m.payload_position_m.get(arm, AT_TCP),
+            payload_at_known=arm in m.payload_position_m,
+        )
+        return dataclasses.replace(known, coupling_nm=self._coupling(m, known))
+
+    def whole(self, m: Measurement) -> Measurement:
+        return m if m.signals == ROBOT.action_names else m.on_robot(BENCH_REST)
+
+    def effects(self, more: Sequence[Effect]) -> list[Effect]:
+        names = {effect.name for effect in more}
+        return of_joint([*(e for e in self._own if e.name not in names), *more], self.signal)
+
+    def freed(self) -> "tuple[list[Effect], ArmJoint]":
+        effects = self._config.effects
+        own: list[Effect] = [e for e in effects if isinstance(e, ArmEffect) and e.fitted and self._is_on(e)]
+        others = [e for e in effects if not any(e is mine for mine in own)]
+        return own, ArmJoint(dataclasses.replace(self._config, effects=others), self.signal)
+
+    def _is_on(self, effect: ArmEffect) -> bool:
+        return bool({self.signal, split_signal(self.signal)[0]} & {*effect.acts_on()})
+
+    def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
+        return selectors(cls, self.signal)
+
+    def in_mujoco(
+        self, motion: JointMotion, gains: Gains, effects: Sequence[Effect], sent: np.ndarray, parts: int, hold: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        steps = np.arange(len(sent) * hold) / (parts * hold)
+        reported, effort = arm_bench.run(
+            self._config,
+            self.signal,
+            sent,
+            hold,
+            np.interp(steps, np.arange(len(motion.coupling_nm)), motion.coupling_nm),
+            gains=gains,
+            start=motion.start,
+            pose=motion.pose,
+            payload_kg=motion.payload_kg,
+            payload_at_m=motion.payload_at_m,
+            effects=effects,
+        )
+        return reported[::parts], effort[::parts]
+
+    def _coupling(self, m: Measurement, known: Surroundings) -> np.ndarray:
+        """(T,) torque beyond the joint's own inertia and weight, because other joints of its arm move."""
+        arm, joint = split_signal(self.signal)
+        angles = moved_by_others(m, self.signal, [f"{arm}_{other}" for other in ROBOT.joints])
+        if len(angles) == 1:
+            return np.zeros(m.num_rows)
+        both = []
+        for free in ([name for name in ROBOT.joints if f"{arm}_{name}" in angles], [joint]):
+            model = arm_bench.arm_spec(
+                self._config, arm, known.pose, free, known.payload_kg, known.payload_at_m
+            ).compile()
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+            q = np.column_stack([angles[f"{arm}_{name}"] for name in free])
+            both.append(torque_along(model, self.signal, q, m.period_s))
+        return both[0] - both[1]
+
+
+def selectors(cls: type[Effect], signal: str) -> dict[str, Any] | None:
+    """Arguments with which an effect acts on one joint of the PiPER alone; None for effects of something else."""
+    arm, joint = signal.split("_", 1)
+    if issubclass(cls, JointEffect):
+        return {"arm": arm, "joints": [joint]} if joint in cls.possible else None
+    return {"arm": arm} if issubclass(cls, ArmEffect) else None

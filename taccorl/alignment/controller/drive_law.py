@@ -1,0 +1,199 @@
+"""Control law of a drive, the same for an axis file and for each joint of a robot file.
+
+==============  =================================================  ========================================================
+law             motor's torque                                     meaning of the target
+==============  =================================================  ========================================================
+``impedance``   kp (q* − q) − kd q̇ + torque_ff                     position; kp in N·m/rad, kd in N·m·s/rad
+``cascade``     kd (kp (q* − q) − q̇) + torque_ff                   position; kp in 1/s, kd in N·m·s/rad
+``velocity``    kd (q̇* − q̇) + torque_ff                            velocity; no kp
+``torque``      τ* + torque_ff                                     torque; no gains. 0: the motor is off
+``pwm``         k_t (V d − k_e q̇) / R,  d = kp (q* − q) − kd q̇     position; duty d is clipped to ± 1, kp in 1/rad, kd in s/rad
+                within ± 1
+==============  =================================================  ========================================================
+
+A controller that computes its torque elsewhere (a PD on a torque interface) is law ``impedance`` where its position target was
+logged, and law ``torque`` where the torque was. Targets stand in the column ``q_target``; of law velocity in ``qd_target``, of
+law torque in ``tau_target``. V is ``supply_v`` of the file, or of a recording (``NAME.supply``, or measurements.yaml). While
+``NAME.enabled`` is 0 the motor neither drives nor brakes.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from taccorl.alignment.controller.joint_kernel import POSITION, TORQUE, VELOCITY
+from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.measurements.measurement import Measurement, TargetKind
+from taccorl.errors import TaccorlError
+from taccorl.sim.settings import check_numbers
+
+Law = Literal["impedance", "cascade", "velocity", "torque", "pwm"]
+WINDING = ("supply_v", "resistance_ohm", "torque_nm_per_a", "emf_v_s_per_rad")
+NEEDED: Mapping[Law, tuple[str, ...]] = {
+    "impedance": ("kp", "kd"),
+    "cascade": ("kp", "kd"),
+    "velocity": ("kd",),
+    "torque": (),
+    "pwm": ("kp", *WINDING[:3]),
+}
+LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4
+"""Of the physics."""
+STEP_SHARE = 0.05
+"""Of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
+WINDING_WITHIN = 3.0
+"""Stall torque and back-EMF of law pwm are fitted from the file's value divided by this to that times this: data sheets are
+no better."""
+_COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
+_KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque"}
+_OF_POSITION_LOOPS = ("integral_action", "error_deadband", "velocity_feedforward")
+"""Effects in a position controller."""
+
+
+@dataclass(kw_only=True)
+class DriveLaw:
+    """Law and numbers of one drive. Units are those of a turning one; of a slide N for N·m, m for rad."""
+
+    law: Law = "impedance"
+    kp: float | None = None
+    """In the unit that the law asks for, over ``kp_factor``."""
+    kd: float | None = None
+    kp_factor: float = 1.0
+    """``kp`` times this is in the law's unit, here and in measurements.yaml: what one step of a gain's register is worth."""
+    kd_factor: float = 1.0
+    torque_ff: float = 0.0
+    """N·m."""
+    supply_v: float | None = None
+    """V: of law pwm."""
+    resistance_ohm: float | None = None
+    """Ω: of the winding, law pwm."""
+    torque_nm_per_a: float | None = None
+    """k_t at the axis or joint, gear included [N·m/A], law pwm."""
+    emf_v_s_per_rad: float | None = None
+    """k_e at the axis or joint [V·s/rad], law pwm; k_t if not given, which it is in SI units."""
+    effort_limit: float | None = None
+    """N·m at which the drive's torque is clipped."""
+    effort_after_target: bool = False
+    """Whether the logged effort of a row answers the row's own target already; else it was taken before that target acts."""
+
+    def check_law(self, owner: str) -> None:
+        """
+        Raises:
+            TaccorlError: ``OWNER.KEY: …``, where a number is wrong, or is missing in the law, or the law has none.
+        """
+        check_numbers(owner, self, positive=("kp_factor", "kd_factor"), finite=("torque_ff",))
+        stated = [name for name in ("kp", "kd", *WINDING, "effort_limit") if getattr(self, name) is not None]
+        check_numbers(owner, self, not_negative=[name for name in stated if name == "kd"])
+        check_numbers(owner, self, positive=[name for name in stated if name != "kd"])
+        for name in NEEDED[self.law]:
+            if getattr(self, name) is None or (self.law != "impedance" and not getattr(self, name)):
+                raise TaccorlError(f"{owner}.{name}: law {self.law} needs it; write `{name}: …`")
+        foreign = () if self.law == "pwm" else WINDING
+        foreign += {"velocity": ("kp",), "torque": ("kp", "kd")}.get(self.law, ())
+        for name in foreign:
+            if name in stated:
+                raise TaccorlError(f"{owner}.{name}: law {self.law} has none; remove it, or mend the law")
+
+    @property
+    def gain_names(self) -> tuple[str, ...]:
+        """Those of kp and kd that the law has."""
+        return tuple(name for name in ("kp", "kd") if getattr(self, name))
+
+    @property
+    def target_kind(self) -> TargetKind:
+        """What a target commands."""
+        return _KINDS.get(self.law, "position")
+
+    @property
+    def stall_nm(self) -> float:
+        """V k_t / R of law pwm [N·m]."""
+        return (self.supply_v or 0.0) * (self.torque_nm_per_a or 0.0) / (self.resistance_ohm or 1.0)
+
+    @property
+    def back_emf(self) -> float:
+        """k_t k_e / R of law pwm [N·m·s/rad]."""
+        emf = self.torque_nm_per_a if self.emf_v_s_per_rad is None else self.emf_v_s_per_rad
+        return (self.torque_nm_per_a or 0.0) * (emf or 0.0) / (self.resistance_ohm or 1.0)
+
+    @property
+    def loop_gains(self) -> Gains:
+        """Of the position error and the velocity [N·m/rad, N·m·s/rad, N·m], whatever the law."""
+        kp, kd = (self.kp or 0.0) * self.kp_factor, (self.kd or 0.0) * self.kd_factor
+        if self.law == "cascade":
+            return Gains(kp * kd, kd, self.torque_ff)
+        if self.law == "pwm":
+            return Gains(kp * self.stall_nm, kd * self.stall_nm, self.torque_ff)
+        return Gains(kp, kd, self.torque_ff)
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Numbers of ``joint_kernel.Drive`` that the law determines."""
+        found: dict[str, float] = {"command": _COMMANDS.get(self.law, POSITION), "midpoint": 1.0}
+        found["effort_after"] = float(self.effort_after_target)
+        if self.law == "pwm":
+            found |= {"duty_torque": self.stall_nm, "back_emf": self.back_emf}
+        if self.effort_limit is not None:
+            found["torque_max"] = self.effort_limit
+        return found
+
+    def timestep_s(self, rate_hz: float, inertia: float) -> float:
+        """Physics step for rows at ``rate_hz`` and an inertia [kg·m²]."""
+        damping = self.loop_gains.kd + self.back_emf
+        wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
+        return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
+
+    def takes(self, effect: str) -> bool:
+        """Whether an effect of this name can act in the law's controller."""
+        return self.target_kind == "position" or effect not in _OF_POSITION_LOOPS
+
+    def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:
+        """Fields of this class from fitted numbers: torque_ff; kp and kd as in ``loop_gains``; ``stall_nm`` and ``back_emf``."""
+        new = {"torque_ff": base["torque_ff"]} if "torque_ff" in base else {}
+        if self.law == "pwm" and "stall_nm" in base:
+            volts, ohms = self.supply_v or 1.0, self.resistance_ohm or 1.0
+            new["torque_nm_per_a"] = base["stall_nm"] * ohms / volts
+            new["emf_v_s_per_rad"] = base["back_emf"] * ohms / new["torque_nm_per_a"]
+            return new
+        if "kd" in base:
+            new["kd"] = base["kd"] / self.kd_factor
+        if "kp" in base:
+            over = base.get("kd", self.loop_gains.kd) if self.law == "cascade" else 1.0
+            new["kp"] = base["kp"] / over / self.kp_factor
+        return new
+
+    def gain_scales(self, signal: str, m: Measurement) -> tuple[float, float]:
+        """Loop gains of a recording over those of the file: of the position error, of the velocity.
+
+        Raises:
+            TaccorlError: it states a gain that the file does not have.
+        """
+        scales = {}
+        for name in ("kp", "kd"):
+            stated, own = getattr(m, name).get(signal), getattr(self, name)
+            if stated is not None and not own:
+                raise TaccorlError(
+                    f"{m.name}: {name} of {signal} is stated, and its file has no {name} with law {self.law}; remove it from "
+                    "measurements.yaml, or write it into the file"
+                )
+            scales[name] = m.gain_scale.get(signal, 1.0) if stated is None else stated / own
+        # Of a cascade K_p is the product of both gains.
+        product = scales["kd"] if self.law == "cascade" and signal in m.kd else 1.0
+        return scales["kp"] * product, scales["kd"]
+
+    def supply(self, signal: str, m: Measurement) -> np.ndarray | None:
+        """(T,) voltage over that of the file; None if the recording has none. What the motor gets from a row on is what the next
+        row reads: the current that its target draws makes the supply sag.
+
+        Raises:
+            TaccorlError: a voltage that the law has no use for.
+        """
+        volts = m.supply_v[:, m.column(signal)] if m.supply_v.size else np.full(m.num_rows, np.nan)
+        if not np.isfinite(volts).any():
+            return None
+        if self.supply_v is None:
+            raise TaccorlError(
+                f"{m.name}: a supply voltage of {signal} is stated, and law {self.law} has no use for it; remove it"
+            )
+        return np.nan_to_num(np.append(volts[1:], volts[-1]) / self.supply_v, nan=1.0)

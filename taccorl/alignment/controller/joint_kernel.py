@@ -1,0 +1,447 @@
+"""One joint of the twin as a loop over physics steps, compiled: a 10 s recording in about a millisecond.
+
+    (J + ΔJ) q̈ = τ_motor + τ_friction − τ_weight(q) − d(t)
+
+It takes the same steps as MuJoCo's discrete integrator does (``mjINT_DISCRETE``, found by experiment and shown in
+``tests/alignment/controller/test_joint_model.py``): with spring K and damping D taken at the end of the step,
+
+    v⁺ = v + h (τ − h K v + f) / M̂,    M̂ = J + h D + h² K,    q⁺ = q + h v⁺
+
+and dry friction f within ± F from a soft constraint, M̂ a = τ − h K v + f, f = −(a − a_ref) / R. K_p and K_d belong to K and D
+except while the motor's torque is at its limit. With play or a spring in the gear the link is a second mass.
+
+A machine without a twin in MuJoCo (``Drive.midpoint``) takes K and D in the middle of the step instead, which is exact to the
+second order in h:
+
+    v⁺ = v + h (τ − ½ h K v + f) / M̂,    M̂ = J + ½ h D + ¼ h² K,    q⁺ = q + ½ h (v + v⁺)
+
+Rows follow the rule of ``alignment.measurements.measurement``: row k is the joint at the time of command k, before it acts.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from taccorl.sim.effects import dropped_commands
+
+# Of the twin's own constraints: effects/coulomb_friction.py and backlash.py (solref, solimp), transmission.py (gear's inertia).
+_FRICTION_RATE = 2.0 / (0.9999 * 0.002)  # 1/s, MuJoCo's b = 2 / (d_max · time constant)
+_FRICTION_SOFTNESS = (1.0 - 0.9999) / 0.9999
+_LIMIT_RATE = 2.0 / (0.99 * 0.002)
+_LIMIT_STIFFNESS = 1.0 / (0.99 * 0.002) ** 2 * 0.99  # 1/s², times the impedance d = 0.99
+_LIMIT_SOFTNESS = (1.0 - 0.99) / 0.99
+_GEAR_INERTIA = 1e-5  # kg m²
+_BRISTLE_DAMPING_S = 0.001  # over their stiffness, effects/stribeck_friction.py
+_STOP_DAMPING_S = 0.005  # over its stiffness, effects/end_stop.py
+MOST_LOST = 0.9
+"""Share of the inertia that a delay of the speed may take; a loop with more than all of it is unstable."""
+_mixed = numba.njit(dropped_commands.mixed)
+_STRIDE = dropped_commands.STRIDE
+
+
+POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
+"""What a command is."""
+
+
+class Drive(NamedTuple):
+    """One joint with its drive: numbers in SI, N·m and rad (of a sliding axis N and m). The defaults do nothing."""
+
+    # Controller: τ = K_p (q* − y) − K_d q̇ + T_ref.
+    kp: float
+    kd: float
+    torque_ff: float
+    # Rigid body.
+    inertia: float
+    """Of the link about the joint, and of the rotor."""
+    rotor_inertia: float = 0.0
+    """Share of ``inertia`` on the motor's side of the gear."""
+    gravity_sin: float = 0.0
+    """Weight's torque S sin q + C cos q, which must be held."""
+    gravity_cos: float = 0.0
+    compensation_sin: float = 0.0
+    """What the motor adds to carry the weight that it knows of."""
+    compensation_cos: float = 0.0
+    gravity_carried: float = 1.0
+    """Times the compensation."""
+    # Bodies and friction.
+    added_inertia: float = 0.0
+    speed_delay: float = 0.0
+    """s: takes K_d times it from the inertia, at most ``MOST_LOST`` of it. The motor gives that torque: the effort holds it."""
+    viscous: float = 0.0
+    quadratic_drag: float = 0.0
+    coulomb: float = 0.0
+    asymmetry: float = 0.0
+    """a in F (1 + a sign v), F is ``coulomb``: a constant torque − a F besides."""
+    stribeck_torque: float = 0.0
+    stribeck_share: float = 1.0
+    stribeck_speed: float = 0.05
+    presliding: float = 5e-4
+    load_friction: float = 0.0
+    """μ in |τ| ≤ μ |τ_motor − τ_load|."""
+    spot_friction: float = 0.0
+    """F₀ in F₀ exp(−((q − q₀) / w)²), besides ``coulomb``, at q₀ …"""
+    spot_angle: float = 0.0
+    spot_width: float = 0.1
+    """… and w."""
+    cogging_torque: float = 0.0
+    cogging_periods: float = 1.0
+    """A turn."""
+    cogging_phase: float = 0.0
+    spring_stiffness: float = 0.0
+    spring_rest: float = 0.0
+    stop_stiffness: float = 0.0
+    """Of a stop that the joint meets at …"""
+    stop_angle: float = 0.0
+    # The command's way.
+    command_delay: float = 0.0
+    command_lag: float = 0.0
+    drop_probability: float = 0.0
+    """Of each command to be lost; which ones follows from …"""
+    drop_seed: float = 0.0
+    slew_rate: float = math.inf
+    feedforward: float = 0.0
+    """Share of K_d q̇* that is added."""
+    # The control loop.
+    deadband: float = 0.0
+    """Of the position error: within ± it nothing is done."""
+    integral_rate: float = 0.0
+    """r in K_p r ∫ e dt, 1/s."""
+    torque_lag: float = 0.0
+    torque_max: float = math.inf
+    stall_torque: float = math.inf
+    """|τ| ≤ stall torque × (1 − |v| / no-load speed) where the motor drives, ≤ stall torque where it brakes."""
+    no_load_speed: float = math.inf
+    torque_scale: float = 1.0
+    fade_rate: float = 0.0
+    """1/s: torque × (1 − rate · t)."""
+    command: float = POSITION
+    """What a command is: a position, a velocity (τ = K_d (q̇* − q̇) + T_ref) or a torque (τ = τ* + T_ref)."""
+    duty_torque: float = math.inf
+    """Torque of the whole supply voltage at rest, V k_t / R: what the controller asks for is clipped to it …"""
+    back_emf: float = 0.0
+    """… before k_t k_e / R times the speed is lost."""
+    effort_after: float = 0.0
+    """1: the reported torque of a row answers the row's command, 0: it is the one until then."""
+    effort_age: float = 0.0
+    """s by which the reported torque is older than the one that acts on average: a sampled loop holds it."""
+    midpoint: float = 0.0
+    """1: steps of second order, 0: those of MuJoCo."""
+    # Gear.
+    backlash: float = 0.0
+    """Whole play."""
+    compliance: float = 0.0
+    compliance_damping: float = 0.0
+    # Encoder: y = scale · (q' + wave · sin(q' + phase)) with q' = q + bias. The controller sees it at once, the report is late.
+    encoder_scale: float = 1.0
+    encoder_bias: float = 0.0
+    encoder_delay: float = 0.0
+    encoder_wave: float = 0.0
+    encoder_wave_phase: float = 0.0
+
+
+@numba.njit(cache=True)
+def _uniform(seed: float, count: int) -> float:
+    """``dropped_commands.uniform`` of one command, in episode 0."""
+    bits = _mixed(_mixed(np.uint64(seed) << np.uint64(32)) + np.uint64(count + 1) * np.uint64(_STRIDE))
+    return (bits >> np.uint64(11)) * 2.0**-53
+
+
+@numba.njit(cache=True)
+def _arriving(drive: Drive, sent: np.ndarray, hold: int, step_s: float) -> np.ndarray:
+    """(S hold,) what the controller works on in each physics step, of targets (S,) held for ``hold`` steps each."""
+    held_s = hold * step_s
+    reached = 1.0 if drive.command_lag <= 0.0 else 1.0 - math.exp(-held_s / drive.command_lag)
+    lagging, goal, at, before = sent[0], sent[0], sent[0], sent[0]
+    commands = np.empty(sent.size * hold)
+    for k in range(sent.size):
+        lagging += (sent[k] - lagging) * reached
+        if drive.drop_probability <= 0.0 or _uniform(drive.drop_seed, k) >= drive.drop_probability:
+            goal = lagging
+        furthest = drive.slew_rate * held_s
+        at = min(max(goal, at - furthest), at + furthest)
+        ahead = 0.0
+        if drive.feedforward != 0.0 and drive.kp > 0.0:
+            ahead = drive.feedforward * drive.kd / drive.kp * (at - before) / held_s
+        before = at
+        commands[k * hold : (k + 1) * hold] = at + ahead
+    if drive.command_delay <= 0.0:
+        return commands
+    # MuJoCo reads its history before it stores: one step at least.
+    late = max(drive.command_delay / step_s, 0.0 if drive.midpoint > 0.0 else 1.0)
+    whole = math.floor(late)
+    share = late - whole
+    arriving = np.empty_like(commands)
+    for n in range(commands.size):
+        newer = commands[n - whole] if n >= whole else sent[0]
+        older = commands[n - whole - 1] if n > whole else sent[0]
+        arriving[n] = newer + (older - newer) * share
+    return arriving
+
+
+@numba.njit(cache=True)
+def _friction(force: float, metric: float, mobility: float, v: float, limit: float, step_s: float) -> float:
+    """MuJoCo's dry friction within ± ``limit`` on a mass ``metric`` that ``force`` acts on; ``mobility`` is MuJoCo's estimate of
+    1 / metric."""
+    soft = _FRICTION_SOFTNESS * mobility
+    reference = -_FRICTION_RATE * v / (1.0 + step_s * _FRICTION_RATE)
+    a = (force + reference / soft) / (metric + 1.0 / soft)
+    return min(max((reference - a) / soft, -limit), limit)
+
+
+@numba.njit(cache=True)
+def _limit(p: Drive, torque: float, v: float) -> float:
+    """The most that the motor's torque–speed line leaves of ``torque``."""
+    return p.stall_torque * max(1.0 - abs(v) / p.no_load_speed, 0.0) if torque * v > 0.0 else p.stall_torque
+
+
+@numba.njit(cache=True)
+def _asked(
+    p: Drive, command: float, before: float, q: float, v: float, integral: float, supply: float, on: float, added: float
+) -> tuple[float, float, float]:
+    """The controller's torque, and how far it counts as a spring and a damper. ``before`` is the command until now: whether the
+    error lies within the dead band is known from it. ``supply``, ``on`` and ``added`` are as in ``simulate``."""
+    if p.command == TORQUE:
+        return on * (command + p.torque_ff + added), 0.0, 0.0
+    if p.command == VELOCITY:
+        return on * (p.kd * (command - v) + p.torque_ff + added), 0.0, on * p.kd
+    seen = q + p.encoder_bias
+    slope = p.encoder_scale * (1.0 + p.encoder_wave * math.cos(seen + p.encoder_wave_phase))
+    angle = p.encoder_scale * (seen + p.encoder_wave * math.sin(seen + p.encoder_wave_phase))
+    error = command - angle
+    stiffness, damping = p.kp * p.encoder_scale, p.kd * slope
+    if p.deadband > 0.0:
+        if abs(before - angle) <= p.deadband:
+            error, stiffness = 0.0, 0.0
+        else:
+            error -= math.copysign(p.deadband, before - angle)
+    asked = p.kp * (error + p.integral_rate * integral) - damping * v + p.torque_ff + added
+    if abs(asked) > p.duty_torque:
+        asked, stiffness, damping = math.copysign(p.duty_torque, asked), 0.0, 0.0
+    asked, stiffness, damping = supply * asked, supply * stiffness, supply * damping
+    if p.back_emf != 0.0:
+        asked, damping = asked - p.back_emf * v, damping + p.back_emf
+    return on * asked, on * stiffness, on * damping
+
+
+@numba.njit(cache=True)
+def _reading(p: Drive, q: float) -> float:
+    """What the encoder says."""
+    seen = q + p.encoder_bias
+    return p.encoder_scale * (seen + p.encoder_wave * math.sin(seen + p.encoder_wave_phase))
+
+
+@numba.njit(cache=True)
+def simulate(
+    drive: Drive,
+    sent: np.ndarray,
+    coupling: np.ndarray,
+    supply: np.ndarray,
+    on: np.ndarray,
+    added: np.ndarray,
+    start: float,
+    hold: int,
+    parts: int,
+    step_s: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The joint under targets, from rest in balance: friction, bristles, integrator and delays have been so for ever.
+
+    Args:
+        sent: (R · parts,) targets [rad], each held for ``hold`` physics steps.
+        coupling: (R,) torque [N·m] that must be held against the other joints' motion, linear in between.
+        supply: (R · parts,) voltage that a position controller gets, over the one that its gains are for.
+        on: (R · parts,) share of the time for which the motor is on.
+        added: (R · parts,) torque [N·m] that the controller adds to its law.
+        start: angle [rad] that the encoder reports at rest.
+        parts: targets a row.
+
+    Returns:
+        reported (R,) [rad] and the controller's torque (R,) [N·m] at each row's time, before the row's targets act.
+    """
+    p, h, rows = drive, step_s, sent.size // parts
+    reported, effort = np.empty(rows), np.empty(rows)
+    command = _arriving(p, sent, hold, h)
+    late = 0.0 if p.encoder_delay <= 0.0 else max(p.encoder_delay / h, 1.0)
+    whole = math.floor(late)
+    ring = np.full(whole + 2, start)  # readings of the newest steps
+    weighs = p.gravity_sin != 0.0 or p.gravity_cos != 0.0 or p.compensation_sin != 0.0 or p.compensation_cos != 0.0
+    geared = p.backlash > 0.0 or p.compliance > 0.0
+    half_play = 0.5 * p.backlash
+    ahead = (
+        0.5 if p.midpoint > 0.0 and not geared else 1.0
+    )  # share of a step by which springs and dampers are taken ahead
+    early = 0.5 * h if p.midpoint > 0.0 and geared else 0.0
+    spring = 1.0 / p.compliance if p.compliance > 0.0 else 0.0
+    spring_damping = p.compliance_damping * spring
+    inertia = p.inertia + p.added_inertia
+    lost = min(p.kd * p.speed_delay, MOST_LOST * inertia)
+    inertia -= lost
+    inertia -= min(early * (p.kd + p.back_emf), 0.5 * inertia)
+    link = p.inertia - p.rotor_inertia  # beyond the gear
+    free = inertia * (link + _GEAR_INERTIA) - link * link
+    motor_mobility, gear_mobility = (link + _GEAR_INERTIA) / free, inertia / free
+    static = p.stribeck_torque * (1.0 + p.stribeck_share)
+    bristle = static / p.presliding if p.stribeck_torque > 0.0 else 0.0
+    bristle_damping = _BRISTLE_DAMPING_S * bristle
+    newest_share = 1.0 if p.torque_lag <= 0.0 else h / (p.torque_lag + h)
+
+    # Where it is when the encoder reports ``start``, and what is in balance there.
+    q, v = start, 0.0
+    for _ in range(20):
+        q += start - _reading(p, q)
+    gear, gear_v = 0.0, 0.0  # angle of the link against the motor, and its rate
+    stop_side = 1.0 if q <= p.stop_angle else -1.0  # it is free where it stands
+    weight, carried = 0.0, 0.0
+    for _ in range(20):
+        sine, cosine = math.sin(q + gear), math.cos(q + gear)
+        weight = p.gravity_sin * sine + p.gravity_cos * cosine
+        carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
+        load = weight + coupling[0]
+        if geared and abs(load) > 1e-9:
+            gear = -math.copysign(half_play, load) - p.compliance * load
+            if p.compliance == 0.0:  # the soft end of the play
+                gear -= load * _LIMIT_SOFTNESS * gear_mobility / _LIMIT_STIFFNESS
+    integral = 0.0
+    torque = _asked(p, command[0], command[0], q, v, integral, supply[0], on[0], added[0])[0]
+    missing = weight + coupling[0] + p.spring_stiffness * (q - p.spring_rest) + p.coulomb * p.asymmetry
+    missing -= p.torque_scale * (torque + carried) + p.cogging_torque * math.sin(
+        p.cogging_periods * q + p.cogging_phase
+    )
+    if p.integral_rate > 0.0:
+        integral = missing / (p.torque_scale * p.kp * p.integral_rate)
+        torque += missing / p.torque_scale
+        missing = 0.0
+    z = min(max(-missing, -static), static) / bristle if bristle > 0.0 else 0.0
+    acceleration = 0.0
+
+    for n in range(sent.size * hold):
+        row, within = divmod(n, hold * parts)
+        strength = p.torque_scale * max(1.0 - p.fade_rate * n * h, 0.0)
+        if weighs:
+            sine, cosine = math.sin(q + gear), math.cos(q + gear)
+            weight = p.gravity_sin * sine + p.gravity_cos * cosine
+            carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
+        load = weight + coupling[row]
+        if row + 1 < rows:
+            load += (within + 1.0 - ahead) / (hold * parts) * (coupling[row + 1] - coupling[row])
+
+        # What can be seen now: the new command has not acted yet.
+        until_now = command[n if p.command_delay > 0.0 and p.midpoint == 0.0 else max(n - 1, 0)]
+        part = n // hold
+        given = 0.0
+        if p.load_friction > 0.0:
+            given = torque
+            if p.torque_lag <= 0.0:
+                given = _asked(p, until_now, until_now, q, v, integral, supply[part], on[part], added[part])[0]
+        if within == 0:
+            by = command[n] if p.effort_after > 0.0 else until_now
+            seen = part if p.effort_after > 0.0 else max(part - 1, 0)
+            shown, by_position, by_speed = _asked(p, by, by, q, v, integral, supply[part], on[part], added[seen])
+            if p.torque_lag > 0.0:
+                shown, by_position, by_speed = torque, 0.0, 0.0
+            older = p.effort_age * (by_position * v + by_speed * acceleration)
+            effort[row] = strength * (shown + older) + lost * acceleration
+            reported[row] = _reading(p, q)
+            if late > 0.0:
+                newer, older = ring[(n - whole) % ring.size], ring[(n - whole - 1) % ring.size]
+                reported[row] = newer + (older - newer) * (late - whole)
+        if late > 0.0:
+            ring[n % ring.size] = _reading(p, q)
+
+        # The drive.
+        asked, stiffness, damping = _asked(
+            p, command[n], until_now, q, v, integral, supply[n // hold], on[n // hold], added[n // hold]
+        )
+        if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
+            asked, damping = asked + early * stiffness * v, damping - early * stiffness
+        gain = newest_share * strength
+        drawn = gain * asked + (strength - gain) * torque + strength * carried
+        controller_stiffness, controller_damping = stiffness, damping
+        stiffness, damping = gain * stiffness, gain * damping
+        most = p.torque_max
+        if p.stall_torque < math.inf:
+            most = min(most, _limit(p, drawn, v))
+        if abs(drawn) > most:
+            drawn = math.copysign(most, drawn)
+            stiffness, damping = 0.0, 0.0
+
+        # What else turns the motor's shaft.
+        force = drawn
+        if p.viscous != 0.0 or p.quadratic_drag != 0.0:
+            force -= (p.viscous + p.quadratic_drag * abs(v)) * v
+            damping += p.viscous + 2.0 * p.quadratic_drag * abs(v)
+        if p.spring_stiffness != 0.0:
+            force -= p.spring_stiffness * (q - p.spring_rest)
+            stiffness += p.spring_stiffness
+        if p.stop_stiffness > 0.0:
+            deep = stop_side * (q - p.stop_angle)
+            if deep > 0.0 and deep + _STOP_DAMPING_S * stop_side * v > 0.0:
+                force -= p.stop_stiffness * (q - p.stop_angle + _STOP_DAMPING_S * v)
+                stiffness += p.stop_stiffness
+                damping += _STOP_DAMPING_S * p.stop_stiffness
+        if p.cogging_torque != 0.0:
+            wave = p.cogging_periods * q + p.cogging_phase
+            force += p.cogging_torque * math.sin(wave)
+            stiffness += max(-p.cogging_torque * p.cogging_periods * math.cos(wave), 0.0)
+        if bristle > 0.0:
+            most = p.stribeck_torque + (static - p.stribeck_torque) * math.exp(-((v / p.stribeck_speed) ** 2))
+            decay = bristle * abs(v) / most
+            force -= bristle * z + bristle_damping * (v - decay * z)
+            damping += bristle_damping
+            if decay * h > 1e-12:
+                z = z * math.exp(-decay * h) - v / decay * math.expm1(-decay * h)
+            else:
+                z += h * v
+        force -= p.coulomb * p.asymmetry
+        limit = p.coulomb
+        if p.load_friction > 0.0:
+            passed = strength * (given + carried)
+            most = min(p.torque_max, _limit(p, passed, v) if p.stall_torque < math.inf else math.inf)
+            limit += p.load_friction * abs(min(max(passed, -most), most) + load)
+        if p.spot_friction > 0.0:
+            limit += p.spot_friction * math.exp(-(((q - p.spot_angle) / p.spot_width) ** 2))
+
+        if ahead < 1.0 and weighs:
+            stiffness += p.gravity_sin * cosine - p.gravity_cos * sine
+        f1 = force - load - ahead * h * stiffness * v
+        m11 = inertia + ahead * h * damping + ahead * ahead * h * h * stiffness
+        if not geared:
+            if limit > 0.0:
+                f1 += _friction(f1, m11, 1.0 / m11, v, limit, h)
+            v_next = v + h * f1 / m11
+        else:
+            # Masses (motor, link): M̂ = [[m11, link], [link, m22]] in (q, gear).
+            a1, a2, back = 0.0, 0.0, 0.0
+            stretch = gear - min(max(gear, -half_play), half_play)
+            m22, f2 = link + _GEAR_INERTIA, -load
+            if spring > 0.0 and (half_play == 0.0 or stretch != 0.0):
+                m22 += h * spring_damping + h * h * spring
+                f2 -= spring * (stretch + h * gear_v) + spring_damping * gear_v
+            for limited in (spring == 0.0 and stretch != 0.0, False):
+                n22, g2 = m22, f2
+                if limited:
+                    stiffer = 1.0 + h * _LIMIT_RATE + h * h * _LIMIT_STIFFNESS
+                    back = -(_LIMIT_RATE * gear_v + _LIMIT_STIFFNESS * (stretch + h * gear_v)) / stiffer
+                    soft = _LIMIT_SOFTNESS * gear_mobility / stiffer
+                    n22 += 1.0 / soft
+                    g2 += back / soft
+                metric, pull = m11 - link * link / n22, f1 - link / n22 * g2
+                if limit > 0.0:
+                    pull += _friction(pull, metric, motor_mobility * inertia / m11, v, limit, h)
+                a1 = pull / metric
+                a2 = (g2 - link * a1) / n22
+                if not limited or (back - a2) * stretch <= 0.0:  # it pushes, it never pulls
+                    break
+            v_next = v + h * a1
+            gear_v += h * a2
+            gear += h * gear_v
+        if p.torque_lag > 0.0:  # as the step took it: at the step's end
+            at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next
+            torque += newest_share * (at_end - torque)
+        if p.integral_rate > 0.0:
+            integral += h * (command[n] - p.encoder_scale * q)
+        acceleration = (v_next - v) / h
+        q += h * (ahead * v_next + (1.0 - ahead) * v)
+        v = v_next
+    return reported, effort

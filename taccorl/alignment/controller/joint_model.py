@@ -1,0 +1,272 @@
+"""One joint of a machine against one recording, in about a millisecond: what identification runs thousands of times.
+
+The other joints move as they were measured. Inertia and weight are those of the compiled model (``rigid_joint``), so what is
+identified on the PiPER holds in its twin; ``test_joint_model.py`` compares with MuJoCo, effect by effect, and
+with the whole twin.
+
+Letters in shapes: T rows.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
+from taccorl.alignment.controller.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.rigid_joint import AxisJoint, Gains, Rigid, RigidJoint, weighs
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.twin import TwinConfig
+
+GRAVITY_M_PER_S2 = 9.81
+SAME_RATE = 0.02
+"""Targets that are received faster than they are logged by less than this share come once a row: stamps are rounded."""
+_ADDITIVE = {
+    "added_inertia",
+    "viscous",
+    "quadratic_drag",
+    "coulomb",
+    "load_friction",
+    "command_delay",
+    "encoder_delay",
+    "speed_delay",
+}
+_FACTORS = {"gravity_carried", "torque_scale", "encoder_scale"}
+
+
+class PayloadLever(NamedTuple):
+    """By how much a payload whose place no recording states is off the place where the twin has it: m g (s sin q + c cos q)."""
+
+    sin_m: float = 0.0
+    """s."""
+    cos_m: float = 0.0
+    """c."""
+
+
+AT_ITS_PLACE = PayloadLever()
+
+
+class _Sent(NamedTuple):
+    """What a drive gets in each part of a row, (T · parts,) each; ``joint_kernel.simulate`` says what."""
+
+    target: np.ndarray
+    supply: np.ndarray
+    on: np.ndarray
+    added: np.ndarray
+
+
+@dataclass(frozen=True)
+class JointResponse:
+    """What the joint did, row by row with the recording."""
+
+    reported: np.ndarray
+    """(T,) rad."""
+    effort: np.ndarray
+    """(T,) N·m that the motor gives at the time of each row, before its command acts: ``Replay.effort`` of the row before."""
+
+
+class JointModel:
+    """A joint of a machine, the machine's own effects that act on it included.
+
+    Raises:
+        TaccorlError: no such joint, or a gripper of the PiPER.
+    """
+
+    def __init__(self, machine: TwinConfig | HasJoints, signal: str) -> None:
+        self._set(joint_of(machine, signal))
+
+    @classmethod
+    def of(cls, joint: RigidJoint) -> "JointModel":
+        """The model of a joint that is known already."""
+        model = cls.__new__(cls)
+        model._set(joint)
+        return model
+
+    @classmethod
+    def axis(
+        cls,
+        name: str,
+        inertia: float,
+        *,
+        gains: Gains,
+        unit: Literal["rad", "m"] = "rad",
+        timestep_s: float = 1.0 / 1200.0,
+    ) -> "JointModel":
+        """An axis by itself: an inertia [kg m²], or a mass [kg] on a slide with ``unit`` m, without weight.
+
+        Effects act on it by ``Effect.drive`` whatever joints they name; those without one are refused.
+        """
+        return cls.of(AxisJoint(name, inertia, gains, unit, timestep_s))
+
+    def _set(self, joint: RigidJoint) -> None:
+        self.joint, self.signal, self.unit, self.gains = joint, joint.signal, joint.unit, joint.gains
+        self._rigid: dict[tuple, Rigid] = {}
+
+    def simulate(
+        self,
+        motion: JointMotion,
+        gains: Gains,
+        effects: Sequence[Effect] = (),
+        lever: PayloadLever = AT_ITS_PLACE,
+        age_s: float = 0.0,
+        facts: Mapping[str, float] | None = None,
+    ) -> JointResponse:
+        """Its answer to the recording's targets, from rest at ``motion.start``.
+
+        Args:
+            gains: those of a recording with ``kp_scale`` = 1.
+            effects: besides the machine's; one of the same name takes the place of the machine's.
+            age_s: of the measured position when the drive's torque acts, besides the joint's own.
+            facts: numbers of the drive in place of the joint's own.
+            lever: left out where effects have no ``drive`` and MuJoCo runs.
+
+        Raises:
+            TaccorlError: rows that are no whole number of physics steps, or an effect that an axis cannot have.
+        """
+        sent, parts, hold, step_s = self._sent(motion)
+        present = self.joint.effects(effects)
+        kp, kd = gains.kp * motion.kp_scale, gains.kd * motion.kd_scale
+        # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
+        scaled = Gains(kp, kd - kp * (self.joint.position_age_s + age_s), gains.torque_ff)
+        speed_late_s = self.joint.speed_delay_s
+        drives = [(effect.name, effect.drive()) for effect in present]
+        timing = [("the drive", {"speed_delay": speed_late_s})] if speed_late_s > 0.0 else []
+        of_effects = [(name, drive) for name, drive in drives if drive is not None]
+        known = {**self.joint.facts, **(facts or {})}
+        known = {k: v for k, v in known.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
+        numbers = _combined([*timing, ("the drive", known), *of_effects])
+        if numbers is None or any(drive is None for _, drive in drives):
+            return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent.target, parts, hold))
+        bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
+        drive = Drive(*scaled, **self._body(motion, bodies)._asdict())
+        drive = drive._replace(**numbers)
+        weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
+        drive = drive._replace(
+            gravity_sin=drive.gravity_sin + weight * lever.sin_m,
+            gravity_cos=drive.gravity_cos + weight * lever.cos_m,
+        )
+        drive = Drive(*(float(x) for x in drive))
+        reported, effort = simulate(
+            drive, sent.target, motion.coupling_nm, *sent[1:], motion.start, hold, parts, step_s
+        )
+        if self.joint.effort_holds_weight:
+            effort = effort + drive.gravity_carried * self.carried_nm(motion, reported)
+        return JointResponse(reported, effort)
+
+    def carried_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
+        """(T,) what the motor gives besides its effort to carry the weight that it knows of, at ``angles`` (T,) rad."""
+        body = self._body(motion, [])
+        return body.compensation_sin * np.sin(angles) + body.compensation_cos * np.cos(angles)
+
+    def inertia_kgm2(self, motion: JointMotion) -> float:
+        """Of the joint with all that it moves in the recording's pose, rotor and known payload included."""
+        return self._body(motion, []).inertia
+
+    def weight_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
+        """(T,) weight that the controller has to hold at ``angles`` (T,) rad: what is not carried for it."""
+        body = self._body(motion, [])
+        sine, cosine = body.gravity_sin - body.compensation_sin, body.gravity_cos - body.compensation_cos
+        return sine * np.sin(angles) + cosine * np.cos(angles)
+
+    def is_weighed(self, motion: JointMotion) -> bool:
+        """Whether weight acts about the joint: not about one whose axis is vertical."""
+        return weighs(self._body(motion, []))
+
+    def _body(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        mounted = motion.moment_kgm, motion.mounted_kgm2
+        key = (motion.pose.tobytes(), motion.payload_kg, *mounted, motion.payload_at_m, *map(repr, bodies))
+        if key not in self._rigid:
+            if len(self._rigid) > 1000:  # a search that changes bodies would fill the memory
+                self._rigid.clear()
+            self._rigid[key] = self.joint.rigid(motion, bodies)
+        return self._rigid[key]
+
+    def _sent(self, motion: JointMotion) -> "tuple[_Sent, int, int, float]":
+        """What the machine sends, parts a row, physics steps for each part, and the step [s]."""
+        step_s = self.joint.timestep_s(motion.rate_hz)
+        steps = 1.0 / (motion.rate_hz * step_s)
+        if abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
+            raise TaccorlError(
+                f"{motion.name}: {motion.rate_hz:g} Hz is {steps:.3f} physics steps of {step_s * 1e3:.3f} ms a "
+                f"row; bring it to {1 / (max(1, round(steps)) * step_s):g} Hz first (Measurement.resampled)"
+            )
+        target, ones = motion.target, np.ones(len(motion.target))
+        sent = _Sent(
+            target,
+            ones if motion.supply is None else motion.supply,
+            ones if motion.on is None else motion.on,
+            0.0 * ones if motion.torque_ff_nm is None else motion.torque_ff_nm,
+        )
+        parts = received = max(1, math.ceil(self.joint.command_hz / motion.rate_hz - SAME_RATE))
+        if self.joint.follows_line:
+            late_s = self.joint.target_late_s
+            if late_s > 0.0 or motion.command_s is not None:
+                parts = round(steps)
+            parts = min(parts, round(steps))
+        while round(steps) % parts:
+            parts -= 1
+        if self.joint.follows_line:
+            if parts > 1 or received > 1:
+                sent = self._in_time(motion, sent, received, parts)
+        elif parts > 1:
+            following = np.append(target[1:], target[-1])
+            share = np.arange(1, parts + 1) / parts
+            target = (target[:, None] + share * (following - target)[:, None]).ravel()
+            sent = _Sent(target, *(np.repeat(values, parts) for values in sent[1:]))
+        return sent, parts, round(steps) // parts, step_s
+
+    def _in_time(self, motion: JointMotion, sent: "_Sent", received: int, parts: int) -> "_Sent":
+        """What is sent at its own times: the mean of each part while the motor is on, of values that are held until the next
+        comes; of targets that are received faster than they are logged the mean of the line between them."""
+        # In rows: the clock of ``time_s`` and the rate may differ by a millionth.
+        rows = len(motion.target)
+        late = self.joint.target_late_s * motion.rate_hz
+        came = (
+            np.arange(rows) if motion.command_s is None else motion.command_s * (rows - 1) / motion.time_s[-1]
+        ) + late
+        edges = np.arange(rows * parts + 1) / parts
+        last = np.maximum(np.searchsorted(came, edges, side="right") - 1, 0)
+        whole, since = np.diff(came), edges - came[last]
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            if (values == values[0]).all():
+                return np.full(rows * parts, values[0])
+            before = np.concatenate([[0.0], np.cumsum(values[:-1] * whole)])
+            return np.diff(before[last] + values[last] * since) * parts
+
+        on = mean(sent.on)
+        target, supply = (
+            np.where(on > 1e-9, mean(values * sent.on) / np.maximum(on, 1e-9), values[0])
+            for values in (sent.target, sent.supply)
+        )
+        found = _Sent(target, supply, on, np.repeat(sent.added, parts))
+        if received > 1:
+            middle = 0.5 * (edges[1:] + edges[:-1]) - 0.5 / received
+            found = found._replace(target=np.interp(middle, came, sent.target))
+        return found
+
+
+def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, float] | None:
+    """One set of numbers; None where two effects want one number that does not simply add up."""
+    numbers: dict[str, float] = {}
+    one_way = 0.0  # a F of asymmetric friction, a constant torque
+    for name, drive in drives:
+        one_way += drive.get("coulomb", 0.0) * drive.get("asymmetry", 0.0)
+        for key, value in drive.items():
+            if key not in Drive._fields:
+                raise TaccorlError(f"effect {name}: drive() names {key!r}, which the one-joint model lacks")
+            if key not in numbers:
+                numbers[key] = value
+            elif key in _ADDITIVE:
+                numbers[key] += value
+            elif key in _FACTORS:
+                numbers[key] *= value
+            else:
+                return None
+    if numbers.get("coulomb"):
+        numbers["asymmetry"] = one_way / numbers["coulomb"]
+    return numbers

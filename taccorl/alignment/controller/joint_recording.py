@@ -1,0 +1,79 @@
+"""Take one joint's part from a recording: ``JointMotion``.
+
+Letters in shapes: T rows.
+"""
+
+import numpy as np
+
+from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.rigid_joint import RigidJoint, Surroundings, resting
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.errors import TaccorlError
+from taccorl.sim.twin import TwinConfig
+
+_TARGET_COLUMNS = {"position": "q_target", "velocity": "qd_target", "torque": "tau_target"}
+
+
+def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints | None, signal: str) -> JointMotion:
+    """A recording as one of its joints sees it.
+
+    Args:
+        machine: whose other joints couple with this one; None for an axis by itself.
+
+    Raises:
+        TaccorlError: no such signal, gaps in its targets, nothing measured at the start, too short, uneven time.
+    """
+    return motion_of(measurement, signal, None if machine is None else joint_of(machine, signal))
+
+
+def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -> JointMotion:
+    """``joint_motion`` of a joint that is known already."""
+    m, j = measurement, measurement.column(signal)
+    target, measured = m.target[:, j].astype(float), m.measured[:, j].astype(float)
+    if m.num_rows < 10:
+        raise TaccorlError(f"{m.name}: {m.num_rows} rows are too short for a motion of {signal}; record some seconds")
+    wanted = "position" if joint is None else joint.target_kind
+    if m.target_kind(signal) != wanted:
+        raise TaccorlError(
+            f"{m.name}: {signal} is commanded by {m.target_kind(signal)}, its law takes a {wanted}; mend the law in its file, or "
+            f"give the column {_TARGET_COLUMNS[wanted]}"
+        )
+    if not np.isfinite(target).all():
+        row = int(np.flatnonzero(~np.isfinite(target))[0])
+        raise TaccorlError(f"{m.name}: {signal} has no target at {m.time_s[row]:.3f} s; cut the recording there")
+    gaps = np.diff(m.time_s)
+    if not (np.abs(gaps - m.period_s) < 0.1 * m.period_s).all():
+        row = int(np.argmax(np.abs(gaps - m.period_s)))
+        raise TaccorlError(
+            f"{m.name}: time is not even, {gaps[row] * 1e3:.1f} ms at {m.time_s[row]:.3f} s where {m.period_s * 1e3:.1f} ms "
+            "are usual. Tables with less jitter than half a row and gaps below 0.25 s are brought to an even rate when they are "
+            "read; this has more: log the driver's or the bus's own stamps, or cut the recording at the gap"
+        )
+    rest = Surroundings(coupling_nm=np.zeros(m.num_rows)) if joint is None else joint.surroundings(m)
+    factor = m.gain_scale.get(signal, 1.0)
+    kp_scale, kd_scale = (factor, factor) if joint is None else joint.gain_scales(m)
+    return JointMotion(
+        name=m.name,
+        time_s=m.time_s,
+        rate_hz=m.rate_hz,
+        target=target,
+        measured=measured,
+        effort=m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan),
+        coupling_nm=rest.coupling_nm,
+        torque_ff_nm=rest.torque_ff_nm,
+        supply=rest.supply,
+        on=rest.on,
+        command_s=m.command_s if m.command_s.size and joint is not None and joint.keeps_times else None,
+        start=resting(m, j),
+        pose=rest.pose,
+        kp_scale=kp_scale,
+        kd_scale=kd_scale,
+        kp_known=joint is not None and signal in m.kp,
+        kd_known=joint is not None and signal in m.kd,
+        payload_kg=rest.payload_kg,
+        moment_kgm=rest.moment_kgm,
+        mounted_kgm2=rest.mounted_kgm2,
+        payload_at_m=rest.payload_at_m,
+        payload_at_known=rest.payload_at_known,
+    )

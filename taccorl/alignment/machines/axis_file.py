@@ -1,0 +1,350 @@
+"""An axis file: one driven axis by itself, such as a slide on a bench, a wheel, or a servo with a pendulum.
+
+::
+
+    kind: axis
+    name: drive            # signal: columns drive.q, drive.q_target, drive.qd, drive.tau, drive.load
+    unit: m                # of its position: rad, or m of a slide; forces are then N for N·m, masses kg for kg·m²
+    inertia: 95.0          # kg, or kg·m²: where the fit starts
+    law: cascade           # what the drive does with its target; impedance if not given
+    kp: 160.18
+    kd: 8557.4
+    limits: [-0.01, 0.26]  # stroke
+    effort_limit: 350.0    # N or N·m that the drive can give
+    effects:               # physics beyond that; taccorl add-effect writes them
+    - {effect: coulomb_friction, torque_nm: 20.4}    # in N on a slide
+
+Laws, targets and what a recording may state of them are those of ``drive_law``. What a recording mounts on a turning axis is
+m l² of inertia and m g l sin(q − q₀) of weight: ``payload_kg`` at ``lever_m``, and an arm of ``arm_kg``, a uniform rod of that
+length.
+"""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import yaml
+
+from taccorl.alignment.controller.drive_law import DriveLaw
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Gains, Rigid, RigidJoint, Surroundings
+from taccorl.alignment.measurements.measurement import Measurement, TargetKind
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects import effects as registry
+from taccorl.sim.effects.effect import Effect, JointEffect
+from taccorl.sim.effects.scaled import OF_A_TURN, Scale, scaled
+from taccorl.sim.settings import check_numbers
+
+GRAVITY_M_PER_S2 = 9.81
+_HEADER = "# An axis: taccorl/alignment/machines/axis_file.py says what may stand here.\n"
+
+
+@dataclass(frozen=True)
+class EffectEntry:
+    """An effect as the file has it, in the units of the axis."""
+
+    name: str
+    values: Mapping[str, Any]
+
+
+@dataclass(kw_only=True)
+class AxisConfig(DriveLaw):
+    """One driven axis. Gains are those that are commanded, unless a recording states others. Units are those of a turning one; of
+    a slide N for N·m, m for rad, kg for kg·m²."""
+
+    kind: Literal["axis"] = "axis"
+    name: str
+    """Of its signal in the recordings."""
+    unit: Literal["rad", "m"]
+    inertia: float
+    """kg·m²."""
+    rotor_inertia: float = 0.0
+    """Share of ``inertia`` on the motor's side of the gear [kg·m²]; without it neither play nor compliance is looked for."""
+    weight_sin: float = 0.0
+    """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
+    weight_cos: float = 0.0
+    """C [N·m]."""
+    lever_m: float = 0.0
+    """Distance from the axis at which a recording's ``payload_kg`` is held, unless the recording states another one; a slide
+    has none."""
+    arm_kg: float = 0.0
+    """Of the arm that holds the payload, unless a recording states another one: a uniform rod as long as the lever."""
+    hangs_at_rad: float = 0.0
+    """Angle at which that payload hangs straight down."""
+    loop_hz: float | None = None
+    """Rate of the drive's control loop, where it is known: its output is held for a period, its speed is a difference."""
+    command_hz: float | None = None
+    """Rate at which the drive receives targets, where they are logged more slowly: a replay joins the rows by straight
+    lines of such steps. If not given, a target is held until the next one comes."""
+    target_late_s: float = 0.0
+    """How long after the time of its row a target acts, transport and reading of the position included; ``diagnose`` fits up to
+    3 ms of it, more is an effect."""
+    limits: tuple[float, float] | None = None
+    """Lowest and highest position [rad]."""
+    force_unit_n: float | None = None
+    """N·m that are for this axis what 1 N·m is for a joint of a small arm: effects are searched for within bounds that grow with
+    it. A tenth of effort_limit if not given, else 1."""
+    length_unit_m: float | None = None
+    """The same for 1 rad; the stroke of a slide if not given, else 1."""
+    effects: tuple[EffectEntry, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_numbers("axis", self, positive=("inertia",))
+        check_numbers("axis", self, not_negative=("lever_m", "arm_kg", "rotor_inertia", "target_late_s"))
+        if self.rotor_inertia > self.inertia:
+            raise TaccorlError(
+                f"axis.rotor_inertia: {self.rotor_inertia:g} is more than inertia, {self.inertia:g}, of which it is a "
+                "part; mend one"
+            )
+        check_numbers("axis", self, finite=("weight_sin", "weight_cos", "hangs_at_rad"))
+        optional = ("loop_hz", "command_hz", "force_unit_n", "length_unit_m")
+        check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
+        self.check_law("axis")
+        if self.limits is not None and not self.limits[0] < self.limits[1]:
+            raise TaccorlError(f"axis.limits: {list(self.limits)} must rise; write the lowest position first")
+        of_turning = ("weight_sin", "weight_cos", "lever_m", "arm_kg", "hangs_at_rad")
+        of_turning = [name for name in of_turning if getattr(self, name)]
+        if self.unit == "m" and of_turning:
+            raise TaccorlError(
+                f"axis.{of_turning[0]}: a slide has none; a constant weight is part of torque_ff, which is fitted"
+            )
+
+    @property
+    def scale(self) -> Scale:
+        """Size of the axis, for the bounds of effects."""
+        force = self.force_unit_n or (self.effort_limit or 10.0) / 10.0
+        stroke = self.limits[1] - self.limits[0] if self.limits and self.unit == "m" else 1.0
+        return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke)
+
+    def effect_class(self, name: str) -> type[Effect] | None:
+        """The effect in the size and units of this axis; None if an axis cannot have it.
+
+        Raises:
+            TaccorlError: no such effect.
+        """
+        cls = registry.get(name)
+        if not issubclass(cls, JointEffect) or (self.unit == "m" and name in OF_A_TURN) or not self.takes(name):
+            return None
+        own = scaled(name, self.scale)
+        numbers: dict[str, Any] = {p.name: p.typical for p in own.parameters()}
+        return own if own(**numbers).drive() and (self.rotor_inertia or name not in NEED_ROTOR) else None
+
+    def made(self) -> list[Effect]:
+        """The effects of the file."""
+        found = []
+        for entry in self.effects:
+            cls = self.effect_class(entry.name)
+            if cls is None and entry.name in NEED_ROTOR and not self.rotor_inertia:
+                raise TaccorlError(
+                    f"effects: {entry.name} needs the part of inertia that is the motor's: write `rotor_inertia: …`"
+                )
+            if cls is None:
+                raise TaccorlError(f"effects: {entry.name} cannot act on an axis; remove it")
+            for key in entry.values:
+                if key not in _settings(cls):
+                    raise TaccorlError(
+                        f"effects: {entry.name} has no parameter {key!r}; {nearest(key, _settings(cls))}"
+                    )
+            values: dict[str, Any] = dict(entry.values)
+            found.append(cls(**values))
+        return found
+
+    def with_numbers(self, base: Mapping[str, float]) -> "AxisConfig":
+        """With fitted numbers, which are called as in ``AxisProblem``."""
+        same = ("inertia", "weight_sin", "weight_cos", "target_late_s")
+        new = {name: base[name] for name in same if name in base}
+        new |= self.law_numbers(base)
+        if "inertia" in new:
+            new["rotor_inertia"] = new["inertia"] * min(self.rotor_inertia / self.inertia, 1.0)
+        return dataclasses.replace(self, **{name: float(value) for name, value in new.items()})
+
+    def with_effects(self, found: Sequence[Effect]) -> "AxisConfig":
+        """With these effects; one of the same name is replaced."""
+        names = {e.name for e in found}
+        entries = [e for e in self.effects if e.name not in names]
+        entries += [EffectEntry(e.name, _values(e)) for e in found]
+        return dataclasses.replace(self, effects=tuple(entries))
+
+
+def _settings(cls: type[Effect]) -> list[str]:
+    return [*(p.name for p in cls.parameters()), "interval", "evidence"]
+
+
+def _values(effect: Effect) -> dict[str, Any]:
+    values: dict[str, Any] = {p.name: float(getattr(effect, p.name)) for p in effect.parameters()}
+    if effect.interval:
+        values["interval"] = {name: (float(low), float(high)) for name, (low, high) in effect.interval.items()}
+    if effect.evidence:
+        values["evidence"] = effect.evidence
+    return values
+
+
+# the file --------------------------------------------------------------------------------------------------------------
+
+
+def load_axis(path: Path) -> AxisConfig:
+    """An axis's file.
+
+    Raises:
+        SpecError: a wrong key or value; with file and line.
+    """
+    return _AxisDocument(AxisConfig, path).value
+
+
+class _AxisDocument(Document[AxisConfig]):
+    """With effects, and the line of what the config itself refuses."""
+
+    def _build(self, kind: Any, node: yaml.Node, key: str) -> Any:
+        if kind is EffectEntry:
+            return self._entry(node, key)
+        return super()._build(kind, node, key)
+
+    def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
+        try:
+            config = super()._dataclass(cls, node, key)
+            if isinstance(config, AxisConfig):
+                config.made()
+            return config
+        except TaccorlError as error:
+            text = str(error)
+            if text.startswith(str(self.path)):
+                raise
+            if text.startswith("axis."):
+                raise self.error(text.split(":", 1)[0].removeprefix("axis."), text.split(": ", 1)[1]) from error
+            raise self.error("effects", text.removeprefix("effects: ")) from error
+
+    def _entry(self, node: yaml.Node, key: str) -> EffectEntry:
+        self._lines.setdefault(key, node.start_mark.line + 1)
+        items = dict(self._items(node, key))
+        if "effect" not in items:
+            raise self.error(key, "key 'effect' is missing; it names the effect: taccorl effects lists them")
+        name = self._scalar(str, items.pop("effect"), f"{key}/effect")
+        if name not in registry:
+            raise self.error(f"{key}/effect", f"no effect {name!r}; {nearest(name, registry)}")
+        kinds: dict[str, Any] = {"interval": dict[str, tuple[float, float]], "evidence": str}
+        values = {k: self._build(kinds.get(k, float), child, f"{key}/{k}") for k, child in items.items()}
+        return EffectEntry(name, values)
+
+
+def axis_text(config: AxisConfig) -> str:
+    """As a file has it: keys at their defaults are left out."""
+    content: dict[str, Any] = {"kind": "axis"}
+    law = {f.name for f in dataclasses.fields(DriveLaw)}
+    for field in sorted(dataclasses.fields(config), key=lambda f: f.name in law):
+        value = getattr(config, field.name)
+        if field.name not in ("kind", "effects") and value != field.default:
+            content[field.name] = list(value) if isinstance(value, tuple) else value
+    if config.effects:
+        content["effects"] = [{"effect": e.name} | _plain(e.values) for e in config.effects]
+    return _HEADER + yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def axis_digest(config: AxisConfig) -> str:
+    """16 hexadecimal digits that two axes share only if they are the same."""
+    return hashlib.sha256(axis_text(config).encode()).hexdigest()[:16]
+
+
+# the model -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DrivenAxis(RigidJoint):
+    """The axis of a file as the one-joint model sees it."""
+
+    config: AxisConfig
+    follows_line: ClassVar[bool] = True
+    keeps_times: ClassVar[bool] = True
+
+    @property
+    def signal(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.config.name
+
+    @property
+    def unit(self) -> Literal["rad", "m"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.config.unit
+
+    @property
+    def gains(self) -> Gains:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.config.loop_gains
+
+    @property
+    def command_hz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.config.command_hz or 0.0
+
+    @property
+    def position_age_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 0.5 / self.config.loop_hz if self.config.loop_hz else 0.0
+
+    @property
+    def target_late_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.config.target_late_s
+
+    @property
+    def speed_delay_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 1.0 / self.config.loop_hz if self.config.loop_hz and self.config.kd else 0.0
+
+    @property
+    def target_kind(self) -> TargetKind:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.config.target_kind
+
+    @property
+    def facts(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Numbers of ``joint_kernel.Drive`` that the file knows."""
+        # What a row shows before its target acts is half a period older than what acts on average.
+        c = self.config
+        return c.facts | ({"effort_age": 0.5 / c.loop_hz} if c.loop_hz and not c.effort_after_target else {})
+
+    def gain_scales(self, m: Measurement) -> tuple[float, float]:
+        return self.config.gain_scales(self.signal, m)
+
+    def timestep_s(self, rate_hz: float) -> float:
+        return self.config.timestep_s(rate_hz, self.config.inertia)
+
+    def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        c = self.config
+        weight = motion.moment_kgm * GRAVITY_M_PER_S2  # m l g sin(q − q₀)
+        sine, cosine = weight * math.cos(c.hangs_at_rad), -weight * math.sin(c.hangs_at_rad)
+        return Rigid(c.inertia + motion.mounted_kgm2, c.rotor_inertia, c.weight_sin + sine, c.weight_cos + cosine)
+
+    def surroundings(self, m: Measurement) -> Surroundings:
+        """The known external force, with the sign of what must be held against it, what is mounted, and the motor's supply.
+
+        Raises:
+            TaccorlError: a payload without a lever, an arm on a slide, a supply voltage that the law has no use for.
+        """
+        c, name = self.config, self.signal
+        payload, lever, arm = (
+            getattr(m, key).get(name, getattr(c, key, 0.0)) for key in ("payload_kg", "lever_m", "arm_kg")
+        )
+        if c.unit == "m" and (lever or arm):
+            raise TaccorlError(f"{m.name}: lever_m or arm_kg of {name} is stated, and a slide has none; remove it")
+        if c.unit == "rad" and payload + arm > 0.0 and lever == 0.0:
+            raise TaccorlError(
+                f"{m.name}: payload_kg or arm_kg of {name} is stated, and nothing says how long its arm is; write `lever_m: …` "
+                f"in the axis file, or `lever_m: {{{name}: …}}` in measurements.yaml"
+            )
+        return Surroundings(
+            coupling_nm=-m.known_load(name),
+            torque_ff_nm=m.torque_ff[:, m.column(name)] if m.torque_ff.size else None,
+            supply=c.supply(name, m),
+            on=m.enabled[:, m.column(name)] if m.enabled.size else None,
+            payload_kg=payload,
+            payload_at_known=True,
+            moment_kgm=payload * lever + 0.5 * arm * lever,
+            mounted_kgm2=payload * lever**2 + arm * lever**2 / 3.0 if c.unit == "rad" else payload,
+        )
+
+    def effects(self, more: Sequence[Effect]) -> list[Effect]:
+        own = {e.name: e for e in (*self.config.made(), *more)}
+        return [effect for effect in own.values() if not effect.is_absent]

@@ -1,0 +1,134 @@
+"""What a sensor of cells reads under the load that was measured: load → effects → gain and offset → ends of the converter.
+
+Letters in shapes: T rows, K cells, R × C the grid.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from taccorl.alignment.machines.cell_tables import CellMeasurement
+from taccorl.alignment.machines.cells_file import CellsConfig
+from taccorl.alignment.touch.model import through
+from taccorl.sim.effects.added import present
+from taccorl.sim.effects.effect import Effect, Memory
+from taccorl.sim.effects.taxel_temperature import NOMINAL_C, TaxelTemperature
+from taccorl.sim.effects.touch_memory import RememberingEffect
+
+MOST_ROWS_HZ = 200.0
+"""Recordings with more rows a second are brought to about that, by means of neighbouring rows."""
+STEPS_OF_ROW = 4
+"""A time constant T comes out too long by Δt² / (12 T n²) with n held steps in a row of Δt: 0.03 ms at T = 20 ms and 100 Hz."""
+
+
+class Calibration(NamedTuple):
+    """Gain and offset of each cell (K,): unit of the reading per 1 of the unit ``reading``, and unit of the reading."""
+
+    gain: np.ndarray
+    offset: np.ndarray
+
+
+def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect] = ()) -> np.ndarray:
+    """(T, K) readings in the unit ``reading``, before gain and offset, of the load of ``m``; a load below 0 counts as none.
+
+    A row's load acts at the row's time; between rows it follows a straight line.
+
+    Args:
+        effects: besides the config's; one of the same name takes the place of the config's.
+
+    Raises:
+        TaccorlError: an effect stands there twice.
+    """
+    names = {effect.name for effect in effects}
+    acting = present([*(e for e in config.effects if e.name not in names), *effects])
+    reading = (np.maximum(m.target, 0.0) / config.load_of_reading).astype(np.float32).reshape(-1, 1, *config.shape)
+    dt_s = np.diff(m.time_s, prepend=m.time_s[0])
+    for effect in acting:
+        if isinstance(effect, TaxelTemperature):
+            effect = effect.at(m.temperature_c if m.temperature_c.size else np.full(m.num_rows, NOMINAL_C))
+        memory = effect.memory(1, config.shape)
+        if isinstance(effect, RememberingEffect) and effect.holds_scan:
+            reading = _along_lines(effect, reading, memory, dt_s)
+        else:
+            reading = through(effect, reading, memory, m.time_s, dt_s)
+    return reading.reshape(m.num_rows, -1).astype(float)
+
+
+def _along_lines(effect: RememberingEffect, reading: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+    """(T, 1, R, C) after an effect that holds its input since the scan before, of readings on straight lines between rows.
+
+    A row is ``STEPS_OF_ROW`` equal steps, each at the mean of its piece of the line, and a step of 0 s at the row's own reading.
+    """
+    share = (np.arange(STEPS_OF_ROW + 1) + 0.5) / STEPS_OF_ROW
+    share[-1] = 1.0
+    before = np.concatenate([reading[:1], reading[:-1]])
+    fine = before[:, None] + share.astype(np.float32)[:, None, None, None] * (reading - before)[:, None]
+    fine_dt_s = np.repeat(dt_s[:, None] / STEPS_OF_ROW, STEPS_OF_ROW + 1, axis=1)
+    fine_dt_s[:, -1] = 0.0
+    times_s = np.cumsum(fine_dt_s.ravel())
+    out = through(effect, fine.reshape(-1, *reading.shape[1:]), memory, times_s, fine_dt_s.ravel())
+    return out[STEPS_OF_ROW :: STEPS_OF_ROW + 1]
+
+
+def readings(config: CellsConfig, response: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """(T, K) in the unit of the reading: g r + o, cut to the ends of the converter."""
+    return np.clip(calibration.gain * response + calibration.offset, config.low, config.high)
+
+
+def within_ends(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
+    """(T, K) bool: the converter is not at one of its ends (within half of its step)."""
+    half = 0.5 * np.maximum(m.quantum, 0.0) + 1e-9 * np.abs(m.measured)
+    return (m.measured > config.low + half) & (m.measured < config.high - half)
+
+
+def calibrated(
+    config: CellsConfig, pairs: Sequence[tuple[np.ndarray, np.ndarray]], before: Calibration | None = None
+) -> Calibration:
+    """Gain and offset of every cell by least squares over (response, reading) pairs of (T, K), NaN where a row does not count.
+
+    Cells that were never loaded have the median gain of the others (``before`` if there is none).
+    """
+    response = np.concatenate([r for r, _ in pairs])
+    reading = np.concatenate([y for _, y in pairs])
+    use = np.isfinite(reading)
+    count = np.maximum(use.sum(axis=0), 1)
+    mean_r = np.where(use, response, 0.0).sum(axis=0) / count
+    mean_y = np.where(use, reading, 0.0).sum(axis=0) / count
+    off_r = np.where(use, response - mean_r, 0.0)
+    power = np.square(off_r).sum(axis=0)
+    known = power > 1e-6 * count
+    product = (off_r * np.where(use, reading - mean_y, 0.0)).sum(axis=0)
+    gain = np.divide(product, power, out=np.full(len(power), np.nan), where=known)
+    other = float(np.nanmedian(gain)) if known.any() else config.sign
+    gain = np.where(known, gain, before.gain if before is not None else other)
+    return Calibration(gain, mean_y - gain * mean_r)
+
+
+def of_file(config: CellsConfig) -> Calibration | None:
+    """Gain and offset as the cells file states them; None if it does not."""
+    if not config.gain:
+        return None
+    return Calibration(np.array(config.gain) * config.load_of_reading, np.array(config.offset))
+
+
+def file_numbers(config: CellsConfig, calibration: Calibration) -> dict[str, list[float]]:
+    """``gain`` and ``offset`` as the cells file has them."""
+    return {"gain": (calibration.gain / config.load_of_reading).tolist(), "offset": calibration.offset.tolist()}
+
+
+def thinned(m: CellMeasurement) -> CellMeasurement:
+    """At most about ``MOST_ROWS_HZ``: each row the mean of as many neighbours."""
+    size = int(m.rate_hz // MOST_ROWS_HZ)
+    if size < 2:
+        return m
+    whole = m.num_rows // size * size
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return values[:whole].reshape(-1, size, *values.shape[1:]).mean(axis=1) if values.size else values
+
+    columns = {
+        name: mean(getattr(m, name)) for name in ("time_s", "target", "measured", "velocity", "effort", "temperature_c")
+    }
+    return dataclasses.replace(m, **columns)

@@ -1,0 +1,232 @@
+"""Measurements of a sensor of cells from CSV and parquet files: time, load and readings, one row an instant.
+
+Without a columns file a table has ``t`` [s], the load as ``force_n``, ``pressure_pa`` or ``depth_m`` (``thumb.force_n`` … where
+cells have loads of their own), for each cell ``thumb.reading`` in the unit of the cells file, and if recorded ``temperature_c``.
+Other names and units are written down in a columns file::
+
+    time: {column: stamp, unit: ms}
+    load: {column: Fz, unit: N}                   # of all cells; or `load:` below each cell
+    temperature: {column: T}                      # °C
+    cells:
+      thumb: {reading: {column: adc3, unit: count}}
+
+The load of row k acted at the time of row k, and follows a straight line to the next. A table with uneven rows
+comes to an even grid by straight lines between its rows.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.quantisation import find_quantum
+from taccorl.alignment.measurements.tables import SEPARATORS, TIME_S, Column, read_columns
+from taccorl.data.finding import Finding
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import RecordingError, nearest
+
+EVEN, LONGEST_GAP_S, LONGEST_GAP_ROWS = 0.1, 0.25, 5
+"""Steps within this share of the period are even; a gap longer than that, and than so many periods, is not bridged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellMeasurement(Measurement):
+    """A recording of a sensor of cells: signals are cells, ``target`` is the load and ``measured`` the reading of each (T, J)."""
+
+    known_units: ClassVar = tuple(READINGS)
+    temperature_c: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T,); empty if it was not recorded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TemperatureColumn:
+    """Where the temperature stands, in °C."""
+
+    column: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellColumns:
+    """Where one cell stands."""
+
+    reading: Column
+    load: Column | None = None
+    """Of a cell with a load of its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellTableSpec:
+    """Names and units of a table's columns."""
+
+    time: Column
+    cells: dict[str, CellColumns]
+    load: Column | None = None
+    """Of all cells."""
+    temperature: TemperatureColumn | None = None
+    separator: str = "comma"
+    """Of CSV files: comma, semicolon or tab."""
+    origin: str = ""
+    """What made the file, e.g. "simulated …"."""
+
+
+def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
+    """A columns file, checked against the cells file.
+
+    Raises:
+        SpecError: with file, line, key and the way out.
+    """
+    document = Document(CellTableSpec, Path(path))
+    spec = document.value
+    if spec.separator not in SEPARATORS:
+        raise document.error("separator", f"{spec.separator!r}; {nearest(spec.separator, SEPARATORS)}")
+    if spec.time.unit not in TIME_S:
+        raise document.error("time/unit", f"{spec.time.unit!r} is no unit of time; {nearest(spec.time.unit, TIME_S)}")
+    for name in spec.cells:
+        if name not in config.names:
+            raise document.error(f"cells/{name}", f"the cells file has no cell {name!r}; {nearest(name, config.names)}")
+    lacking = [name for name in config.names if name not in spec.cells]
+    if lacking:
+        raise document.error("cells", f"cell {lacking[0]!r} of the cells file is missing")
+    kind = LOADS[config.load.unit][0]
+    for name, cell in spec.cells.items():
+        own, factor = READINGS.get(cell.reading.unit, ("", 0.0)), READINGS[config.reading.unit]
+        if own[0] != factor[0]:
+            same = [unit for unit, (quantity, _) in READINGS.items() if quantity == factor[0]]
+            text = f"{cell.reading.unit!r} is no unit like the cells file's {config.reading.unit}; "
+            raise document.error(f"cells/{name}/reading/unit", text + nearest(cell.reading.unit, same))
+        load, key = (cell.load, f"cells/{name}/load") if not config.load.shared else (spec.load, "load")
+        if load is None:
+            shared = (
+                "each cell has a load of its own (shared: false)"
+                if not config.load.shared
+                else "all cells share one load"
+            )
+            raise document.error(key, f"is missing: by the cells file {shared}")
+        if LOADS.get(load.unit, ("",))[0] != kind:
+            same = [unit for unit, (other, _) in LOADS.items() if other == kind]
+            raise document.error(
+                f"{key}/unit",
+                f"{load.unit!r} is no unit like the cells file's {config.load.unit}; {nearest(load.unit, same)}",
+            )
+    return spec
+
+
+def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> CellTableSpec:
+    """The columns of a table that has our own names.
+
+    Raises:
+        RecordingError: a column is missing or unknown; names file, column and the way out.
+    """
+    load = LOADS[config.load.unit][0]
+    known = ["t", "temperature_c", *(f"{name}.reading" for name in config.names)]
+    loads = [load] if config.load.shared else [f"{name}.{load}" for name in config.names]
+    for column in header:
+        if column not in (*known, *loads):
+            raise RecordingError(
+                f"{path}: column {column!r} is none of this sensor's; {nearest(column, [*known, *loads])}. Other names and units "
+                "are written down in a columns file (--columns; taccorl/alignment/machines/cell_tables.py shows one)"
+            )
+    for column in ("t", *loads, *(f"{name}.reading" for name in config.names)):
+        if column not in header:
+            raise RecordingError(
+                f"{path}: no column {column!r}; it has {', '.join(header)}. Other names and units are written down in a columns "
+                "file (--columns; taccorl/alignment/machines/cell_tables.py shows one)"
+            )
+    unit = {"force_n": "N", "pressure_pa": "Pa", "depth_m": "m"}[load]
+    own = {
+        name: CellColumns(
+            reading=Column(column=f"{name}.reading", unit=config.reading.unit),
+            load=None if config.load.shared else Column(column=f"{name}.{load}", unit=unit),
+        )
+        for name in config.names
+    }
+    return CellTableSpec(
+        time=Column(column="t", unit="s"),
+        cells=own,
+        load=Column(column=load, unit=unit) if config.load.shared else None,
+        temperature=TemperatureColumn(column="temperature_c") if "temperature_c" in header else None,
+    )
+
+
+def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None = None) -> CellMeasurement:
+    """A table as a measurement of the sensor, in the units of the cells file.
+
+    Raises:
+        RecordingError: a column is missing, a cell of the table is empty or no number, time does not run forwards; names file,
+            line or row, and column.
+    """
+    path = Path(path)
+
+    def choose(header: list[str]) -> list[str]:
+        return _wanted(spec or own_cell_columns(path, header, config))
+
+    header, columns = read_columns(path, choose, spec.separator if spec else "comma")
+    spec = spec or own_cell_columns(path, header, config)
+    time_s = columns[spec.time.column] * TIME_S[spec.time.unit]
+    if len(time_s) < 2:
+        raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
+    steps = np.diff(time_s)
+    if (steps <= 0).any():
+        row = int(np.argmax(steps <= 0)) + 2
+        raise RecordingError(
+            f"{path}: time does not run forwards at row {row}: {time_s[row - 1]:.6g} s; leave such rows out"
+        )
+    load_factor = LOADS[config.load.unit][1]
+    load, reading = np.empty((2, len(time_s), config.num_cells))
+    for k, name in enumerate(config.names):
+        cell = spec.cells[name]
+        column = cell.load if spec.load is None else spec.load
+        assert column is not None
+        load[:, k] = columns[column.column] * (LOADS[column.unit][1] / load_factor)
+        reading[:, k] = columns[cell.reading.column] * (
+            READINGS[cell.reading.unit][1] / READINGS[config.reading.unit][1]
+        )
+    found = CellMeasurement(
+        name=path.name,
+        time_s=time_s - time_s[0],
+        target=load,
+        measured=reading,
+        signals=config.names,
+        units=(config.reading.unit,) * config.num_cells,
+        quantum=np.array([find_quantum(column) for column in reading.T]),
+        source=path,
+        origin=spec.origin,
+        start_ns=round(time_s[0] * 1e9),
+        temperature_c=columns[spec.temperature.column] if spec.temperature else np.empty(0),
+    )
+    return _even(found)
+
+
+def _wanted(spec: CellTableSpec) -> list[str]:
+    names = [spec.time.column, *(c.reading.column for c in spec.cells.values())]
+    names += [c.column for c in (spec.load, *(cell.load for cell in spec.cells.values())) if c is not None]
+    names += [spec.temperature.column] if spec.temperature else []
+    return list(dict.fromkeys(names))
+
+
+def _even(m: CellMeasurement) -> CellMeasurement:
+    """At even times, by straight lines between rows.
+
+    Raises:
+        RecordingError: a gap of more than ``LONGEST_GAP_S`` and ``LONGEST_GAP_ROWS``.
+    """
+    steps, period = np.diff(m.time_s), m.period_s
+    if (np.abs(steps - period) < EVEN * period).all():
+        return m
+    gap = int(np.argmax(steps))
+    if steps[gap] > max(LONGEST_GAP_S, LONGEST_GAP_ROWS * period):
+        raise RecordingError(
+            f"{m.source}: no row for {steps[gap]:.2f} s after {m.time_s[gap]:.2f} s; cut the table there into two files"
+        )
+    even = m.resampled(1.0 / period)
+    temperature = np.interp(even.time_s, m.time_s, m.temperature_c) if m.temperature_c.size else m.temperature_c
+    text = (
+        f"rows were not even (steps {1e3 * steps.min():.2f} … {1e3 * steps.max():.2f} ms): brought to {1 / period:.6g} Hz by "
+        "straight lines. Log the driver's own stamps to avoid it"
+    )
+    finding = Finding("resampled", "warning", "time", text)
+    return dataclasses.replace(even, temperature_c=temperature, findings=(*m.findings, finding))

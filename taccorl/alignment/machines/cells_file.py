@@ -1,0 +1,278 @@
+"""A sensor of one or more cells that something of known size presses, and the file that describes it.
+
+::
+
+    kind: cells
+    cells: [thumb]                    # names; of a grid: rows: 4 and columns: 6, cells are then r0c0 … r3c5
+    load: {unit: N, rated: 20}        # what presses: a force, a pressure or a depth, and what the sensor is made for
+    reading: {unit: count, lowest: 0, highest: 1023}    # ends of the converter; falls: true where it falls under load
+    rate_hz: 100                      # of the recordings
+    gain: [41.2]                      # count per N, cell by cell; taccorl diagnose --until=noise_floor and add-effect write it
+    offset: [12.0]                    # count without load
+    effects:
+    - {effect: taxel_creep, share: 0.2, time_constant_s: 1.1}
+
+The model is y = clip(g r + o, lowest … highest): the effects make r of the load, each cell has its gain g and offset o. In the
+unit ``reading``, in which effects have their numbers, 1 is a tenth of the rated load. What the converter cuts off at its ends
+is a fact of the file and no effect.
+"""
+
+import dataclasses
+import hashlib
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.added import present
+from taccorl.sim.effects.effect import CELLS, Effect, TouchEffect
+from taccorl.sim.twin_file import EffectsDocument, effect_entry, write_whole
+
+LOADS: dict[str, tuple[str, float]] = {
+    "N": ("force_n", 1.0),
+    "mN": ("force_n", 1e-3),
+    "kN": ("force_n", 1e3),
+    "gf": ("force_n", 9.80665e-3),
+    "kgf": ("force_n", 9.80665),
+    "lbf": ("force_n", 4.4482216),
+    "Pa": ("pressure_pa", 1.0),
+    "hPa": ("pressure_pa", 1e2),
+    "kPa": ("pressure_pa", 1e3),
+    "MPa": ("pressure_pa", 1e6),
+    "mbar": ("pressure_pa", 1e2),
+    "bar": ("pressure_pa", 1e5),
+    "psi": ("pressure_pa", 6894.757),
+    "m": ("depth_m", 1.0),
+    "mm": ("depth_m", 1e-3),
+    "um": ("depth_m", 1e-6),
+    "µm": ("depth_m", 1e-6),
+}
+"""Unit of a load → its column in tables without a columns file, and the factor to that column's unit."""
+READINGS: dict[str, tuple[str, float]] = {
+    "count": ("count", 1.0),
+    "V": ("V", 1.0),
+    "mV": ("V", 1e-3),
+    "uV": ("V", 1e-6),
+    "µV": ("V", 1e-6),
+    "ohm": ("ohm", 1.0),
+    "Ω": ("ohm", 1.0),
+    "kohm": ("ohm", 1e3),
+    "kΩ": ("ohm", 1e3),
+    "Mohm": ("ohm", 1e6),
+    "S": ("S", 1.0),
+    "mS": ("S", 1e-3),
+    "uS": ("S", 1e-6),
+    "µS": ("S", 1e-6),
+    "F": ("F", 1.0),
+    "nF": ("F", 1e-9),
+    "pF": ("F", 1e-12),
+    "fF": ("F", 1e-15),
+    "A": ("A", 1.0),
+    "mA": ("A", 1e-3),
+    "uA": ("A", 1e-6),
+    "µA": ("A", 1e-6),
+    "N": ("N", 1.0),
+    "mN": ("N", 1e-3),
+    "Pa": ("Pa", 1.0),
+    "kPa": ("Pa", 1e3),
+}
+"""Unit of a reading → the quantity's own unit and the factor to it."""
+READINGS_OF_RATED = 10.0
+"""The rated load in the unit ``reading``. Touch effects have their bounds for readings of this size."""
+_HEADER = "# A sensor of cells. taccorl/alignment/machines/cells_file.py says what may stand here.\n"
+
+
+@dataclass(kw_only=True)
+class Load:
+    """What presses the cells."""
+
+    unit: str
+    """A key of ``LOADS``."""
+    rated: float
+    """Greatest load that the sensor is made for, in ``unit``."""
+    shared: bool = True
+    """All cells bear the load of one column; false: each cell has a column of its own."""
+
+
+@dataclass(kw_only=True)
+class Reading:
+    """Unit, converter range and direction of the readings, the same for all cells."""
+
+    unit: str
+    """A key of ``READINGS``."""
+    lowest: float | None = None
+    """Lower end of the converter, in ``unit``; none if not given."""
+    highest: float | None = None
+    """Upper end of the converter, in ``unit``; none if not given."""
+    falls: bool = False
+    """Whether the reading falls under load, as a resistance does."""
+
+
+@dataclass(kw_only=True)
+class CellsConfig:
+    """A sensor of cells, as its file says."""
+
+    kind: Literal["cells"] = "cells"
+    name: str = ""
+    """As tables and reports call it; the file's stem if not given."""
+    cells: list[str] = field(default_factory=list)
+    """Names of cells that have no place in a grid."""
+    rows: int | None = None
+    columns: int | None = None
+    """Of a grid."""
+    load: Load
+    reading: Reading
+    rate_hz: float | None = None
+    """Rows a second of the recordings; not checked if not given."""
+    gain: list[float] = field(default_factory=list)
+    """Unit of the reading per unit of the load, cell by cell, row after row; fitted if not given."""
+    offset: list[float] = field(default_factory=list)
+    """Reading without load, cell by cell."""
+    effects: list[Effect] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if bool(self.cells) == (self.rows is not None or self.columns is not None):
+            raise TaccorlError("cells: give names, `cells: [thumb]`, or a grid, `rows: 4` and `columns: 6`")
+        if not self.cells and not (self.rows and self.columns and min(self.rows, self.columns) > 0):
+            raise TaccorlError(f"rows {self.rows} and columns {self.columns}: a grid needs both, 1 or more")
+        if len(set(self.cells)) < len(self.cells):
+            raise TaccorlError(f"cells: {self.cells}: name each once")
+        if self.load.unit not in LOADS:
+            raise TaccorlError(
+                f"load: {self.load.unit!r} is no unit of a force, pressure or depth; {nearest(self.load.unit, LOADS)}"
+            )
+        if not 0 < self.load.rated < math.inf:
+            raise TaccorlError(f"load: rated {self.load.rated:g} {self.load.unit}; give the greatest load, above 0")
+        if self.reading.unit not in READINGS:
+            raise TaccorlError(
+                f"reading: {self.reading.unit!r} is no unit of a reading; {nearest(self.reading.unit, READINGS)}"
+            )
+        if self.low >= self.high:
+            raise TaccorlError(f"reading: lowest {self.low:g} is not below highest {self.high:g}")
+        if self.rate_hz is not None and not 0 < self.rate_hz < math.inf:
+            raise TaccorlError(f"rate_hz: {self.rate_hz:g} is not above 0")
+        for key in ("gain", "offset"):
+            numbers = getattr(self, key)
+            if numbers and len(numbers) != self.num_cells:
+                raise TaccorlError(
+                    f"{key}: {len(numbers)} numbers for {self.num_cells} cells; give one for each cell, or none"
+                )
+        if bool(self.gain) != bool(self.offset):
+            raise TaccorlError("gain and offset: give both, or none and they are fitted")
+        self.effects = [_of_cells(effect) for effect in self.effects]
+        present(self.effects)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns; cells with names are one row."""
+        return (1, len(self.cells)) if self.cells else (self.rows or 0, self.columns or 0)
+
+    @property
+    def num_cells(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the cells, row after row."""
+        rows, columns = self.shape
+        return tuple(self.cells) or tuple(f"r{i}c{j}" for i in range(rows) for j in range(columns))
+
+    @property
+    def gives(self) -> tuple[str, ...]:
+        """What its recordings may know of ``taccorl.sim.effects.effect.NEEDS``, but for the temperature."""
+        return ("reading", "neighbours") if not self.cells and self.num_cells > 1 else ("reading",)
+
+    @property
+    def low(self) -> float:
+        return -math.inf if self.reading.lowest is None else self.reading.lowest
+
+    @property
+    def high(self) -> float:
+        return math.inf if self.reading.highest is None else self.reading.highest
+
+    @property
+    def sign(self) -> float:
+        """−1 where the reading falls under load."""
+        return -1.0 if self.reading.falls else 1.0
+
+    @property
+    def load_of_reading(self) -> float:
+        """Load [``load.unit``] that is 1 in the unit ``reading``."""
+        return self.load.rated / READINGS_OF_RATED
+
+    def told(self, value: float, unit: str) -> tuple[float, str]:
+        """A number in a unit made of ``reading`` as a load: (0.4, "reading/min") → (0.8, "N/min") at 20 N rated."""
+        if "reading" not in unit:
+            return value, unit
+        return value * self.load_of_reading, unit.replace("reading", self.load.unit)
+
+
+def make_cells_effect(name: str, **values: Any) -> Effect:
+    """An effect of a sensor of cells.
+
+    Raises:
+        TaccorlError: as ``make_effect``; or it does not act on cells.
+    """
+    return _of_cells(make_effect(name, **values))
+
+
+def _of_cells(effect: Effect) -> Effect:
+    if "cells" not in effect.kinds() or not isinstance(effect, TouchEffect):
+        raise TaccorlError(
+            f"effects: {effect.name} acts on {', '.join(effect.kinds())}, not on cells; taccorl effects --for=cells lists those"
+        )
+    return dataclasses.replace(effect, pads=[CELLS])
+
+
+def load_cells(path: Path) -> CellsConfig:
+    """A cells file.
+
+    Raises:
+        SpecError: with file, line and key.
+    """
+    path = Path(path)
+    document = EffectsDocument(CellsConfig, path)
+    config: CellsConfig = document.value
+    for k, effect in enumerate(config.effects):
+        lacking = [word for word in effect.needs if word not in (*config.gives, "temperature")]
+        if lacking:
+            raise document.error(f"effects/{k}", f"{effect.name} needs {lacking[0]}; give rows and columns of the grid")
+    config.name = config.name or path.stem
+    return config
+
+
+def cells_text(config: CellsConfig) -> str:
+    """``config`` as its file has it."""
+    plain = {
+        f.name: value
+        for f in dataclasses.fields(config)
+        if f.name not in ("effects", "load", "reading") and (value := getattr(config, f.name)) not in (None, [])
+    }
+    plain |= {"load": _short(config.load), "reading": _short(config.reading)}
+    for key in ("gain", "offset"):
+        if key in plain:
+            plain[key] = [float(f"{x:.7g}") for x in plain[key]]
+    plain["effects"] = [{k: v for k, v in effect_entry(e).items() if k != "pads"} for e in config.effects]
+    return _HEADER + yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+
+
+def _short(note: Load | Reading) -> dict[str, Any]:
+    return {f.name: v for f in dataclasses.fields(note) if (v := getattr(note, f.name)) is not None}
+
+
+def cells_digest(config: CellsConfig) -> str:
+    """16 hexadecimal digits that two sensors share only if they are the same."""
+    return hashlib.sha256(cells_text(config).encode()).hexdigest()[:16]
+
+
+def save_cells(config: CellsConfig, path: Path) -> None:
+    """Write ``cells_text``; the file is replaced as a whole or not at all.
+
+    Raises:
+        TaccorlError: the folder cannot be written to.
+    """
+    write_whole(path, cells_text(config))

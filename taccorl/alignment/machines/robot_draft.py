@@ -1,0 +1,101 @@
+"""A first robot file from an MJCF or URDF file: what the model says, and ``TODO`` where only the user knows."""
+
+import os
+from pathlib import Path
+
+from taccorl.alignment.machines.robot_file import TODO
+from taccorl.alignment.machines.robot_model import JointFacts, RobotModel, load_robot_model
+
+_LAWS = {
+    "impedance": "kp (q* − q) − kd q̇ + torque_ff. Columns NAME.q, NAME.q_target, NAME.tau; a PD on a torque interface, too",
+    "cascade": "kd (kp (q* − q) − q̇) + torque_ff. Columns as for impedance; kp in 1/s",
+    "velocity": "kd (q̇* − q̇) + torque_ff. Column NAME.qd_target; no kp",
+    "torque": "τ* + torque_ff. Column NAME.tau_target (a current times k_t: `factor:` in a columns file); no kp, no kd",
+    "pwm": "k_t (V d − k_e q̇) / R, duty d = kp (q* − q) − kd q̇ within ± 1: supply_v, resistance_ohm, torque_nm_per_a",
+}
+_HEADER = """\
+# A robot, drafted from {model}. Write a value for each TODO; loading the file names those that are left.
+# taccorl compare sweeps/ --twin={name}      how far this model is from recordings, and where
+# taccorl diagnose sweeps/ --twin={name}     which physical effect it lacks
+"""
+
+
+def robot_draft(model: Path, out: Path) -> tuple[str, RobotModel]:
+    """Text of a robot file at ``out``, and the model that it names.
+
+    Raises:
+        TaccorlError: the model cannot be used (``load_robot_model``).
+    """
+    robot = load_robot_model(model)
+    relative = Path(os.path.relpath(Path(model).resolve(), Path(out).resolve().parent)).as_posix()
+    lines = [_HEADER.format(model=Path(model).name, name=Path(out).name).rstrip()]
+    lines += [f"# Of the model: {remark}." for remark in robot.remarks]
+    lines += [
+        "kind: robot",
+        f"model: {relative}",
+        f"gravity_compensation: {TODO}      # 1.0 if the controller adds the arm's weight to its torque, 0.0 if it does not",
+        "# law: what the drive does with its target, and so the numbers that it needs (k_t and k_e at the joint, gear included):",
+        *(f"#   {law + ':':<11}{words}" for law, words in _LAWS.items()),
+        "joints:                        # remove those that no recording moves; they are held where the model has them",
+    ]
+    for facts in robot.joints.values():
+        lines += _joint(facts)
+    return "\n".join(lines) + "\n", robot
+
+
+def _joint(facts: JointFacts) -> list[str]:
+    turn, torque = ("rad", "N·m") if facts.unit == "rad" else ("m", "N")
+    inertia = "kg·m²" if facts.unit == "rad" else "kg"
+    per_gear = "turns of the motor for one of the joint" if facts.unit == "rad" else "rad of the motor for one m"
+    limits = "no limits" if facts.limits is None else f"{facts.limits[0]:.4g} … {facts.limits[1]:.4g} {turn}"
+    servo = next((a for a in facts.actuators if a.kp > 0), None)
+    speed = next((a for a in facts.actuators if a.kd > 0), None)
+    lines = [
+        f"  {facts.name}:   # {limits}; inertia {facts.inertia:.3g} {inertia} at the model's zero pose",
+        f"    law: {'velocity ' if speed and not servo else 'impedance'}             # or another one of those above",
+    ]
+    if servo:
+        source = f"   # {torque}/{turn}, of actuator {servo.name}; is it what the drive runs?"
+        lines += [f"    kp: {servo.kp:.6g}{source}", f"    kd: {servo.kd:.6g}   # {torque}·s/{turn}"]
+    elif speed:
+        lines += [f"    kd: {speed.kd:.6g}   # {torque}·s/{turn}, of actuator {speed.name}; is it what the drive runs?"]
+    else:
+        lines += [
+            f"    kp: {TODO}                   # {torque}/{turn}: position gain of the drive; a guess where nobody knows it",
+            f"    kd: {TODO}                   # {torque}·s/{turn}: damping gain",
+        ]
+    lines += [f"    gains: {TODO}                # commanded: the drive runs kp and kd; fitted: nobody knows them"]
+    if facts.armature > 0:
+        lines += [
+            f"    rotor_inertia: {facts.armature:.6g}   # {inertia}: the model's armature, already at the joint, so gear is 1",
+        ]
+    else:
+        lines += [
+            "    # rotor_inertia: 1.0e-5    # kg·m² of the motor; without it no effect in the gear is looked for",
+            f"    # gear: 100.0              # {per_gear}",
+        ]
+    limit = facts.effort_limit or next((a.effort_limit for a in facts.actuators if a.effort_limit), None)
+    if limit:
+        lines += [f"    effort_limit: {limit:.6g}   # {torque}; torques beyond are clipped"]
+    else:
+        lines += [f"    # effort_limit: 10.0       # {torque}; the model names none"]
+    lines += [
+        "    # loop_hz: 1000.0          # of the drive's control loop, where it is known",
+        "    # command_hz: 1000.0       # where the drive receives targets faster than they are logged",
+        "    # effort_after_target: true   # where the effort of a row answers the row's own target already",
+    ]
+    effects = []
+    if facts.damping > 0:
+        effects.append(f"{{effect: viscous_friction, damping_nms_per_rad: {facts.damping:.6g}}}")
+    if facts.friction > 0:
+        effects.append(f"{{effect: coulomb_friction, torque_nm: {facts.friction:.6g}}}")
+    if facts.stiffness > 0:
+        effects.append(
+            f"{{effect: cable_spring, stiffness_nm_per_rad: {facts.stiffness:.6g}, rest_rad: {facts.spring_rest:.6g}}}"
+        )
+    if effects:
+        lines += [
+            "    effects:   # the model's damping, dry friction and springs",
+            *(f"    - {line}" for line in effects),
+        ]
+    return lines

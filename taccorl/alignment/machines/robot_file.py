@@ -1,0 +1,400 @@
+"""A robot file: any robot as a kinematic tree of an MJCF or URDF file, with what only its user knows of each joint's drive.
+
+::
+
+    kind: robot
+    model: my_arm.xml                 # MJCF or URDF, relative to this file; meshes are not needed
+    gravity_compensation: 1.0         # share of the weight that the controller adds to its torque; 0 if it adds none
+    joints:
+      elbow:                          # as the model calls it, and as the tables' columns do: elbow.q, elbow.q_target
+        law: impedance                # τ = kp (q* − q) − kd q̇ + torque_ff; others: drive_law
+        kp: 40.0                      # N·m/rad; of a sliding joint N/m
+        kd: 1.5                       # N·m·s/rad
+        gains: commanded              # kp and kd are what the controller runs; fitted: nobody knows, these are a start
+        rotor_inertia: 1.2e-5         # kg·m² of the motor, and …
+        gear: 100.0                   # … turns of the motor for one of the joint: 0.12 kg·m² at the joint
+        effort_limit: 30.0            # N·m; torques beyond are clipped
+        loop_hz: 1000.0               # of the drive's own control loop, where it is known
+        effects:                      # physics beyond rigid bodies and control; taccorl add-effect writes them
+        - {effect: coulomb_friction, torque_nm: 0.41}
+
+``taccorl init-robot my_arm.xml`` writes such a file with all that the model says, and ``TODO`` where only the user knows.
+"""
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import mujoco
+import numpy as np
+import yaml
+
+from taccorl.alignment.controller.drive_law import DriveLaw
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.rigid_joint import (
+    NEED_ROTOR,
+    Gains,
+    Rigid,
+    RigidJoint,
+    Surroundings,
+    moved_by_others,
+    needed_nm,
+    resting,
+    rigid_terms,
+    torque_along,
+)
+from taccorl.alignment.machines.robot_model import JointFacts, RobotModel, load_robot_model
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.errors import SpecError, TaccorlError, nearest
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.settings import check_numbers
+from taccorl.sim.twin_file import EffectsDocument, effect_entry
+
+TODO = "TODO"
+_GIVES = ("target", "position", "velocity", "acceleration", "effort", "load")
+"""What the model of one joint knows (``Effect.needs``)."""
+_STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
+_HEADER = "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
+
+
+@dataclass(kw_only=True)
+class JointConfig(DriveLaw):
+    """The drive of one joint. Units are those of a hinge; of a sliding joint N for N·m, m for rad, kg for kg·m²."""
+
+    gains: Literal["commanded", "fitted"] = "commanded"
+    """Whether kp and kd are what the controller runs, or only where a fit starts. Of law pwm they are the servo's own, and stall
+    torque and back-EMF are fitted."""
+    rotor_inertia: float = 0.0
+    """kg·m² of the motor's rotor, on the motor's side of the gear."""
+    gear: float = 1.0
+    """Turns of the motor for one of the joint; of a sliding joint rad/m."""
+    loop_hz: float | None = None
+    """Rate of the drive's control loop."""
+    command_hz: float | None = None
+    """Rate at which the drive receives targets, where they are logged more slowly: a replay joins the rows by straight
+    lines of such steps. If not given, a target is held until the next row."""
+    position_age_s: float = 0.0
+    """How much older than the loop's timing says the measured position is when the torque acts; ``diagnose`` fits it."""
+    effects: list[Effect] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        check_numbers("joint", self, positive=("gear",), not_negative=("rotor_inertia",))
+        optional = ("loop_hz", "command_hz")
+        check_numbers("joint", self, positive=[name for name in optional if getattr(self, name) is not None])
+        self.check_law("joint")
+        if self.law == "pwm" and self.gains == "fitted":
+            raise TaccorlError(
+                "joint.gains: of law pwm stall torque and back-EMF are fitted, not kp and kd; "
+                "write those that the servo has, and `gains: commanded`"
+            )
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether ``diagnose`` fits numbers of the law, because nobody knows them."""
+        return self.law == "pwm" or self.gains == "fitted"
+
+    @property
+    def armature(self) -> float:
+        """kg·m²: the rotor's inertia as it acts at the joint."""
+        return self.rotor_inertia * self.gear**2
+
+
+@dataclass(kw_only=True)
+class RobotConfig:
+    """A robot file."""
+
+    kind: Literal["robot"]
+    model: str
+    """MJCF or URDF file, relative to this one."""
+    gravity_compensation: float = 0.0
+    """Share of the weight that the controller adds to its torque."""
+    joints: dict[str, JointConfig]
+
+    def __post_init__(self) -> None:
+        check_numbers("robot", self, not_negative=("gravity_compensation",))
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot file with its model. ``joint`` returns what the one-joint model needs."""
+
+    config: RobotConfig
+    rigid: RobotModel
+    path: Path
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Joint of the model → rad or m; those that the file does not name can be recorded, too, and are then known to move."""
+        return {name: facts.unit for name, facts in self.rigid.joints.items()}
+
+    def joint(self, signal: str) -> "RobotJoint":
+        if signal not in self.config.joints:
+            raise TaccorlError(f"{self.path}: no joint {signal!r}; {nearest(signal, self.config.joints)}")
+        return RobotJoint(self, signal)
+
+    def with_joint(self, signal: str, config: JointConfig) -> "Robot":
+        """With another drive at one joint."""
+        joints = {name: config if name == signal else own for name, own in self.config.joints.items()}
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, joints=joints))
+
+    def text(self, path: Path) -> str:
+        """As a file at ``path`` has it: keys that are at their defaults are left out."""
+        model = self.rigid.path.resolve()
+        folder = Path(path).resolve().parent
+        content: dict[str, Any] = {"kind": "robot", "model": Path(os.path.relpath(model, folder)).as_posix()}
+        content |= _set(self.config, ("gravity_compensation",))
+        content["joints"] = {}
+        for name, joint in self.config.joints.items():
+            names = [f.name for f in dataclasses.fields(JointConfig) if f.name != "effects"]
+            content["joints"][name] = _set(joint, names)
+            if joint.effects:
+                content["joints"][name]["effects"] = [
+                    {k: v for k, v in effect_entry(e).items() if k not in ("arm", "joints")} for e in joint.effects
+                ]
+        return _HEADER + yaml.safe_dump(
+            content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
+        )
+
+    def digest(self) -> str:
+        """16 hexadecimal digits that two robots share only if file and model are the same."""
+        model = self.rigid.path.read_bytes()
+        return hashlib.sha256(self.text(self.path).encode() + model).hexdigest()[:16]
+
+
+def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
+    fields = {f.name: f for f in dataclasses.fields(config)}
+    return {name: getattr(config, name) for name in names if getattr(config, name) != fields[name].default}
+
+
+def load_robot(path: Path) -> Robot:
+    """A robot file and its model.
+
+    Raises:
+        SpecError: the file holds ``TODO``, a wrong key or value, or a joint that the model lacks; with file and line.
+        TaccorlError: the model cannot be used (``load_robot_model``).
+    """
+    path = Path(path)
+    _refuse_todo(path)
+    document = EffectsDocument(RobotConfig, path)
+    config = document.value
+    model = path.parent / config.model
+    if not model.is_file():
+        raise document.error("model", f"no file {config.model!r} beside it; write the path of the MJCF or URDF file")
+    rigid = load_robot_model(model, config.gravity_compensation)
+    if not config.joints:
+        raise document.error("joints", f"names no joint; the model has {', '.join(rigid.joints)}")
+    for name, joint in config.joints.items():
+        if name not in rigid.joints:
+            raise document.error(
+                f"joints/{name}", f"{config.model} has no joint {name!r}; {nearest(name, rigid.joints)}"
+            )
+        for k, effect in enumerate(joint.effects):
+            key = f"joints/{name}/effects/{k}"
+            if not acts_on_joint(type(effect), weight=True, rotor=True):
+                raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
+            if not joint.takes(effect.name):
+                raise document.error(
+                    key, f"{effect.name} acts in a position loop, and law {joint.law} has none; remove it"
+                )
+            if effect.name in NEED_ROTOR and joint.armature == 0.0:
+                raise document.error(
+                    key, f"{effect.name} needs the inertia of the motor: write rotor_inertia (kg·m²) and gear of {name}"
+                )
+    return Robot(config, rigid, path)
+
+
+def _refuse_todo(path: Path) -> None:
+    """
+    Raises:
+        SpecError: names each line that still says ``TODO``, with its comment, which says what to write.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return  # what reads it says so
+    left: list[tuple[int, str]] = []
+    joint = ""
+    for number, line in enumerate(lines, 1):
+        content, _, comment = line.partition("#")
+        key, _, value = content.partition(":")
+        if not value.strip() and key.startswith("  ") and not key.startswith("   "):
+            joint = key.strip()
+        if value.strip() == TODO:
+            owner = f"{joint}/" if key.startswith("    ") else ""
+            left.append((number, f"{owner}{key.strip()} ({comment.strip() or 'write its value'})"))
+    if left:
+        words = "; ".join(f"line {number} {what}" for number, what in left)
+        raise SpecError(f"{path}:{left[0][0]}: {TODO} is left, write a value instead: {words}")
+
+
+def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool) -> bool:
+    """Whether an effect can act on one joint of a robot file: the one-joint model knows it by its numbers.
+
+    Args:
+        weight: the controller carries weight.
+        rotor: the rotor's inertia is known.
+    """
+    if "joint" not in cls.kinds() or not cls.works_with((*_GIVES, *["weight"] * weight)):
+        return False
+    if cls.name in NEED_ROTOR and not rotor:
+        return False
+    typical = {p.name: p.typical for p in cls.parameters()}
+    return bool(make_effect(cls.name, **typical).drive())
+
+
+class RobotJoint(RigidJoint):
+    """One joint of a robot file. Positions of a pose are the model's ``qpos``."""
+
+    effort_holds_weight: ClassVar[bool] = True
+    exact_timing: ClassVar[bool] = True
+    follows_line: ClassVar[bool] = True
+
+    def __init__(self, robot: Robot, signal: str) -> None:
+        self._robot, self._config = robot, robot.config.joints[signal]
+        self.signal, self.unit = signal, robot.rigid.joints[signal].unit
+        self.gains = self._config.loop_gains
+        self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
+        self.command_hz = self._config.command_hz or 0.0
+        # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
+        # the output that a row shows before its own target acts. After it acts, the output is new.
+        loop_s = 0.0 if self._config.loop_hz is None else 1.0 / self._config.loop_hz
+        newer = -1.0 if self._config.effort_after_target else 1.0
+        self.facts = self._config.facts | {"effort_age": 0.5 * newer * loop_s}
+        self.position_age_s, self.speed_delay_s = 0.5 * loop_s + self._config.position_age_s, loop_s
+
+    @property
+    def known(self) -> JointFacts:
+        """What the model says of the joint."""
+        return self._robot.rigid.joints[self.signal]
+
+    def gain_scales(self, m: Measurement) -> tuple[float, float]:
+        return self._config.gain_scales(self.signal, m)
+
+    @property
+    def winding(self) -> dict[str, float]:
+        """Stall torque and back-EMF of law pwm; of others none."""
+        c = self._config
+        return {"stall_nm": c.stall_nm, "back_emf": c.back_emf} if c.law == "pwm" else {}
+
+    def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
+        gains, facts = super().numbers(values)
+        if "stall_nm" not in values:
+            return gains, facts
+        factor = values["stall_nm"] / self._config.stall_nm
+        gains = gains._replace(kp=self.gains.kp * factor, kd=self.gains.kd * factor)
+        return gains, {"duty_torque": values["stall_nm"], "back_emf": values["back_emf"]}
+
+    def timestep_s(self, rate_hz: float) -> float:
+        return self._config.timestep_s(rate_hz, self.known.inertia + self._config.armature)
+
+    def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        terms = rigid_terms(self._robot.rigid.model, self.signal, motion.pose)
+        return terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
+
+    def surroundings(self, m: Measurement) -> Surroundings:
+        if any(kg > 0 for kg in m.payload_kg.values()):
+            raise TaccorlError(
+                f"{m.name}: payload_kg is known for the PiPER's hands only; write a second model file with the mass fixed to its "
+                "link, and a robot file for it"
+            )
+        model = self._robot.rigid.model
+        pose = model.qpos0.copy()
+        for name in self._robot.rigid.joints:
+            if name in m.signals:
+                pose[model.joint(name).qposadr[0]] = resting(m, m.column(name))
+        coupling = self._coupling(m, pose) - m.known_load(self.signal)
+        j = m.column(self.signal)
+        on, added = (values[:, j] if values.size else None for values in (m.enabled, m.torque_ff))
+        return Surroundings(
+            coupling_nm=coupling, pose=pose, supply=self._config.supply(self.signal, m), on=on, torque_ff_nm=added
+        )
+
+    def whole(self, m: Measurement) -> Measurement:
+        """With all joints of the model, and with the file's gains where they are commanded and the recording states none.
+
+        Raises:
+            TaccorlError: a signal that the model lacks, or has in another unit.
+        """
+        names, units = tuple(self._robot.units), tuple(self._robot.units.values())
+        for name, unit in zip(m.signals, m.units, strict=True):
+            if name not in names:
+                model = self._robot.rigid.path.name
+                raise TaccorlError(
+                    f"{m.name}: {model} has no joint {name!r}; {nearest(name, names)}. Rename its columns"
+                )
+            if unit != self._robot.units[name]:
+                raise TaccorlError(f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}")
+            for key in ("lever_m", "arm_kg"):
+                if name in getattr(m, key):
+                    raise TaccorlError(
+                        f"{m.name}: {key} of {name} is stated, which only an axis file takes; remove it from measurements.yaml, "
+                        "and fix the mass to its link in the model"
+                    )
+            if m.enabled.size and not m.enabled[:, m.column(name)].all() and self._robot.config.gravity_compensation:
+                row = int(np.argmin(m.enabled[:, m.column(name)]))
+                raise TaccorlError(
+                    f"{m.name}: the motor of {name} is off at {m.time_s[row]:.3f} s, and by the robot file its controller "
+                    "carries the weight; cut the recording there"
+                )
+        stated: dict[str, dict[str, float]] = {"kp": dict(m.kp), "kd": dict(m.kd)}
+        for name, joint in self._robot.config.joints.items():
+            if joint.gains == "commanded":
+                for key in joint.gain_names:
+                    stated[key].setdefault(name, m.gain_scale.get(name, 1.0) * getattr(joint, key))
+        m = dataclasses.replace(m, kp=stated["kp"], kd=stated["kd"])
+        if m.signals == names:
+            return m
+        kinds = tuple(m.target_kind(name) if name in m.signals else "position" for name in names)
+        absent = {"load": 0.0, "torque_ff": 0.0, "supply_v": np.nan, "enabled": 1.0}
+        arrays: dict[str, np.ndarray] = {
+            name: np.full((m.num_rows, len(names)), absent.get(name, np.nan))
+            for name in ("measured", "velocity", "effort", *m.extra_columns)
+        }
+        model = self._robot.rigid.model
+        rest = [model.qpos0[model.joint(name).qposadr[0]] for name in names]
+        arrays["target"] = np.tile(rest, (m.num_rows, 1))
+        quantum = np.zeros(len(names))
+        for j, name in enumerate(names):
+            if name in m.signals:
+                quantum[j] = m.quantum[m.column(name)]
+                for key, values in arrays.items():
+                    values[:, j] = getattr(m, key)[:, m.column(name)]
+        return dataclasses.replace(m, **arrays, quantum=quantum, signals=names, units=units, target_kinds=kinds)
+
+    def effects(self, more: Sequence[Effect]) -> list[Effect]:
+        names = {effect.name for effect in more}
+        every = [*(e for e in self._config.effects if e.name not in names), *more]
+        return [effect for effect in every if not effect.is_absent]
+
+    def freed(self) -> "tuple[list[Effect], RobotJoint]":
+        own = [e for e in self._config.effects if e.fitted]
+        bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if not e.fitted])
+        return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal)
+
+    def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
+        weight, rotor = self._robot.config.gravity_compensation > 0, self._config.armature > 0
+        return {} if acts_on_joint(cls, weight=weight, rotor=rotor) and self._config.takes(cls.name) else None
+
+    def _coupling(self, m: Measurement, pose: np.ndarray) -> np.ndarray:
+        """(T,) torque because other joints move; of a sliding joint its weight as well, which does not change as it slides."""
+        model, joint = self._robot.rigid.model, self._robot.rigid.model.joint(self.signal)
+        slide = model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE
+        constant = np.zeros(m.num_rows)
+        if slide:
+            still = np.zeros((1, model.nv))
+            constant += needed_nm(model, self.signal, pose[None], still, still)[0]
+        angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
+        if len(angles) == 1:
+            return constant
+        both = []
+        for moving in (list(angles), [self.signal]):
+            q = np.tile(pose, (m.num_rows, 1))
+            for name in moving:
+                q[:, model.joint(name).qposadr[0]] = angles[name]
+            both.append(torque_along(model, self.signal, q, m.period_s))
+        return both[0] - both[1] + constant

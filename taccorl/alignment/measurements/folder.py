@@ -1,0 +1,452 @@
+"""All measurements of a folder, and which of them are for fitting, for judging and for the final figures.
+
+A folder of recordings may hold a ``measurements.yaml`` that says what the files cannot::
+
+    spec: piper_flexitac_mcap         # how its recordings are read; not needed where only one shipped spec reads the format
+    columns: columns.yaml             # names and units of its tables
+    validation_every: 3                 # every third motion judges; or say it recording by recording
+    recordings:
+      sweep_05.mcap: {use: validation}
+      sweep_02.mcap: {repeat_of: sweep_01.mcap}
+      sweep_03.mcap: {kp: {left_joint5: 40}, kd: {left_joint5: 4}, effort_scale: {left_joint1: 0.25}}
+      sweep_04.mcap: {payload_kg: {left: 0.5}, payload_position_m: {left: [0, 0, 0.2]}}
+      swing_01.csv: {payload_kg: {servo: 0.3}, lever_m: {servo: 0.15}, arm_kg: {servo: 0.02}, supply_v: {servo: 7.4}}
+      press_01.mcap: {pressed: &ball {shape: sphere, radius_m: 0.012, arm: left, position_m: [0.001, 0, 0.003]}}
+      press_02.mcap: {pressed: *ball, use: validation}
+      press_03.mcap: {pressed: {shape: rod, radius_m: 0.008, length_m: 0.04, arm: left, rpy_rad: [0, 1.5708, 0]}}
+
+``payload_kg`` is a known mass in the gripper. Its centre of mass is ``payload_position_m`` [m] in link 6's frame: origin at the
+flange, z along the hand towards the fingers, y the direction in which they close. Not stated, it is the TCP, [0, 0, 0.168].
+``pressed`` is a known object between the fingers of one arm; with it ``taccorl compare`` and ``diagnose`` look at the arm's pads.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from taccorl.alignment.measurements.dataset_rows import read_dataset
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.pressed import PressedObject, indenter
+from taccorl.alignment.measurements.recorded import read_recording
+from taccorl.alignment.measurements.tables import SUFFIXES, TableSpec, load_table_spec, read_table
+from taccorl.data.decode import natural_key
+from taccorl.data.recording import find_sources
+from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_recording_specs
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import RecordingError, TaccorlError, nearest
+from taccorl.robots import ROBOT
+
+INDEX = "measurements.yaml"
+TableReader = Callable[[Path, Any], Measurement]
+"""Reads a table: its path, and its columns file if there is one."""
+FARTHEST_PAYLOAD_M = 1.0
+"""Of a payload's centre of mass from the flange: the arm itself reaches 0.63 m (PiPER manual)."""
+Use = Literal["fit", "validation", "test"]
+if TYPE_CHECKING:
+    ArmName = str
+else:  # the names that a measurements.yaml may give: others are an error with its line
+    ArmName = Literal[*ROBOT.arms]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PressedNote:
+    """A known object between the fingers of one arm: what ``indenter`` takes."""
+
+    shape: Literal["sphere", "rod"]
+    radius_m: float
+    arm: ArmName
+    length_m: float | None = None
+    """Of a rod, which has flat ends; a sphere has none."""
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Its middle: in the TCP's frame (middle between the pads, z = approach, fingers close along y), or in the world's."""
+    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Fixed-axis roll, pitch, yaw; a rod lies along its own z, and [0, 1.5708, 0] lays it across the pads."""
+    frame: Literal["tcp", "world"] = "tcp"
+    """tcp: it keeps its place in the hand; world: it is fixed to the bench."""
+
+    def made(self) -> PressedObject:
+        """For ``touch_motion``."""
+        size = {} if self.length_m is None else {"length_m": self.length_m}
+        place = {"position_m": self.position_m, "rpy_rad": self.rpy_rad, "frame": self.frame}
+        return indenter(self.shape, self.radius_m, self.arm, **size, **place)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingNote:
+    """What is known of one recording besides its file."""
+
+    use: Use | None = None
+    """fit: parameters are fitted to it; validation: choices are made on it; test: nothing is chosen on it."""
+    repeat_of: str | None = None
+    kp: dict[str, float] = field(default_factory=dict)
+    """Signal → commanded gain [N·m/rad, N/m]."""
+    kd: dict[str, float] = field(default_factory=dict)
+    """Signal → [N·m·s/rad, N·s/m]."""
+    gain_scale: dict[str, float] = field(default_factory=dict)
+    """Signal → factor of both gains over the other recordings', where no more than that is known."""
+    payload_kg: dict[str, float] = field(default_factory=dict)
+    """Arm, or an axis of its own file → mass held."""
+    lever_m: dict[str, float] = field(default_factory=dict)
+    """Axis of its own file → distance from the axis to the payload, where it is not that file's."""
+    arm_kg: dict[str, float] = field(default_factory=dict)
+    """Axis of its own file → mass of the arm that holds the payload, a uniform rod as long as the lever."""
+    supply_v: dict[str, float] = field(default_factory=dict)
+    """Axis of its own file → voltage of its motor's supply, where no column has it."""
+    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Arm → centre of mass of what is held, in link 6's frame (flange, z along the hand); the TCP, [0, 0, 0.168], by default."""
+    effort_scale: dict[str, float] = field(default_factory=dict)
+    """Signal → factor to N·m, N: PiPER's firmware 1.5 to 1.8 reports joints 1 to 3 four times too large
+    (piper_sdk issue 73)."""
+    pressed: PressedNote | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementIndex:
+    """``measurements.yaml``."""
+
+    spec: str | None = None
+    columns: str | None = None
+    validation_every: int = 0
+    """0: only what is named."""
+    recordings: dict[str, RecordingNote] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Several measurements and what each is for; the split is part of every result made from them."""
+
+    fit: tuple[Measurement, ...]
+    validation: tuple[Measurement, ...] = ()
+    test: tuple[Measurement, ...] = ()
+    rule: str = ""
+    """How they were divided, in words."""
+    skipped: tuple[str, ...] = ()
+    """What else lay in the folder and was not read, and why."""
+
+    @property
+    def all(self) -> tuple[Measurement, ...]:
+        return (*self.fit, *self.validation, *self.test)
+
+    def record(self) -> dict[str, object]:
+        """The split for a report: rule and names."""
+        names = {use: [m.name for m in getattr(self, use)] for use in ("fit", "validation", "test")}
+        return {"rule": self.rule, **names, "skipped": list(self.skipped)}
+
+
+def read_measurements(
+    path: Path,
+    *,
+    spec: str | Path | RecordingSpec | None = None,
+    columns: Path | TableSpec | None = None,
+    validation: Sequence[str] = (),
+    test: Sequence[str] = (),
+    validation_every: int | None = None,
+    units: Mapping[str, str] | None = None,
+    table: "TableReader | None" = None,
+) -> Measurements:
+    """A recording, a table, a dataset, or a folder of those, divided.
+
+    Args:
+        spec: recording spec; else the index's, else the only shipped one that reads the format.
+        columns: columns file of the tables; else the index's, else our own names.
+        validation, test: names of measurements; with those the index's ``use`` is not looked at.
+        validation_every: every k-th motion that is not named is for validation; else the index's.
+        units: signal of the machine → unit of its position, for tables without a columns file; the PiPER's if not given.
+        table: reads a table, by its path and that of the columns file, of a machine whose tables are not of joints; ``columns``
+            is then a path.
+
+    Raises:
+        TaccorlError: nothing to read, unknown names, or a motion and its repeat on both sides.
+    """
+    path = Path(path)
+    folder = path if path.is_dir() else path.parent
+    index = _load_index(folder, ROBOT.arms if units is None else (*ROBOT.arms, *units))
+    spec = spec if spec is not None or index.spec is None else _beside(folder, index.spec)
+    columns = columns if columns is not None or index.columns is None else folder / index.columns
+    table = table or _joint_tables(columns, units)
+    skipped: list[str] = []
+    found = sorted(_read(path, spec, lambda one: table(one, columns), skipped), key=lambda m: natural_key(m.name))
+    found = _noted(found, index, folder, whole=path.is_dir())
+    whole = path.is_dir()
+    if validation or test or not whole:  # who asks for one file wants to fit it
+        named = {"validation": list(validation), "test": list(test)}
+    else:
+        named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "validation", "test")}
+    every = index.validation_every * whole if validation_every is None else validation_every
+    return dataclasses.replace(split(found, **named, validation_every=every), skipped=tuple(skipped))
+
+
+def _joint_tables(columns: Path | TableSpec | None, units: Mapping[str, str] | None) -> TableReader:
+    spec = columns if isinstance(columns, TableSpec) or columns is None else load_table_spec(columns)
+    return lambda path, _: read_table(path, spec, units)
+
+
+def split(
+    measurements: Iterable[Measurement],
+    *,
+    fit: Sequence[str] = (),
+    validation: Sequence[str] = (),
+    test: Sequence[str] = (),
+    validation_every: int = 0,
+) -> Measurements:
+    """Divide by name, and every k-th of the other motions to ``validation``. The same list gives the same split.
+
+    A motion and its repeats count as one and stay together: in validation, a repeat would measure the noise and not the model.
+
+    Raises:
+        TaccorlError: a name that no measurement has, one named twice, a motion on both sides, or nothing left to fit.
+    """
+    measurements = list(measurements)
+    names = [m.name for m in measurements]
+    if len(set(names)) != len(names):
+        raise TaccorlError(
+            f"two measurements are called {next(n for n in names if names.count(n) > 1)!r}; rename one file"
+        )
+    uses: dict[str, str] = {}
+    for use, listed in (("fit", fit), ("validation", validation), ("test", test)):
+        for name in listed:
+            if name not in names:
+                raise TaccorlError(f"{use}: no measurement {name!r}; {nearest(name, names)}")
+            if uses.setdefault(name, use) != use:
+                raise TaccorlError(f"{name} is both {uses[name]} and {use}; name it once")
+    if validation_every < 0 or validation_every == 1:
+        raise TaccorlError(f"validation_every: {validation_every} leaves nothing to fit; 0 is none, 2 every second")
+    motion = motions(measurements)
+    for name, use in list(uses.items()):
+        for other in (n for n in names if motion[n] == motion[name]):
+            if uses.setdefault(other, use) != use:
+                raise TaccorlError(
+                    f"{name} ({use}) and {other} ({uses[other]}) repeat one motion: put both on one side"
+                )
+    free = list(dict.fromkeys(motion[n] for n in names if n not in uses))
+    taken = {m for k, m in enumerate(free) if validation_every and k % validation_every == validation_every - 1}
+    for name in names:
+        uses.setdefault(name, "validation" if motion[name] in taken else "fit")
+    sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "validation", "test")}
+    if not sides["fit"]:
+        raise TaccorlError(
+            f"nothing is left to fit: {len(sides['validation'])} for validation, {len(sides['test'])} for the test"
+        )
+    words = [f"{len(validation) + len(test)} by name"] * bool(validation or test)
+    words += [f"every {validation_every}. of {len(free)} motions for validation"] * bool(validation_every)
+    return Measurements(sides["fit"], sides["validation"], sides["test"], rule=", ".join(words) or "all for fitting")
+
+
+def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
+    """Name → name of the first recording of its motion, which need not be at hand.
+
+    Raises:
+        TaccorlError: repeats in a circle.
+    """
+    of = {m.name: m.repeat_of for m in measurements}
+    roots = {}
+    for name in of:
+        root, seen = name, [name]
+        while of.get(root) is not None:
+            root = str(of[root])
+            if root in seen:
+                raise TaccorlError(f"{' repeats '.join([*seen, root])}: a circle; mend repeat_of")
+            seen.append(root)
+        roots[name] = root
+    return roots
+
+
+def _load_index(folder: Path, holders: Sequence[str]) -> MeasurementIndex:
+    path = folder / INDEX
+    if not path.is_file():
+        return MeasurementIndex()
+    document = Document(MeasurementIndex, path)
+    index = document.value
+    for name, note in index.recordings.items():
+        for key in ("kp", "kd", "gain_scale", "payload_kg", "lever_m", "arm_kg", "supply_v"):
+            bad = next((s for s, v in getattr(note, key).items() if v < 0), None)
+            if bad:
+                raise document.error(f"recordings/{name}/{key}/{bad}", f"{getattr(note, key)[bad]:g} is below 0")
+        axes = [h for h in holders if h not in (*ROBOT.arms, *ROBOT.action_names)]
+        for key in ("payload_kg", "payload_position_m", "lever_m", "arm_kg", "supply_v"):
+            known = {"payload_kg": holders, "payload_position_m": ROBOT.arms}.get(key, axes)
+            arm = next((a for a in getattr(note, key) if a not in known), None)
+            if arm:
+                others = [h for h in known if h not in ROBOT.action_names]
+                what = "arm" if set(known) & set(ROBOT.arms) else "axis of a file of kind axis"
+                raise document.error(
+                    f"recordings/{name}/{key}/{arm}", f"no {what} {arm!r}; {', '.join(others) or 'there is none'}"
+                )
+        _check_payload_positions(document, f"recordings/{name}/payload_position_m", note)
+        if note.pressed is not None:
+            _check_pressed(document, f"recordings/{name}/pressed", note.pressed)
+    if index.columns and not (folder / index.columns).is_file():
+        raise document.error("columns", f"no file {index.columns!r} beside it")
+    return index
+
+
+def _check_payload_positions(document: Document[MeasurementIndex], key: str, note: RecordingNote) -> None:
+    for arm, at_m in note.payload_position_m.items():
+        if not all(math.isfinite(x) and abs(x) <= FARTHEST_PAYLOAD_M for x in at_m):
+            text = f"{list(at_m)} is further than {FARTHEST_PAYLOAD_M:g} m from the flange; is it in millimetres?"
+            raise document.error(f"{key}/{arm}", text)
+
+
+def _check_pressed(document: Document[MeasurementIndex], key: str, pressed: PressedNote) -> None:
+    if (pressed.shape == "rod") != (pressed.length_m is not None):
+        need = "a rod needs its length_m" if pressed.shape == "rod" else "a sphere has no length_m; leave it out"
+        raise document.error(key if pressed.length_m is None else f"{key}/length_m", need)
+    for name in ("radius_m", "length_m"):
+        size = getattr(pressed, name)
+        if size is not None and not 0 < size < math.inf:
+            raise document.error(f"{key}/{name}", f"{size:g} is not above 0")
+    if 2 * pressed.radius_m > ROBOT.opening_max_m:
+        text = (
+            f"{pressed.radius_m:g} m does not fit between the fingers, which open {ROBOT.opening_max_m:g} m; "
+            "is it in millimetres?"
+        )
+        raise document.error(f"{key}/radius_m", text)
+
+
+def _beside(folder: Path, name: str) -> str | Path:
+    """A spec beside the index, or the shipped one of that name."""
+    return folder / name if (folder / name).is_file() else name
+
+
+def _note(index: MeasurementIndex, measurement: Measurement) -> RecordingNote:
+    return index.recordings.get(measurement.name, RecordingNote())
+
+
+def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, whole: bool) -> list[Measurement]:
+    names = [m.name for m in found]
+    unknown = [name for name in index.recordings if name not in names]
+    if whole and unknown:
+        raise TaccorlError(f"{folder / INDEX}: no recording {unknown[0]!r} here; {nearest(unknown[0], names)}")
+    noted = []
+    for m in found:
+        note = _note(index, m)
+        if whole and note.repeat_of is not None and note.repeat_of not in names:
+            raise TaccorlError(
+                f"{folder / INDEX}: recordings → {m.name} → repeat_of: no recording {note.repeat_of!r} here; "
+                f"{nearest(note.repeat_of, names)}"
+            )
+        for key in ("kp", "kd", "effort_scale", "supply_v"):
+            for name in getattr(note, key):
+                if name not in m.signals:
+                    raise TaccorlError(
+                        f"{folder / INDEX}: recordings → {m.name} → {key}: no signal {name!r}; "
+                        f"{nearest(name, m.signals)}"
+                    )
+        for arm in note.payload_position_m:
+            if not (m.payload_kg | note.payload_kg).get(arm):
+                raise TaccorlError(
+                    f"{folder / INDEX}: recordings → {m.name} → payload_position_m: {arm} holds no payload; state payload_kg, "
+                    "or leave it out"
+                )
+        if note.pressed is not None and m.touch is None:
+            why = next((f" ({f.text})" for f in m.findings if f.check == "no_baseline"), "")
+            raise TaccorlError(
+                f"{folder / INDEX}: recordings → {m.name} → pressed: the recording holds no frames of the pads{why}; record "
+                "them, or leave pressed out"
+            )
+        repeat_of = note.repeat_of or m.repeat_of
+        if repeat_of and index.recordings.get(repeat_of, RecordingNote()).pressed != note.pressed:
+            raise TaccorlError(
+                f"{folder / INDEX}: recordings → {m.name} → pressed: it repeats {repeat_of}, for which pressed is not the same; "
+                "mend pressed, or repeat_of"
+            )
+        supply_v = m.supply_v
+        if note.supply_v:
+            if supply_v.size:
+                raise TaccorlError(
+                    f"{folder / INDEX}: recordings → {m.name} → supply_v: the recording has a column of it; remove one of them"
+                )
+            supply_v = np.tile([note.supply_v.get(name, np.nan) for name in m.signals], (m.num_rows, 1))
+        scale = np.array([note.effort_scale.get(name, 1.0) for name in m.signals])
+        noted.append(
+            dataclasses.replace(
+                m,
+                repeat_of=repeat_of,
+                kp=m.kp | note.kp,
+                kd=m.kd | note.kd,
+                gain_scale=m.gain_scale | note.gain_scale,
+                payload_kg=m.payload_kg | note.payload_kg,
+                lever_m=note.lever_m,
+                arm_kg=note.arm_kg,
+                supply_v=supply_v,
+                payload_position_m=m.payload_position_m | note.payload_position_m,
+                pressed=note.pressed.made() if note.pressed is not None else None,
+                effort=m.effort * scale,
+            )
+        )
+    return noted
+
+
+def _read(
+    path: Path, spec: str | Path | RecordingSpec | None, table: Callable[[Path], Measurement], skipped: list[str]
+) -> list[Measurement]:
+    if not path.exists():
+        siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+        raise RecordingError(f"{path}: no such file or folder; {nearest(path.name, siblings)}")
+    if (path / "meta" / "info.json").is_file():
+        return read_dataset(path)
+    if path.is_file():
+        if path.suffix in SUFFIXES:
+            return [table(path)]
+        return _read_recordings(path, spec, skipped)
+    children = sorted(path.iterdir(), key=lambda p: natural_key(p.name))
+    datasets = [p for p in children if (p / "meta" / "info.json").is_file()]
+    tables = [p for p in children if p.is_file() and p.suffix in SUFFIXES]
+    found = [m for p in datasets for m in read_dataset(p)] + [table(p) for p in tables]
+    left: list[str] = []
+    try:
+        found += _read_recordings(path, spec, left)
+    except _NoRecording as error:
+        if not found:
+            raise RecordingError(
+                f"{error}; tables ({', '.join(SUFFIXES)}) and datasets there are none either"
+            ) from error
+    read = {p.name for p in (*datasets, *tables)} | {INDEX}
+    read |= {p.name for p in children if p.suffix in (".yaml", ".yml")}  # specs and columns files
+    skipped += [text for text in left if text.split(" (")[0] not in read]
+    return found
+
+
+class _NoRecording(RecordingError):
+    """A folder without recordings, which may still hold tables."""
+
+
+def _read_recordings(path: Path, spec: str | Path | RecordingSpec | None, skipped: list[str]) -> list[Measurement]:
+    loaded = spec if isinstance(spec, RecordingSpec) or spec is None else load_recording_spec(spec)
+    try:
+        found = find_sources(
+            path,
+            reader=loaded.reader if loaded else None,
+            split_bag=bool(loaded and loaded.split_bag),
+            skipped=skipped if path.is_dir() else None,
+        )
+    except RecordingError as error:
+        raise _NoRecording(str(error)) from error
+    # Datasets were read before; find_sources lists them as recordings, too.
+    found = [(reader, source) for reader, source in found if reader != "lerobot"]
+    if not found:
+        raise _NoRecording(f"{path}: no recording here")
+    measurements = []
+    for reader, source in found:
+        own = loaded or _only_spec(path, reader)
+        try:
+            measurements.append(read_recording(source, own))
+        except TaccorlError as error:
+            text = str(error)
+            raise RecordingError(text if text.startswith(source.name) else f"{source.name}: {text}") from error
+    return measurements
+
+
+def _only_spec(path: Path, reader: str) -> RecordingSpec:
+    fitting = {name: spec for name, spec in shipped_recording_specs().items() if spec.reader == reader}
+    if len(fitting) != 1:
+        raise RecordingError(
+            f"{path}: {len(fitting)} shipped specs read {reader} ({', '.join(fitting) or 'none'}); say which: "
+            f"--spec=NAME, or `spec:` in {INDEX}. `taccorl inspect` drafts one"
+        )
+    return next(iter(fitting.values()))

@@ -1,0 +1,286 @@
+"""A measurement: what was commanded and what was measured, on one clock. The twin is compared with it row by row.
+
+The rule of every row, and of every reader: **the target of row k is in force from time k on, and the position of row k is
+where the joint was at time k**, before that target could act. ``taccorl.sim.replay`` answers by the same rule. One row off (5 ms)
+turned K_p 151 into 690 in an identification (MuJoCo's sensordata after a step is the state before it).
+
+Letters in shapes: T rows, J signals (of the robot: in the order of actions), N touch frames, K taxels.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+
+from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.data.episode import ChannelTiming
+from taccorl.data.finding import Finding
+from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+
+UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}
+"""Unit of a position → those of its velocity and effort."""
+
+
+def unit_of(name: str) -> str:
+    """Unit of one of the robot's signals."""
+    return "m" if name.endswith("gripper") else "rad"
+
+
+TargetKind = Literal["position", "velocity", "torque"]
+ROBOT_UNITS = tuple(unit_of(name) for name in ROBOT.action_names)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Touch:
+    """Frames of the pads at their own rate. Pads are scanned at different times, so each has its own."""
+
+    time_s: np.ndarray
+    """(N, 4) when each pad's frame had been scanned to its end, on the measurement's clock, in the order of
+    ``ROBOT.pads``."""
+    counts: np.ndarray
+    """(N, K) int16 counts above baseline, unclipped."""
+    baseline: np.ndarray
+    """(K,) counts that were subtracted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """One recording on one clock, at the rate at which commands were sent.
+
+    Raises:
+        TaccorlError: shapes that do not fit each other.
+    """
+
+    known_units: ClassVar[tuple[str, ...]] = tuple(UNITS)
+    name: str
+    time_s: np.ndarray
+    """(T,) since the first row. Even for recordings; a table keeps its own times, which the checks judge."""
+    target: np.ndarray
+    """(T, J) rad, m: in force from ``time_s[k]`` on."""
+    measured: np.ndarray
+    """(T, J) rad, m: at ``time_s[k]``; NaN where nothing was measured for too long."""
+    velocity: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) rad/s, m/s as the driver reports it; NaN where it does not."""
+    effort: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) N·m, N as the driver reports it; NaN where it does not. PiPER firmware may report another scale."""
+    load: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) N·m, N: external torque that is known to push the joint, positive where it drives it forwards; empty if none is."""
+    torque_ff: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) N·m, N that the controller is known to have added to its law; part of ``effort``; empty if none is."""
+    supply_v: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) V that feeds the motor; NaN where it was not recorded; empty if it never was."""
+    enabled: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, J) 0 while the motor is off, else 1; empty if it is never off."""
+    command_s: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T,) when each row's targets came, on the clock of ``time_s``; empty where they came with their rows."""
+    signals: tuple[str, ...] = ROBOT.action_names
+    units: tuple[str, ...] = ROBOT_UNITS
+    """Of positions, one per signal: rad or m."""
+    target_kinds: tuple[TargetKind, ...] = ()
+    """What ``target`` commands, one per signal; positions if not given."""
+    quantum: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(J,) step between neighbouring encoder readings [rad, m], found before any interpolation; 0 where none shows."""
+    touch: Touch | None = None
+    source: Path = Path()
+    """File or dataset it was read from."""
+    origin: str = ""
+    """What made it, e.g. "surrogate recording …"; empty where the file does not say."""
+    instruction: str = ""
+    start_ns: int = 0
+    """The recording's clock at row 0 (ns)."""
+    repeat_of: str | None = None
+    """Name of the measurement whose motion this one repeats, command for command."""
+    kp: dict[str, float] = field(default_factory=dict)
+    """Signal → gain that was commanded [N·m/rad, N/m], where somebody wrote it down."""
+    kd: dict[str, float] = field(default_factory=dict)
+    """Signal → [N·m·s/rad, N·s/m]."""
+    gain_scale: dict[str, float] = field(default_factory=dict)
+    """Signal → factor of both gains over the other recordings', where no more than that is known."""
+    payload_kg: dict[str, float] = field(default_factory=dict)
+    """Arm → known mass in its gripper."""
+    lever_m: dict[str, float] = field(default_factory=dict)
+    """Axis → distance from it at which its payload is held, where it is not the one of the axis's file."""
+    arm_kg: dict[str, float] = field(default_factory=dict)
+    """Axis → mass of the arm that holds the payload: a uniform rod from the axis to the lever's end."""
+    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Arm → where the payload's centre of mass is, in link 6's frame (origin at the flange, z along the hand); the TCP,
+    (0, 0, 0.168) m, where it is not stated."""
+    pressed: PressedObject | None = None
+    """Known object between the fingers of one arm, where somebody wrote it down: what its pads are judged by."""
+    time_error_s: float = 0.0
+    """A row's position and target may be taken this much apart from its time (rows of a dataset show the last
+    sample)."""
+    timing: tuple[ChannelTiming, ...] = ()
+    """How each channel's own samples came; empty for tables."""
+    findings: tuple[Finding, ...] = ()
+    """What reading it brought up."""
+
+    def __post_init__(self) -> None:
+        shape = (len(self.time_s), len(self.signals))
+        for name in ("velocity", "effort"):
+            if getattr(self, name).size == 0:
+                object.__setattr__(self, name, np.full(shape, np.nan))
+        if self.quantum.size == 0:
+            object.__setattr__(self, "quantum", np.zeros(shape[1]))
+        for name in ("target", "measured", "velocity", "effort", *self.extra_columns):
+            found = getattr(self, name).shape
+            if found != shape:
+                raise TaccorlError(f"measurement {self.name}: {name} is {found}, times and signals say {shape}")
+        if (
+            len(self.units) != shape[1]
+            or len(self.target_kinds) not in (0, shape[1])
+            or self.quantum.shape != shape[1:]
+            or len(set(self.signals)) != shape[1]
+        ):
+            raise TaccorlError(f"measurement {self.name}: units, quantum and names do not fit signals {self.signals}")
+        wrong = [u for u in self.units if u not in self.known_units]
+        if wrong:
+            raise TaccorlError(f"measurement {self.name}: units are {' or '.join(self.known_units)}, not {wrong[0]!r}")
+
+    @property
+    def extra_columns(self) -> list[str]:
+        """Of ``load``, ``torque_ff``, ``supply_v`` and ``enabled`` those that it has."""
+        return [name for name in ("load", "torque_ff", "supply_v", "enabled") if getattr(self, name).size]
+
+    @property
+    def num_rows(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def period_s(self) -> float:
+        """Median time between rows."""
+        return float(np.median(np.diff(self.time_s))) if self.num_rows > 1 else float("nan")
+
+    @property
+    def rate_hz(self) -> float:
+        """Rows a second, rounded to a thousandth."""
+        return round(1.0 / self.period_s, 3)
+
+    def column(self, signal: str) -> int:
+        """Number of a signal.
+
+        Raises:
+            TaccorlError: there is none of that name.
+        """
+        if signal not in self.signals:
+            raise TaccorlError(f"{self.name} has no signal {signal!r}; {nearest(signal, self.signals)}")
+        return self.signals.index(signal)
+
+    def target_kind(self, signal: str) -> TargetKind:
+        """What the target of a signal commands."""
+        return self.target_kinds[self.column(signal)] if self.target_kinds else "position"
+
+    def known_load(self, signal: str) -> np.ndarray:
+        """(T,) external torque on a signal; 0 where none is known."""
+        return self.load[:, self.column(signal)] if self.load.size else np.zeros(self.num_rows)
+
+    def twin_cannot_take(self, signal: str) -> str:
+        """What the recording has of a signal that the PiPER's twin cannot take, and what to do; empty if nothing."""
+        j = self.column(signal)
+        if self.known_load(signal).any():
+            return "a known load; remove the column"
+        if self.torque_ff.size and self.torque_ff[:, j].any():
+            return "a torque_ff of its own in each row; remove the column"
+        if self.supply_v.size and np.isfinite(self.supply_v[:, j]).any():
+            return "a supply voltage; remove supply_v"
+        if self.enabled.size and not self.enabled[:, j].all():
+            row = int(np.argmin(self.enabled[:, j]))
+            return f"a motor that is off at {self.time_s[row]:.3f} s; cut the recording there"
+        stated = next((key for key in ("lever_m", "arm_kg") if signal in getattr(self, key)), "")
+        return stated and f"{stated}; remove it from measurements.yaml"
+
+    def moved(self, signal: str) -> np.ndarray:
+        """(T,) positions by which it is judged whether a signal moves: commanded, or measured where targets are no positions."""
+        return (self.target if self.target_kind(signal) == "position" else self.measured)[:, self.column(signal)]
+
+    def only(self, signals: Sequence[str]) -> Self:
+        """With these signals alone."""
+        at = [self.column(signal) for signal in signals]
+        names = ("target", "measured", "velocity", "effort", *self.extra_columns)
+        return dataclasses.replace(
+            self,
+            **{name: getattr(self, name)[:, at] for name in names},
+            quantum=self.quantum[at],
+            signals=tuple(signals),
+            units=tuple(self.units[j] for j in at),
+            target_kinds=tuple(self.target_kinds[j] for j in at) if self.target_kinds else (),
+        )
+
+    def with_position_targets(self, positions: np.ndarray) -> Self:
+        """With ``positions`` (T, J) as targets of the signals whose targets are no positions."""
+        if not self.target_kinds:
+            return self
+        kept = np.array([kind == "position" for kind in self.target_kinds])
+        return dataclasses.replace(self, target=np.where(kept, self.target, positions), target_kinds=())
+
+    def has_effort(self) -> np.ndarray:
+        """(J,) bool: recorded, and not only zeros."""
+        return np.isfinite(self.effort).any(axis=0) & (np.nan_to_num(self.effort) != 0).any(axis=0)
+
+    def resampled(self, rate_hz: float) -> Self:
+        """The same at an even ``rate_hz``, in straight lines between rows: keeps the mean time of every command and position.
+
+        Raises:
+            TaccorlError: less than two rows, or time that does not run forwards.
+        """
+        if self.num_rows < 2 or (np.diff(self.time_s) <= 0).any():
+            raise TaccorlError(f"{self.name}: its time does not run forwards; it cannot be brought to {rate_hz:g} Hz")
+        steps = int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1
+        time_s = self.time_s[0] + np.arange(steps) / rate_hz
+        columns = {
+            name: np.column_stack([np.interp(time_s, self.time_s, c) for c in getattr(self, name).T])
+            for name in ("target", "measured", "velocity", "effort", *self.extra_columns)
+        }
+        if self.enabled.size:
+            columns["enabled"] = np.where(columns["enabled"] < 0.5, 0.0, 1.0)
+        return dataclasses.replace(self, time_s=time_s, command_s=np.empty(0), **columns)
+
+    def on_robot(self, rest: np.ndarray) -> "Measurement":
+        """All signals of the robot in the order of actions: those that it lacks stay at ``rest`` (J,) and were not measured.
+
+        Raises:
+            TaccorlError: a signal that the robot does not have, or has in another unit.
+        """
+        for name, unit in zip(self.signals, self.units, strict=True):
+            if name not in ROBOT.action_names:
+                raise TaccorlError(
+                    f"{self.name}: the robot has no signal {name!r}; {nearest(name, ROBOT.action_names)}. Rename it in "
+                    "the columns file"
+                )
+            if unit != unit_of(name):
+                raise TaccorlError(f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}")
+            if (kind := self.target_kind(name)) != "position":
+                raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
+            if extra := self.twin_cannot_take(name):
+                raise TaccorlError(f"{self.name}: {name} has {extra}: the robot's twin cannot take it")
+        at = [ROBOT.action_names.index(name) for name in self.signals]
+        arrays: dict[str, np.ndarray] = {
+            name: np.full((self.num_rows, ROBOT.num_actions), np.nan) for name in ("measured", "velocity", "effort")
+        }
+        arrays["target"] = np.tile(np.asarray(rest, dtype=float), (self.num_rows, 1))
+        for name, values in arrays.items():
+            values[:, at] = getattr(self, name)
+        quantum = np.zeros(ROBOT.num_actions)
+        quantum[at] = self.quantum
+        return dataclasses.replace(
+            self,
+            **arrays,
+            quantum=quantum,
+            load=np.empty(0),
+            torque_ff=np.empty(0),
+            supply_v=np.empty(0),
+            enabled=np.empty(0),
+            signals=ROBOT.action_names,
+            units=ROBOT_UNITS,
+            target_kinds=(),
+        )
+
+
+def other_arm(signal: str) -> str:
+    """``left_joint5`` → ``right_joint5``; a name without an arm stays."""
+    swap = {"left_": "right_", "right_": "left_"}
+    return next((new + signal.removeprefix(old) for old, new in swap.items() if signal.startswith(old)), signal)

@@ -1,0 +1,215 @@
+"""Library of motions to record for one joint: the paper's sweep and others that separate effects. 200 Hz, at rest at both ends.
+
+    chirp            10 s as the paper's sweep (App. B.1), 0.1 to 2.5 Hz (a choice, the paper gives no frequencies)
+    wide triangle    there and back over a wide range in 14 s: friction, weight, what hangs on the angle
+    steps            nine holds of a second: delays, slipping, integrators
+    small chirp      0.02 rad up to 4 Hz: play, dead bands, stiction
+    chirp at 2× K_p and K_d; chirp with 0.3 kg in the hand: what gains and inertia hide
+
+Validation (choices are made on it) and test (final figures) are other motions about other middles.
+
+Letters in shapes: T rows.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+
+RATE_HZ = 200
+SWEEP_S = 10.0
+"""Of the sweep with which joints are identified (paper App. B.1)."""
+SWEEP_HZ = (0.1, 2.5)
+"""From, to. A choice: the paper gives no frequencies."""
+REST_S = 1.0
+"""Before and after each motion."""
+SPEED_RAD_PER_S = 3.0
+"""Of targets, at most; the arm's rating is 3.1 rad/s for the slowest joint (PiPER manual)."""
+TORQUE_NM = (25.0, 25.0, 25.0, 10.0, 10.0, 10.0)
+"""Of each joint, weight and motion together: a choice, no rating is published."""
+MARGIN_RAD = 0.05
+"""Kept from the joint's limits."""
+SWEEP_RAD = 0.35
+"""Amplitude of the chirp where speed and torque allow it."""
+SLOW_HZ, FAST_HZ = SWEEP_HZ
+KNOWN_KG = 0.3
+"""Weighed, and gripped for one recording."""
+OPENING_M = 0.02
+"""The gripper's, all the time."""
+REST_POSE = (0.0, 1.732, -0.883, 0.0, 0.2, 0.0)
+"""Joints of the arm that is not under test."""
+
+POSES = (
+    (0.0, 1.34, -2.3, 0.0, -0.6, 0.3),
+    (0.0, 1.35, -2.1, 0.2, 0.1, 0.2),
+    (0.0, 0.3, -1.4, 0.0, 0.1, -0.4),
+    (0.0, 1.2, -1.6, 0.0, 0.7, 0.0),
+    (0.0, 1.2, -1.4, 0.1, 0.1, 0.4),
+    (0.0, 0.8, -1.2, -0.4, 0.3, 0.0),
+)
+"""Where the arm stands while joint 1, 2, … is under test, in its middle: over the wide range nothing is touched."""
+WIDE_RAD = (1.1, 0.9, 0.9, 1.1, 0.95, 1.2)
+"""Half of the wide triangle's range."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """One motion of a joint to be recorded."""
+
+    name: str
+    target: Callable[["Room"], np.ndarray]
+    """(T,) rad."""
+    gain: float = 1.0
+    """Times K_p and K_d."""
+    payload_kg: float = 0.0
+    repeat_of: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """Range of motion of one joint: middle, widest reach and amplitude of the sweep [rad]."""
+
+    middle_rad: float
+    wide_rad: float
+    sweep_rad: float
+    """Amplitude of the chirp's slow part."""
+
+    @classmethod
+    def of(cls, joint: int, middle_rad: float, inertia_kgm2: float, weight_nm: float) -> "Room":
+        """Range of motion of joint 1 to 6 with this inertia and weight."""
+        low, high = ROBOT.links[joint - 1].range_rad
+        wide = min(WIDE_RAD[joint - 1], middle_rad - low - MARGIN_RAD, high - middle_rad - MARGIN_RAD)
+        left_nm = max(TORQUE_NM[joint - 1] - abs(weight_nm), 0.2 * TORQUE_NM[joint - 1])
+        sweep = min(SWEEP_RAD, left_nm / (inertia_kgm2 * (2 * math.pi * FAST_HZ) ** 2 * 0.6))
+        return cls(middle_rad=middle_rad, wide_rad=wide, sweep_rad=min(sweep, 0.6 * wide))
+
+
+def chirp(seconds: float, low_hz: float, high_hz: float, amplitude_rad: float) -> np.ndarray:
+    """Chirp (T,) [rad] from 0 to 0, with a smaller amplitude where it would be too fast."""
+    time_s = _time(seconds)
+    hz = low_hz + (high_hz - low_hz) * time_s / seconds
+    angle = 2 * np.pi * (low_hz * time_s + (high_hz - low_hz) * time_s**2 / (2 * seconds))
+    height = np.minimum(amplitude_rad, SPEED_RAD_PER_S / (2 * np.pi * hz))
+    return height * np.sin(angle) * _fade(time_s, seconds)
+
+
+def triangle(seconds: float, amplitude_rad: float, turns: int = 1) -> np.ndarray:
+    """Triangle (T,) [rad] from 0 up, down and back."""
+    time_s = _time(seconds)
+    return amplitude_rad * np.interp(time_s * turns / seconds % 1.0, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0])
+
+
+def steps(levels_rad: np.ndarray, hold_s: float = 1.0) -> np.ndarray:
+    """Steps (T,) [rad] from one level to the next at the highest speed."""
+    most = SPEED_RAD_PER_S / RATE_HZ
+    at, out = 0.0, []
+    for level in levels_rad:
+        for _ in range(round(hold_s * RATE_HZ)):
+            at += min(max(level - at, -most), most)
+            out.append(at)
+    return np.array(out)
+
+
+def multisine(seconds: float, amplitude_rad: float, seed: int) -> np.ndarray:
+    """Multisine (T,) [rad]: four sines with random phases, from 0 to 0."""
+    rng = np.random.default_rng(seed)
+    time_s = _time(seconds)
+    hz = np.array([0.15, 0.4, 0.9, 1.7])
+    waves = np.sin(2 * np.pi * hz * time_s[:, None] + rng.uniform(0, 2 * np.pi, 4)) / np.sqrt(hz + 0.3)
+    motion = waves.sum(axis=1) * _fade(time_s, seconds)
+    motion *= amplitude_rad / np.abs(motion).max()
+    fastest = np.abs(np.diff(motion)).max() * RATE_HZ
+    return motion * min(1.0, SPEED_RAD_PER_S / fastest)
+
+
+def _time(seconds: float) -> np.ndarray:
+    return np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+
+
+def _fade(time_s: np.ndarray, seconds: float) -> np.ndarray:
+    share = np.clip(np.minimum(time_s, seconds - time_s) / 0.5, 0.0, 1.0)
+    return share**2 * (3 - 2 * share)
+
+
+def _rested(motion: np.ndarray, middle_rad: float) -> np.ndarray:
+    still = np.zeros(round(REST_S * RATE_HZ))
+    return middle_rad + np.concatenate([still, motion, still])
+
+
+def _chirp(room: Room) -> np.ndarray:
+    return _rested(chirp(SWEEP_S, SLOW_HZ, FAST_HZ, room.sweep_rad), room.middle_rad)
+
+
+def _steps(levels: tuple[float, ...], off: float, hold_s: float = 1.0) -> Callable[[Room], np.ndarray]:
+    return lambda room: _rested(
+        steps(np.array(levels) * room.sweep_rad, hold_s), room.middle_rad + off * room.sweep_rad
+    )
+
+
+CHIRP = Motion(name="chirp", target=_chirp)
+AGAIN = Motion(name="chirp_again", target=_chirp, repeat_of="chirp")
+WIDE_TRIANGLE = Motion(name="wide_triangle", target=lambda r: _rested(triangle(14.0, r.wide_rad), r.middle_rad))
+STIFFER_CHIRP = Motion(name="chirp_2x_gain", target=_chirp, gain=2.0)
+LOADED_CHIRP = Motion(name="chirp_payload", target=_chirp, payload_kg=KNOWN_KG)
+PACK = (
+    WIDE_TRIANGLE,
+    Motion(name="steps", target=_steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0), 0.0)),
+    Motion(name="small_chirp", target=lambda r: _rested(chirp(6.0, 0.2, 4.0, 0.02), r.middle_rad)),
+    STIFFER_CHIRP,
+    LOADED_CHIRP,
+)
+HELD_STEPS = Motion(name="held_steps", target=_steps((0.0, -0.6, 0.85, 0.9, -1.0, 0.6, 0.5, -0.3, 0.0), -0.2))
+"""Recorded twice, too: with dry friction a robot repeats its steps worse than its chirp."""
+VALIDATION = (
+    Motion(
+        name="held_chirp",
+        target=lambda r: _rested(chirp(10.0, 0.15, 2.1, 0.77 * r.sweep_rad), r.middle_rad - 0.3 * r.sweep_rad),
+    ),
+    Motion(name="held_triangle", target=lambda r: _rested(triangle(12.0, 0.8 * r.wide_rad, 2), r.middle_rad)),
+    HELD_STEPS,
+    dataclasses.replace(HELD_STEPS, name="held_steps_again", repeat_of="held_steps"),
+)
+TEST = (
+    Motion(name="test_multisine", target=lambda r: _rested(multisine(10.0, 1.2 * r.sweep_rad, 5), r.middle_rad)),
+    Motion(
+        name="test_multisine_far",
+        target=lambda r: _rested(multisine(8.0, 0.7 * r.sweep_rad, 9), r.middle_rad + 0.4 * r.sweep_rad),
+    ),
+)
+LIBRARY = (
+    CHIRP,
+    *PACK,
+    Motion(
+        name="slow_triangle",
+        target=lambda r: _rested(triangle(30.0, 0.5 * r.wide_rad), r.middle_rad),
+    ),
+    Motion(name="holds", target=_steps((0.3, -0.3, 0.8, -0.8, 0.0), 0.0, hold_s=4.0)),
+    Motion(name="steps_2x_gain", target=_steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0), 0.0), gain=2.0),
+    Motion(
+        name="triangle_payload", target=lambda r: _rested(triangle(14.0, r.wide_rad), r.middle_rad), payload_kg=KNOWN_KG
+    ),
+)
+"""What ``taccorl excite`` chooses from."""
+DESIGNS = {"chirp": (CHIRP, AGAIN), "pack": (CHIRP, AGAIN, *PACK)}
+"""What is recorded for fitting: the paper's sweep (twice, for the noise floor), or all."""
+JUDGED_ON = {"chirp": (CHIRP,), "pack": (CHIRP, WIDE_TRIANGLE, STIFFER_CHIRP, LOADED_CHIRP)}
+"""On which of them the strength of what is hidden is measured."""
+
+
+def joint_number(signal: str) -> int:
+    """``left_joint5`` → 5.
+
+    Raises:
+        TaccorlError: no such joint.
+    """
+    arm, _, joint = signal.partition("_")
+    if arm not in ROBOT.arms or joint not in ROBOT.joints:
+        raise TaccorlError(
+            f"no joint {signal!r}; {nearest(signal, [f'{a}_{j}' for a in ROBOT.arms for j in ROBOT.joints])}"
+        )
+    return ROBOT.joints.index(joint) + 1

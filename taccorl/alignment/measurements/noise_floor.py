@@ -1,0 +1,359 @@
+"""How small the error of a perfect twin would be: the noise floor of every signal, from the recordings themselves.
+
+    repeats       RMS difference of two recordings of one motion / √2, after laying one over the other
+    rest          RMS about a straight line while nothing was commanded to move
+    residue       RMS about a Savitzky–Golay smooth that lets the motion through untouched, / √(1 − h₀)
+    quantisation  q / √12, q the encoder's step
+
+Repeats are used where there are any: only they see what the robot itself does not repeat. Where few blocks hold most of their
+difference (bursts), their median is taken, so that the floor does not contain the bursts. Without repeats the surer one of rest
+and residue (the other one if it lies clearly above), which is then a lower bound. The floor is never below the
+quantisation, and never 0. All estimates are reported.
+
+Letters in shapes: T rows, J signals, B blocks of rows, K taxels.
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.signal import savgol_coeffs, savgol_filter
+from scipy.stats import chi2
+from scipy.stats import t as student
+
+from taccorl.alignment.measurements.folder import motions
+from taccorl.alignment.measurements.measurement import UNITS, Measurement
+from taccorl.alignment.measurements.repeats import overlay
+from taccorl.errors import TaccorlError
+
+Kind = Literal["position", "velocity", "effort"]
+Method = Literal["repeats", "rest", "residue", "quantisation", "number"]
+BLOCK_S = 0.25
+"""Estimates are made block by block; their scatter gives the interval."""
+BLOCK_ROWS = 24
+"""Shortest block: at 30 rows a second 0.8 s."""
+SETTLE_S = 1.5
+"""After its last command a joint creeps on: time constants are about 0.1 s, exp(−15) of the way is left."""
+REST_TARGET = 2e-5
+"""A command that stays within this (rad, m) rests: 0.001°, PiPER's resolution, may flicker."""
+WINDOW, ORDER = 9, 4
+"""Of the smooth. It follows motion up to 0.61 of half the row rate (Schafer 2011, f_c = (ORDER + 1) / (3.2 M −
+4.6), M = 4)."""
+BANDWIDTH_FACTOR = 5.0
+"""The smooth must follow so many times the motion's highest frequency: at a fifth it misses 2 · 10⁻⁵ of the motion."""
+MOTION_POWER = 0.99
+"""Share of the motion's power below its highest frequency."""
+OTHER_START = 5.0
+"""Two recordings of one motion that differ by so many times what they usually do began at different places."""
+MOVING = 1e-3
+"""rad, m: a command that stays within this is no motion whose bandwidth could matter."""
+BURST_POWER, BURST_SHARE, BURST_RATIO = 0.8, 0.25, 3.0
+"""Repeats differ in bursts where less than such a share of the blocks holds so much of the squared difference, and the RMS of all
+is so many times that of the usual block."""
+NUMBER = 2.0**-24
+"""Last bit of a 32-bit number of size 1: no floor is smaller than that of the numbers."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One estimate of the noise of one signal, in the signal's unit."""
+
+    method: Method
+    value: float
+    low: float
+    high: float
+    """95 % interval."""
+    n: int
+    """Samples it rests on."""
+    without_bursts: bool = False
+    """Of repeats: the median of the blocks, since few of them hold most of the difference."""
+
+
+@dataclass(frozen=True)
+class SignalFloor:
+    """The noise floor of one signal."""
+
+    signal: str
+    kind: Kind
+    unit: str
+    used: Estimate
+    estimates: tuple[Estimate, ...]
+    """All that could be made."""
+    lower_bound: bool
+    """True without repeats: what the robot does not repeat is not in it."""
+
+    @property
+    def value(self) -> float:
+        """Standard deviation; always above 0."""
+        return self.used.value
+
+    def words(self) -> str:
+        """``0.204 mrad (0.198 … 0.211, from repeats, n = 4000)``"""
+        factor, prefix = (1e3, "m") if self.kind != "effort" else (1.0, "")
+        a, b, c = (f"{x * factor:.3g}" for x in (self.used.value, self.used.low, self.used.high))
+        bound = "; a lower bound: record the motion twice" if self.lower_bound else ""
+        bursts = ", bursts left out" if self.used.without_bursts else ""
+        return f"{a} {prefix}{self.unit} ({b} … {c}, from {self.used.method}{bursts}, n = {self.used.n}{bound})"
+
+
+def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") -> dict[str, SignalFloor]:
+    """Signal → its floor. Signals that were never recorded (effort, velocity) have none.
+
+    Args:
+        measurements: of one robot; each gives what it can. Those with ``repeat_of`` are laid over what they repeat.
+
+    Raises:
+        TaccorlError: none given, other signals, or a repeat that does not repeat.
+    """
+    measurements = list(measurements)
+    if not measurements:
+        raise TaccorlError("noise floor: no measurement")
+    signals, units = measurements[0].signals, measurements[0].units
+    other = next((m for m in measurements if m.signals != signals), None)
+    if other:
+        raise TaccorlError(
+            f"noise floor: {other.name} and {measurements[0].name} hold different signals; read them apart"
+        )
+    blocks: dict[Method, list[_Blocks]] = {
+        "repeats": [_repeat_blocks(a, b, kind) for a, b in repeat_pairs(measurements)],
+        "rest": [_rest_blocks(m, kind) for m in measurements],
+        "residue": [_residue_blocks(m, kind) for m in measurements],
+    }
+    estimates = {method: _estimate(method, found, len(signals), kind) for method, found in blocks.items()}
+    floors = {}
+    for j, (signal, unit) in enumerate(zip(signals, units, strict=True)):
+        values = np.concatenate([_values(m, kind)[:, j] for m in measurements])
+        if not np.isfinite(values).any():
+            continue
+        found = [e for method in blocks if (e := estimates[method][j]) is not None]
+        step = max(float(m.quantum[j]) for m in measurements) if kind == "position" else 0.0
+        if step > 0:
+            rounding = step / math.sqrt(12)
+            found.append(Estimate("quantisation", rounding, rounding, rounding, int(np.isfinite(values).sum())))
+        last = NUMBER * max(1e-3, float(np.nanmax(np.abs(values))))
+        used = _chosen(found) or Estimate("number", last, last, last, 0)
+        if used.value < last:
+            used = Estimate("number", last, last, last, used.n)
+        name = {"position": unit, "velocity": UNITS[unit][0], "effort": UNITS[unit][1]}[kind]
+        repeated = any(e.method == "repeats" for e in found)
+        floors[signal] = SignalFloor(signal, kind, name, used, tuple(found), lower_bound=not repeated)
+    return floors
+
+
+def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]:
+    """(first, repeat) for every further recording of a motion."""
+    by_name = {m.name: m for m in measurements}
+    firsts: dict[str, M] = {}
+    pairs = []
+    roots = motions(by_name.values())
+    for name, root in sorted(roots.items(), key=lambda item: item[0] != item[1]):  # the original first, if it is here
+        first = firsts.setdefault(root, by_name[name])
+        if first.name != name:
+            pairs.append((first, by_name[name]))
+    return pairs
+
+
+def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
+    """(K,) counts: noise of every taxel from the residue at the pads' own rate, at least 1 / √12; None without
+    touch."""
+    touched = [m.touch for m in measurements if m.touch is not None]
+    frames = [(t.counts.astype(np.float32), 1.0 / float(np.median(np.diff(t.time_s[:, 0])))) for t in touched]
+    values = residue_floor(frames) if frames else np.zeros(0)
+    return np.maximum(values, 1.0 / math.sqrt(12)) if values.size and np.isfinite(values).all() else None
+
+
+def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+    """(K,) noise of each column of (values (T, K), rate [Hz]) by the residue method; NaN where all are too short.
+
+    In the median over blocks: contact comes and goes in few of them. Blocks with NaN do not count.
+    """
+    found = [b for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels) if len(b.mean_squares)]
+    if not found:
+        return np.full(channels[0][0].shape[1], np.nan)
+    squares = np.concatenate([b.mean_squares for b in found])
+    own = [column[np.isfinite(column)] for column in squares.T]
+    return np.sqrt([float(_median(c, found[0].freedom)) if len(c) else np.nan for c in own])
+
+
+def _chosen(found: list[Estimate]) -> Estimate | None:
+    """Repeats; else the surer one of rest and residue, unless the other lies above its interval; never below rounding."""
+    by = {e.method: e for e in found}
+    surer, other = by.get("rest"), by.get("residue")
+    if surer is None or (other is not None and other.high - other.low < surer.high - surer.low):
+        surer, other = other, surer
+    if surer is not None and other is not None and other.low > surer.high:
+        surer = other
+    both = [e for e in (by.get("repeats") or surer, by.get("quantisation")) if e is not None]
+    return max(both, key=lambda e: e.value, default=None)
+
+
+def _values(m: Measurement, kind: Kind) -> np.ndarray:
+    return {"position": m.measured, "velocity": m.velocity, "effort": m.effort}[kind]
+
+
+# blocks ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Mean squares of blocks of one recording, scaled so that white noise of variance σ² gives σ² on average."""
+
+    mean_squares: np.ndarray
+    """(B, J); NaN where a block says nothing about a signal."""
+    rows: int
+    """Rows in a block."""
+    freedom: float
+    """Degrees of freedom of a block of white noise."""
+
+
+def _repeat_blocks(first: Measurement, second: Measurement, kind: Kind) -> _Blocks:
+    laid = overlay(first, second)
+    rows = _block_rows(first.rate_hz)
+    squares = _mean_squares(laid.difference[kind], rows) / laid.noise_gain
+    return _Blocks(_without_beginning(squares), rows, float(rows))
+
+
+def _without_beginning(squares: np.ndarray) -> np.ndarray:
+    """(B, J) with NaN at first, while the two differ ``OTHER_START`` times as much as later: a joint with dry friction rests
+    elsewhere each time, until it is moved. That is no noise: the twin begins where the recording began."""
+    measured = np.where(np.isfinite(squares).any(axis=0), squares, 0.0)
+    usual = OTHER_START**2 * np.nanmedian(measured, axis=0)
+    still_off = np.logical_and.accumulate(squares > usual, axis=0)
+    return np.where(still_off, np.nan, squares)
+
+
+def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:
+    """Blocks in which no joint is commanded to move, each about its own straight line."""
+    rows = _block_rows(m.rate_hz)
+    values = _values(m, kind)
+    line = np.column_stack([np.ones(rows), np.linspace(-1, 1, rows)])
+    projector = line @ np.linalg.pinv(line)
+    found = []
+    for first, end in rest_stretches(m):
+        for at in range(first, end - rows + 1, rows):
+            block = values[at : at + rows]
+            found.append(((block - projector @ block) ** 2).sum(axis=0) / (rows - 2))
+    return _Blocks(np.array(found).reshape(-1, values.shape[1]), rows, float(rows - 2))
+
+
+def rest_stretches(m: Measurement) -> list[tuple[int, int]]:
+    """[first, end) of every stretch in which all commands rest and the joints have had ``SETTLE_S`` to arrive."""
+    changed = np.flatnonzero(np.any(np.abs(np.diff(m.target, axis=0)) > REST_TARGET, axis=1)) + 1
+    edges = [0, *changed.tolist(), m.num_rows]
+    settle = round(SETTLE_S / m.period_s)
+    stretches = []
+    for first, end in itertools.pairwise(edges):
+        begin = first if first == 0 else first + settle
+        if end > begin:
+            stretches.append((begin, end))
+    return stretches
+
+
+def _residue_blocks(m: Measurement, kind: Kind) -> _Blocks:
+    """Blocks about the smooth; NaN for signals that move too fast for it."""
+    blocks = _smooth_blocks(_values(m, kind), m.rate_hz)
+    half = WINDOW // 2
+    reach_hz = (ORDER + 1) / (3.2 * half - 4.6) * m.rate_hz / 2
+    fast = motion_hz(m) * BANDWIDTH_FACTOR > reach_hz
+    blocks.mean_squares[:, fast] = np.nan
+    return blocks
+
+
+def _smooth_blocks(values: np.ndarray, rate_hz: float) -> _Blocks:
+    rows = _block_rows(rate_hz)
+    half = WINDOW // 2
+    if len(values) < WINDOW + rows:
+        return _Blocks(np.empty((0, values.shape[1])), rows, 1.0)
+    residue = (values - savgol_filter(values, WINDOW, ORDER, axis=0, mode="nearest"))[half:-half]
+    kernel = -savgol_coeffs(WINDOW, ORDER)
+    kernel[half] += 1.0
+    correlation = np.convolve(kernel, kernel[::-1])
+    passed = float(correlation[WINDOW - 1])  # 1 − h₀: the share of white noise that the residue keeps
+    freedom = rows * passed**2 / float((correlation**2).sum())
+    return _Blocks(_mean_squares(residue, rows) / passed, rows, freedom)
+
+
+def motion_hz(m: Measurement) -> np.ndarray:
+    """(J,) frequency below which ``MOTION_POWER`` of each joint's motion lies; 0 for those that are not commanded
+    to move."""
+    found = np.zeros(len(m.signals))
+    window = np.hanning(m.num_rows)
+    frequency = np.fft.rfftfreq(m.num_rows, m.period_s)
+    for j in np.flatnonzero(np.ptp(m.target, axis=0) > MOVING):
+        x = m.measured[:, j]
+        x = np.where(np.isfinite(x), x, np.nanmean(x)) if np.isfinite(x).any() else np.zeros(m.num_rows)
+        power = np.cumsum(np.abs(np.fft.rfft((x - x.mean()) * window)) ** 2)
+        found[j] = frequency[int(np.searchsorted(power, MOTION_POWER * power[-1]))] if power[-1] > 0 else 0.0
+    return found
+
+
+def _block_rows(rate_hz: float) -> int:
+    return max(BLOCK_ROWS, round(BLOCK_S * rate_hz))
+
+
+def _mean_squares(values: np.ndarray, rows: int) -> np.ndarray:
+    """(B, J) of whole blocks."""
+    count = len(values) // rows
+    return (values[: count * rows].reshape(count, rows, -1) ** 2).mean(axis=1)
+
+
+# estimates -------------------------------------------------------------------------------------------------------------
+
+
+def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kind) -> list[Estimate | None]:
+    """One estimate per signal over the blocks of all recordings; None where there are none."""
+    blocks = [b for b in blocks if len(b.mean_squares)]
+    if not blocks:
+        return [None] * num_signals
+    squares = np.concatenate([b.mean_squares for b in blocks])
+    rows, freedom = min(b.rows for b in blocks), min(b.freedom for b in blocks)
+    found: list[Estimate | None] = []
+    for column in squares.T:
+        own = column[np.isfinite(column)]
+        if len(own) == 0:
+            found.append(None)
+            continue
+        # Repeats in the mean (unless positions differ in bursts): what happens once belongs to it, and the noise of an effort
+        # grows with the motion. The others in the median: a stretch that
+        # still creeps, or a kink that the smooth cuts, is not noise.
+        bursts = method == "repeats" and kind == "position" and _in_bursts(own, freedom)
+        robust = method != "repeats" or bursts
+        square = float(_median(own[:, None], freedom)[0]) if robust else float(own.mean())
+        spread = _log_spread(own, freedom, robust=robust)
+        value = math.sqrt(square)
+        found.append(Estimate(method, value, value / spread, value * spread, len(own) * rows, bursts))
+    return found
+
+
+def _in_bursts(squares: np.ndarray, freedom: float) -> bool:
+    """True if few of the blocks (B,) hold most of the squared difference."""
+    ordered = np.sort(squares)[::-1]
+    few = math.ceil(BURST_SHARE * len(ordered))
+    usual = float(_median(squares[:, None], freedom)[0])
+    return bool(ordered[:few].sum() > BURST_POWER * ordered.sum() and ordered.mean() > BURST_RATIO**2 * usual)
+
+
+def _median(squares: np.ndarray, freedom: float) -> np.ndarray:
+    """(J,) variance from the median of blocks (B, J): a χ²'s median lies below its mean by a known share."""
+    return np.median(squares, axis=0) / (chi2.median(freedom) / freedom)
+
+
+def _log_spread(squares: np.ndarray, freedom: float, *, robust: bool) -> float:
+    """Factor to both sides of a standard deviation, 95 %, from the scatter of its blocks, at least that of white
+    noise."""
+    least = math.sqrt(2.0 / freedom)
+    count = len(squares)
+    if count > 1 and (squares > 0).all():
+        log = np.log(squares)
+        spread = (
+            1.4826 * float(np.median(np.abs(log - np.median(log)))) if robust else float(squares.std() / squares.mean())
+        )
+    else:
+        spread = least
+    error = (
+        max(spread, least) / math.sqrt(count) * (1.2533 if robust else 1.0)
+    )  # a median scatters √(π/2) times as much
+    return math.exp(0.5 * float(student.ppf(0.975, max(count - 1, 2))) * error)

@@ -1,0 +1,327 @@
+"""Measurements from recordings: MCAP, bags, HDF5.
+
+A recording is read at its own command rate, not at the dataset's 30 rows a second: one file, one measurement, whole, rests
+before and after the motion included. Its clock is an even grid laid through the command's stamps. Where a sample lies on the grid
+it is taken as it is; where it does not, the value is on the straight line between its neighbours, which keeps the mean time of
+commands and positions (the last sample instead would be half a period late). Nothing is drawn across longer gaps.
+"""
+
+import dataclasses
+import json
+import math
+import re
+from typing import Any
+
+import numpy as np
+
+from taccorl.alignment.measurements.measurement import UNITS, Measurement, Touch
+from taccorl.alignment.measurements.quantisation import find_quantum
+from taccorl.data import decode
+from taccorl.data.arms import ACTION, STATE
+from taccorl.data.cutting import Cutter, Unfit
+from taccorl.data.episode import ChannelTiming
+from taccorl.data.finding import Finding
+from taccorl.data.recording import Recording, Source, opened, readers
+from taccorl.data.spec import DatasetSpec, EpisodesSpec, InstructionSpec, RecordingSpec
+from taccorl.data.timing import NS_PER_S
+from taccorl.errors import RecordingError
+
+TACTILE = "observation.tactile"
+RATE_TOLERANCE = 0.02
+"""A channel whose median rate is so near the spec's runs at the spec's rate; its clock merely drifts."""
+LONGEST_LINE = 3.0
+"""Periods without a sample across which a straight line is drawn: a driver loses one or two samples now and then."""
+_EXTRA = {"effort": ("effort",), "velocity": ("qvel", "velocity")}
+"""What lies beside a position: the message's field of that name, or (HDF5) a neighbouring array of one of these
+names."""
+
+
+def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
+    """Read one recording as a measurement. Episode markers are ignored; the instruction is the first one's.
+
+    Raises:
+        RecordingError: not readable, a topic of the spec is missing, or commands and states do not overlap.
+    """
+    narrow, spans = _joint_channels(source, spec)
+    with opened(source, narrow) as recording:
+        found: list[Finding] = []
+        cutter = _cutter(recording, found)
+        return _Rows(cutter, spans).measurement(_Notes.of(recording, spec), tuple(found))
+
+
+def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
+    """Our names of the elements of state and action: ``left_joint_5.pos`` is ``left_joint5``.
+
+    Raises:
+        RecordingError: state and action differ, or hold something else than rad and m.
+    """
+    state, action = (spec.features.get(key) for key in (STATE, ACTION))
+    if state is None or action is None or not state.names or state.names != action.names:
+        raise RecordingError(f"{spec.name}: {STATE} and {ACTION} must both be there, under the same names")
+    if state.unit != action.unit or set(signal_units(spec)) - set(UNITS):
+        raise RecordingError(f"{spec.name}: {STATE} and {ACTION} must both be in rad and m, they are in {state.unit}")
+    return tuple(re.sub(r"joint_(\d+)$", r"joint\1", name.removesuffix(".pos")) for name in state.names)
+
+
+def signal_units(spec: DatasetSpec) -> tuple[str, ...]:
+    """Unit of every element of the state."""
+    state = spec.features[STATE]
+    return (state.unit,) * state.size if isinstance(state.unit, str) else state.unit
+
+
+@dataclasses.dataclass(frozen=True)
+class _Span:
+    """Where the values of one extra channel belong."""
+
+    kind: str
+    """effort or velocity."""
+    first: int
+    size: int
+
+
+def _joint_channels(source: Source, spec: RecordingSpec) -> tuple[RecordingSpec, dict[str, _Span]]:
+    """The spec without pictures, with effort and velocity beside each state channel where the recording has them."""
+    wanted = [key for key in (STATE, ACTION, TACTILE) if key in spec.features]
+    names = signal_names(spec.target)
+    channels = {c: spec.channels[c] for key in wanted for c in spec.features[key].channels}
+    states = [spec.channels[c] for c in spec.features[STATE].channels]
+    firsts = _first_messages(source, spec, [c.topic for c in states])
+    present = readers.get(spec.reader)(source, spec).topics()
+    spans: dict[str, _Span] = {}
+    at = 0
+    for name, state in zip(spec.features[STATE].channels, states, strict=True):
+        width = len(state.pick) or (len(names) if len(states) == 1 else len(names) // len(states))
+        for kind, beside in _EXTRA.items():
+            extra, size = None, width
+            if state.field == "position" and state.pick:
+                extra, size = dataclasses.replace(state, field=kind, scale=()), _listed(firsts.get(state.topic), kind)
+                if 0 < size < width and tuple(decode.get(firsts[state.topic], "name"))[:size] == state.pick[:size]:
+                    extra = dataclasses.replace(
+                        extra, pick=()
+                    )  # piper_ros: six velocities for seven names, in their order
+            elif state.topic.endswith("/qpos"):
+                topic = next((t for b in beside if (t := state.topic.removesuffix("qpos") + b) in present), None)
+                extra = dataclasses.replace(state, topic=topic, scale=()) if topic else None
+            if extra is not None and 0 < size <= width and (size == width or not extra.pick):
+                channels[f"{name}.{kind}"] = extra
+                spans[f"{name}.{kind}"] = _Span(kind, at, size)
+        at += width
+    narrow = dataclasses.replace(
+        spec,
+        channels=channels,
+        features={key: spec.features[key] for key in wanted},
+        episodes=EpisodesSpec(by="whole_file"),
+        # Asked for as a topic, texts may be absent: a sweep needs no markers.
+        instruction=InstructionSpec(from_="topic", topic=spec.episodes.topic or spec.instruction.topic),
+    )
+    return narrow, spans
+
+
+def _first_messages(source: Source, spec: RecordingSpec, topics: list[str]) -> dict[str, Any]:
+    firsts: dict[str, Any] = {}
+    for message in readers.get(spec.reader)(source, spec).messages(topics):
+        firsts.setdefault(message.topic, message.value)
+        if len(firsts) == len(set(topics)):
+            break
+    return firsts
+
+
+def _listed(message: Any, field: str) -> int:
+    """How many numbers a message lists there."""
+    try:
+        return int(np.size(decode.get(message, field)))
+    except RecordingError:
+        return 0
+
+
+def _cutter(recording: Recording, found: list[Finding]) -> Cutter:
+    """Clocks and baselines; without touch where the pads were not at rest at the start."""
+    try:
+        return Cutter(recording)
+    except Unfit as why:
+        features = {k: f for k, f in recording.spec.features.items() if k != TACTILE}
+        found.append(
+            Finding("no_baseline", "warning", TACTILE, f"touch is left out: {why}. Record a second without touch first")
+        )
+        return Cutter(dataclasses.replace(recording, spec=dataclasses.replace(recording.spec, features=features)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Notes:
+    """What is written down in a recording besides its channels: metadata records of any name, with these keys."""
+
+    origin: str
+    instruction: str
+    repeat_of: str | None
+    numbers: dict[str, dict[str, float]]
+    """``kp``, ``kd``, ``gain_scale`` (signal → number) and ``payload_kg`` (arm → number), each as JSON."""
+    payload_position_m: dict[str, tuple[float, float, float]]
+    """Arm → centre of mass in link 6's frame, as JSON."""
+
+    @classmethod
+    def of(cls, recording: Recording, spec: RecordingSpec) -> "_Notes":
+        written = {k: v for record in recording.reader.metadata.values() for k, v in record.items()}
+        texts = [text for topic in recording.texts.values() for _, text in topic]
+        if spec.episodes.by == "markers":
+            texts = [t.removeprefix("start:") for t in texts if t.startswith("start:")]
+        told = next((t.strip() for t in texts if t.strip()), written.get("instruction", spec.instruction.text or ""))
+        numbers: dict[str, dict[str, float]] = {}
+        for key in ("kp", "kd", "gain_scale", "payload_kg"):
+            try:
+                numbers[key] = {str(k): float(v) for k, v in json.loads(written.get(key, "{}")).items()}
+            except (ValueError, TypeError, AttributeError) as error:
+                raise RecordingError(
+                    f'{recording.source.name}: metadata {key} is {written[key]!r}, not like {{"left_joint5": 40.0}}'
+                ) from error
+        try:
+            stated = json.loads(written.get("payload_position_m", "{}")).items()
+            places = {str(arm): (float(x), float(y), float(z)) for arm, (x, y, z) in stated}
+        except (ValueError, TypeError, AttributeError) as error:
+            raise RecordingError(
+                f"{recording.source.name}: metadata payload_position_m is {written['payload_position_m']!r}, not like "
+                '{"left": [0, 0, 0.168]}'
+            ) from error
+        return cls(written.get("origin", ""), told, written.get("repeat_of") or None, numbers, places)
+
+
+class _Rows:
+    """Channels of one recording on the command's grid."""
+
+    def __init__(self, cutter: Cutter, spans: dict[str, _Span]) -> None:
+        self.cutter, self.spans, self.spec = cutter, spans, cutter.spec
+        self.commands, self.states = (self.spec.features[key].channels for key in (ACTION, STATE))
+        self.rate_hz = self._rate_hz()
+        self.period_ns = round(NS_PER_S / self.rate_hz)
+        self.grid_ns = self._grid()
+
+    def _rate_hz(self) -> float:
+        rates = {c: NS_PER_S / float(np.median(np.diff(self._time_ns(c)))) for c in self.commands if self._many(c)}
+        if not rates:
+            raise RecordingError(f"{self.cutter.recording.source.name}: less than two commands; nothing to replay")
+        name, rate_hz = max(rates.items(), key=lambda item: item[1])
+        said = self.spec.channels[name].rate_hz
+        return said if abs(rate_hz / said - 1) < RATE_TOLERANCE else rate_hz
+
+    def _many(self, channel: str) -> bool:
+        return len(self.cutter.clocks[channel].time_ns) > 1
+
+    def _time_ns(self, channel: str) -> np.ndarray:
+        return self.cutter.clocks[channel].time_ns
+
+    def _values(self, channel: str) -> np.ndarray:
+        values = self.cutter.recording.channels[channel].values
+        assert values is not None, "joint channels hold numbers"
+        return np.asarray(values[self.cutter.clocks[channel].order], dtype=float)
+
+    def _grid(self) -> np.ndarray:
+        """(T,) ns from the first to the last common instant, through the stamps of the command that moves most."""
+        both = (*self.commands, *self.states)
+        start = max(int(self._time_ns(c)[0]) for c in both)
+        end = min(int(self._time_ns(c)[-1]) for c in both)
+        moves = max(self.commands, key=lambda c: float(np.ptp(self._values(c), axis=0).max()))
+        stamps = self._time_ns(moves)
+        half = self.period_ns // 2
+        # Median distance from the nearest tick: stamps jitter about the instant at which the driver meant to send.
+        off = int(np.median((stamps - stamps[0] + half) % self.period_ns - half))
+        first = int(stamps[0]) + off
+        first += max(0, -(-(start - first) // self.period_ns)) * self.period_ns
+        if end - first < 2 * self.period_ns:
+            raise RecordingError(
+                f"{self.cutter.recording.source.name}: commands and states overlap for "
+                f"{max(0, end - start) / NS_PER_S:.3f} s; record both from before the motion to after it"
+            )
+        num_rows = (end - first) // self.period_ns + 2
+        grid = first + np.rint(np.arange(num_rows) * (NS_PER_S / self.rate_hz)).astype(
+            np.int64
+        )  # rounded one by one: no drift
+        return grid[grid <= end]
+
+    def _on_grid(self, channel: str, *, held: bool) -> np.ndarray:
+        """(T, size) of one channel; across long gaps held (a command stays in force) or NaN (nobody knows)."""
+        time_ns, values = self._time_ns(channel), self._values(channel)
+        before = np.clip(np.searchsorted(time_ns, self.grid_ns, side="right") - 1, 0, len(time_ns) - 1)
+        after = np.minimum(before + 1, len(time_ns) - 1)
+        step = np.maximum(time_ns[after] - time_ns[before], 1)
+        past = np.clip(self.grid_ns - time_ns[before], 0, None)
+        long = (step > LONGEST_LINE * self.period_ns) & (past > 0)
+        # A command after a long silence: in force until one period before the next, then on the line to it.
+        late = np.clip(1 - (time_ns[after] - self.grid_ns) / self.period_ns, 0.0, 1.0)
+        share = np.where(long, late if held else np.nan, past / step)
+        share = np.where(after == before, 0.0, share)
+        return values[before] + share[:, None] * (values[after] - values[before])
+
+    def measurement(self, notes: _Notes, findings: tuple[Finding, ...]) -> Measurement:
+        """All of it."""
+        names = signal_names(self.spec.target)
+        shape = (len(self.grid_ns), len(names))
+        extra = {kind: np.full(shape, np.nan) for kind in _EXTRA}
+        for channel, span in self.spans.items():
+            extra[span.kind][:, span.first : span.first + span.size] = self._on_grid(channel, held=False)
+        raw = [self._values(c) for c in self.states]
+        touch = self._touch() if TACTILE in self.spec.features else None
+        source = self.cutter.recording.source
+        no_clock = self.spec.reader == "hdf5"  # row k is k / rate, whenever it was
+        return Measurement(
+            name=source.path.name + (f"#{source.part}" if source.part else ""),
+            time_s=(self.grid_ns - self.grid_ns[0]) / NS_PER_S,
+            target=np.concatenate([self._on_grid(c, held=True) for c in self.commands], axis=1),
+            measured=np.concatenate([self._on_grid(c, held=False) for c in self.states], axis=1),
+            velocity=extra["velocity"],
+            effort=extra["effort"],
+            signals=names,
+            units=signal_units(self.spec.target),
+            quantum=np.array([find_quantum(column) for part in raw for column in part.T]),
+            touch=touch,
+            source=source.path,
+            origin=notes.origin,
+            instruction=notes.instruction,
+            start_ns=int(self.grid_ns[0]),
+            repeat_of=notes.repeat_of,
+            kp=notes.numbers["kp"],
+            kd=notes.numbers["kd"],
+            gain_scale=notes.numbers["gain_scale"],
+            payload_kg=notes.numbers["payload_kg"],
+            payload_position_m=notes.payload_position_m,
+            time_error_s=self.period_ns / NS_PER_S if no_clock else 0.0,
+            timing=tuple(self._timing(c, key) for key in (STATE, ACTION) for c in self.spec.features[key].channels),
+            findings=findings,
+        )
+
+    def _timing(self, channel: str, key: str) -> ChannelTiming:
+        clock = self.cutter.clocks[channel]
+        steps = np.diff(clock.time_ns) / NS_PER_S
+        median = float(np.median(steps)) if len(steps) else math.inf
+        off = np.abs((clock.time_ns - self.grid_ns[0] + self.period_ns // 2) % self.period_ns - self.period_ns // 2)
+        return ChannelTiming(
+            channel=channel,
+            feature=key,
+            align="line",
+            rate_hz=round(1.0 / median, 3),
+            gaps=int((steps > 1.5 * median).sum()),
+            longest_gap_s=round(float(steps.max()), 6) if len(steps) else 0.0,
+            age_median_s=round(float(np.median(off)) / NS_PER_S, 6),
+            age_max_s=round(float(off.max()) / NS_PER_S, 6),
+            duplicates=clock.duplicates,
+            out_of_order=clock.out_of_order,
+            zero_stamps=clock.zero_stamps,
+            nominal_hz=self.spec.channels[channel].rate_hz,
+        )
+
+    def _touch(self) -> Touch:
+        """Frame n of the first pad, with each other pad's nearest frame; every pad keeps its own times.
+
+        Specs take off a scan as latency, to say when a frame began; here a frame's time is the end of its scan.
+        """
+        channels = self.spec.features[TACTILE].channels
+        scan_s = self.spec.target.sensors[TACTILE].scan_time_s
+        first = self._time_ns(channels[0])
+        columns, times = [], []
+        for channel in channels:
+            time_ns = self._time_ns(channel)
+            after = np.clip(np.searchsorted(time_ns, first), 1, len(time_ns) - 1)
+            nearer = np.where(first - time_ns[after - 1] <= time_ns[after] - first, after - 1, after)
+            columns.append(self._values(channel)[nearer])
+            times.append((time_ns[nearer] - self.grid_ns[0]) / NS_PER_S + scan_s)
+        baseline = self.cutter.baselines[TACTILE]
+        counts = np.concatenate(columns, axis=1) - baseline
+        return Touch(time_s=np.stack(times, axis=1), counts=counts.astype(np.int16), baseline=baseline)

@@ -1,0 +1,160 @@
+"""Two recordings of one motion laid over each other by their commands: what differs then is noise, and what the robot does
+not repeat.
+
+Letters in shapes: M common rows, J signals.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.errors import TaccorlError
+
+SAME_SHARE = 0.01
+"""Commands of one motion differ by less than this share of the motion once they lie over each other."""
+SAME_QUANTA = 1e-4
+"""… or by less than this (rad, m): rounding on the way."""
+COMMON_SHARE = 0.5
+"""Of the shorter recording's motion: less in common measures nothing."""
+AFTER_S = 0.5
+"""The motion counts from its first command to so long after its last."""
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """The second recording on the rows of the first."""
+
+    shift_s: float
+    """Time in the second recording − time in the first, at the same command."""
+    difference: dict[str, np.ndarray]
+    """position, velocity, effort → (M, J) second − first while the motion lasts."""
+    time_s: np.ndarray
+    """(M,) time in the first recording."""
+    target_rms: float
+    """What is left between the commands (rad, m)."""
+    noise_gain: float
+    """Variance of ``difference`` for noise of variance 1 in both: 1 + Σ c², c the weights that shift by part of a
+    row."""
+
+
+def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SHARE) -> Overlay:
+    """Lay ``second`` over ``first``: the shift is where their commands agree best, to a fraction of a row.
+
+    Args:
+        same_share: by which share of the motion commands may differ once they lie over each other; more for loads, which are
+            measured and not commanded.
+
+    Raises:
+        TaccorlError: other signals, or other commands.
+    """
+    if first.signals != second.signals:
+        raise TaccorlError(f"{second.name} and {first.name} hold different signals; one cannot repeat the other")
+    for what in ("kp", "kd", "gain_scale", "payload_kg", "lever_m", "arm_kg", "payload_position_m"):
+        one, other = getattr(first, what), getattr(second, what)
+        silent = what in ("kp", "kd") and not (one and other)  # nobody wrote them down: not known to differ
+        if one != other and not silent:
+            raise TaccorlError(
+                f"{second.name} does not repeat {first.name}: {what} is {other or 'as usual'} there and {one or 'as usual'} "
+                "here; mend repeat_of"
+            )
+    rate_hz = first.rate_hz
+    a, b = first.resampled(rate_hz), second.resampled(rate_hz)
+    scale = np.maximum(np.ptp(a.target, axis=0), 1e-9)
+    lag = _lag(a.target / scale, b.target / scale)
+    share, lag = _refine(a.target, b.target, lag)
+    rows, start = _common(a.num_rows, b.num_rows, lag)
+    target = _shifted(b.target, start, share, len(rows)) - a.target[rows]
+    moving = _moving(a.target[rows], round(AFTER_S * rate_hz))
+    whole = _moving(a.target, 0).sum()
+    rms = float(np.sqrt(np.mean(target[moving] ** 2))) if moving.any() else 0.0
+    motion = float(np.sqrt(np.mean(np.var(a.target, axis=0))))
+    if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > max(same_share * motion, SAME_QUANTA):
+        raise TaccorlError(
+            f"{second.name} does not repeat {first.name}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
+            f"over {moving.sum() / rate_hz:.1f} s in common; mend repeat_of, or record the same command file twice"
+        )
+    weights = _weights(share)
+    difference = {
+        kind: (_shifted(y, start, share, len(rows)) - x[rows])[moving]
+        for kind, x, y in (
+            ("position", a.measured, b.measured),
+            ("velocity", a.velocity, b.velocity),
+            ("effort", a.effort, b.effort),
+        )
+    }
+    zero_s = first.time_s[0] - second.time_s[0]
+    return Overlay(
+        (lag + share) / rate_hz - zero_s, difference, a.time_s[rows][moving], rms, 1.0 + float((weights**2).sum())
+    )
+
+
+def repeats(first: Measurement, second: Measurement) -> bool:
+    """Whether both were given the same commands."""
+    try:
+        overlay(first, second)
+    except TaccorlError:
+        return False
+    return True
+
+
+def _lag(a: np.ndarray, b: np.ndarray) -> int:
+    """Whole rows by which ``b`` (T, J) lies later than ``a``: highest correlation of their steps."""
+    da, db = np.diff(a, axis=0), np.diff(b, axis=0)
+    size = len(da) + len(db) - 1
+    spectrum = np.conj(np.fft.rfft(da, size, axis=0)) * np.fft.rfft(db, size, axis=0)
+    correlation = np.fft.irfft(spectrum.sum(axis=1), size)
+    best = int(np.argmax(correlation))
+    return best - size if best >= len(db) else best
+
+
+def _refine(a: np.ndarray, b: np.ndarray, lag: int) -> tuple[float, int]:
+    """(share of a row in [0, 1), whole rows): lowest point of a parabola through the squared differences of
+    commands."""
+    costs = []
+    for k in (lag - 1, lag, lag + 1):
+        rows, start = _common(len(a), len(b), k)
+        costs.append(float(np.mean((b[start : start + len(rows)] - a[rows]) ** 2)) if len(rows) else np.inf)
+    before, at, after = costs
+    bend = before - 2 * at + after
+    part = 0.5 * (before - after) / bend if np.isfinite(bend) and bend > 0 else 0.0
+    if abs(part) < 0.02 or at <= 1e-12:
+        return 0.0, lag
+    whole = int(np.floor(part))
+    return part - whole, lag + whole
+
+
+def _common(num_a: int, num_b: int, lag: int) -> tuple[np.ndarray, int]:
+    """Rows of a that have a partner row + lag in b with neighbours for the shift, and b's row for the first of them."""
+    first, end = max(0, 1 - lag), min(num_a, num_b - 2 - lag)
+    return np.arange(first, max(first, end)), first + lag
+
+
+def _weights(share: float) -> np.ndarray:
+    """(4,) Lagrange weights of rows −1, 0, 1, 2 for a point at ``share`` of the way from row 0 to row 1."""
+    w = share
+    return np.array(
+        [
+            -w * (w - 1) * (w - 2) / 6,
+            (w + 1) * (w - 1) * (w - 2) / 2,
+            -(w + 1) * w * (w - 2) / 2,
+            (w + 1) * w * (w - 1) / 6,
+        ]
+    )
+
+
+def _shifted(values: np.ndarray, start: int, share: float, count: int) -> np.ndarray:
+    """(count, J) of ``values`` from row ``start + share`` on."""
+    if share == 0.0:
+        return values[start : start + count]
+    rows = np.stack([values[start + k : start + k + count] for k in (-1, 0, 1, 2)])
+    return np.tensordot(_weights(share), rows, axes=1)
+
+
+def _moving(target: np.ndarray, after: int) -> np.ndarray:
+    """(M,) bool: from the first change of a command to ``after`` rows past the last."""
+    changed = np.flatnonzero(np.any(np.diff(target, axis=0) != 0, axis=1))
+    inside = np.zeros(len(target), dtype=bool)
+    if len(changed):
+        inside[changed[0] : changed[-1] + 2 + after] = True
+    return inside

@@ -1,0 +1,453 @@
+"""Measurements from CSV, parquet and MATLAB files: one row an instant, one column (of a .mat file: one variable) a quantity.
+
+Without a columns file the table speaks our own language: ``t`` [s], and for every signal ``left_joint5.q`` [rad, m],
+``left_joint5.q_target``, and where recorded ``left_joint5.qd`` [rad/s, m/s], ``left_joint5.tau`` [N·m, N] and
+``left_joint5.load`` [N·m, N], an external torque that is known to push the joint, positive forwards. An axis by itself may have
+``servo.torque_ff`` [N·m, N], which its controller adds to the law, ``servo.supply`` [V] and ``servo.enabled``, 0 while its motor
+is off. Other names and units are written down in a columns file; no unit is ever guessed::
+
+    time: {column: stamp, unit: ms}
+    signals:
+      left_joint5:
+        q:        {column: pos_5, unit: deg}
+        q_target: {column: cmd_5, unit: deg}
+        qd:       {column: speed_5, unit: rpm}
+        tau:      {column: current_5, unit: Nm, factor: 0.000082}    # mA, 0.082 Nm/A; a factor of -1 mends a sign
+        supply:   {column: volts_5, unit: V, factor: 0.1}            # of an axis or robot file with law pwm
+        enabled:  {column: torque_enable_5, unit: "1", if_missing: 1}   # of a file that lacks the column
+"""
+
+import csv
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import scipy.io
+
+from taccorl.alignment.measurements.even_rows import even_rows
+from taccorl.alignment.measurements.measurement import Measurement, TargetKind, unit_of
+from taccorl.alignment.measurements.quantisation import find_quantum
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import RecordingError, nearest
+from taccorl.robots import ROBOT
+
+SUFFIXES = (".csv", ".parquet", ".mat")
+SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
+
+_TURN, _DEG = 2 * math.pi, math.pi / 180
+TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+"""Unit of time → seconds."""
+POSITION = {"rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "deg": ("rad", _DEG), "mdeg": ("rad", 1e-3 * _DEG)}
+POSITION |= {
+    "rev": ("rad", _TURN),
+    "m": ("m", 1.0),
+    "cm": ("m", 1e-2),
+    "mm": ("m", 1e-3),
+    "um": ("m", 1e-6),
+    "µm": ("m", 1e-6),
+}
+"""Unit of a position → ours and the factor to it."""
+VELOCITY = {"rad/s": ("rad", 1.0), "mrad/s": ("rad", 1e-3), "deg/s": ("rad", _DEG), "rpm": ("rad", _TURN / 60)}
+VELOCITY |= {"rev/s": ("rad", _TURN), "m/s": ("m", 1.0), "cm/s": ("m", 1e-2), "mm/s": ("m", 1e-3)}
+"""Unit of a velocity → the position's unit that it goes with, and the factor to that a second."""
+EFFORT = {"Nm": ("rad", 1.0), "N·m": ("rad", 1.0), "Ncm": ("rad", 1e-2), "Nmm": ("rad", 1e-3), "mNm": ("rad", 1e-3)}
+EFFORT |= {"kgcm": ("rad", 0.0980665), "N": ("m", 1.0), "kN": ("m", 1e3), "mN": ("m", 1e-3)}
+"""Unit of an effort → the position's unit that it goes with, and the factor to N·m or N. Amperes are no effort: a torque
+constant is somebody's guess until it is written down as a column in N·m."""
+_CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT, "load": EFFORT}
+_CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
+_CONVERSIONS |= {"torque_ff": EFFORT, "supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
+TARGETS = ("q_target", "qd_target", "tau_target")
+"""Exactly one of them commands a signal."""
+_KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One column of the table."""
+
+    column: str
+    unit: str
+    factor: float = 1.0
+    """The column's numbers times this are in ``unit``: turns of a tick, N·m of a mA, −1 for a sign."""
+    if_missing: float | None = None
+    """The column's number throughout a file that lacks it; without it such a file is refused."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SignalColumns:
+    """Where one signal stands."""
+
+    q: Column
+    """Measured position."""
+    q_target: Column | None = None
+    """Commanded position; or else one of:"""
+    qd_target: Column | None = None
+    """Commanded velocity."""
+    tau_target: Column | None = None
+    """Commanded torque; 0 while the motor is off."""
+    qd: Column | None = None
+    """Measured velocity."""
+    tau: Column | None = None
+    """Effort of the motor."""
+    load: Column | None = None
+    """Known external torque, positive where it drives the joint forwards."""
+    torque_ff: Column | None = None
+    """Torque that the controller adds to its law."""
+    supply: Column | None = None
+    """Voltage of the motor's supply."""
+    enabled: Column | None = None
+    """0 while the motor is off, else 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableSpec:
+    """Names and units of a table's columns."""
+
+    time: Column
+    signals: dict[str, SignalColumns]
+    """Signal → its columns. The robot's signals are ``left_joint1`` … ``right_gripper``; others may have any name."""
+    separator: str = "comma"
+    """Of CSV files: comma, semicolon or tab."""
+    target_rows_late: int = 0
+    """Rows by which the file shows a target too late: 1 where row k holds the target that was in force from row k − 1 on,
+    −1 where it holds the one of row k + 1."""
+    origin: str = ""
+    """What made the file, e.g. "surrogate …"."""
+    instruction: str = ""
+
+
+def is_table(m: Measurement) -> bool:
+    """Whether a measurement was read from a table, whose user has a columns file and no recording spec."""
+    return m.source.suffix in SUFFIXES
+
+
+def load_table_spec(path: Path) -> TableSpec:
+    """A columns file, checked.
+
+    Raises:
+        SpecError: with file, line, key and the way out.
+    """
+    document = Document(TableSpec, Path(path))
+    spec = document.value
+    if spec.separator not in SEPARATORS:
+        raise document.error("separator", f"{spec.separator!r}; {nearest(spec.separator, SEPARATORS)}")
+    if spec.time.unit not in TIME_S:
+        raise document.error("time/unit", f"{spec.time.unit!r} is no unit of time; {nearest(spec.time.unit, TIME_S)}")
+    if not spec.signals:
+        raise document.error("signals", "names no signal")
+    for name, signal in spec.signals.items():
+        kinds: dict[str, str] = {}
+        if (num := sum(getattr(signal, key) is not None for key in TARGETS)) != 1:
+            raise document.error(
+                f"signals/{name}",
+                "key 'q_target' is missing; or qd_target, tau_target"
+                if num == 0
+                else f"has {num} targets; one of {', '.join(TARGETS)} commands it",
+            )
+        for key, column in _columns_of(signal):
+            known, where = _CONVERSIONS[key], f"signals/{name}/{key}/unit"
+            if column.unit not in known:
+                hint = (
+                    "; a current needs its motor's torque constant: write `unit: Nm` with `factor:` in Nm a unit of the column"
+                    if column.unit in ("A", "mA")
+                    else ""
+                )
+                if column.unit in ("ticks", "tick", "counts", "count"):
+                    hint = "; write `unit: rad` with `factor:` in rad a tick"
+                raise document.error(where, f"{column.unit!r} is no unit of {key}; {nearest(column.unit, known)}{hint}")
+            if not math.isfinite(column.factor) or column.factor == 0.0:
+                raise document.error(where, f"factor {column.factor:g}; give a finite number other than 0")
+            if known[column.unit][0]:
+                kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
+        if len(kinds) > 1:
+            raise document.error(f"signals/{name}", f"{' and '.join(kinds.values())}: does it turn or slide?")
+        unit = POSITION[signal.q.unit][0]
+        if name in ROBOT.action_names and unit != unit_of(name):
+            raise document.error(
+                f"signals/{name}/q/unit", f"{signal.q.unit!r}: {name} is in {unit_of(name)} or a part of it"
+            )
+    names = [c.column for c in (spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s)))]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise document.error("signals", f"column {twice[0]!r} is used twice")
+    return spec
+
+
+def _columns_of(signal: SignalColumns) -> Iterable[tuple[str, Column]]:
+    for field in fields(signal):
+        column = getattr(signal, field.name)
+        if column is not None:
+            yield field.name, column
+
+
+def robot_units() -> dict[str, str]:
+    """Signal of the PiPER → unit of its position."""
+    return {name: unit_of(name) for name in ROBOT.action_names}
+
+
+def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | None = None) -> TableSpec:
+    """The columns of a table that speaks our language.
+
+    Args:
+        signal_units: signal of the machine → unit of its position, rad or m; the PiPER's if not given.
+
+    Raises:
+        RecordingError: ``t`` or a position or a target is missing, or a column is unknown; names file and column.
+    """
+    if "t" not in header:
+        raise RecordingError(
+            f"{path}: no column 't' [s]; it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}. Other "
+            "names and units are written down in a columns file (taccorl/alignment/measurements/tables.py shows one)"
+        )
+    known = robot_units() if signal_units is None else signal_units
+    parts: dict[str, set[str]] = {}
+    for k, column in enumerate(header):
+        name, _, key = column.rpartition(".")
+        if column == "t":
+            continue
+        if key not in _CONVERSIONS or not name:
+            own = [f"{n}.{key}" for n in known for key in _CONVERSIONS]
+            raise RecordingError(
+                f"{path}: column {k + 1} {column!r} is not NAME.{', .'.join(_CONVERSIONS)}; {nearest(column, own)}"
+            )
+        if name not in known:
+            whose = "the robot" if signal_units is None else "the machine of the file"
+            raise RecordingError(
+                f"{path}: column {k + 1} {column!r}: {whose} has no {name!r} ({nearest(name, known)}). "
+                "Signals of other machines need their own file (--twin) or a columns file, which state their units"
+            )
+        parts.setdefault(name, set()).add(key)
+    for name, keys in parts.items():
+        targets = [key for key in TARGETS if key in keys]
+        if len(targets) > 1:
+            raise RecordingError(
+                f"{path}: {name} has {' and '.join(targets)}; one of them commands it: remove the others"
+            )
+        for needed in ("q", *(["q_target"] if not targets else [])):
+            if needed not in keys:
+                raise RecordingError(
+                    f"{path}: column '{name}.{needed}' is missing; {name} has {', '.join(sorted(keys))}"
+                )
+    units = {
+        "rad": {
+            "q": "rad",
+            "q_target": "rad",
+            "qd": "rad/s",
+            "tau": "Nm",
+            "load": "Nm",
+            "qd_target": "rad/s",
+            "tau_target": "Nm",
+        },
+        "m": {"q": "m", "q_target": "m", "qd": "m/s", "tau": "N", "load": "N", "qd_target": "m/s", "tau_target": "N"},
+    }
+    for keys in units.values():
+        keys |= {"torque_ff": keys["tau"], "supply": "V", "enabled": "1"}
+    signals = {
+        name: SignalColumns(
+            **{key: Column(column=f"{name}.{key}", unit=units[known[name]][key]) for key in parts[name]}
+        )
+        for name in sorted(parts, key=list(known).index)
+    }
+    if not signals:
+        raise RecordingError(f"{path}: it holds times and no signal")
+    return TableSpec(time=Column(column="t", unit="s"), signals=signals)
+
+
+def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[str, str] | None = None) -> Measurement:
+    """A CSV or parquet file as a measurement. Even rows stay as they are; others come to an even grid (``even_rows``).
+
+    Args:
+        spec: names and units of its columns; our own names if not given.
+        signal_units: as ``own_spec``, for a table without a spec.
+
+    Raises:
+        RecordingError: a column is missing, a cell is empty or no number; names file, line and column.
+    """
+    path = Path(path)
+    header, columns = read_columns(
+        path,
+        lambda header: _wanted(spec or own_spec(path, header, signal_units), header),
+        spec.separator if spec else "comma",
+    )
+    spec = spec or own_spec(path, header, signal_units)
+    time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
+    if len(time_s) < 2:
+        raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
+    shape = (len(time_s), len(spec.signals))
+    nothing = {"load": 0.0, "torque_ff": 0.0, "enabled": 1.0}
+    values = {key: np.full(shape, nothing.get(key, np.nan)) for key in _CONVERSIONS}
+    units = []
+    kinds: list[TargetKind] = []
+    for j, signal in enumerate(spec.signals.values()):
+        units.append(POSITION[signal.q.unit][0])
+        for key, column in _columns_of(signal):
+            if key in TARGETS:
+                kinds.append(_KINDS[key])
+            read = columns[column.column] if column.column in columns else np.full(len(time_s), column.if_missing)
+            values["q_target" if key in TARGETS else key][:, j] = (
+                read * column.factor * _CONVERSIONS[key][column.unit][1]
+            )
+    between = ~np.isin(values["enabled"], (0.0, 1.0))
+    if between.any():
+        row, j = np.argwhere(between)[0]
+        raise RecordingError(
+            f"{path}: row {row + 1}: {list(spec.signals)[j]}.enabled is {values['enabled'][row, j]:g}; write 0 while the "
+            "motor is off, else 1"
+        )
+
+    def extra(key: str) -> np.ndarray:
+        return values[key][rows] if any(getattr(s, key) for s in spec.signals.values()) else np.empty(0)
+
+    late = spec.target_rows_late
+    if abs(late) >= len(time_s) - 1:
+        raise RecordingError(f"{path}: target_rows_late {late} leaves nothing of {len(time_s)} rows")
+    rows = slice(max(0, -late), len(time_s) - max(0, late))  # rows for which the target in force is in the file
+    start = time_s[rows][0]
+    found = Measurement(
+        name=path.name,
+        time_s=time_s[rows] - start,
+        target=values["q_target"][rows.start + late : rows.stop + late],
+        measured=values["q"][rows],
+        velocity=values["qd"][rows],
+        effort=values["tau"][rows],
+        load=extra("load"),
+        torque_ff=extra("torque_ff"),
+        supply_v=extra("supply"),
+        enabled=extra("enabled"),
+        signals=tuple(spec.signals),
+        units=tuple(units),
+        target_kinds=tuple(kinds),
+        quantum=np.array([find_quantum(column) for column in values["q"].T]),
+        source=path,
+        origin=spec.origin,
+        instruction=spec.instruction,
+        start_ns=round(start * 1e9),
+    )
+    return even_rows(found)
+
+
+def _wanted(spec: TableSpec, header: list[str]) -> list[str]:
+    columns = [spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s))]
+    return [c.column for c in columns if c.if_missing is None or c.column in header]
+
+
+def read_columns(
+    path: Path, choose: Callable[[list[str]], list[str]], separator: str = "comma"
+) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Columns of a CSV or parquet file as numbers: the header, and name → (T,).
+
+    Args:
+        choose: names of the columns to read, from the header; may raise.
+        separator: a key of ``SEPARATORS``, for CSV.
+
+    Raises:
+        RecordingError: a column is missing or there twice, a cell is empty or no number; names file, line and column.
+    """
+    if path.suffix == ".mat":
+        return _read_mat(path, choose)
+    return _read_parquet(path, choose) if path.suffix == ".parquet" else _read_csv(path, choose, separator)
+
+
+def _chosen(path: Path, header: list[str], choose: Callable[[list[str]], list[str]]) -> list[str]:
+    """Columns to read, each of which must be there once."""
+    twice = sorted({h for h in header if header.count(h) > 1})
+    wanted = choose(header)
+    for name in wanted:
+        if name not in header:
+            raise RecordingError(f"{path}: no column {name!r}; {nearest(name, header)}")
+        if name in twice:
+            raise RecordingError(f"{path}: column {name!r} stands there twice")
+    return wanted
+
+
+def _read_csv(
+    path: Path, choose: Callable[[list[str]], list[str]], separator: str
+) -> tuple[list[str], dict[str, np.ndarray]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.reader(file, delimiter=SEPARATORS[separator], strict=True)
+            header = [cell.strip() for cell in next(rows, [])]
+            if not header:
+                raise RecordingError(f"{path}: is empty")
+            other = next((word for word, sign in SEPARATORS.items() if len(header) == 1 and sign in header[0]), None)
+            if other:
+                raise RecordingError(
+                    f"{path}: its columns are parted by {other}; write `separator: {other}` in a columns file"
+                )
+            wanted = _chosen(path, header, choose)
+            at = [header.index(name) for name in wanted]
+            found: list[list[float]] = []
+            for row in rows:
+                if not row:
+                    continue
+                if len(row) != len(header):
+                    raise RecordingError(f"{path}:{rows.line_num}: {len(row)} cells, the header has {len(header)}")
+                found.append([_number(row[k], path, rows.line_num, header[k]) for k in at])
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f"{path}: cannot be read as CSV: {error}") from error
+    return header, dict(zip(wanted, np.array(found, dtype=float).reshape(-1, len(wanted)).T, strict=True))
+
+
+def _number(cell: str, path: Path, line: int, column: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        comma = (
+            " (a decimal comma? write points)"
+            if cell.strip().replace(",", ".").replace(".", "", 1).strip("-").isdigit()
+            else ""
+        )
+        what = f"{cell!r} is no number{comma}" if cell.strip() else "is empty; leave the row out"
+        raise RecordingError(f"{path}:{line}: column {column!r}: {what}") from None
+    if not math.isfinite(value):
+        raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; leave the row out")
+    return value
+
+
+def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[list[str], dict[str, np.ndarray]]:
+    try:
+        header = list(pq.read_schema(path).names)
+        wanted = _chosen(path, header, choose)
+        table = pq.read_table(path, columns=wanted)
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(f"{path}: cannot be read as parquet: {' '.join(str(error).split())}") from error
+    columns = {}
+    for name in wanted:
+        column = table[name]
+        if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+            raise RecordingError(f"{path}: column {name!r} holds {column.type}, not numbers")
+        values = np.asarray(column.to_numpy(), dtype=float)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            raise RecordingError(f"{path}: column {name!r}: row {bad[0]} is empty or not finite; leave the row out")
+        columns[name] = values
+    return header, columns
+
+
+def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Variables of a MATLAB file up to version 7 that are vectors of numbers."""
+    try:
+        content = scipy.io.loadmat(path)
+    except (OSError, ValueError, NotImplementedError) as error:
+        raise RecordingError(
+            f"{path}: cannot be read as a MATLAB file up to version 7: {' '.join(str(error).split())}"
+        ) from error
+    vectors = {
+        name: np.asarray(value, dtype=float).ravel()
+        for name, value in content.items()
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.size == max(value.shape, default=0) > 1
+    }
+    wanted = _chosen(path, list(vectors), choose)
+    lengths = {name: len(vectors[name]) for name in wanted}
+    if len(set(lengths.values())) > 1:
+        raise RecordingError(f"{path}: its variables differ in length: {lengths}")
+    for name in wanted:
+        bad = np.flatnonzero(~np.isfinite(vectors[name]))
+        if len(bad):
+            raise RecordingError(f"{path}: variable {name!r}: row {bad[0]} is not finite; leave the row out")
+    return list(vectors), {name: vectors[name] for name in wanted}

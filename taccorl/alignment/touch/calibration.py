@@ -1,0 +1,307 @@
+"""Tactile calibration, paper App. B.2: λ_noise from readings without contact, then (k_n, k_d) on matched contact replays.
+
+The fit is least squares on the counts of all taxels that the object comes near. The match is measured, on recordings that were
+not used for the fit, by the quantities that the paper aligns: masks of active taxels, their number, centroids, histograms,
+temporal differences. Twin and measurement go through the same threshold.
+
+k_n and the sensor's gain (counts for a reading of 1) cannot be told apart by counts: the gain stays as configured.
+
+Letters in shapes: T frames, P pads, R × C taxels.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import norm, wasserstein_distance
+
+from taccorl.alignment.touch.model import TouchModel
+from taccorl.alignment.touch.motion import TouchMotion
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.twin import TwinConfig
+
+QUANTILE = 0.999
+"""Of the readings without contact, that many lie below λ_noise."""
+MIN_FRAMES = 50
+"""Without contact, for a noise level: half a second."""
+BLOCK_S = 0.5
+"""Residuals further apart than this count as independent in the intervals."""
+_NEAR_M = 3e-4  # taxels that the object comes so near to take part in the fit
+_MIN_IN_CONTACT = 20  # frames
+_STIFFNESS_PER_M, _DAMPING_S_PER_M = (1.0, 1e6), (0.0, 1e4)
+_STEP = 1e-3  # of finite differences, in shares of the numbers to start from
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """Readings of pads without contact: mean, noise and threshold."""
+
+    pads: tuple[str, ...]
+    mean_count: np.ndarray
+    """(P, R, C) counts above baseline."""
+    std_count: np.ndarray
+    """(P, R, C) of each taxel."""
+    threshold_count: float
+    """λ_noise of all taxels together: the quantile 0.999 of their readings."""
+    num_frames: tuple[int, ...]
+    """Per pad."""
+
+    @property
+    def pooled_std_count(self) -> float:
+        return float(np.sqrt(np.mean(np.square(self.std_count))))
+
+    @property
+    def threshold_of_taxels_count(self) -> np.ndarray:
+        """(P, R, C) λ_noise of each by its own mean and standard deviation, as if normally distributed."""
+        return self.mean_count + norm.ppf(QUANTILE) * self.std_count
+
+
+@dataclass(frozen=True)
+class Number:
+    """An estimate with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class TouchMatch:
+    """Agreement of measured and simulated touch over all frames of some recordings. Perfect is 0, for ``mask_iou`` 1."""
+
+    rms_count: float
+    """Of counts, taxels that are ever active in either."""
+    mask_iou: float
+    """Masks of active taxels: intersection over union, all frames together."""
+    active_count: float
+    """Mean difference of the number of active taxels of a pad, in frames with contact."""
+    centroid_m: float
+    """Mean distance of the centroids of counts, in frames in which both have active taxels."""
+    histogram_count: float
+    """Wasserstein distance of the active taxels' counts."""
+    temporal_count: float
+    """RMS difference of the change from frame to frame, taxels that are ever active in either."""
+    num_frames: int
+    """Of single pads, in contact."""
+
+
+@dataclass(frozen=True)
+class TouchCalibration:
+    """Result of ``calibrate_touch``."""
+
+    noise: NoiseLevel
+    stiffness: Number
+    """k_n, reading per metre."""
+    damping: Number
+    """k_d, reading per m/s."""
+    correlation: float
+    """Of the two estimates: near ±1 the recordings say only a combination; press at two speeds."""
+    before: TouchMatch
+    """On the validation recordings, with the twin's own k_n and k_d."""
+    after: TouchMatch
+    fitted_to: tuple[str, ...]
+    validation: tuple[str, ...]
+    trouble: str
+    """Why it is not to be relied upon; empty if nothing speaks against it."""
+
+    def mended(self, config: TwinConfig) -> TwinConfig:
+        """``config`` with the fitted numbers."""
+        fitted = {
+            "normal_stiffness_per_m": self.stiffness.value,
+            "normal_damping_s_per_m": self.damping.value,
+        }
+        return dataclasses.replace(config, sensor=dataclasses.replace(config.sensor, **fitted))
+
+
+def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
+    """λ_noise from the frames in which nothing is near a pad, nor was in the second before.
+
+    Raises:
+        TaccorlError: less than half a second of such frames, or recordings of different pads.
+    """
+    pads = _pads(motions)
+    still = [
+        [motion.measured[:, p][motion.undisturbed()[:, p]].astype(float) for motion in motions]
+        for p in range(len(pads))
+    ]
+    frames = [np.concatenate(of_pad) for of_pad in still]
+    short = next((pad for pad, of_pad in zip(pads, frames, strict=True) if len(of_pad) < MIN_FRAMES), None)
+    if short:
+        raise TaccorlError(
+            f"touch calibration: pad {short} has {min(map(len, frames))} frames without contact in {_names(motions)}; record "
+            "some seconds before the first touch"
+        )
+    means = np.array([of_pad.mean(axis=0) for of_pad in frames])
+    # About the mean of each recording: baselines are taken anew for each.
+    centred = [[one - one.mean(axis=0) for one in of_pad if len(one) > 1] for of_pad in still]
+    rest = [max(sum(map(len, of_pad)) - len(of_pad), 1) for of_pad in centred]
+    squares = np.array([sum(np.square(one).sum(axis=0) for one in of_pad) for of_pad in centred])
+    std = np.sqrt(squares / np.array(rest)[:, None, None])
+    return NoiseLevel(
+        pads=pads,
+        mean_count=means,
+        std_count=np.maximum(std, 1 / math.sqrt(12)),
+        threshold_count=float(np.quantile(np.concatenate([f.ravel() for f in frames]), QUANTILE)),
+        num_frames=tuple(map(len, frames)),
+    )
+
+
+def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray], threshold_count: float) -> TouchMatch:
+    """Compare measured with ``simulated`` counts (T, P, R, C); a taxel is active above ``threshold_count`` (λ_noise)."""
+    both = [(m.measured.astype(np.float32), s.astype(np.float32)) for m, s in zip(motions, simulated, strict=True)]
+    masks = [(a > threshold_count, b > threshold_count) for a, b in both]
+    ever = [a.any(axis=0) | b.any(axis=0) for a, b in masks]
+    union = sum(int((a | b).sum()) for a, b in masks)
+    if union == 0:
+        raise TaccorlError(
+            f"touch: no taxel ever reads above λ_noise = {threshold_count:g} counts in {_names(motions)}"
+        )
+    contact = [motion.near(0.0).any(axis=(2, 3)) for motion in motions]
+    active = [np.abs(a.sum(axis=(2, 3)) - b.sum(axis=(2, 3)))[c] for (a, b), c in zip(masks, contact, strict=True)]
+    centroids = [
+        np.linalg.norm(_centroids(x, a) - _centroids(y, b), axis=-1) for (x, y), (a, b) in zip(both, masks, strict=True)
+    ]
+    far = np.concatenate([c[np.isfinite(c)] for c in centroids])
+    values = [
+        np.concatenate([x[m] for x, m in zip(side, of_side, strict=True)]) for side, of_side in _sides(both, masks)
+    ]
+    differences = [(x - y)[:, of] for (x, y), of in zip(both, ever, strict=True)]
+    return TouchMatch(
+        rms_count=_rms(differences),
+        mask_iou=sum(int((a & b).sum()) for a, b in masks) / union,
+        active_count=float(np.concatenate(active).mean()),
+        centroid_m=float(far.mean()) if len(far) else math.nan,
+        histogram_count=float(wasserstein_distance(*values)) if all(map(len, values)) else math.nan,
+        temporal_count=_rms([np.diff(d, axis=0) for d in differences]),
+        num_frames=int(sum(c.sum() for c in contact)),
+    )
+
+
+def calibrate_touch(
+    fit: Sequence[TouchMotion], validation: Sequence[TouchMotion], config: TwinConfig
+) -> TouchCalibration:
+    """λ_noise and (k_n, k_d) from matched contact replays; ``config``'s own effects act throughout.
+
+    Raises:
+        TaccorlError: nothing for validation, too little contact or too little without any, or a sensor other than FlexiTac.
+    """
+    if not fit or not validation:
+        raise TaccorlError(
+            f"touch calibration: {len(fit)} recordings to fit and {len(validation)} for validation; give at least one of each"
+        )
+    model = TouchModel(config)
+    noise = noise_level(fit)
+    taxels = [motion.near(_NEAR_M).any(axis=0) for motion in fit]
+    in_contact = [int(motion.near(0.0).any(axis=(1, 2, 3)).sum()) for motion in fit]
+    if sum(in_contact) < _MIN_IN_CONTACT:
+        raise TaccorlError(
+            f"touch calibration: {sum(in_contact)} frames in contact in {_names(fit)}; record presses of known depth"
+        )
+    start = np.array([model.sensor.normal_stiffness_per_m, model.sensor.normal_damping_s_per_m])
+    scale = np.array([max(start[0], 1.0), max(start[1], 0.005 * start[0], 1e-3)])
+
+    def left(x: np.ndarray) -> list[np.ndarray]:
+        found = []
+        for motion, of in zip(fit, taxels, strict=True):
+            counts = model.counts(motion, model.simulate(motion, *(x * scale)))
+            found.append(((counts - motion.measured)[:, of] / noise.std_count[of]).astype(float))
+        return found
+
+    def stacked(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([one.ravel() for one in left(x)])
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        here = stacked(x)  # steps are absolute: at k_d = 0 a relative one would be none
+        return np.stack([(stacked(x + step) - here) / _STEP for step in _STEP * np.eye(2)], axis=1)
+
+    low_x, high_x = np.array([_STIFFNESS_PER_M, _DAMPING_S_PER_M]).T / scale
+    first = np.clip(start / scale, low_x, high_x)
+    solved = least_squares(stacked, first, jac=slopes, bounds=(low_x, high_x), x_scale="jac")  # pyright: ignore[reportArgumentType]
+    times = [motion.time_s.mean(axis=1) for motion in fit]
+    covariance = _block_covariance(solved.jac, left(solved.x), times) * np.outer(scale, scale)
+    value, std = solved.x * scale, np.sqrt(np.diag(covariance))
+    low, high = value - 1.96 * std, value + 1.96 * std
+    threshold = noise.threshold_count
+    matches = [
+        touch_match(validation, [model.counts(m, model.simulate(m, *numbers)) for m in validation], threshold)
+        for numbers in (start, value)
+    ]
+    return TouchCalibration(
+        noise=noise,
+        stiffness=Number(float(value[0]), float(low[0]), float(high[0]), "1/m"),
+        damping=Number(float(value[1]), float(max(low[1], 0.0)), float(high[1]), "s/m"),
+        correlation=float(covariance[0, 1] / (std[0] * std[1])) if std.all() else math.nan,
+        before=matches[0],
+        after=matches[1],
+        fitted_to=tuple(m.name for m in fit),
+        validation=tuple(m.name for m in validation),
+        trouble=_trouble(solved.status, value, std),
+    )
+
+
+def _trouble(status: int, value: np.ndarray, std: np.ndarray) -> str:
+    said = []
+    if status <= 0:
+        said.append("not converged: still improving when it was stopped")
+    if value[0] <= 1.01 * _STIFFNESS_PER_M[0] or value[0] >= 0.99 * _STIFFNESS_PER_M[1]:
+        said.append(f"k_n is at its bound, {value[0]:g}: the taxels hardly read what depth says; check object and pose")
+    if value[1] <= std[1]:
+        said.append("k_d is no more than its error: readings come late or the presses are too slow to show it")
+    return "; ".join(said)
+
+
+def _block_covariance(jacobian: np.ndarray, residuals: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> np.ndarray:
+    """(2, 2) of the estimates, if residuals of one block of time hang together in any way (sandwich)."""
+    curvature = np.linalg.pinv(jacobian.T @ jacobian)
+    meat, at = np.zeros((2, 2)), 0
+    for left, time_s in zip(residuals, times, strict=True):
+        rows = slice(at, at + left.size)
+        at += left.size
+        scores = (jacobian[rows] * left.reshape(-1, 1)).reshape(len(left), -1, 2).sum(axis=1)
+        block = ((time_s - time_s[0]) / BLOCK_S).astype(int)
+        sums = np.stack([np.bincount(block, scores[:, k]) for k in range(2)], axis=1)
+        meat += sums.T @ sums
+    return curvature @ meat @ curvature
+
+
+def _centroids(counts: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """(T, P, 2) m of the active taxels' counts; NaN where none is active."""
+    weight = np.where(active, counts, 0.0)
+    total = weight.sum(axis=(2, 3))
+    rows, columns = (np.arange(n) * ROBOT.pad.pitch_m for n in ROBOT.pad.shape)
+    with np.errstate(invalid="ignore"):
+        y = (weight.sum(axis=3) @ rows) / total
+        x = (weight.sum(axis=2) @ columns) / total
+    return np.stack([x, y], axis=-1)
+
+
+def _sides(both: Sequence, masks: Sequence) -> list:
+    """Measured values with their masks, simulated values with theirs."""
+    return [([pair[k] for pair in both], [pair[k] for pair in masks]) for k in range(2)]
+
+
+def _rms(arrays: Sequence[np.ndarray]) -> float:
+    return math.sqrt(sum(float(np.square(a).sum()) for a in arrays) / max(sum(a.size for a in arrays), 1))
+
+
+def _pads(motions: Sequence[TouchMotion]) -> tuple[str, ...]:
+    if not motions:
+        raise TaccorlError("touch: no recording with contact")
+    pads = motions[0].pads
+    other = next((m for m in motions if m.pads != pads), None)
+    if other:
+        raise TaccorlError(
+            f"touch: {motions[0].name} touches {', '.join(pads)} and {other.name} {', '.join(other.pads)}, of "
+            f"{', '.join(ROBOT.pads)}; "
+            "calibrate them apart"
+        )
+    return pads
+
+
+def _names(motions: Sequence[TouchMotion]) -> str:
+    return ", ".join(m.name for m in motions)

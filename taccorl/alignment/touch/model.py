@@ -1,0 +1,153 @@
+"""What the pads of the twin would have sent in a matched contact replay: depth → law → effects → counts.
+
+The same law (``normal_reading``) and the same ``reading`` hooks as in the simulation. What an effect does to a pad's place on
+its finger acts on the depth (``PadFrameEffect``); effects of the robot's and of the parts' mechanics do not show here, because
+nothing moves but what was measured.
+
+Letters in shapes: T frames, P pads of the motion, B frames of a block, R × C taxels.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from taccorl.alignment.touch.motion import TouchMotion
+from taccorl.data.spec import find_spec, load_sensor_spec
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.effects.added import present
+from taccorl.sim.effects.effect import Effect, Memory, TouchEffect
+from taccorl.sim.effects.pad_frame import PadFrameEffect
+from taccorl.sim.effects.touch_memory import RememberingEffect
+from taccorl.sim.sensors.flexitac import FlexiTacConfig, normal_reading
+from taccorl.sim.twin import TwinConfig
+
+_TAXELS_AT_ONCE = 64 * ROBOT.num_taxels  # 0.4 MB: a core's cache holds what is being worked on
+
+
+class TouchModel:
+    """The pads of a twin.
+
+    Args:
+        config: its effects always act, those of ``simulate`` in addition.
+
+    Raises:
+        TaccorlError: another sensor than FlexiTac.
+    """
+
+    def __init__(self, config: TwinConfig) -> None:
+        if not isinstance(config.sensor, FlexiTacConfig):
+            raise TaccorlError(f"touch model: it knows FlexiTac pads, not {type(config.sensor).__name__}")
+        self.sensor = config.sensor
+        self.spec = load_sensor_spec(find_spec(config.sensor.spec))
+        self._own = list(config.effects)
+
+    def simulate(
+        self,
+        motion: TouchMotion,
+        stiffness_per_m: float,
+        damping_s_per_m: float,
+        effects: Sequence[Effect] = (),
+        start_s: float | None = None,
+    ) -> np.ndarray:
+        """(T, P, R, C) float32 readings, one scan after the other from pads that nothing has touched.
+
+        Args:
+            start_s: when the recording began, of a motion without its first frames; else it is at the first frame.
+
+        Raises:
+            TaccorlError: two of the effects are the same one on the same pad, or one must have whole pads and the motion is cut.
+        """
+        acting = present([*self._own, *effects])
+        depth, rate = motion.depth(_offsets(acting, motion.pads))
+        shape = depth.shape[2:]
+        acting = [e for e in acting if _reads(e)]
+        if shape != motion.layout.shape:
+            acting = [_within(e, motion.window) for e in acting]
+        slots = [ROBOT.pads.index(pad) for pad in motion.pads]
+        time_s = motion.time_s.mean(axis=1)
+        time_s = time_s - (time_s[0] if start_s is None else start_s)
+        dt_s = np.diff(time_s, prepend=time_s[0])
+        memories = [_memory(effect, motion) for effect in acting]
+        seen = np.empty(depth.shape, np.float32)
+        at_once = _TAXELS_AT_ONCE // (len(ROBOT.pads) * math.prod(shape))
+        for start in range(0, len(time_s), at_once):
+            some = slice(start, start + at_once)
+            law = normal_reading(depth[some], rate[some], float(stiffness_per_m), float(damping_s_per_m))
+            if not acting:
+                seen[some] = law
+                continue
+            reading = np.zeros((len(law), len(ROBOT.pads), *shape), np.float32)
+            reading[:, slots] = law
+            for effect, memory in zip(acting, memories, strict=True):
+                reading = through(effect, reading, memory, time_s[some], dt_s[some])
+            seen[some] = reading[:, slots]
+        return seen
+
+    def windowed(self, effects: Sequence[Effect]) -> bool:
+        """Whether a ``TouchMotion.cut`` can be simulated with these effects beside the twin's own."""
+        whole = (slice(None), slice(None))
+        acting = [e for e in (*self._own, *effects) if _reads(e) and not e.is_absent]
+        return all(isinstance(e, TouchEffect) and e.within(whole) is not None for e in acting)
+
+    def remembers(self, effects: Sequence[Effect]) -> bool:
+        """Whether a frame's readings hang on the frames before it."""
+        shape = self.spec.rows, self.spec.columns
+        return any(bool(e.memory(1, shape)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
+
+    def counts(self, motion: TouchMotion, reading: np.ndarray) -> np.ndarray:
+        """(T, P, R, C) counts above baseline, without noise and rounding; the converter's ends are kept."""
+        return np.clip(
+            self.sensor.gain_count * reading, -motion.baseline, self.spec.max_count - motion.baseline, dtype=np.float32
+        )
+
+
+def _reads(effect: Effect) -> bool:
+    """Whether it changes readings where the taxels' depths are known."""
+    return type(effect).reading is not Effect.reading and effect.layer != "robot"
+
+
+def _within(effect: Effect, window: tuple[slice, slice]) -> Effect:
+    found = effect.within(window) if isinstance(effect, TouchEffect) else None
+    if found is None:
+        raise TaccorlError(f"touch model: effect {effect.name} must have whole pads, and the motion is a cut of them")
+    return found
+
+
+def _memory(effect: Effect, motion: TouchMotion) -> Memory:
+    """State of the effects' memory before the first scan, for the taxels in the motion's window."""
+    shape = motion.layout.shape
+    return {
+        name: np.ascontiguousarray(array[..., *motion.window]) if array.shape[-2:] == shape else array
+        for name, array in effect.memory(1, shape).items()
+    }
+
+
+def _offsets(effects: Sequence[Effect], pads: Sequence[str]) -> tuple[tuple[float, float, float], ...]:
+    """By how much the effects move the taxels of each pad, in its frame; empty if none does."""
+    moving = [effect for effect in effects if isinstance(effect, PadFrameEffect)]
+    if not moving:
+        return ()
+    total = np.array(
+        [np.sum([e.offset_pad_m(pad) for e in moving if pad in e.pads], axis=0) * np.ones(3) for pad in pads]
+    )
+    return tuple((float(x), float(y), float(z)) for x, y, z in total)
+
+
+def through(effect: Effect, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+    """Frames (B, P, R, C) of all pads as they come out of an effect; its memory goes on.
+
+    Args:
+        memory: as after the frames before; {} for an effect without memory. Changed in place.
+        time_s, dt_s: (B,) since the first scan, and since the scan before.
+    """
+    if not memory:
+        return effect.reading(reading, memory, time_s, dt_s)
+    if isinstance(effect, RememberingEffect):
+        reading[:, effect.slots] = effect.scans(reading[:, effect.slots][:, None], memory, dt_s[:, None])[:, 0]
+        return reading
+    scans = [
+        effect.reading(reading[k : k + 1], memory, time_s[k : k + 1], dt_s[k : k + 1]) for k in range(len(reading))
+    ]
+    return np.concatenate(scans)

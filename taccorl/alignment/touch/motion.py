@@ -1,0 +1,287 @@
+"""Depth of each taxel in a known object during a measurement, from geometry alone without dynamics (paper App. B.2).
+
+The fingers stand where their opening was measured, the object where it is known to be, so a taxel's depth δ and its rate δ̇
+follow, at the instants at which the board scanned it. Where the object is thicker than the opening, the difference is what the
+pads were pressed in by: a sprung pad of the twin yields by as much, so its taxels read the same depth (``taccorl.sim.pad``).
+
+An object is fixed to the hand (``tcp``: a jig on the gripper, or a part that stays in its grasp) or to the bench (``world``);
+then the arm's measured joints count as well, and 0.2 mrad of theirs are 0.1 mm here.
+
+Letters in shapes: T frames, P pads, R × C taxels, I instants of a scan, S rows of the measurement.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_filter
+
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.alignment.touch.felt_solids import shapes_in_object
+from taccorl.data.spec import SensorSpec, find_spec, load_sensor_spec
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.robots.robot_spec import PadLayout
+from taccorl.sim.robot import RobotConfig, link_poses, mount_pos_world_m
+from taccorl.sim.sensors import as_wire
+from taccorl.sim.sensors.flexitac import scan_instants_s
+from taccorl.sim.signed_distance import Shapes
+from taccorl.sim.twin import TwinConfig
+
+SMOOTH_S, SMOOTH_ORDER = 0.045, 3
+"""Savitzky–Golay window of openings and joints: 9 rows at 200 Hz. An opening's noise of 10 µm becomes 6 µm and 0.5 mm/s."""
+_STEP_S = 5e-4  # of central differences of the pads' poses, along splines through the smoothed rows
+_KEPT = 4  # depths of a motion with its pads moved: what a fit asks for again and again
+_NEAR_M = 1e-3  # a pad that never comes so near to the object takes no part
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TouchMotion:
+    """Matched contact replay: poses of the taxels in the object, frame by frame, and the measured counts. Made by
+    ``touch_motion``."""
+
+    measurement: Measurement = field(repr=False)
+    """That it was made from."""
+    pads: tuple[str, ...]
+    """Pads that the object came near, in the order of ``ROBOT.pads``."""
+    time_s: np.ndarray
+    """(T, P) stamps on the measurement's clock: ends of scans."""
+    measured: np.ndarray
+    """(T, P, R, C) int16 counts above baseline."""
+    baseline: np.ndarray
+    """(P, R, C) counts at rest."""
+    object_from_pad: np.ndarray
+    """(T, P, I, 3, 4) at the instants at which the taxels of ``groups`` were read."""
+    velocity: np.ndarray
+    """(T, P, I, 3, 4) its time derivative."""
+    groups: np.ndarray
+    """(I, G) flat numbers of the taxels that are read at one instant."""
+    shapes: tuple[Shapes, ...]
+    clearance_m: np.ndarray
+    """(T, P, I) the object is at least so far out of the plane of the taxels; below 0 it may reach through."""
+    layout: PadLayout
+    """Taxels of a whole pad; ``window`` says which of them are simulated."""
+    window: tuple[slice, slice] = (slice(None), slice(None))
+    """Rows and columns of the pads that R × C are: all but for a ``cut``."""
+
+    @property
+    def name(self) -> str:
+        return self.measurement.name
+
+    _known: dict[tuple, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
+
+    def depth(self, offsets_m: tuple[tuple[float, float, float], ...] = ()) -> tuple[np.ndarray, np.ndarray]:
+        """δ [m] and δ̇ [m/s], each (T, P, R, C) float32 and 0 where nothing touches.
+
+        Args:
+            offsets_m: per pad, in its own frame, by how much its taxels lie elsewhere than on a nominal finger.
+        """
+        if not any(any(offset) for offset in offsets_m):
+            offsets_m = ()
+        if offsets_m not in self._known:
+            while len(self._known) >= _KEPT:
+                del self._known[next(iter(self._known))]
+            self._known[offsets_m] = self._depth(offsets_m)
+        return self._known[offsets_m]
+
+    def cut(self, frames: np.ndarray, window: tuple[slice, slice]) -> "TouchMotion":
+        """Copy with some frames, rows and columns only, to make the repeated simulations of a fit cheaper.
+
+        Args:
+            frames: (T,) bool.
+        """
+        number = np.arange(self.layout.num_taxels).reshape(self.layout.shape)
+        local = np.full(number.size, -1)
+        local[number[window].ravel()] = np.arange(number[window].size)
+        groups = local[self.groups]
+        instants, places = (groups >= 0).any(axis=1), (groups >= 0).any(axis=0)
+        groups = groups[np.ix_(instants, places)]
+        if (groups < 0).any():
+            raise TaccorlError(f"touch motion: taxels {window} are no rectangle of what the board reads at one instant")
+        arrays = {
+            name: np.ascontiguousarray(getattr(self, name)[frames][:, :, instants])
+            for name in ("object_from_pad", "velocity", "clearance_m")
+        }
+        return dataclasses.replace(
+            self,
+            time_s=self.time_s[frames],
+            measured=self.measured[frames][:, :, *window],
+            baseline=self.baseline[:, *window],
+            groups=groups,
+            window=window,
+            **arrays,
+        )
+
+    def _depth(self, offsets_m: tuple[tuple[float, float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
+        offset = np.array(offsets_m or [(0.0, 0.0, 0.0)] * len(self.pads))
+        taxel_xy = _taxel_xy(self.layout)[self.window]
+        xyz = np.append(taxel_xy.reshape(-1, 2), np.zeros((taxel_xy.size // 2, 1)), axis=1)
+        # Taxels of a group lie in a line: what is common to them goes into the position, what differs into the grid.
+        first = xyz[self.groups[:, 0]]
+        along = xyz[self.groups[0]] - first[0]
+        grid = np.stack([along[:, 0], along[:, 1], np.ones(len(along))])
+        start = np.append(first + offset[:, None], np.ones((len(offset), len(first), 1)), axis=2)  # (P, I, 4)
+        frame, pad, instant = np.nonzero(self.clearance_m < offset[:, None, 2])
+        at = start[pad, instant]
+        flat = _moved(self.object_from_pad[frame, pad, instant], at), _moved(self.velocity[frame, pad, instant], at)
+        felt_m, felt_mps = np.zeros((2, len(flat[0]), grid.shape[1]), np.float32)
+        for kind in self.shapes:
+            for number in range(len(kind.geoms)):
+                felt = kind.feel(np.full(len(felt_m), number), *flat, grid)
+                deeper = felt.depth_m > felt_m
+                np.copyto(felt_m, felt.depth_m, where=deeper)
+                np.copyto(felt_mps, felt.depth_rate_mps, where=deeper)
+        taxels = np.zeros((2, *self.clearance_m.shape[:2], self.groups.size), np.float32)
+        where = frame[:, None], pad[:, None], self.groups[instant]
+        taxels[0][where], taxels[1][where] = felt_m, felt_mps
+        taxels.flags.writeable = False
+        depth_m, rate_mps = taxels.reshape(*taxels.shape[:3], *taxel_xy.shape[:2])
+        return depth_m, rate_mps
+
+    def near(self, margin_m: float) -> np.ndarray:
+        """(T, P, R, C) bool: a taxel that lay ``margin_m`` further out would touch."""
+        return self.depth(((0.0, 0.0, margin_m),) * len(self.pads))[0] > 0
+
+    def undisturbed(self, margin_m: float = 3e-4, after_s: float = 1.0) -> np.ndarray:
+        """(T, P) bool: nothing is near the pad, and nothing touched it in the last ``after_s``."""
+        near = self.near(margin_m).any(axis=(2, 3))
+        last = np.where(near, self.time_s, -np.inf)
+        return self.time_s - np.maximum.accumulate(last, axis=0) > after_s
+
+
+def _moved(matrices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) rows x, y, 1 of a pad's plane, whose origin is moved to points (n, 4)."""
+    moved = matrices[..., [0, 1, 3]]
+    moved[..., 2] = np.einsum("nxk,nk->nx", matrices, points)
+    return moved
+
+
+def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
+    """Make the matched contact replay of a measurement, from its gripper openings and its pad frames.
+
+    Args:
+        config: for the robot's mounts and the sensor's scan.
+
+    Raises:
+        TaccorlError: no frames of the pads, no opening or joints measured, or the object never came near a pad.
+    """
+    if measurement.touch is None:
+        raise TaccorlError(f"{measurement.name}: it holds no frames of the pads; record them, or leave this one out")
+    spec = load_sensor_spec(find_spec(config.sensor.spec if hasattr(config.sensor, "spec") else "flexitac_v2"))  # pyright: ignore[reportAttributeAccessIssue]
+    instants_s, groups = _scan_groups(spec)
+    slots = [ROBOT.pads.index(f"{pressed.arm}_{finger}") for finger in ROBOT.fingers]
+    stamps = measurement.touch.time_s
+    covered = (stamps[:, slots] + instants_s[0] >= measurement.time_s[0]) & (stamps[:, slots] <= measurement.time_s[-1])
+    frames = covered.all(axis=1)
+    if frames.sum() < 10:
+        raise TaccorlError(
+            f"{measurement.name}: {frames.sum()} of {len(frames)} frames of the pads lie between its first and its last row; "
+            "check the clocks of pads and joints"
+        )
+    stamps = stamps[frames][:, slots]
+    moving = _Fingers(measurement, config.robot, pressed)
+    times = stamps[:, :, None] + instants_s
+    pose, later, earlier = (moving.object_from_pad(times + shift) for shift in (0.0, _STEP_S, -_STEP_S))
+    shapes, corners_m = shapes_in_object(pressed.solids)
+    layout = dataclasses.replace(ROBOT.pad, rows=spec.rows, columns=spec.columns)
+    whole = (-1, len(ROBOT.pads), *layout.shape)
+    motion = TouchMotion(
+        measurement=measurement,
+        pads=tuple(ROBOT.pads[s] for s in slots),
+        time_s=stamps,
+        measured=measurement.touch.counts.reshape(whole)[frames][:, slots],
+        baseline=measurement.touch.baseline.reshape(whole)[0, slots],
+        object_from_pad=pose,
+        velocity=(later - earlier) / (2 * _STEP_S),
+        groups=groups,
+        shapes=tuple(shapes),
+        layout=layout,
+        clearance_m=((corners_m - pose[..., None, :, 3]) @ pose[..., :, 2, None])[..., 0].min(axis=-1),
+    )
+    comes_near = motion.near(_NEAR_M).any(axis=(0, 2, 3))
+    if not comes_near.any():
+        raise TaccorlError(
+            f"{measurement.name}: the object never comes within {_NEAR_M * 1e3:g} mm of the pads of the {pressed.arm} arm, whose "
+            f"opening is at least {np.nanmin(moving.opening_m) * 1e3:.2f} mm; check its size, its pose and the frame it is in"
+        )
+    return _only(motion, np.flatnonzero(comes_near))
+
+
+def _only(motion: TouchMotion, pads: np.ndarray) -> TouchMotion:
+    if len(pads) == len(motion.pads):
+        return motion
+    arrays: dict[str, Any] = {
+        name: np.ascontiguousarray(getattr(motion, name)[:, pads])
+        for name in ("time_s", "measured", "object_from_pad", "velocity", "clearance_m")
+    }
+    return TouchMotion(
+        measurement=motion.measurement,
+        pads=tuple(motion.pads[p] for p in pads),
+        baseline=motion.baseline[pads],
+        groups=motion.groups,
+        shapes=motion.shapes,
+        layout=motion.layout,
+        **arrays,
+    )
+
+
+def _taxel_xy(layout: PadLayout) -> np.ndarray:
+    """(R, C, 2) m in the pad's frame, as ``PadArray`` has them."""
+    x = (np.arange(layout.columns) + 0.5) * layout.pitch_m - layout.width_m / 2
+    y = (np.arange(layout.rows) + 0.5) * layout.pitch_m - layout.length_m / 2
+    return np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=2)
+
+
+def _scan_groups(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Instants (I,) before the stamp [s], and the taxels (I, G) that the board reads at each."""
+    number = np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
+    return scan_instants_s(spec), as_wire(number, spec).copy()
+
+
+class _Fingers:
+    """Poses of both pads of an arm in the object's frame, at any time of a measurement."""
+
+    def __init__(self, measurement: Measurement, robot: RobotConfig, pressed: PressedObject) -> None:
+        names = [f"{pressed.arm}_gripper"]
+        if pressed.frame == "world":
+            names += [f"{pressed.arm}_{joint}" for joint in ROBOT.joints]
+        rows = measurement.measured[:, [measurement.column(name) for name in names]]
+        there = np.isfinite(rows).all(axis=1)
+        if there.mean() < 0.5:
+            raise TaccorlError(
+                f"{measurement.name}: {', '.join(names)} were measured in {there.mean():.0%} of its rows; depths need them"
+            )
+        window = max(SMOOTH_ORDER + 2, round(SMOOTH_S * measurement.rate_hz)) // 2 * 2 + 1
+        if there.sum() < window:
+            raise TaccorlError(f"{measurement.name}: {there.sum()} measured rows are too few; {window} are needed")
+        time_s = measurement.time_s
+        even = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in rows.T])
+        self._rows = CubicSpline(time_s, savgol_filter(even, window, SMOOTH_ORDER, axis=0))
+        self._pressed, self._robot = pressed, robot
+        self.opening_m = even[:, 0]
+
+    def object_from_pad(self, time_s: np.ndarray) -> np.ndarray:
+        """(T, 2, I, 3, 4) at times (T, 2, I): finger a, then finger b."""
+        rows = self._rows(time_s)
+        tcp_from_pad = np.zeros((*time_s.shape, 3, 4))
+        for f, side in enumerate((1.0, -1.0)):
+            z, y = np.array([0.0, -side, 0.0]), np.array([0.0, 0.0, 1.0])
+            tcp_from_pad[:, f, :, :, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+            tcp_from_pad[:, f, :, 1, 3] = side * rows[:, f, :, 0] / 2
+        object_from_frame = np.linalg.inv(self._pressed.pose)
+        if self._pressed.frame == "tcp":
+            return _compose(object_from_frame, tcp_from_pad)
+        tcp = link_poses(rows[..., 1:])[..., -1, :, :]
+        tcp[..., :3, 3] += ROBOT.tcp_from_hand_m * tcp[..., :3, 2]
+        tcp[..., :3, 3] += mount_pos_world_m(self._pressed.arm, self._robot)
+        return _compose(object_from_frame @ tcp, tcp_from_pad)
+
+
+def _compose(a_from_b: np.ndarray, b_from_c: np.ndarray) -> np.ndarray:
+    """(..., 4, 4) and (..., 3, 4) → (..., 3, 4)."""
+    composed = a_from_b[..., :3, :3] @ b_from_c
+    composed[..., 3] += a_from_b[..., :3, 3]
+    return composed

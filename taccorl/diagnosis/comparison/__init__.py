@@ -1,0 +1,1 @@
+"""Replay of measurements in the twin, the residuals, and where they are large."""

@@ -1,0 +1,146 @@
+"""Residual as a function of the variables on which physical effects depend, with a band that includes the correlation of rows.
+
+A curve that leaves zero says along what the twin is off; it does not say why.
+
+Letters in shapes: T rows, B blocks, V bins of a variable.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from taccorl.alignment.measurements.measurement import UNITS
+from taccorl.diagnosis.comparison.localise import LEAST_SHARE, Motion, bridged, motions_of
+from taccorl.diagnosis.comparison.result import BLOCK_S, Comparison, Kind, drawn_blocks
+
+BINS = 14
+STANDS = 1e-6
+"""A variable that spans less (rad, rad/s, N·m, s) does not vary: what is left is rounding."""
+Measure = Literal["mean", "RMS"]
+"""Of the residual along a variable: along time and speed its sign changes with the direction, its size tells."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable on which physical effects depend, such as speed or position."""
+
+    name: str
+    words: str
+    """Effects that would show along it, so that a reader knows why it is drawn. No more than that."""
+    measure: Measure
+    values: Callable[[Motion], np.ndarray]
+
+
+VARIABLES: tuple[Variable, ...] = (
+    Variable("velocity", "friction, drag, damping, delay", "mean", lambda m: m.velocity),
+    Variable("position", "gravity, springs, cogging, encoder waves", "mean", lambda m: bridged(m.trace.position)),
+    Variable("commanded acceleration", "inertia, delay, slew limits", "mean", lambda m: m.acceleration),
+    Variable(
+        "modelled torque", "load friction, compliance, saturation, torque scale", "mean", lambda m: m.trace.torque
+    ),
+    Variable("time", "heating, drift", "RMS", lambda m: m.trace.time_s - m.trace.time_s[0]),
+    Variable("commanded speed", "slew limits, lag, feed-forward", "RMS", lambda m: np.abs(m.target_speed)),
+)
+
+
+def variable_unit(variable: str, position_unit: str) -> str:
+    """Unit of the variable's axis, for a signal whose position is in ``position_unit``."""
+    speed, effort = UNITS[position_unit]
+    units = {"velocity": speed, "position": position_unit, "commanded acceleration": f"{speed}²", "time": "s"}
+    return units.get(variable, effort if variable == "modelled torque" else speed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """Residual of one signal along one variable, in the signal's unit."""
+
+    signal: str
+    kind: Kind
+    variable: str
+    measure: Measure
+    at: np.ndarray
+    """(V,) mean of the variable in each bin; bins of equal width, those with hardly a row left out."""
+    middle: np.ndarray
+    """(V,) mean or RMS of the residual."""
+    low: np.ndarray
+    """(V,) 95 % band, from blocks of ``BLOCK_S``: neighbouring rows are alike."""
+    high: np.ndarray
+    explained: float
+    """Share of the residual's variance (along time and speed: of its square's) that lies in the bins' means."""
+    by_chance: float
+    """What of it 95 % of residuals of the same shape would reach that have nothing to do with the variable (shifted round in
+    time)."""
+
+    @property
+    def beyond_chance(self) -> bool:
+        return self.explained > self.by_chance
+
+
+def curves(comparison: Comparison, signal: str, kind: Kind = "position") -> list[Curve]:
+    """Curves along every variable that varies, from all recordings of the signal together."""
+    motions = motions_of(comparison.of(signal, kind))
+    found = [_curve(motions, signal, kind, variable) for variable in VARIABLES]
+    return [c for c in found if c is not None]
+
+
+def _curve(motions: Sequence[Motion], signal: str, kind: Kind, variable: Variable) -> Curve | None:
+    values = np.concatenate([variable.values(m) for m in motions])
+    residual = np.concatenate([m.trace.residual for m in motions])
+    rows = [max(1, round(BLOCK_S / m.trace.period_s)) for m in motions]
+    sizes = [len(m.trace.time_s) for m in motions]
+    firsts = np.concatenate([[0], np.cumsum([-(-size // r) for size, r in zip(sizes, rows, strict=True)])])
+    block = np.concatenate(
+        [first + np.arange(size) // r for first, size, r in zip(firsts[:-1], sizes, rows, strict=True)]
+    )
+    known = np.isfinite(values) & np.isfinite(residual)
+    low, high = np.quantile(values[known], (0.01, 0.99)) if known.sum() > 10 * BINS else (0.0, 0.0)
+    if high - low < STANDS:
+        return None
+    which = np.clip(np.floor((values - low) / (high - low) * BINS), 0, BINS - 1)
+    values, which, block = values[known], which[known].astype(int), block[known]
+    seen = residual[known] ** 2 if variable.measure == "RMS" else residual[known]
+    # (B, V) sums and numbers: a bootstrap of blocks is then a product of matrices.
+    shape = (int(firsts[-1]), BINS)
+    sums, counts = np.zeros(shape), np.zeros(shape)
+    np.add.at(sums, (block, which), seen)
+    np.add.at(counts, (block, which), 1.0)
+    kept = counts.sum(axis=0) >= LEAST_SHARE * len(values)
+    if kept.sum() < 3:
+        return None
+    weights = drawn_blocks(shape[0])
+    with np.errstate(invalid="ignore", divide="ignore"):  # a draw may hold no row of a bin
+        draws = ((weights @ sums) / (weights @ counts))[:, kept]
+    curve = np.vstack(
+        [sums.sum(axis=0)[kept] / counts.sum(axis=0)[kept], np.nanquantile(draws, (0.025, 0.975), axis=0)]
+    )
+    middle, band_low, band_high = np.sqrt(curve) if variable.measure == "RMS" else curve
+    return Curve(
+        signal=signal,
+        kind=kind,
+        variable=variable.name,
+        measure=variable.measure,
+        at=np.bincount(which, values, BINS)[kept] / counts.sum(axis=0)[kept],
+        middle=middle,
+        low=band_low,
+        high=band_high,
+        explained=_explained(seen, which, BINS),
+        by_chance=_by_chance(seen, which, BINS),
+    )
+
+
+def _explained(residual: np.ndarray, which: np.ndarray, num: int) -> float:
+    """1 − variance about the bins' means / variance."""
+    left = residual - residual.mean()
+    power = float(left @ left)
+    counts = np.bincount(which, minlength=num)
+    means = np.bincount(which, left, num) / np.maximum(counts, 1)
+    return float(counts @ means**2) / power if power > 0 else 0.0
+
+
+def _by_chance(residual: np.ndarray, which: np.ndarray, num: int) -> float:
+    """95th percentile over shifts of the residual by random parts of the whole."""
+    rng = np.random.default_rng(0)
+    shifts = rng.integers(len(residual) // 10, max(len(residual) - len(residual) // 10, 2), 100)
+    return float(np.quantile([_explained(np.roll(residual, s), which, num) for s in shifts], 0.95))

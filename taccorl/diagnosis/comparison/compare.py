@@ -1,0 +1,214 @@
+"""Every recording's commands through the twin, and what is left: residual = measurement − replay.
+
+Two ways, one rule. **joint**: wherever nothing is touched and no gripper is commanded to move, each joint that is commanded
+runs alone in the one-joint model, and the others move as they were measured: what one joint does wrong stays with
+that joint. **twin**: everywhere else (contact, grippers), the whole twin follows the commands. Touch is a matched contact replay
+(``taccorl.alignment.touch.model``): the pads where they were measured, in an object whose place is known.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from taccorl.alignment.checks.clock import check_against_twin
+from taccorl.alignment.checks.telemetry import MOVED
+from taccorl.alignment.measurements.folder import Measurements, Use
+from taccorl.alignment.measurements.measurement import UNITS, Measurement
+from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor, touch_floor
+from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.alignment.touch.model import TouchModel
+from taccorl.data.finding import Finding
+from taccorl.diagnosis.comparison.replays import (
+    BENCH_REST,
+    Response,
+    in_contact,
+    matched_contact,
+    replay_joints,
+    replay_whole,
+)
+from taccorl.diagnosis.comparison.result import USES, Comparison, Kind, TouchTrace, Trace
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.twin import TwinConfig
+
+GRIPPERS = tuple(f"{arm}_gripper" for arm in ROBOT.arms)
+
+
+def compare(
+    config: TwinConfig,
+    measurements: Measurements,
+    *,
+    name: str = "twin",
+    pressed: PressedObject | None = None,
+    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> Comparison:
+    """Replay all recordings and keep what is left.
+
+    Args:
+        name: of the twin, for titles.
+        pressed: what the fingers press in recordings with pads that do not say it themselves, and where it is. Only then touch
+            is compared: a reading means nothing to a twin that does not know what was touched.
+        progress: told (recording, recordings done, recordings in all).
+
+    Raises:
+        TaccorlError: a signal that the robot does not have, recordings with nothing to compare, or one that says what was
+            pressed and whose pads say otherwise.
+    """
+    uses: list[tuple[Use, Measurement]] = [
+        (use, m.on_robot(BENCH_REST)) for use in USES for m in getattr(measurements, use)
+    ]
+    every = [m for _, m in uses]
+    floors: dict[Kind, dict[str, SignalFloor]] = {kind: noise_floor(every, kind) for kind in ("position", "effort")}
+    traces: list[Trace] = []
+    touches: list[TouchTrace] = []
+    left_out: list[str] = []
+    clock: dict[str, tuple[Finding, ...]] = {}
+    levels = {signal: floor.value for signal, floor in floors["position"].items()}
+    responses = replay_all(config, every, progress)
+    for (use, m), response in zip(uses, responses, strict=True):
+        traces += traces_of(m, use, response, floors)
+        if np.isfinite(response.reported).any():
+            clock[m.name] = tuple(check_against_twin(response.measurement, response.reported, levels))
+    for signal in GRIPPERS:
+        names = [m.name for m in every if signal in held_up(m)]
+        if names:
+            left_out.append(
+                f"{signal} of {', '.join(names)}: something was between the fingers, and nothing is in the twin"
+            )
+    if any(m.touch is not None for m in every):
+        touches, why_not = _touches(config, uses, pressed)
+        left_out += why_not
+    if not traces and not touches:
+        raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")
+    return Comparison(
+        twin=name,
+        effects=tuple(e.name for e in config.effects if not e.is_absent),
+        traces=tuple(traces),
+        touches=tuple(touches),
+        split=measurements.record(),
+        clock=clock,
+        left_out=tuple(left_out),
+    )
+
+
+def replay_all(
+    config: TwinConfig, measurements: Sequence[Measurement], progress: Callable[[str, int, int], None]
+) -> list[Response]:
+    """What the twin does in each of them, by the rule above; nothing where no signal can be compared."""
+    found = []
+    for k, m in enumerate(measurements):
+        progress(m.name, k, len(measurements))
+        moved = moving(m)
+        if not compared(m):
+            found.append(replay_joints(config, m, []))
+        elif moved and not in_contact(m).any() and not any("gripper" in s for s in moved):
+            found.append(replay_joints(config, m, moved))
+        else:
+            found.append(replay_whole(config, m))
+    progress("", len(measurements), len(measurements))
+    return found
+
+
+def moving(m: Measurement) -> list[str]:
+    """Signals whose command moves."""
+    spans = np.ptp(m.target, axis=0)
+    return [s for s, unit, span in zip(m.signals, m.units, spans, strict=True) if span > MOVED[unit]]
+
+
+def compared(m: Measurement) -> list[str]:
+    """Signals that move (where none does, all), but for grippers that something holds up."""
+    return [s for s in moving(m) or m.signals if s not in held_up(m)]
+
+
+def held_up(m: Measurement) -> list[str]:
+    """Grippers of arms that press something, as the recording or its pads say: the twin's would close further."""
+    touched = np.asarray(in_contact(m).any(axis=0))
+    stated = [m.pressed is not None and m.pressed.arm == arm for arm in ROBOT.arms]
+    return [signal for signal, held, said in zip(GRIPPERS, touched, stated, strict=True) if held or said]
+
+
+def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
+    """One for each signal that is compared and was measured, and one for its effort where that was recorded."""
+    touched = in_contact(response.measurement)
+    found = []
+    even = response.measurement
+    for signal in compared(m):
+        j, arm = even.column(signal), signal.split("_", 1)[0]
+        columns: dict[Kind, tuple[np.ndarray, np.ndarray]] = {
+            "position": (even.measured[:, j], response.reported[:, j]),
+            "effort": (even.effort[:, j], response.effort[:, j]),
+        }
+        for kind, (measured, replayed) in columns.items():
+            recorded = np.isfinite(measured).any() if kind == "position" else even.has_effort()[j]
+            if not recorded or signal not in floors[kind]:
+                continue
+            unit = even.units[j] if kind == "position" else UNITS[even.units[j]][1]
+            found.append(
+                Trace(
+                    recording=m.name,
+                    use=use,
+                    signal=signal,
+                    kind=kind,
+                    unit=unit,
+                    way=response.way,
+                    time_s=even.time_s,
+                    target=even.target[:, j],
+                    position=even.measured[:, j],
+                    measured=measured,
+                    replayed=replayed,
+                    torque=response.effort[:, j],
+                    touched=touched[:, ROBOT.arms.index(arm)]
+                    if arm in ROBOT.arms
+                    else np.zeros(even.num_rows, dtype=bool),
+                    floor=floors[kind][signal],
+                    origin=m.origin,
+                )
+            )
+    return found
+
+
+def _touches(
+    config: TwinConfig, uses: Sequence[tuple[Use, Measurement]], pressed: PressedObject | None
+) -> tuple[list[TouchTrace], list[str]]:
+    """Matched contact replays, and why there are none of some recordings."""
+    felt: list[tuple[Use, Measurement]] = [(use, m) for use, m in uses if m.touch is not None]
+    unknown = [m.name for _, m in felt if m.pressed is None and pressed is None]
+    found, why_not = [], []
+    if unknown:
+        why_not.append(
+            f"touch of {', '.join(unknown)}: what was pressed is not known; say it: `pressed` in measurements.yaml, or "
+            "--pressed.shape=… --pressed.radius_m=…"
+        )
+    if len(unknown) == len(felt):
+        return found, why_not
+    model, sensor = TouchModel(config), TouchModel(config).sensor
+    floor = touch_floor([m for _, m in felt])
+    if floor is None:
+        return [], [f"touch of {', '.join(m.name for _, m in felt)}: too few frames for a noise floor"]
+    floor = floor.reshape(len(ROBOT.pads), model.spec.rows, model.spec.columns)
+    for use, m in felt:
+        solid = m.pressed or pressed
+        if solid is None:
+            continue
+        try:
+            motion = matched_contact(m, config, solid)
+        except TaccorlError as error:
+            if m.pressed is not None:
+                raise
+            why_not.append(f"touch: {error}")
+            continue
+        reading = model.simulate(motion, sensor.normal_stiffness_per_m, sensor.normal_damping_s_per_m)
+        found.append(
+            TouchTrace(
+                recording=m.name,
+                use=use,
+                pads=motion.pads,
+                time_s=motion.time_s,
+                measured=motion.measured,
+                replayed=model.counts(motion, reading),
+                floor=floor[[ROBOT.pads.index(pad) for pad in motion.pads]],
+                origin=m.origin,
+                touched=np.asarray((motion.depth()[0] > 0).any(axis=(2, 3))),
+            )
+        )
+    return found, why_not

@@ -1,0 +1,219 @@
+"""Localise the error of a twin by regime, a part of the motion such as slow, fast or after a reversal.
+
+This says WHERE, never WHY: a delay, a payload, a wrong gain scale and missing inertia all light up "high speed" and "high load"
+(measured on surrogates). ``taccorl diagnose`` tells causes apart, by simulating each.
+
+Letters in shapes: T rows.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from taccorl.diagnosis.comparison.result import Comparison, Kind, Trace
+
+SMOOTH_S = 0.1
+"""Velocities are slopes of straight lines over so many seconds: cubics would overshoot at a sudden stop, and show a reversal."""
+SLOW, FAST = 0.05, 0.7
+"""Of the peak speed (99th percentile): below the first is near zero, above the second is high."""
+REVERSAL_S = 0.15
+"""After the velocity has changed its sign: friction and backlash take about as long to be crossed."""
+HIGH_LOAD = 0.75
+"""Quantile of |torque| above which the load is high."""
+LEAST_SHARE = 0.01
+"""Of the rows: a regime with less says nothing."""
+
+
+@dataclass(frozen=True)
+class Regime:
+    """A regime: a condition that selects rows of a motion."""
+
+    name: str
+    group: str
+    """Regimes of one group exclude each other."""
+    words: str
+    rows: Callable[["Motion"], np.ndarray]
+    """(T,) bool."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of a joint in one recording, from its own measurement (gaps are interpolated): velocity, acceleration, scales."""
+
+    trace: Trace
+    velocity: np.ndarray
+    """(T,)."""
+    acceleration: np.ndarray
+    """(T,) commanded: of the target, smoothed."""
+    target_speed: np.ndarray
+    """(T,) of the target, smoothed."""
+    peak_speed: float
+    """99th percentile over all recordings of the signal."""
+    span: tuple[float, float]
+    """Of the measured positions of all recordings of the signal."""
+    high_torque: float
+    """|torque| above which the load is high, over all recordings of the signal."""
+
+    @property
+    def after_reversal(self) -> np.ndarray:
+        """(T,) bool. A reversal counts when the joint has gone faster than near zero on both sides."""
+        sign = np.where(np.abs(self.velocity) > SLOW * self.peak_speed, np.sign(self.velocity), 0.0)
+        moving = np.flatnonzero(sign)
+        after = np.zeros(len(sign), dtype=bool)
+        rows = round(REVERSAL_S / self.trace.period_s)
+        turned = np.flatnonzero(np.diff(sign[moving]) != 0)
+        for last, first in zip(moving[turned], moving[turned + 1], strict=True):
+            crossing = last + int(np.argmin(np.abs(self.velocity[last : first + 1])))
+            after[crossing : crossing + rows] = True
+        return after
+
+
+def motions_of(traces: Sequence[Trace]) -> list[Motion]:
+    """Motions of all traces of one signal, with common scales."""
+    velocities = [_slope(bridged(t.position), t.period_s) for t in traces]
+    peak = float(np.quantile(np.abs(np.concatenate(velocities)), 0.99))
+    positions = np.concatenate([t.position for t in traces])
+    torques = np.abs(np.concatenate([t.torque for t in traces]))
+    known = torques[np.isfinite(torques)]
+    high = float(np.quantile(known, HIGH_LOAD)) if len(known) else np.inf
+    span = (float(np.nanmin(positions)), float(np.nanmax(positions)))
+    found = []
+    for t, velocity in zip(traces, velocities, strict=True):
+        speed = _slope(t.target, t.period_s)
+        found.append(Motion(t, velocity, _slope(speed, t.period_s), speed, peak, span, high))
+    return found
+
+
+def bridged(values: np.ndarray) -> np.ndarray:
+    known = np.isfinite(values)
+    at = np.arange(len(values))
+    return np.interp(at, at[known], values[known]) if known.any() else np.zeros(len(values))
+
+
+def _slope(values: np.ndarray, period_s: float) -> np.ndarray:
+    window = min(2 * round(SMOOTH_S / period_s / 2) + 1, len(values) - (len(values) + 1) % 2)
+    if window < 3:
+        return np.gradient(values, period_s)
+    return np.asarray(savgol_filter(values, window, 1, deriv=1, delta=period_s, mode="interp"))
+
+
+def _third(values: np.ndarray, low: float, high: float, part: int) -> np.ndarray:
+    share = (values - low) / max(high - low, 1e-12) * 3
+    return np.clip(np.floor(share), 0, 2) == part
+
+
+def _pose(part: int) -> Callable[[Motion], np.ndarray]:
+    return lambda m: _third(bridged(m.trace.position), *m.span, part)
+
+
+def _time(part: int) -> Callable[[Motion], np.ndarray]:
+    return lambda m: _third(m.trace.time_s, m.trace.time_s[0], m.trace.time_s[-1], part)
+
+
+REGIMES: tuple[Regime, ...] = (
+    Regime(
+        "near zero speed",
+        "speed",
+        f"slower than {SLOW:.0%} of its peak speed",
+        lambda m: np.abs(m.velocity) < SLOW * m.peak_speed,
+    ),
+    Regime(
+        "medium speed",
+        "speed",
+        f"{SLOW:.0%} to {FAST:.0%} of its peak speed",
+        lambda m: (np.abs(m.velocity) >= SLOW * m.peak_speed) & (np.abs(m.velocity) <= FAST * m.peak_speed),
+    ),
+    Regime(
+        "high speed",
+        "speed",
+        f"faster than {FAST:.0%} of its peak speed",
+        lambda m: np.abs(m.velocity) > FAST * m.peak_speed,
+    ),
+    Regime("forwards", "direction", "moving towards larger positions", lambda m: m.velocity > SLOW * m.peak_speed),
+    Regime("backwards", "direction", "moving towards smaller positions", lambda m: m.velocity < -SLOW * m.peak_speed),
+    Regime(
+        "after a reversal", "reversal", f"within {REVERSAL_S:g} s of a change of direction", lambda m: m.after_reversal
+    ),
+    Regime(
+        "high load",
+        "load",
+        f"the twin's motor torque is in its highest {1 - HIGH_LOAD:.0%}",
+        lambda m: np.abs(m.trace.torque) > m.high_torque,
+    ),
+    Regime("pose, low third", "pose", "lowest third of the way it goes", _pose(0)),
+    Regime("pose, middle third", "pose", "middle third of the way it goes", _pose(1)),
+    Regime("pose, high third", "pose", "highest third of the way it goes", _pose(2)),
+    Regime("first third", "time", "of each recording's time", _time(0)),
+    Regime("second third", "time", "of each recording's time", _time(1)),
+    Regime("last third", "time", "of each recording's time", _time(2)),
+    Regime("in contact", "contact", "a pad of its arm touches", lambda m: m.trace.touched),
+    Regime("no contact", "contact", "no pad of its arm touches", lambda m: ~m.trace.touched & _has_contact(m)),
+)
+WHERE_NOT_WHY = (
+    "This says where the twin is off, not why: delays, loads, gains and inertia light up the same regimes. "
+    "`taccorl diagnose` tries each cause."
+)
+
+
+def _has_contact(m: Motion) -> np.ndarray:
+    return np.full(len(m.trace.time_s), bool(m.trace.touched.any()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """Error of one signal in one regime."""
+
+    signal: str
+    kind: Kind | Literal["touch"]
+    regime: str
+    rmse: float
+    ratio: float
+    """RMSE / noise floor."""
+    share_of_error: float
+    """Of the signal's summed squared residual."""
+    share_of_time: float
+    n: int
+
+    @property
+    def lift(self) -> float:
+        """Ratio of its share of the error to its share of the time."""
+        return self.share_of_error / self.share_of_time
+
+
+def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
+    """Every signal in every regime that it was in for ``LEAST_SHARE`` of the time; all recordings together."""
+    cells = []
+    for signal in [s for s, k in comparison.signals if k == kind]:
+        motions = motions_of(comparison.of(signal, kind))
+        squares = [m.trace.residual**2 for m in motions]
+        total, rows = (float(f(np.concatenate(squares))) for f in (np.nansum, lambda s: np.isfinite(s).sum()))
+        floor = motions[0].trace.floor.value
+        for regime in REGIMES:
+            inside = np.concatenate([s[regime.rows(m)] for s, m in zip(squares, motions, strict=True)])
+            n = int(np.isfinite(inside).sum())
+            if n < LEAST_SHARE * rows or n == 0:
+                continue
+            rmse = float(np.sqrt(np.nanmean(inside)))
+            share = float(np.nansum(inside)) / total if total > 0 else 0.0
+            cells.append(
+                Cell(
+                    signal=signal,
+                    kind=kind,
+                    regime=regime.name,
+                    rmse=rmse,
+                    ratio=rmse / floor,
+                    share_of_error=share,
+                    share_of_time=n / rows,
+                    n=n,
+                )
+            )
+    return cells
+
+
+def worst_regime(cells: Sequence[Cell], signal: str, kind: str = "position") -> Cell | None:
+    """Regime with the highest RMSE, among those that cover only a part of the time."""
+    own = [c for c in cells if c.signal == signal and c.kind == kind and c.share_of_time < 0.9]
+    return max(own, key=lambda c: c.ratio, default=None)

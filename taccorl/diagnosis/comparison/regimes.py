@@ -1,0 +1,160 @@
+"""Errors by recording and regime, and differences in coverage between fit and validation recordings.
+
+One pooled number hides a recording, a speed, a direction or a part of the range in which the twin is off.
+
+Letters in shapes: T rows.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.alignment.measurements.folder import Use
+from taccorl.diagnosis.comparison.along import variable_unit
+from taccorl.diagnosis.comparison.localise import LEAST_SHARE, REGIMES, Motion, bridged, motions_of
+from taccorl.diagnosis.comparison.result import USES, Trace
+from taccorl.diagnosis.search.result import SearchConfig
+
+ALL = "all rows"
+GROUPS = ("speed", "direction", "pose")
+"""Of ``localise.REGIMES``."""
+AT_FLOOR = SearchConfig().stop_at
+"""Noise floors up to which an error is at the floor, as for the search."""
+DISAGREE = 1.3
+"""Ratio of two errors that is remarkable."""
+COVERED = 0.75
+"""Share of a range that the other use must cover; less is remarkable."""
+INNER = (0.005, 0.995)
+"""Quantiles that count as the ends of a range: single rows of noise are outside."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegimeError:
+    """One recording, or all recordings of one use, in one regime."""
+
+    recording: str
+    """Empty: all of this use."""
+    use: Use
+    regime: str
+    error: float
+    """RMS residual in noise floors."""
+    n: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coverage:
+    """The range of one variable in the recordings of each use."""
+
+    variable: str
+    unit: str
+    ranges: dict[Use, tuple[float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegimeErrors:
+    """Errors of one signal after the fit, by recording and regime."""
+
+    signal: str
+    rows: tuple[RegimeError, ...]
+    coverage: tuple[Coverage, ...]
+    remarks: tuple[str, ...]
+    """Where fit and validation disagree or cover different ranges; a sentence each, the most important first."""
+
+    @property
+    def worst(self) -> RegimeError | None:
+        """The recording and regime with the greatest error; None where nothing was measured."""
+        own = [r for r in self.rows if r.recording and r.regime != ALL]
+        return max(own, key=lambda r: r.error, default=None)
+
+
+def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
+    """Errors of all recordings of one signal, replayed by the fitted twin."""
+    motions = motions_of(traces)
+    regimes: list[tuple[str, Callable[[Motion], np.ndarray]]] = [(ALL, _every)]
+    regimes += [(r.name, r.rows) for r in REGIMES if r.group in GROUPS]
+    rows = [_row(m.trace.recording, m.trace.use, name, [m], inside) for m in motions for name, inside in regimes]
+    uses: list[Use] = [use for use in USES if any(m.trace.use == use for m in motions)]
+    pooled = [
+        _row("", use, name, [m for m in motions if m.trace.use == use], inside)
+        for use in uses
+        for name, inside in regimes
+    ]
+    found = [r for r in (*pooled, *rows) if r is not None]
+    coverage = _coverage(motions)
+    return RegimeErrors(
+        signal=traces[0].signal,
+        rows=tuple(found),
+        coverage=tuple(coverage),
+        remarks=(*_disagreements(found), *_gaps(coverage)),
+    )
+
+
+def _every(motion: Motion) -> np.ndarray:
+    return np.ones(len(motion.trace.time_s), dtype=bool)
+
+
+def _row(
+    recording: str, use: Use, regime: str, motions: Sequence[Motion], inside: Callable[[Motion], np.ndarray]
+) -> RegimeError | None:
+    """None: fewer rows of it than ``LEAST_SHARE``."""
+    squares = [(m.trace.residual / m.trace.floor.value) ** 2 for m in motions]
+    chosen = np.concatenate([s[inside(m)] for s, m in zip(squares, motions, strict=True)])
+    n = int(np.isfinite(chosen).sum())
+    if n == 0 or n < LEAST_SHARE * sum(np.isfinite(s).sum() for s in squares):
+        return None
+    return RegimeError(recording=recording, use=use, regime=regime, error=float(np.sqrt(np.nanmean(chosen))), n=n)
+
+
+def _coverage(motions: Sequence[Motion]) -> list[Coverage]:
+    unit = motions[0].trace.unit if motions[0].trace.kind == "position" else "rad"
+    variables: dict[str, Callable[[Motion], np.ndarray]] = {
+        "position": lambda m: bridged(m.trace.position),
+        "velocity": lambda m: m.velocity,
+        "commanded acceleration": lambda m: m.acceleration,
+    }
+    found = []
+    for name, values in variables.items():
+        ranges: dict[Use, tuple[float, float]] = {}
+        for use in USES:
+            own = [values(m) for m in motions if m.trace.use == use]
+            if own:
+                low, high = np.quantile(np.concatenate(own), INNER)
+                ranges[use] = (float(low), float(high))
+        found.append(Coverage(variable=name, unit=variable_unit(name, unit), ranges=ranges))
+    return found
+
+
+def _disagreements(rows: Sequence[RegimeError]) -> list[str]:
+    """Pooled errors of fit and validation, in all rows and regime by regime."""
+    pooled = {(r.use, r.regime): r.error for r in rows if not r.recording}
+    found = []
+    for regime in dict.fromkeys(r.regime for r in rows):
+        fit, validation = pooled.get(("fit", regime)), pooled.get(("validation", regime))
+        if fit is None or validation is None:
+            continue
+        high, low = max(fit, validation), min(fit, validation)
+        if high > AT_FLOOR and high > DISAGREE * low:
+            found.append(
+                f"{regime}: fit recordings end at {fit:.2f} noise floors, validation recordings at {validation:.2f}"
+            )
+    return found
+
+
+def _gaps(coverage: Sequence[Coverage]) -> list[str]:
+    """Ranges of fit recordings that validation recordings do not cover, and the other way round."""
+    found = []
+    for c in coverage:
+        if "fit" not in c.ranges or "validation" not in c.ranges:
+            continue
+        fit, validation = c.ranges["fit"], c.ranges["validation"]
+        for mine, other, words in (
+            (fit, validation, "fit recordings reach {0}, validation recordings {1}: what acts beyond is not validated"),
+            (validation, fit, "validation recordings reach {0}, fit recordings {1}: what acts beyond was not fitted"),
+        ):
+            span = mine[1] - mine[0]
+            shared = max(0.0, min(mine[1], other[1]) - max(mine[0], other[0]))
+            if span > 0 and shared < COVERED * span:
+                told = [f"{ends[0]:.3g} … {ends[1]:.3g} {c.unit}" for ends in (mine, other)]
+                found.append(f"{c.variable}: " + words.format(*told))
+    return found

@@ -1,0 +1,155 @@
+"""A measurement's commands through the twin: joint by joint, or the whole of it; and its pads in what they pressed. Row k is the
+twin at the time of row k.
+
+Letters in shapes: T rows.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from taccorl.alignment.controller.arm_bench import held_payload
+from taccorl.alignment.controller.arm_joint import BENCH_REST as BENCH_REST
+from taccorl.alignment.controller.arm_joint import HasJoints
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_motion import AT_TCP
+from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.alignment.touch.motion import TouchMotion, touch_motion
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
+from taccorl.sim.replay import replay
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.twin import TwinConfig
+
+CONTACT_COUNTS = 30.0
+"""A taxel beyond this is contact: λ_f = 0.4 (paper Table 3) at the data spec's 75 counts for 1."""
+DEEP_M, FELT_COUNTS = 2e-4, 1.0
+"""Taxels so deep in an object read at least so much on average, whatever the pad."""
+START_S = 0.1
+"""Where the joints were at the start is the mean of so long a rest: one reading's noise would be a swing of the twin."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What the twin did."""
+
+    measurement: Measurement
+    """The recording as it was replayed: all signals, resampled at a rate whose period is a whole number of physics steps."""
+    way: Literal["joint", "twin"]
+    reported: np.ndarray
+    """(T, J) rad, m, J signals of the machine; NaN for those that were not replayed."""
+    effort: np.ndarray
+    """(T, J) N·m, N that the motors give at the time of each row; NaN where not known."""
+
+
+def replay_joints(machine: TwinConfig | HasJoints, m: Measurement, signals: Sequence[str]) -> Response:
+    """Each of ``signals`` alone, the others as they were measured; gains and payloads as the recording knows them."""
+    m = evened(m, machine) if isinstance(machine, TwinConfig) else m
+    reported, effort = np.full((2, m.num_rows, len(m.signals)), np.nan)
+    for signal in signals:
+        model, j = JointModel(machine, signal), m.column(signal)
+        done = model.simulate(motion_of(m, signal, model.joint), model.gains)
+        reported[:, j], effort[:, j] = done.reported, done.effort
+    return Response(m, "joint", reported, effort)
+
+
+def replay_whole(config: TwinConfig, m: Measurement) -> Response:
+    """The whole twin on the empty bench, from where the robot stood.
+
+    Raises:
+        TaccorlError: the twin diverged.
+    """
+    m = evened(m, config)
+    sim = Simulation(Bench(), _as_recorded(config, m))
+    sim.reset([0])
+    done = replay(sim, m.target, m.rate_hz, _start(m))
+    if sim.diverged[0] or not np.isfinite(done.reported).all():
+        raise TaccorlError(f"{m.name}: the twin diverged in its replay; look at its gains and effects")
+    # ``Replay.effort`` is at the end of each command's stretch: the time of the next row.
+    effort = np.concatenate([np.full((1, len(ROBOT.action_names)), np.nan), done.effort[:-1]])
+    return Response(m, "twin", done.reported, effort)
+
+
+def _as_recorded(config: TwinConfig, m: Measurement) -> TwinConfig:
+    """With the gains that were commanded and the masses that were held, where the recording knows them."""
+    controllers = {}
+    for arm in ROBOT.arms:
+        control = config.controller_of(arm)
+        for key, known in (("kp_nm_per_rad", m.kp), ("kd_nms_per_rad", m.kd)):
+            values = [
+                known.get(f"{arm}_{joint}", value)
+                for joint, value in zip(ROBOT.joints, getattr(control, key), strict=True)
+            ]
+            control = dataclasses.replace(control, **{key: values})
+        controllers[arm] = control
+    held = [
+        held_payload(arm, mass, m.payload_position_m.get(arm, AT_TCP)) for arm, mass in m.payload_kg.items() if mass > 0
+    ]
+    return dataclasses.replace(config, arm_controllers=controllers, effects=[*config.effects, *held])
+
+
+def evened(m: Measurement, config: TwinConfig) -> Measurement:
+    """At the nearest even rate that is a whole number of physics steps: 200 Hz for 199.97 Hz.
+
+    Raises:
+        TaccorlError: faster than the physics.
+    """
+    physics_hz = 1.0 / config.physics.timestep_s
+    if m.rate_hz > 1.25 * physics_hz:
+        raise TaccorlError(f"{m.name}: {m.rate_hz:g} rows a second, the twin steps {physics_hz:g} times a second")
+    rate_hz = physics_hz / max(1, round(physics_hz / m.rate_hz))
+    even = abs(m.rate_hz - rate_hz) < 1e-3 and np.ptp(np.diff(m.time_s)) < 1e-6
+    return m if even else m.resampled(rate_hz)
+
+
+def _start(m: Measurement) -> np.ndarray:
+    """(14,) measured at rest before the first command moves; the first target where nothing was measured."""
+    changed = np.flatnonzero(np.any(m.target != m.target[0], axis=1))
+    rest = min(changed[0] if len(changed) else m.num_rows, round(START_S * m.rate_hz))
+    rows = m.measured[: max(rest, 1)]
+    seen = np.isfinite(rows).any(axis=0)
+    start = m.target[0].copy()
+    start[seen] = np.nanmean(rows[:, seen], axis=0)
+    return np.clip(start, ROBOT.action_low, ROBOT.action_high)
+
+
+def in_contact(m: Measurement) -> np.ndarray:
+    """(T, arms) bool: a pad of the arm is in contact at the time of each row; False without pads."""
+    if m.touch is None:
+        return np.zeros((m.num_rows, len(ROBOT.arms)), dtype=bool)
+    pads = len(ROBOT.pads)
+    beyond = np.asarray((m.touch.counts.reshape(len(m.touch.counts), pads, -1) > CONTACT_COUNTS).any(axis=2))
+    felt = [np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5 for p in range(pads)]
+    by_arm = np.reshape(felt, (len(ROBOT.arms), len(ROBOT.fingers), -1))
+    return np.asarray(by_arm.any(axis=1)).T
+
+
+def matched_contact(m: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
+    """Where the taxels were in the object; what was said of the object must fit what the pads say.
+
+    Raises:
+        TaccorlError: as ``touch_motion``; the object touches no pad, or a pad does not feel it.
+    """
+    motion = touch_motion(m, config, pressed)
+    depth, _ = motion.depth()
+    if not (depth > 0).any():
+        most = float(motion.measured.max())
+        told = f", and their taxels read up to {most:.0f} counts" if most > CONTACT_COUNTS else ""
+        raise TaccorlError(
+            f"{m.name}: what is pressed comes near the pads of the {pressed.arm} arm and never touches them, by its size, "
+            f"pose and the measured opening{told}; press it, or correct radius_m and position_m of its `pressed`"
+        )
+    for p, pad in enumerate(motion.pads):
+        deep = depth[:, p] > DEEP_M
+        if deep.any() and abs(float(motion.measured[:, p][deep].mean())) < FELT_COUNTS:
+            raise TaccorlError(
+                f"{m.name}: {pad} should be {1e3 * depth[:, p].max():.2f} mm deep in what is pressed, and its taxels read "
+                "nothing; look whether it is plugged in, whether `pressed` names the right arm, and at the clocks"
+            )
+    return motion

@@ -1,0 +1,1 @@
+"""Which motion or press to record next, to separate rival effects."""

@@ -1,0 +1,313 @@
+"""Choose the motion to record next: the one that separates rival explanations most after a refit (T-optimal design).
+Joints here; presses of the pads, by the same measure, in ``presses``.
+
+T-optimal design (Atkinson and Fedorov 1975): for rivals A and B and a motion, A predicts what would be measured; B with all its
+numbers is fitted to that; what it cannot follow, in noise floors, is the discrimination, in the worse of both directions. Below
+about one floor the recording would not tell them apart. Recordings that are there already are part of both fits.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taccorl.alignment.controller import arm_bench
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_recording import joint_motion
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.motions import (
+    LIBRARY,
+    OPENING_M,
+    POSES,
+    RATE_HZ,
+    TORQUE_NM,
+    Motion,
+    Room,
+    joint_number,
+)
+from taccorl.diagnosis.problems.joint_problem import GainsAre, JointProblem
+from taccorl.diagnosis.problems.joints import moves
+from taccorl.diagnosis.search.fit import fit, rms, stacked
+from taccorl.diagnosis.search.problem import Problem, Recording, Values, chosen
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.twin import TwinConfig
+
+TELLS = 1.25
+"""Discrimination in floors from which a recording tells two rivals apart: √(1 + 1.25²) = 1.6 times the floor."""
+SAME = 0.25
+"""Below this many floors on every motion two effects are one."""
+STEPS = 12
+"""Of a refit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """A recording that could be made, with its discrimination of rivals."""
+
+    ways: dict[str, tuple[float, float]]
+    """"a | b" → floors that stay between the two after a refit of b to a's truth, and of a to b's."""
+
+    @property
+    def discrimination(self) -> dict[str, float]:
+        """Pair "a | b" → discrimination in noise floors, the smaller of both directions."""
+        return {pair: min(ways) for pair, ways in self.ways.items()}
+
+    @property
+    def worst(self) -> float:
+        """Smallest discrimination over all pairs of rivals."""
+        return min(self.discrimination.values(), default=0.0)
+
+    @property
+    def mean(self) -> float:
+        return float(np.mean(list(self.discrimination.values()))) if self.discrimination else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedMotion(Planned):
+    """A motion of a joint."""
+
+    motion: Motion
+    target: np.ndarray
+    """(T,) rad at 200 Hz."""
+    peak_torque_nm: float
+    """That the motor would need, carried weight included, as the twin says."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan[PlannedT: Planned]:
+    """Recordings that could be made of one part, best first."""
+
+    part: str
+    """``left_joint5``, ``left pads``."""
+    rivals: tuple[str, ...]
+    floor: float
+    """Of noise: rad of a joint, counts of a row of a pad's taxel."""
+    planned: tuple[PlannedT, ...]
+    refused: dict[str, str]
+    """Motion or press → why it must not be recorded."""
+    pose: dict[str, float] = field(default_factory=dict)
+    """Other joints and gripper of the arm → where they stand meanwhile [rad, m]; empty for presses."""
+
+    @property
+    def hopeless(self) -> tuple[str, ...]:
+        """Pairs of rivals that none of these recordings separates reliably."""
+        pairs = [f"{a} | {b}" for a, b in itertools.combinations(self.rivals, 2)]
+        return tuple(pair for pair in pairs if self.best(pair) < TELLS)
+
+    def best(self, pair: str) -> float:
+        """Floors between the two on what keeps them furthest apart; 0 where nothing may be recorded."""
+        return max((p.discrimination[pair] for p in self.planned), default=0.0)
+
+
+def plan(
+    config: TwinConfig,
+    signal: str,
+    rivals: Sequence[str],
+    *,
+    pose: np.ndarray,
+    floor_rad: float,
+    measurements: Measurements | None = None,
+    fitted: Mapping[str, Values] | None = None,
+    gains: GainsAre = "auto",
+    done: Callable[[str], None] = lambda _: None,
+) -> Plan[PlannedMotion]:
+    """Score every motion of the library.
+
+    Args:
+        rivals: two effects or more.
+        pose: (7,) rad, m: where the arm stands, the joint in the middle of its motions.
+        floor_rad: noise floor of the angle.
+        measurements: recordings that are there already.
+        fitted: effect → all numbers of the twin with it, where it has been fitted; else it is typical of its kind.
+
+    Raises:
+        TaccorlError: less than two rivals, or the joint has no room to move about its pose.
+    """
+    check_rivals(rivals)
+    room = room_of(config, signal, pose)
+    if min(room.wide_rad, room.sweep_rad) <= 0:
+        raise TaccorlError(
+            f"excite: {signal} stands at {room.middle_rad:.3f} rad, at its limit; give it room to both sides"
+        )
+    planned, refused = [], {}
+    for motion in LIBRARY:
+        target = motion.target(room)
+        peak = peak_torque_nm(config, signal, pose, motion, target)
+        limit = TORQUE_NM[joint_number(signal) - 1]
+        column = ROBOT.action_names.index(signal)
+        if target.min() < ROBOT.action_low[column] or target.max() > ROBOT.action_high[column]:
+            refused[motion.name] = f"goes to {target.min():.2f} … {target.max():.2f} rad, beyond the joint's limits"
+        elif peak > limit:
+            refused[motion.name] = f"needs {peak:.1f} N·m of {limit:g}"
+        else:
+            apart = _apart(config, signal, rivals, pose, motion, target, floor_rad, measurements, fitted or {}, gains)
+            planned.append(PlannedMotion(motion=motion, target=target, peak_torque_nm=peak, ways=apart))
+        done(motion.name)
+    return Plan(
+        part=signal,
+        rivals=tuple(rivals),
+        floor=floor_rad,
+        planned=best_first(planned),
+        refused=refused,
+        pose=other_joints(signal, pose),
+    )
+
+
+def other_joints(signal: str, pose: np.ndarray) -> dict[str, float]:
+    """``pose`` (7,) by name, without the joint under test."""
+    arm = signal.split("_", 1)[0]
+    names = [f"{arm}_{joint}" for joint in (*ROBOT.joints, "gripper")]
+    return {name: round(float(value), 4) for name, value in zip(names, pose, strict=True) if name != signal}
+
+
+def check_rivals(rivals: Sequence[str]) -> None:
+    """
+    Raises:
+        TaccorlError: less than two.
+    """
+    if len(set(rivals)) < 2:
+        raise TaccorlError(
+            f"excite: give two effects or more that are to be told apart, not {', '.join(rivals) or 'none'}"
+        )
+
+
+def best_first[PlannedT: Planned](planned: Sequence[PlannedT]) -> tuple[PlannedT, ...]:
+    return tuple(sorted(planned, key=lambda p: (-p.worst, -p.mean)))
+
+
+def room_of(config: TwinConfig, signal: str, pose: np.ndarray) -> Room:
+    """Range of motion of the joint about ``pose`` (7,)."""
+    number = joint_number(signal)
+    body = arm_bench.rigid(config, signal, pose, 0.0, [])
+    middle = float(pose[number - 1])
+    weight = body.gravity_sin * math.sin(middle) + body.gravity_cos * math.cos(middle)
+    return Room.of(number, middle, body.inertia, weight)
+
+
+def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
+    """Pose (7,) of the arm while this joint is swept: as in the recordings that sweep it, else as in ``motions.POSES``."""
+    arm, number = signal.split("_", 1)[0], joint_number(signal)
+    swept = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
+    pose = np.array([*POSES[number - 1], OPENING_M])
+    for k, name in enumerate([f"{arm}_{joint}" for joint in (*ROBOT.joints, "gripper")]):
+        if swept and name in swept[0].signals:
+            pose[k] = swept[0].target[0, swept[0].column(name)]
+    return pose
+
+
+def imagined(
+    config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray, floor_rad: float
+) -> Measurement:
+    """Simulated measurement of a motion by the twin, with noise, in place of a recording that is not made yet."""
+    j = ROBOT.action_names.index(signal)
+    arm = signal.split("_", 1)[0]
+    targets = np.zeros((len(target), len(ROBOT.action_names)))
+    targets[:, ROBOT.arm_slice(arm)] = pose
+    targets[:, j] = target
+    k = joint_number(signal) - 1
+    control = config.controller_of(arm)
+    m = Measurement(
+        name=motion.name,
+        time_s=np.arange(len(target)) / RATE_HZ,
+        target=targets,
+        measured=targets.copy(),
+        kp={signal: control.kp_nm_per_rad[k] * motion.gain},
+        kd={signal: control.kd_nms_per_rad[k] * motion.gain},
+        payload_kg={arm: motion.payload_kg} if motion.payload_kg else {},
+        origin="imagined: the twin's own answer",
+    )
+    m.measured[:, j] += control.torque_ff_nm[k] / (control.kp_nm_per_rad[k] * motion.gain)  # where it rests
+    model = JointModel(config, signal)
+    answer = model.simulate(joint_motion(m, config, signal), model.gains)
+    noise = floor_rad * np.random.default_rng(0).standard_normal(len(target))
+    m.measured[:, j] = answer.reported + noise
+    return m
+
+
+def peak_torque_nm(config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray) -> float:
+    """Largest torque of the motor on a motion, including gravity compensation."""
+    m = imagined(config, signal, pose, motion, target, 0.0)
+    model, seen = JointModel(config, signal), joint_motion(m, config, signal)
+    answer = model.simulate(seen, model.gains)
+    # Effort is what the motor gives beyond the weight that its controller carries (gravity compensation).
+    return float(np.abs(answer.effort + model.carried_nm(seen, answer.reported)).max())
+
+
+def _apart(
+    config: TwinConfig,
+    signal: str,
+    rivals: Sequence[str],
+    pose: np.ndarray,
+    motion: Motion,
+    target: np.ndarray,
+    floor_rad: float,
+    measurements: Measurements | None,
+    fitted: Mapping[str, Values],
+    gains: GainsAre,
+) -> dict[str, tuple[float, float]]:
+    """Pair → floors between the two on this motion, each being the truth."""
+    new = imagined(config, signal, pose, motion, target, floor_rad)
+    known = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
+    known = [m if m.signals == ROBOT.action_names else m.on_robot(new.target[0]) for m in known]
+    problem = JointProblem(config, signal, Measurements((*known, new)), gains=gains, effort=False)
+    recordings = [dataclasses.replace(r, floor=np.array([floor_rad])) for r in problem.fit]
+    present = [problem.candidates[name].make(problem.start) for name in problem.present]
+    told = explanations(problem, rivals, problem.start, fitted)
+    return {
+        f"{a} | {b}": floors_between(problem, present, told[a], told[b], recordings)
+        for a, b in itertools.combinations(rivals, 2)
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """A hypothesis: one effect with all fitted numbers of the part."""
+
+    values: Values
+    effect: Effect
+
+
+def explanations(
+    problem: Problem, rivals: Sequence[str], start: Mapping[str, float], fitted: Mapping[str, Values]
+) -> dict[str, Explanation]:
+    """Rivals with the numbers that were ``fitted`` with each; without, typical of their kind.
+
+    Args:
+        start: numbers of the part without a rival.
+
+    Raises:
+        TaccorlError: a rival that is no candidate of the problem.
+    """
+    found = {}
+    for c in chosen(problem, rivals):
+        typical = {f.name: f.start for f in c.frees} | c.starts[len(c.starts) // 2]
+        values = dict(start) | typical | fitted.get(c.name, {})
+        found[c.name] = Explanation(values=values, effect=c.make(values))
+    return found
+
+
+def floors_between(
+    problem: Problem, present: Sequence[Effect], a: Explanation, b: Explanation, recordings: Sequence[Recording]
+) -> tuple[float, float]:
+    """Residual RMS [noise floors] between two explanations on the last recording, after fitting b to data simulated from a,
+    and vice versa.
+
+    Args:
+        present: effects that the twin has in any case; their numbers are fitted, too.
+        recordings: those that are there already, then the one that could be made.
+    """
+
+    def left(truth: Explanation, other: Explanation) -> float:
+        effects = [*present, truth.effect]
+        said = [dataclasses.replace(r, measured=problem.simulate(truth.values, effects, r)) for r in recordings]
+        names = (*(e.name for e in present), other.effect.name)
+        model = fit(problem, said, names, other.values, STEPS)
+        return rms(stacked(problem, model.values, model.effects, said[-1:]))
+
+    return left(a, b), left(b, a)

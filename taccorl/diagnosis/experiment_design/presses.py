@@ -1,0 +1,347 @@
+"""Choose the press to record next: a library of presses of an arm's pads, scored by how well each separates rivals.
+
+    press_hold_release   a ball to three depths at two speeds: k_n, k_d, the law
+    deep_presses         to 1.6 mm: what saturates or bends
+    slow_ramp            up and down with inner loops: hysteresis
+    long_hold            8 s, and 5 s of nothing after its release: creep
+    quick_taps           a dozen of 0.06 s: delay, lag
+    light_touches        0.05 to 0.3 mm: thresholds, where the pad begins
+    rod_across           a line over all columns: gains, crosstalk, a shifted pad
+    rests                10 s of nothing before and after one press: a drifting zero
+
+A ball or a rod of known size in the hand, its place known. What the fingers do is an opening over time; commands lie below it by
+as much as the twin's gripper yields to the pads' springs. Limits: the gripper's range, the fingers' speed, the pads' travel.
+
+Letters in shapes: T rows or frames, P pads, R × C taxels.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.alignment.measurements.folder import Measurements, PressedNote
+from taccorl.alignment.measurements.measurement import Measurement, Touch
+from taccorl.alignment.measurements.motions import RATE_HZ, REST_POSE
+from taccorl.alignment.touch.model import TouchModel
+from taccorl.alignment.touch.motion import TouchMotion, touch_motion
+from taccorl.diagnosis.comparison.replays import matched_contact
+from taccorl.diagnosis.experiment_design.excitation import (
+    Explanation,
+    Plan,
+    Planned,
+    best_first,
+    check_rivals,
+    explanations,
+    floors_between,
+)
+from taccorl.diagnosis.problems.pads import part_of, presses
+from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, TouchProblem
+from taccorl.diagnosis.search.problem import Values
+from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+from taccorl.sim.effects import effects as registry
+from taccorl.sim.effects.effect import Effect, TouchEffect
+from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.robot import RobotConfig
+from taccorl.sim.sensors.flexitac import FlexiTacConfig
+from taccorl.sim.twin import TwinConfig
+
+RADIUS_M = {"sphere": 0.012, "rod": 0.008}
+ROD_LENGTH_M = 0.04
+FINGER_SPEED_M_PER_S = 0.05
+"""Of each, at most: a choice, no rating is published."""
+AWAY_M = -1e-3
+"""Penetration while nothing is pressed: a millimetre of air at each pad."""
+REST_S = 2.5
+"""Before and after."""
+FRAME_S = 0.01
+SMOOTH_ROWS = 13
+"""Corners are rounded over 65 ms: fingers have some inertia."""
+GAIN_SPREAD = 0.1
+"""Of the taxels of a gain map that is not known: a choice."""
+
+Knots = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Press:
+    """One press to be recorded: object, place, and depth over time."""
+
+    name: str
+    knots: Knots
+    """(s, m) of penetration into each pad, straight lines between; below 0 is air."""
+    shape: str = "sphere"
+    x_m: float = 0.001
+    z_m: float = 0.003
+    """Place of the object's middle in the TCP's frame, on no taxel's own middle; a rod lies across the pads, along x."""
+
+    def pressed(self, arm: str) -> PressedNote:
+        """Entry ``pressed`` of measurements.yaml."""
+        place = {"arm": arm, "radius_m": RADIUS_M[self.shape], "position_m": (self.x_m, 0.0, self.z_m)}
+        if self.shape == "sphere":
+            return PressedNote(shape="sphere", **place)
+        return PressedNote(shape="rod", length_m=ROD_LENGTH_M, rpy_rad=(0.0, round(math.pi / 2, 4), 0.0), **place)
+
+    def penetration_m(self) -> np.ndarray:
+        """Penetration (T,) at 200 Hz; negative values are distances to the pad."""
+        time_s, depth_m = np.array(self.knots).T
+        rows = np.arange(-(SMOOTH_ROWS // 2), round(time_s[-1] * RATE_HZ) + SMOOTH_ROWS // 2) / RATE_HZ
+        return np.convolve(np.interp(rows, time_s, depth_m), np.ones(SMOOTH_ROWS) / SMOOTH_ROWS, mode="valid")
+
+    def opening_m(self) -> np.ndarray:
+        """(T,) between the fingers at 200 Hz."""
+        return 2 * (RADIUS_M[self.shape] - self.penetration_m())
+
+
+def _presses(
+    depths_m: Sequence[float],
+    rises_s: Sequence[float],
+    hold_s: float,
+    *,
+    before_s: float = REST_S,
+    between_s: float = 0.5,
+    after_s: float = REST_S,
+) -> Knots:
+    """Each depth at each speed."""
+    knots, at = [(0.0, AWAY_M), (before_s, AWAY_M)], before_s
+    for depth, rise in itertools.product(depths_m, rises_s):
+        knots += [(at + rise, depth), (at + rise + hold_s, depth), (at + 2 * rise + hold_s, AWAY_M)]
+        at += 2 * rise + hold_s + between_s
+        knots.append((at, AWAY_M))
+    return (*knots, (at + after_s, AWAY_M))
+
+
+_LOOPS = ((2.5, AWAY_M), (6.0, 9e-4), (7.5, 4.5e-4), (9.0, 1e-3), (11.0, 2e-4), (13.0, 7e-4), (15.0, AWAY_M))
+LIBRARY = (
+    Press(name="press_hold_release", knots=_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8)),
+    Press(name="deep_presses", knots=_presses((4e-4, 1e-3, 1.6e-3), (0.4,), 0.6)),
+    Press(name="slow_ramp", knots=((0.0, AWAY_M), *_LOOPS, (17.5, AWAY_M))),
+    Press(name="long_hold", knots=_presses((8e-4,), (0.3,), 8.0, after_s=5.0)),
+    Press(name="quick_taps", knots=_presses((1e-3,) * 12, (0.06,), 0.08, between_s=0.3)),
+    Press(name="light_touches", knots=_presses((5e-5, 1e-4, 2e-4, 3e-4), (0.8,), 0.5)),
+    Press(name="rod_across", knots=_presses((3e-4, 7e-4), (0.15, 0.6), 0.6), shape="rod", x_m=0.0, z_m=0.012),
+    Press(name="rests", knots=_presses((6e-4,), (0.3,), 0.8, before_s=10.0, after_s=10.0)),
+)
+"""What ``taccorl excite --pads`` chooses from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedPress(Planned):
+    """A press of one arm's pads."""
+
+    press: Press
+    opening_m: np.ndarray
+    """(T,) at 200 Hz: where the fingers shall be."""
+    target_m: np.ndarray
+    """(T,) what to command, as the twin's gripper yields."""
+    peak_force_n: float
+    """On each pad, as its spring in the twin says; 0 of rigid pads, which say nothing."""
+
+
+def plan_presses(
+    config: TwinConfig,
+    arm: str,
+    rivals: Sequence[str],
+    *,
+    measurements: Measurements | None = None,
+    fitted: Mapping[str, Values] | None = None,
+    done: Callable[[str], None] = lambda _: None,
+) -> Plan[PlannedPress]:
+    """Score every press of the library.
+
+    Args:
+        rivals: two effects or more.
+        measurements: recordings that are there already; those that say what these pads pressed count, and their noise is the
+            floor. The twin's own sensor noise is without any.
+        fitted: effect → all numbers of the twin with it, where it has been fitted; else it is typical of its kind.
+
+    Raises:
+        TaccorlError: less than two rivals, or one that pads do not show or have already; no such arm; recordings of which none
+            says what these pads pressed; another sensor than FlexiTac.
+    """
+    if arm not in ROBOT.arms:
+        raise TaccorlError(f"excite: no pads of an arm {arm!r}; {nearest(arm, ROBOT.arms)}")
+    check_rivals(rivals)
+    for name in rivals:
+        _check_of_pads(name)
+    known = _known(config, arm, measurements)
+    floor_count = TouchProblem(known, config).floor_count if known else _sensor_floor(config)
+    planned, refused = [], {}
+    for press in LIBRARY:
+        opening = press.opening_m()
+        force, target = grip(config.robot, press)
+        refusal = _refusal(config.robot, press, target)
+        if refusal:
+            refused[press.name] = refusal
+        else:
+            apart = _apart(config, arm, rivals, press, floor_count, known, fitted or {})
+            planned.append(
+                PlannedPress(
+                    press=press,
+                    opening_m=opening,
+                    target_m=target,
+                    peak_force_n=float(force.max()),
+                    ways=apart,
+                )
+            )
+        done(press.name)
+    floor = float(np.median(floor_count))
+    return Plan(part=part_of(arm), rivals=tuple(rivals), floor=floor, planned=best_first(planned), refused=refused)
+
+
+def grip(robot: RobotConfig, press: Press) -> tuple[np.ndarray, np.ndarray]:
+    """Force (T,) on each pad [N] and command (T,) [m] of a press: u = o − F / k_grip with F = K δ, at rest.
+
+    Rigid pads do not say how hard they are pressed: then commands are openings.
+    """
+    stiffness = robot.pad_stiffness_n_per_m if robot.pads == "sprung" else 0.0
+    force = stiffness * np.maximum(press.penetration_m(), 0.0)
+    return force, press.opening_m() - force / robot.grip_stiffness_n_per_m
+
+
+def travel_m(robot: RobotConfig) -> float:
+    """Largest depth to which a pad can be pressed, limited by the gripper's force and the rubber's thickness."""
+    return min(
+        ROBOT.pad_thickness_m,
+        robot.grip_force_max_n / robot.pad_stiffness_n_per_m if robot.pads == "sprung" else np.inf,
+    )
+
+
+def _refusal(robot: RobotConfig, press: Press, target_m: np.ndarray) -> str:
+    """Why it must not be recorded; empty if it may."""
+    deepest, opening = float(press.penetration_m().max()), press.opening_m()
+    fastest = float(np.abs(np.diff(opening)).max()) * RATE_HZ / 2
+    if deepest > travel_m(robot) + 1e-9:
+        return f"goes {1e3 * deepest:.2f} mm deep, the pads' travel is {1e3 * travel_m(robot):.2f} mm"
+    if min(target_m.min(), opening.min()) < 0 or opening.max() > ROBOT.opening_max_m:
+        return (
+            f"needs commands of {1e3 * target_m.min():.1f} … {1e3 * target_m.max():.1f} mm, the gripper takes "
+            f"0 … {1e3 * ROBOT.opening_max_m:g} mm"
+        )
+    if fastest > FINGER_SPEED_M_PER_S:
+        return f"moves each finger at {1e3 * fastest:.0f} mm/s of {1e3 * FINGER_SPEED_M_PER_S:g}"
+    return ""
+
+
+def imagined_press(config: TwinConfig, arm: str, press: Press) -> TouchMotion:
+    """Simulated counts of the twin in a press, with noise, in place of a recording that is not made yet."""
+    opening = press.opening_m()
+    time_s = np.arange(len(opening)) / RATE_HZ
+    target = np.tile([*REST_POSE, ROBOT.opening_max_m] * len(ROBOT.arms), (len(opening), 1))
+    target[:, ROBOT.gripper_index(arm)] = opening
+    stamps = np.arange(2 * FRAME_S, time_s[-1], FRAME_S)
+    num_taxels = ROBOT.num_taxels
+    sensor = _flexitac(config)
+    touch = Touch(
+        time_s=np.tile(stamps[:, None], (1, len(ROBOT.pads))),
+        counts=np.zeros((len(stamps), num_taxels), np.int16),
+        baseline=np.full(num_taxels, np.mean(sensor.resting_count)),
+    )
+    pressed = press.pressed(arm).made()
+    m = Measurement(
+        name=press.name,
+        time_s=time_s,
+        target=target,
+        measured=target.copy(),
+        touch=touch,
+        pressed=pressed,
+        origin="imagined: the twin's own answer",
+    )
+    motion = touch_motion(m, config, pressed)
+    counts = _said(TouchModel(config), motion)
+    counts += sensor.noise_std_count * np.random.default_rng(0).standard_normal(counts.shape)
+    return dataclasses.replace(motion, measured=np.round(counts).astype(np.int16))
+
+
+def _said(
+    model: TouchModel, motion: TouchMotion, effects: Sequence[Effect] = (), base: Values | None = None
+) -> np.ndarray:
+    """(T, P, R, C) counts above baseline without noise, of the twin's own k_n and k_d where ``base`` has none."""
+    sensor, base = model.sensor, base or {}
+    k_n, k_d = base.get("k_n", sensor.normal_stiffness_per_m), base.get("k_d", sensor.normal_damping_s_per_m)
+    return model.counts(motion, model.simulate(motion, k_n, k_d, effects))
+
+
+def _apart(
+    config: TwinConfig,
+    arm: str,
+    rivals: Sequence[str],
+    press: Press,
+    floor_count: np.ndarray,
+    known: Sequence[TouchMotion],
+    fitted: Mapping[str, Values],
+) -> dict[str, tuple[float, float]]:
+    """Pair → floors between the two in this press, each being the truth."""
+    plain = imagined_press(config, arm, press)
+    problem = TouchProblem([*known, plain], config)
+    problem.floor_count = np.broadcast_to(floor_count, problem.floor_count.shape)
+    _check_candidates(problem, config, arm, rivals)
+    present = [problem.candidates[name].make(problem.start) for name in problem.present]
+    told = {name: _mapped(e, problem.pads) for name, e in explanations(problem, rivals, problem.start, fitted).items()}
+    before = [problem.recording(m) for m in known]
+    model = TouchModel(config)
+    louder = {name: np.abs(_said(model, plain, [e.effect], e.values) - _said(model, plain)) for name, e in told.items()}
+    apart = {}
+    for a, b in itertools.combinations(rivals, 2):
+        # Taxels count that would read something if either were true: those beside the object, too.
+        seen = plain.measured + np.maximum(louder[a], louder[b])
+        recordings = [*before, problem.recording(dataclasses.replace(plain, measured=seen))]
+        apart[f"{a} | {b}"] = floors_between(problem, present, told[a], told[b], recordings)
+    return apart
+
+
+def _mapped(e: Explanation, pads: Sequence[str]) -> Explanation:
+    """A gain map has no typical one: some gains are drawn."""
+    if not isinstance(e.effect, TaxelGainMap):
+        return e
+    gains = 1.0 + GAIN_SPREAD * np.random.default_rng(0).standard_normal((len(pads), *ROBOT.pad.shape))
+    return dataclasses.replace(e, effect=TaxelGainMap.of(np.clip(gains, 0.0, None), pads))
+
+
+def _check_of_pads(name: str) -> None:
+    if not issubclass(registry.get(name), TouchEffect):
+        raise TaccorlError(
+            f"excite: {name} is no effect of pads: nothing that they read in a known object would show it"
+        )
+
+
+def _check_candidates(problem: TouchProblem, config: TwinConfig, arm: str, rivals: Sequence[str]) -> None:
+    for name in rivals:
+        if name in problem.present or any(name == e.name and {*e.acts_on()} & {*problem.pads} for e in config.effects):
+            raise TaccorlError(
+                f"excite: the twin has {name} on the {part_of(arm)} already; leave it out, or take it from the twin's file"
+            )
+        if name not in problem.candidates:
+            raise TaccorlError(
+                f"excite: {name} has no numbers that could be fitted to what pads read; these have: "
+                f"{', '.join(problem.candidates)}"
+            )
+
+
+def _known(config: TwinConfig, arm: str, measurements: Measurements | None) -> list[TouchMotion]:
+    """Matched contact replays of the recordings that say what these pads pressed."""
+    if measurements is None:
+        return []
+    found = [
+        matched_contact(m, config, m.pressed) for m in measurements.fit if presses(m, arm) and m.pressed is not None
+    ]
+    if not found:
+        raise TaccorlError(
+            f"{part_of(arm)}: no fit recording says what they pressed; state `pressed` in measurements.yaml, or leave "
+            "--measurements out"
+        )
+    return found
+
+
+def _sensor_floor(config: TwinConfig) -> np.ndarray:
+    """Counts of a row: the twin's noise and the converter's step, in the mean over its frames; at least rounding."""
+    rounding = 1 / math.sqrt(12)
+    return np.array(max(math.hypot(_flexitac(config).noise_std_count, rounding) / math.sqrt(FRAMES_A_ROW), rounding))
+
+
+def _flexitac(config: TwinConfig) -> FlexiTacConfig:
+    return TouchModel(config).sensor

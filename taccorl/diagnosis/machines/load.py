@@ -1,0 +1,25 @@
+"""Load the machine that a file describes, whatever its kind."""
+
+from pathlib import Path
+
+from taccorl.diagnosis.machines.machine import Machine, machines
+from taccorl.diagnosis.machines.piper import PiperTwin
+from taccorl.errors import SpecError, nearest
+from taccorl.sim.twin_file import kind_of
+
+
+def load_machine(path: Path | None) -> Machine:
+    """The machine that a file describes; the nominal twin of the PiPER without a file.
+
+    Raises:
+        SpecError: the file cannot be read, its kind is unknown, or it does not fit that kind; with file and line.
+    """
+    if path is None:
+        return PiperTwin.nominal()
+    path = Path(path)
+    kind, line = kind_of(path)
+    if kind is None:
+        return PiperTwin.load(path)
+    if kind not in machines:
+        raise SpecError(f"{path}:{line}: kind: no kind of machine {kind!r}; {nearest(kind, machines)}")
+    return machines.get(kind).load(path)

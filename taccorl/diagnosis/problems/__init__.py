@@ -1,0 +1,1 @@
+"""Parts of machines as problems for the search: joints, axes, pads, cells."""

@@ -1,0 +1,190 @@
+"""Identification of one driven axis: its fitted numbers, candidate effects and recordings, as the search for missing effects
+needs them. An axis is a slide on a bench, a motor with a mass, a servo with a pendulum.
+
+Inertia and a constant torque are fitted, and the weight where the file states one. So are the gains, within ``GAINS_WITHIN`` of
+those commanded, where the effort was recorded, which identifies them: a few per cent of them outweigh the friction of a fast
+drive. Of law ``pwm`` the stall torque and the back-EMF are, within ``WINDING_WITHIN``: data sheets are no better. How late a
+target acts is fitted up to ``TIMING_S``: a cycle of the drive's loop is of no interest, and shows.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from taccorl.alignment.controller.drive_law import WINDING_WITHIN
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.diagnosis.search.identifiable import TIMING_S
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects as registry
+from taccorl.sim.effects.effect import Effect
+
+GAINS_WITHIN = 1.25
+"""Factor to both sides."""
+WEIGHT_WITHIN = 3.0
+"""Times the weight's torque that the file states, of both signs."""
+MOST_TORQUE = 20.0
+"""Of a constant torque, in force units of the axis."""
+_NO_CANDIDATES = ("armature", "gravity_mismatch")
+"""More inertia is the inertia, which is fitted; an axis carries no weight by itself."""
+
+
+class AxisProblem:
+    """An axis and recordings of it. Channels: position, and effort where every recording has it; in the units of the axis.
+
+    Raises:
+        TaccorlError: the recordings lack the axis, have it in another unit, or command what its law does not take.
+    """
+
+    def __init__(self, axis: AxisConfig, measurements: Measurements) -> None:
+        self.axis, self.signal = axis, axis.name
+        own = axis.made()
+        self.present = tuple(e.name for e in own)
+        self._bare = dataclasses.replace(axis, effects=())
+        everything = measurements.all
+        self.effort = all(m.has_effort()[m.column(axis.name)] for m in everything)
+        kinds = ("position", "effort") if self.effort else ("position",)
+        self.floors = [noise_floor(everything, kind)[axis.name] for kind in kinds]
+        self.floor_values = np.array([f.value for f in self.floors])
+        if self.effort and self.floors[0].lower_bound and axis.law in ("impedance", "cascade"):
+            # Without repeats an encoder's resolution is no floor: the loop answers an error of the force by one of the position.
+            self.floor_values[0] = max(self.floor_values[0], self.floor_values[1] / axis.loop_gains.kp)
+        self.fit, self.validation, self.test = (
+            [self._recording(m) for m in side]
+            for side in (measurements.fit, measurements.validation, measurements.test)
+        )
+        self.base = self._base()
+        self.start: Values = {f.name: f.start for f in self.base}
+        self.start |= {f"{e.name}.{p.name}": getattr(e, p.name) for e in own for p in e.parameters()}
+        self.candidates: dict[str, Candidate] = {}
+        self.learn(self.start)
+
+    @property
+    def noise(self) -> str:
+        return "; effort ".join(f.words() for f in self.floors)
+
+    @property
+    def numbers(self) -> str:
+        """Where the always fitted numbers are from."""
+        return f"fitted: {', '.join(f.name for f in self.base)}; other numbers as the file states them"
+
+    @property
+    def measured(self) -> str:
+        """What the errors are of."""
+        return "positions and efforts together" if self.effort else "positions"
+
+    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+        """(T, C) position, and effort."""
+        answer = simulated(self._bare.with_numbers(base), recording.data, effects)
+        return np.column_stack([answer.reported, answer.effort][: 1 + self.effort])
+
+    def learn(self, values: Mapping[str, float]) -> None:
+        """Starts of searches hang on the forces that the motor would give."""
+        seen = self._seen(values)
+        for name in registry:
+            if not registry.get(name).fitted or name in _NO_CANDIDATES:
+                continue
+            cls = self.axis.effect_class(name)
+            if cls is not None:
+                self.candidates[name] = candidate(cls, seen)
+
+    def prepare(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    ) -> list[Effect]:
+        """An axis has no maps."""
+        return list(effects)
+
+    def _base(self) -> tuple[Free, ...]:
+        axis, unit = self.axis, self.axis.scale.unit_of
+        force, inertia = axis.scale.force, axis.inertia
+        most = max(MOST_TORQUE * force, 10.0 * abs(axis.torque_ff))
+        found = [
+            Free(name="inertia", unit=unit("kg·m²"), start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True),
+            Free(name="torque_ff", unit=unit("N·m"), start=axis.torque_ff, low=-most, high=most, scale=force),
+        ]
+        weight = float(np.hypot(axis.weight_sin, axis.weight_cos))
+        if weight > 0.0:
+            for name in ("weight_sin", "weight_cos"):
+                most = WEIGHT_WITHIN * weight
+                found.append(
+                    Free(name=name, unit="N·m", start=getattr(axis, name), low=-most, high=most, scale=0.1 * weight)
+                )
+        if axis.law == "pwm":
+            within, numbers = WINDING_WITHIN, {"stall_nm": axis.stall_nm, "back_emf": axis.back_emf}
+        elif self.effort:
+            within, numbers = GAINS_WITHIN, {"kp": axis.loop_gains.kp, "kd": axis.loop_gains.kd}
+        else:
+            within, numbers = 1.0, {}
+        if axis.target_kind == "position":
+            high = max(TIMING_S, axis.target_late_s)
+            found.append(Free(name="target_late_s", unit="s", start=axis.target_late_s, low=0.0, high=high, scale=1e-4))
+        units = {"stall_nm": "N·m", "kp": "N·m/rad"}
+        found += [
+            Free(
+                name=name,
+                unit=unit(units.get(name, "N·m·s/rad")),
+                start=at,
+                low=at / within,
+                high=at * within,
+                log=True,
+            )
+            for name, at in numbers.items()
+            if at > 0.0
+        ]
+        return tuple(found)
+
+    def _recording(self, m: Measurement) -> Recording:
+        motion = axis_motion(self.axis, m)
+        columns = [motion.measured, motion.effort][: 1 + self.effort]
+        channels = (f"{self.signal} [{self.axis.unit}]", f"{self.signal} effort [{self.axis.scale.unit_of('N·m')}]")
+        return Recording(
+            name=m.name,
+            time_s=motion.time_s,
+            measured=np.column_stack(columns),
+            floor=self.floor_values,
+            channels=channels[: 1 + self.effort],
+            data=motion,
+        )
+
+    def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
+        motions: list[JointMotion] = [r.data for r in self.fit]
+        bare = self._bare.with_numbers(values)
+        answers = [simulated(bare, m, []) for m in motions]
+        asked = [
+            m.target if self.axis.target_kind == "position" else a.reported
+            for m, a in zip(motions, answers, strict=True)
+        ]
+        speeds = np.concatenate([np.abs(np.gradient(q, 1.0 / m.rate_hz)) for q, m in zip(asked, motions, strict=True)])
+        return {
+            "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
+            "peak_speed_rad_per_s": float(speeds.max()),
+            "span_rad": max(float(np.ptp(q)) for q in asked),
+            "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
+            "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
+            "duration_s": max(float(m.time_s[-1]) for m in motions),
+        }
+
+
+def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
+    """A recording of an axis, with the gains that it states.
+
+    Raises:
+        TaccorlError: it lacks the axis, has it in another unit, or commands what its law does not take.
+    """
+    j = m.column(axis.name)
+    if m.units[j] != axis.unit:
+        raise TaccorlError(f"{m.name}: {axis.name} is in {m.units[j]}, the axis's file says {axis.unit}")
+    return motion_of(m, axis.name, DrivenAxis(axis))
+
+
+def simulated(axis: AxisConfig, motion: JointMotion, effects: Sequence[Effect]) -> JointResponse:
+    """Answer of the axis to a recording's targets, with the effects of its file and ``effects``."""
+    model = JointModel.of(DrivenAxis(axis))
+    return model.simulate(motion, model.gains, effects)

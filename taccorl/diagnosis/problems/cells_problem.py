@@ -1,0 +1,202 @@
+"""A sensor of cells as a problem for the search: candidates are all effects on readings, channels at most 64 cells.
+
+Each cell's gain and offset are always fitted, in closed form: for every set of effects they are the least squares over the fit
+recordings (variable projection, Golub and Pereyra 1973), so the search sees only what no gain and offset explains, and a grid of
+hundreds of cells costs no more unknowns than one.
+
+Rows in which the converter is at an end are not fitted and not judged.
+
+Letters in shapes: T rows, K cells, C channels.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from taccorl.alignment.checks.cells import LOADED
+from taccorl.alignment.machines.cell_model import (
+    Calibration,
+    calibrated,
+    file_numbers,
+    readings,
+    responses,
+    thinned,
+    within_ends,
+)
+from taccorl.alignment.machines.cell_tables import CellMeasurement
+from taccorl.alignment.machines.cells_file import CellsConfig
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.noise_floor import repeat_pairs, residue_floor
+from taccorl.alignment.measurements.repeats import overlay
+from taccorl.diagnosis.problems.touch_problem import MAX_CHANNELS, touch_candidate
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, split_rows
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects as registry
+from taccorl.sim.effects.effect import CELLS, Effect
+
+SAME_LOAD = 0.2
+"""Share of its motion by which the load of a repeat may differ."""
+SAME_FLOORS = 1.0
+"""A repeat is judged where its load differs by no more than so many noise floors of the reading."""
+SAME_TEMPERATURE_K = 0.5
+"""The same for its temperature, where that was recorded."""
+_KEPT = 64
+"""Sets of effects whose calibration is remembered: a step of the solver asks for each set once a recording."""
+
+
+class CellsProblem:
+    """Satisfies ``taccorl.diagnosis.machines.machine.PartProblem``.
+
+    Args:
+        config: the sensor. Its effects are ``present``: fitted anew with everything else.
+        measurements: ``CellMeasurement``s of it.
+
+    Raises:
+        TaccorlError: no cell is loaded in the fit recordings.
+    """
+
+    numbers = "gain and offset of each cell fitted"
+    measured = "readings of the cells"
+
+    def __init__(self, config: CellsConfig, measurements: Measurements) -> None:
+        self.config = dataclasses.replace(config, effects=[])
+        self.floor = reading_floor(config, prepared_all(config, measurements.all))
+        """(K,) in the unit of the reading."""
+        sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]
+        load = np.concatenate([m.target for m in sides[0]])
+        loaded = np.flatnonzero(load.max(axis=0) > LOADED * config.load.rated)
+        if len(loaded) == 0:
+            raise TaccorlError(
+                f"{config.name}: no cell bears {LOADED:.0%} of the rated load in a fit recording; press it"
+            )
+        some = np.random.default_rng(0).permutation(loaded)[:MAX_CHANNELS]
+        self._channels = np.sort(some)
+        self.fit: Sequence[Recording] = [self._recording(m) for m in sides[0]]
+        self.validation: Sequence[Recording] = [self._recording(m) for m in sides[1]]
+        self.test: Sequence[Recording] = [self._recording(m) for m in sides[2]]
+        self._calibrate_on: Sequence[Recording] = self.fit if self.validation else split_rows(self.fit)[0]
+        self._calibrations: dict[tuple, tuple[Calibration, dict[str, np.ndarray]]] = {}
+        self.base: tuple[Free, ...] = ()
+        seen = {
+            "peak_reading": float(load.max()) / config.load_of_reading,
+            "duration_s": max(float(m.time_s[-1] - m.time_s[0]) for m in sides[0]),
+        }
+        gives = [*config.gives, *(["temperature"] if all(m.temperature_c.size for side in sides for m in side) else [])]
+        self.candidates: dict[str, Candidate] = {
+            name: touch_candidate(cls, seen, [CELLS])
+            for name in registry
+            if (cls := registry.get(name)).fitted and "cells" in cls.kinds() and cls.works_with(gives)
+        }
+        self.present = tuple(e.name for e in config.effects if not e.is_absent and e.name in self.candidates)
+        self.start: Values = {
+            f.name: getattr(e, f.name.split(".", 1)[1])
+            for e in config.effects
+            if e.name in self.present
+            for f in self.candidates[e.name].frees
+        }
+        repeated = bool(repeat_pairs(measurements.all))
+        bound = "" if repeated else "; a lower bound: record a press twice (repeat_of)"
+        level = float(np.median(self.floor[self._channels]))
+        self.noise = f"{level:.3g} {config.reading.unit} (the median cell{bound})"
+
+    def _recording(self, m: CellMeasurement) -> Recording:
+        unit = self.config.reading.unit
+        return Recording(
+            name=m.name,
+            time_s=m.time_s,
+            measured=m.measured[:, self._channels],
+            floor=self.floor[self._channels],
+            channels=tuple(f"{self.config.names[k]} [{unit}]" for k in self._channels),
+            data=m,
+        )
+
+    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+        """(T, C) readings."""
+        calibration, known = self._calibrated(effects)
+        response = known.get(recording.name)
+        if response is None:
+            response = responses(self.config, recording.data, effects)
+        return readings(self.config, response, calibration)[:, self._channels]
+
+    def _calibrated(self, effects: Sequence[Effect]) -> tuple[Calibration, dict[str, np.ndarray]]:
+        """Gain and offset of each cell beside ``effects``, and the responses of the recordings that they were fitted to."""
+        key = tuple((e.name, *(getattr(e, p.name) for p in e.parameters())) for e in effects)
+        if key not in self._calibrations:
+            known = {r.name: responses(self.config, r.data, effects) for r in self._calibrate_on}
+            pairs = [(known[r.name], self._fitted_rows(r)) for r in self._calibrate_on]
+            while len(self._calibrations) >= _KEPT:
+                self._calibrations.pop(next(iter(self._calibrations)))
+            self._calibrations[key] = calibrated(self.config, pairs), known
+        return self._calibrations[key]
+
+    def _fitted_rows(self, r: Recording) -> np.ndarray:
+        """(T, K) readings of all cells in the rows that are fitted."""
+        there = np.isfinite(r.measured).any(axis=1, keepdims=True)
+        return np.where(there, r.data.measured, np.nan)
+
+    def file_numbers(self, effects: Sequence[Effect]) -> dict[str, float]:
+        """``gain_thumb`` [unit of the reading per unit of the load] and ``offset_thumb`` … beside ``effects``."""
+        told = file_numbers(self.config, self._calibrated(effects)[0])
+        return {
+            f"{key}_{name}": x
+            for key in ("gain", "offset")
+            for name, x in zip(self.config.names, told[key], strict=True)
+        }
+
+    def learn(self, values: Mapping[str, float]) -> None:
+        """Starts of searches hang on the recordings alone."""
+
+    def prepare(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    ) -> list[Effect]:
+        """Gains and offsets are no effects: ``simulate`` has them."""
+        return list(effects)
+
+
+def prepared_all(config: CellsConfig, measurements: Sequence) -> list[CellMeasurement]:
+    """Recordings as they are fitted and judged: without readings at the converter's ends, at most 200 rows a second."""
+    return [
+        thinned(dataclasses.replace(m, measured=np.where(within_ends(config, m), m.measured, np.nan)))
+        for m in measurements
+    ]
+
+
+def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
+    """(K,) noise floor of each cell in the unit of the reading: its own noise and, times its gain, that of the load; where a
+    press was repeated, at least what the cell does not repeat under the same load."""
+    step = np.max([m.quantum for m in measurements], axis=0) / math.sqrt(12)
+    own, load = (_own_noise([(getattr(m, kind), m.rate_hz) for m in measurements]) for kind in ("measured", "target"))
+    gain = np.abs(calibrated(config, [(m.target, m.measured) for m in measurements]).gain)
+    floor = np.hypot(np.maximum(own, step), gain * load)
+    squares, rows = np.zeros(len(floor)), np.zeros(len(floor))
+    for one, repeat in repeat_pairs(measurements):
+        time_s = one.time_s + overlay(one, repeat, SAME_LOAD).shift_s
+        inside = (time_s >= repeat.time_s[0]) & (time_s <= repeat.time_s[-1])
+        for k in range(len(floor)):
+            again, pressed = (
+                np.interp(time_s[inside], repeat.time_s, x[:, k]) for x in (repeat.measured, repeat.target)
+            )
+            same = np.ones(len(again), dtype=bool)
+            if one.temperature_c.size and repeat.temperature_c.size:
+                warmer = np.interp(time_s[inside], repeat.time_s, repeat.temperature_c) - one.temperature_c[inside]
+                same = np.abs(warmer) < SAME_TEMPERATURE_K
+            same &= gain[k] * np.abs(pressed - one.target[inside, k]) < SAME_FLOORS * floor[k]
+            difference = (again - one.measured[inside, k])[same]
+            squares[k] += np.nansum(np.square(difference)) / 2
+            rows[k] += np.isfinite(difference).sum()
+    repeated = np.sqrt(squares / np.maximum(rows, 1))
+    spread = np.array([np.nanstd(np.concatenate([m.measured[:, k] for m in measurements])) for k in range(len(floor))])
+    return np.maximum(np.maximum(floor, repeated), 1e-6 * spread + 1e-12)
+
+
+def _own_noise(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+    """(K,) noise of each column by ``residue_floor``; where recordings are too short for it, from second differences of rows,
+    whose variance is 6 times the noise's."""
+    noise = residue_floor(channels)
+    for k in np.flatnonzero(~np.isfinite(noise)):
+        second = np.concatenate([np.diff(values[:, k], n=2) for values, _ in channels])
+        second = np.abs(second[np.isfinite(second)])
+        noise[k] = 1.4826 * np.median(second) / math.sqrt(6) if len(second) else 0.0
+    return noise

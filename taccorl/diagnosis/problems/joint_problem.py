@@ -1,0 +1,281 @@
+"""One joint as a problem for the search: its controller's numbers, the effects it may have, its recordings.
+
+Channels are the angle, and the motor's effort where every recording has it. Commanded gains that the recordings state stay fixed:
+free ones hide missing physics (on the knee of a Unitree Go2 they gave K_p 116 for a commanded 20; recordings of
+iit-DLSLab/sim2real-robot-identification).
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
+from taccorl.alignment.controller.arm_joint import selectors as selectors
+from taccorl.alignment.controller.drive_law import WINDING_WITHIN
+from taccorl.alignment.controller.joint_kernel import MOST_LOST
+from taccorl.alignment.controller.joint_model import JointModel, PayloadLever
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.measurements.folder import Measurements, motions
+from taccorl.alignment.measurements.measurement import UNITS, Measurement
+from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
+from taccorl.diagnosis.search.identifiable import TIMING_S
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects as registry
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.speed_delay import SpeedDelay
+from taccorl.sim.twin import TwinConfig
+
+GainsAre = Literal["auto", "commanded", "fitted"]
+"""``auto``: commanded where every recording states K_p and K_d."""
+# Paper App. B.1.
+KP = Free(name="kp", unit="N·m/rad", start=500.0, low=10.0, high=1e5, log=True)
+KD = Free(name="kd", unit="N·m·s/rad", start=50.0, low=1.0, high=1e3, log=True)
+TORQUE_FF = Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0)
+"""The paper's bounds are ± 8 N·m; at such a bound an effect has to make up for the rest (a stiff joint off by 10 mrad has 18)."""
+WIDER = 100.0
+"""Softly driven joints have gains far below the paper's bounds, which are for whole position drives: both bounds are wider by
+this factor, downwards."""
+_GAIN_LIKE = ("torque_scale",)
+"""No candidates where gains are fitted: those take it up, and what it does to the carried weight is ``gravity_mismatch``."""
+WEIGHS = 3.0
+"""Floors of the angle by which a weight must move the joint (standard deviation) to tell the scale of the torques. A choice."""
+EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
+"""Reported effort over torque: PiPER firmware differs in it."""
+SPEED_DELAY = Free(name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3)
+"""τ of the effect speed_delay: what a sampled loop does to the inertia. Fitted where something besides the inertia
+says something about the scale of the torques: else K_p takes it up (``taccorl.diagnosis.search.identifiable``)."""
+POSITION_AGE = Free(name="position_age_s", unit="s", start=0.0, low=-1e-3, high=TIMING_S, scale=1e-4)
+"""Age of the measured position when the drive's torque acts, besides what is known of the loop. Fitted beside commanded gains
+where the machine says so (``RigidJoint.exact_timing``): fitted ones take it up, K_d − K_p a."""
+PAYLOAD_PLACE = tuple(
+    Free(name=name, unit="m", start=0.0, low=-0.05, high=0.05, scale=5e-3)
+    for name in ("payload_sin_m", "payload_cos_m")
+)
+"""s and c of ``PayloadLever``. Fitted where a fit recording holds a payload whose place is not stated; 50 mm are a choice."""
+OF_RECORDINGS = (EFFORT_SCALE.name, *(f.name for f in PAYLOAD_PLACE))
+"""Always fitted numbers that say something of the recordings; the twin has no place for them."""
+
+
+class JointProblem:
+    """A joint of the PiPER's twin, or of another machine, and recordings of it.
+
+    Args:
+        signal: name of the joint; of the PiPER ``left_joint5``.
+        gains: whether commanded gains are believed.
+        effort: whether the motor's effort is a second channel where every recording has it.
+
+    Raises:
+        TaccorlError: no such joint, gains that are to be believed and are not stated, recordings that cannot be used.
+    """
+
+    def __init__(
+        self,
+        machine: TwinConfig | HasJoints,
+        signal: str,
+        measurements: Measurements,
+        *,
+        gains: GainsAre = "auto",
+        effort: bool = True,
+    ) -> None:
+        joint = joint_of(machine, signal)
+        whole = {use: tuple(map(joint.whole, getattr(measurements, use))) for use in ("fit", "validation", "test")}
+        measurements = dataclasses.replace(measurements, **whole)
+        everything = measurements.all
+        silent = [m.name for m in everything if any(signal not in getattr(m, name) for name in joint.gain_names)]
+        if gains == "commanded" and silent:
+            raise TaccorlError(
+                f"{silent[0]}: the commanded gains of {signal} are not stated; write {' and '.join(joint.gain_names)} into its "
+                "measurements.yaml, or fit them (gains=fitted)"
+            )
+        self.signal, self.commanded = signal, not silent and (gains != "fitted" or not joint.gain_names)
+        own, bare = joint.freed()
+        self.present = tuple(effect.name for effect in own)
+        self.model = JointModel.of(bare)
+        self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
+        self.floors = floors_of(everything, signal, effort=self.effort)
+        """Pooled over all recordings; one whose motion was repeated is judged by its own."""
+        root = motions(everything)
+        repeated = [r for r in root.values() if sum(other == r for other in root.values()) > 1]
+        groups = {r: [m for m in everything if root[m.name] == r] for r in repeated}
+        self._own_floors = {r: floors_of(group, signal, effort=self.effort) for r, group in groups.items()}
+        self._motion = root
+        self.fit, self.validation, self.test = (
+            [self._recording(m) for m in side]
+            for side in (measurements.fit, measurements.validation, measurements.test)
+        )
+        self.base = self._base()
+        self.candidates: dict[str, Candidate] = {}
+        self.learn(self.model.gains._asdict())
+        self.start: Values = (
+            self.model.gains._asdict()
+            | dict(joint.winding)
+            | {f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()}
+        )
+        if any(f.name == SPEED_DELAY.name for f in self.base):
+            delays = (e for e in bare.effects([]) if isinstance(e, SpeedDelay))
+            self.start[SPEED_DELAY.name] = sum(e.delay_s for e in delays)
+
+    @property
+    def inertia_kgm2(self) -> float:
+        """Of the joint: the least of the fit recordings, whose loop timing is the most uncertain."""
+        return min(self.model.inertia_kgm2(r.data) for r in self.fit)
+
+    def pinned_by(self, names: Sequence[str]) -> tuple[str, ...]:
+        """What fixes the scale of the torques (``diagnosis.search.identifiable``) while the effects ``names`` are fitted."""
+        commanded = self.commanded and not self.model.joint.winding
+        words = "commanded gains" if self.model.joint.gain_names else "commanded torques"
+        found = [words] * commanded + ["recorded effort"] * (self.effort and not commanded)
+        unknown = {"gravity_mismatch", "payload"} & {*names}
+        if not unknown and self._weighs():
+            found.append("known weight")
+        return tuple(found)
+
+    def _weight_shows(self, least_floors: float) -> bool:
+        """Whether known weight that the controller holds moves the joint by more than so many noise floors."""
+        weights = np.concatenate([self.model.weight_nm(r.data, self._asked(r.data)) for r in self.fit])
+        return float(np.std(weights)) > least_floors * self.floors[0].value * self.model.gains.kp
+
+    def _weighs(self) -> bool:
+        """Whether that weight varies more than the torque J q̈ of the motion, which else decides."""
+        if not self._weight_shows(WEIGHS):
+            return False
+        motions: list[JointMotion] = [r.data for r in self.fit]
+        weights = np.concatenate([self.model.weight_nm(m, self._asked(m)) for m in motions])
+        torques = []
+        for m in motions:
+            angle = self.model.simulate(m, self.model.gains).reported
+            torques.append(self.model.inertia_kgm2(m) * np.gradient(np.gradient(angle, m.time_s), m.time_s))
+        return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
+
+    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+        """(T, C) angle [rad], and effort [N·m] as the driver would report it."""
+        lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
+        if SPEED_DELAY.name in base:
+            effects = [
+                *effects,
+                SpeedDelay(**self.model.joint.selectors(SpeedDelay) or {}, delay_s=float(base[SPEED_DELAY.name])),
+            ]
+        age_s = float(base.get(POSITION_AGE.name, 0.0))
+        gains, facts = self.model.joint.numbers(base)
+        answer = self.model.simulate(recording.data, gains, effects, lever, age_s=age_s, facts=facts)
+        if not self.effort:
+            return answer.reported[:, None]
+        return np.column_stack([answer.reported, base.get("effort_scale", 1.0) * answer.effort])
+
+    def learn(self, values: Mapping[str, float]) -> None:
+        """Starts of searches hang on the torques that the motor would give with these gains."""
+        seen = self._seen(values)
+        for name in registry:
+            cls = registry.get(name)
+            where = self.model.joint.selectors(cls) if cls.fitted else None
+            scaled = self.commanded and not self.model.joint.winding
+            if where is not None and (scaled or name not in _GAIN_LIKE):
+                self.candidates[name] = candidate(cls, seen, **where)
+
+    def prepare(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    ) -> list[Effect]:
+        """Joints have no maps."""
+        return list(effects)
+
+    def _asked(self, motion: JointMotion) -> np.ndarray:
+        """(T,) targets; measured positions where targets are no positions."""
+        if self.model.joint.target_kind == "position":
+            return motion.target
+        seen = np.isfinite(motion.measured)
+        return np.interp(motion.time_s, motion.time_s[seen], motion.measured[seen])
+
+    def _base(self) -> tuple[Free, ...]:
+        kp, kd, torque_ff = self.model.gains
+        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)]
+        # A loop whose speed is later than J / K_d is unstable.
+        delay = dataclasses.replace(
+            SPEED_DELAY, high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9))
+        )
+        joint = self.model.joint
+        if self.commanded:
+            aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
+            found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [POSITION_AGE] * aged
+        elif not joint.winding:
+            starts = {"kp": (KP, kp), "kd": (KD, max(kd, KD.low / WIDER))}
+            gains = [_around(*starts[name]) for name in joint.gain_names]
+            found = gains + found + [delay] * (self.effort or self._weight_shows(1.0))
+        found += [_within(name, value) for name, value in joint.winding.items()]
+        payloads: list[JointMotion] = [
+            r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known
+        ]
+        return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
+
+    def _recording(self, m: Measurement) -> Recording:
+        motion = motion_of(m, self.signal, self.model.joint)
+        columns = [motion.measured, motion.effort] if self.effort else [motion.measured]
+        names = [f"{self.signal} [{self.model.unit}]", f"{self.signal} effort [{UNITS[self.model.unit][1]}]"]
+        return Recording(
+            name=m.name,
+            time_s=motion.time_s,
+            measured=np.column_stack(columns),
+            floor=np.array(self._floor_values(m)),
+            channels=tuple(names[: len(columns)]),
+            data=motion,
+        )
+
+    def _floor_values(self, m: Measurement) -> list[float]:
+        """Of each channel. The noise of an effort grows with gains and motion: it is at least what no smooth curve explains."""
+        values = [f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]
+        if self.effort:
+            residue = (e.value for e in noise_floor([m], "effort")[self.signal].estimates if e.method == "residue")
+            values[1] = max(values[1], *residue, 0.0)
+        return values
+
+    def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""
+        motions: list[JointMotion] = [r.data for r in self.fit]
+        gains, facts = self.model.joint.numbers(values)
+        answers = [self.model.simulate(m, gains, facts=facts) for m in motions]
+        weights = [self.model.carried_nm(m, a.reported) for m, a in zip(motions, answers, strict=True)]
+        asked = [
+            m.target if self.model.joint.target_kind == "position" else a.reported
+            for m, a in zip(motions, answers, strict=True)
+        ]
+        speeds = np.concatenate([np.abs(np.gradient(q, 1.0 / m.rate_hz)) for q, m in zip(asked, motions, strict=True)])
+        angles = np.concatenate(asked)
+        return {
+            "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
+            "peak_motor_nm": max(float(np.abs(a.effort + w).max()) for a, w in zip(answers, weights, strict=True)),
+            "peak_speed_rad_per_s": float(speeds.max()),
+            "span_rad": float(np.ptp(angles)),
+            "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
+            "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
+            "duration_s": max(float(m.time_s[-1]) for m in motions),
+        }
+
+
+def _around(gain: Free, start: float) -> Free:
+    """A gain with wider bounds, which hold its start."""
+    low, high = min(gain.low / WIDER, 0.1 * start), gain.high if start < gain.high else 10.0 * start
+    return dataclasses.replace(gain, start=start, low=low, high=high)
+
+
+def _within(name: str, value: float) -> Free:
+    """A number of the winding about the one that the file states."""
+    unit = "N·m" if name == "stall_nm" else "N·m·s/rad"
+    return Free(name=name, unit=unit, start=value, low=value / WINDING_WITHIN, high=value * WINDING_WITHIN, log=True)
+
+
+def floors_of(measurements: Sequence[Measurement], signal: str, *, effort: bool) -> list[SignalFloor]:
+    """Noise floor of the angle, and of the effort.
+
+    Raises:
+        TaccorlError: never measured.
+    """
+    found = []
+    for kind in ("position", "effort")[: 1 + effort]:
+        floors = noise_floor(measurements, kind)
+        if signal not in floors:
+            raise TaccorlError(f"{signal}: its {kind} was not measured in any recording")
+        found.append(floors[signal])
+    return found

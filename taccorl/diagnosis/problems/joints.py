@@ -1,0 +1,229 @@
+"""Every joint that the recordings move, each diagnosed by itself, and the twin that comes out of it."""
+
+import copy
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+import numpy as np
+
+from taccorl.alignment.controller.arm_joint import HasJoints
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import SignalFloor
+from taccorl.diagnosis.problems.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
+from taccorl.diagnosis.search.identifiability import Identifiability
+from taccorl.diagnosis.search.identifiable import Known, absolute_numbers, identifiable_numbers
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.solve import solve
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, TouchEffect
+from taccorl.sim.twin import TwinConfig
+
+MOVES_RAD = 2e-3
+"""A joint that is commanded to move by more, or moves by more where it is not commanded by position, is swept."""
+SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFinding:
+    """What was found out about one joint."""
+
+    signal: str
+    diagnosis: Diagnosis
+    can_tell: Identifiability
+    """What its recordings can show and tell apart, whatever they say."""
+    floors: tuple[SignalFloor, ...]
+    """Of the angle, and of the effort if that was used."""
+    commanded: bool
+    """Gains are the commanded ones; else they were fitted."""
+    recordings: dict[str, tuple[str, ...]]
+    """fit, validation, test → names."""
+    rows_split: bool
+    """No recording was marked for validation: rows at the end of each were."""
+    known: Known
+    """The numbers that the recordings identify, and what they leave open of the others."""
+
+    @property
+    def part(self) -> str:
+        """How tables and reports call it."""
+        return self.signal
+
+    @property
+    def noise(self) -> str:
+        return "; effort ".join(f.words() for f in self.floors)
+
+    @property
+    def numbers(self) -> str:
+        """Where the always fitted numbers are from."""
+        if "stall_nm" in self.diagnosis.base:
+            return "gains as the file states them, stall torque and back-EMF fitted"
+        return "commanded gains" if self.commanded else "gains fitted (not stated by the recordings)"
+
+    @property
+    def measured(self) -> str:
+        """What the errors are of."""
+        return "angles and efforts together" if len(self.floors) > 1 else "angles"
+
+    remark = ""
+
+
+def swept_joints(measurements: Measurements) -> tuple[str, ...]:
+    """Joints that at least one fit recording moves."""
+    return tuple(s for s in SIGNALS if any(moves(m, s) for m in measurements.fit))
+
+
+def moves(m: Measurement, signal: str) -> bool:
+    """Whether the recording commands the joint to move, and its arm presses nothing: what pushes back at a hand turns its joints,
+    and one joint by itself does not know of it."""
+    if m.pressed is not None and signal.startswith(f"{m.pressed.arm}_"):
+        return False
+    if signal not in m.signals:
+        return False
+    positions = m.moved(signal)
+    return bool(np.isfinite(positions).any()) and float(np.nanmax(positions) - np.nanmin(positions)) > MOVES_RAD
+
+
+def of_joints(measurements: Measurements, signals: Sequence[str]) -> Measurements:
+    """Without the recordings that move none of ``signals``."""
+    sides = {
+        use: tuple(m for m in getattr(measurements, use) if any(moves(m, s) for s in signals))
+        for use in ("fit", "validation", "test")
+    }
+    return dataclasses.replace(measurements, **sides)
+
+
+def diagnose_joint(
+    machine: TwinConfig | HasJoints,
+    signal: str,
+    measurements: Measurements,
+    *,
+    gains: GainsAre = "auto",
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+) -> JointFinding:
+    """Search for what is missing at one joint, in the recordings that move it.
+
+    Raises:
+        TaccorlError: none of the fit recordings moves it.
+    """
+    own = of_joints(measurements, [signal])
+    if not own.fit:
+        raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
+    problem = JointProblem(machine, signal, own, gains=gains)
+    solved = solve(signal, problem, problem.fit, problem.validation, problem.test, search, without)
+    known = known_numbers(problem, solved.diagnosis)
+    return JointFinding(
+        signal=signal,
+        known=known,
+        diagnosis=with_intervals(solved.diagnosis, known),
+        can_tell=solved.can_tell,
+        floors=tuple(problem.floors),
+        commanded=problem.commanded,
+        recordings={use: tuple(m.name for m in getattr(own, use)) for use in ("fit", "validation", "test")},
+        rows_split=solved.rows_split,
+    )
+
+
+def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
+    """What the recordings of a joint identify of the numbers that were fitted to them."""
+    pinned_by = problem.pinned_by(found.names)
+    kd = problem.model.gains.kd if problem.commanded else None
+    return Known(
+        identifiable=identifiable_numbers(found.after, problem.commanded, bool(pinned_by), kd),
+        absolute=absolute_numbers(found.after, inertia_kgm2=problem.inertia_kgm2, pinned=bool(pinned_by), kd=kd),
+        pinned_by=pinned_by,
+    )
+
+
+def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
+    """``found`` with the absolute numbers' intervals, in its effects too, and the identified numbers in their evidence."""
+    effects = []
+    for effect in found.effects:
+        prefix = f"{effect.name}."
+        own = [n.words() for n in known.identifiable if n.name.startswith(prefix)]
+        evidence = "; ".join(part for part in (effect.evidence, f"identified: {', '.join(own)}" * bool(own)) if part)
+        mine = [n for n in known.absolute if n.name.startswith(prefix) and np.isfinite([n.low, n.high]).all()]
+        ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in mine}
+        effects.append(dataclasses.replace(effect, interval=effect.interval | ends, evidence=evidence))
+    remarks = (*found.remarks, *_payload_remarks(found))
+    return dataclasses.replace(
+        found, effects=tuple(effects), intervals=found.intervals | known.intervals, remarks=remarks
+    )
+
+
+def _payload_remarks(found: Diagnosis) -> list[str]:
+    """A payload is elsewhere than the twin has it, and no recording states where."""
+    names = [f.name for f in PAYLOAD_PLACE]
+    ends = [found.intervals[name] for name in names if name in found.base]
+    if not any(low > 0.0 or high < 0.0 for low, high in ends):
+        return []
+    off_mm = 1e3 * math.hypot(*(float(found.base[name]) for name in names))
+    return [
+        f"The payload pulls as if it were {off_mm:.1f} mm off the TCP. No recording states its place: state payload_position_m "
+        "in measurements.yaml, else compare shows an error there that this diagnosis does not."
+    ]
+
+
+def each[FindingT](
+    diagnosed: Callable[[str], FindingT], parts: Sequence[str], workers: int, done: Callable[[str], None]
+) -> list[FindingT]:
+    """``diagnosed`` of every part, in ``workers`` processes; the same for any number of them."""
+    if workers <= 1 or len(parts) <= 1:
+        found = []
+        for part in parts:
+            found.append(diagnosed(part))
+            done(part)
+        return found
+    with ProcessPoolExecutor(min(workers, len(parts)), mp_context=get_context("spawn")) as pool:
+        jobs = {pool.submit(diagnosed, part): part for part in parts}
+        for job in as_completed(jobs):
+            job.result()
+            done(jobs[job])
+        return [job.result() for job in jobs]
+
+
+def set_numbers(
+    config: TwinConfig, signal: str, base: Mapping[str, float], intervals: Mapping[str, Sequence[float]]
+) -> None:
+    """Write fitted gains into one arm of ``config``, and the delay of the speed unless its interval holds 0.
+
+    Where a payload lies and how efforts are scaled belongs to recordings, not to the twin.
+    """
+    arm, joint = signal.split("_", 1)
+    control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
+    k = ROBOT.joints.index(joint)
+    fields = {"kp": control.kp_nm_per_rad, "kd": control.kd_nms_per_rad, "torque_ff": control.torque_ff_nm}
+    for name, values in fields.items():
+        if name in base:
+            values[k] = float(base[name])
+    if "speed_delay_s" in base:
+        sure = intervals["speed_delay_s"][0] > 0.0
+        delay = make_effect("speed_delay", arm=arm, joints=[joint], delay_s=float(base["speed_delay_s"]) * sure)
+        add_effect(config, delay)
+        config.effects = [e for e in config.effects if e is not delay or not e.is_absent]
+
+
+def add_effect(config: TwinConfig, effect: Effect) -> None:
+    """Put an effect into ``config``; what an entry of the same name does to the same joints or pads, it replaces."""
+    kept: list[Effect] = []
+    for other in config.effects:
+        shared = set(other.acts_on()) & set(effect.acts_on()) if other.name == effect.name else set()
+        kept += _elsewhere(other, shared) if shared else [other]
+    config.effects = [*kept, effect]
+
+
+def _elsewhere(effect: Effect, taken: set[str]) -> list[Effect]:
+    """Entries that do what ``effect`` does, but not to ``taken``."""
+    rest = [thing for thing in effect.acts_on() if thing not in taken]
+    if isinstance(effect, JointEffect):
+        arms = {arm: [t.removeprefix(f"{arm}_") for t in rest if t.startswith(f"{arm}_")] for arm in ROBOT.arms}
+        return [dataclasses.replace(effect, arm=arm, joints=joints) for arm, joints in arms.items() if joints]
+    if isinstance(effect, ArmEffect):
+        return [dataclasses.replace(effect, arm=arm) for arm in rest]
+    return [dataclasses.replace(effect, pads=rest)] if isinstance(effect, TouchEffect) and rest else []

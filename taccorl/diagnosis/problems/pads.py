@@ -1,0 +1,246 @@
+"""The pads of every arm that pressed a known object, each pair diagnosed by itself, and the twin that comes out of it.
+
+A pair is judged by matched contact replays (``TouchProblem``): its fingers stand where they were measured, in an object whose
+place is known. A twin has one k_n and one k_d for all of its pads, effects act on the pads in which they were found.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import repeat_pairs
+from taccorl.alignment.touch.motion import TouchMotion
+from taccorl.diagnosis.comparison.replays import matched_contact
+from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem
+from taccorl.diagnosis.search.evidence import block_squares, standard_score
+from taccorl.diagnosis.search.fit import fit
+from taccorl.diagnosis.search.identifiability import Identifiability
+from taccorl.diagnosis.search.problem import Recording, split_rows
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.search import gain_of
+from taccorl.diagnosis.search.solve import solve
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.twin import TwinConfig
+
+FIELDS = {"k_n": "normal_stiffness_per_m", "k_d": "normal_damping_s_per_m"}
+"""Fitted number → field of the twin's sensor. The zeros of pads are of a recording's baseline and have no place in a twin."""
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PadFinding:
+    """What was found out about the pads of one arm."""
+
+    arm: str
+    pads: tuple[str, ...]
+    """Those that came near the objects."""
+    diagnosis: Diagnosis
+    can_tell: Identifiability
+    """What their recordings can show and tell apart, whatever they say."""
+    floor_count: float
+    """Noise floor of a row, the mean of ``FRAMES_A_ROW`` frames: median over the taxels that were looked at."""
+    lower_bound: bool
+    """No press was recorded twice: what the pads and the opening do not repeat is not in the floor."""
+    recordings: dict[str, tuple[str, ...]]
+    """fit, validation, test → names."""
+    rows_split: bool
+    """No recording was marked for validation: rows at the end of each were."""
+    gains: GainStatistics | None = None
+    """That taxels' gains differ, which no validation recording could judge: none presses the taxels that were fitted to."""
+    not_shared: tuple[str, ...] = ()
+    """These validation recordings."""
+
+    @property
+    def part(self) -> str:
+        """``left pads``: how tables and reports call them."""
+        return part_of(self.arm)
+
+    @property
+    def remark(self) -> str:
+        """What the search could not judge, and the press that would show it; empty if there is nothing."""
+        return gain_words(self.gains, self.not_shared) if self.gains else ""
+
+    @property
+    def noise(self) -> str:
+        bound = "; a lower bound: record a press twice" if self.lower_bound else ""
+        return f"{self.floor_count:.2g} counts, a taxel's mean over {FRAMES_A_ROW} frames (the median taxel{bound})"
+
+    @property
+    def numbers(self) -> str:
+        """Where the always fitted numbers are from."""
+        return "k_n, k_d and each pad's zero fitted"
+
+    measured = f"means of {FRAMES_A_ROW} frames"
+    known = None
+
+
+def part_of(arm: str) -> str:
+    return f"{arm} pads"
+
+
+def pads_of(base: Mapping[str, float]) -> list[str]:
+    """Pads whose zero is among the fitted numbers."""
+    return [name.removeprefix("zero_") for name in base if name.startswith("zero_")]
+
+
+def presses(m: Measurement, arm: str) -> bool:
+    """Whether it is stated what the pads of an arm pressed in a recording."""
+    return m.pressed is not None and m.pressed.arm == arm
+
+
+def pressed_arms(measurements: Measurements) -> tuple[str, ...]:
+    """Arms whose pads press a known object in at least one fit recording."""
+    return tuple(arm for arm in ROBOT.arms if any(presses(m, arm) for m in measurements.fit))
+
+
+def diagnose_arm(
+    config: TwinConfig,
+    arm: str,
+    measurements: Measurements,
+    *,
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+) -> PadFinding:
+    """Search for what is missing in the pads of one arm, in the recordings that say what they pressed.
+
+    Raises:
+        TaccorlError: no fit recording says so, or one that cannot be a matched contact replay of the same pads.
+    """
+    uses: dict[str, tuple[Measurement, ...]] = {
+        use: tuple(m for m in getattr(measurements, use) if presses(m, arm)) for use in ("fit", "validation", "test")
+    }
+    if not uses["fit"]:
+        raise TaccorlError(
+            f"{part_of(arm)}: no fit recording says what they pressed; state `pressed` in measurements.yaml"
+        )
+    motions = {use: [_motion(m, config) for m in some] for use, some in uses.items()}
+    every = [motion for some in motions.values() for motion in some]
+    _check_pads(every)
+    problem = TouchProblem(every, config)
+    fit_to, validation, test = problem.recordings(motions["fit"], motions["validation"], motions["test"])
+    floor_count = float(np.median(np.concatenate([r.floor for r in fit_to])))
+    solved = solve(part_of(arm), problem, fit_to, validation, test, search, without)
+    gains = None
+    if not solved.rows_split:
+        found = solved.diagnosis
+        gains = unjudged_gains(problem, found, solved.fit_to, solved.validation, search or SearchConfig())
+    return PadFinding(
+        gains=gains,
+        not_shared=tuple(problem.not_shared),
+        arm=arm,
+        pads=problem.pads,
+        diagnosis=solved.diagnosis,
+        can_tell=solved.can_tell,
+        floor_count=floor_count,
+        lower_bound=not repeat_pairs(m for some in uses.values() for m in some),
+        recordings={use: tuple(m.name for m in some) for use, some in uses.items()},
+        rows_split=solved.rows_split,
+    )
+
+
+def unjudged_gains(
+    problem: TouchProblem,
+    found: Diagnosis,
+    fit_to: Sequence[Recording],
+    validation: Sequence[Recording],
+    config: SearchConfig,
+) -> GainStatistics | None:
+    """Statistics of the taxels' gains, if a map of them explains what a search has left over but cannot be judged by it, because
+    validation recordings press other taxels.
+
+    The map is then judged in time instead of on other recordings: estimated from the first rows of every recording, on the
+    others, by the search's own measures. None if it is not believed, or if the search could judge it: a map that it took
+    without a common taxel only moved k_n.
+    """
+    name = TaxelGainMap.name
+    names = tuple(n for n in found.names if n != name)
+    left_over = found.status in ("something_else", "too_many")
+    if not left_over or not problem.not_shared or name not in problem.candidates:
+        return None
+    early, late = split_rows([*fit_to, *validation])
+    without = fit(problem, early, names, found.after.values)
+    with_it = fit(problem, early, (*names, name), without.values)
+    before = block_squares(problem, without, late)
+    better = before - block_squares(problem, with_it, late)
+    # Of a map as a whole, not of each of its numbers: what its gains are is not claimed here, only that they differ.
+    if config.too_little(gain_of(better, before), standard_score(better)):
+        return None
+    return problem.gain_statistics(with_it.values, with_it.effects, [*fit_to, *validation])
+
+
+def gain_words(gains: GainStatistics, not_shared: Sequence[str]) -> str:
+    """One remark: what is the matter, why it is no finding of the search, what to record."""
+    parts = []
+    if gains.num_dead:
+        parts.append(f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({gains.dead_share:.0%}) read nothing")
+    parts.append(f"the gains of {'the others' if parts else 'taxels'} spread by {gains.log_std:.0%}")
+    return (
+        f"{' and '.join(parts)} (dead_taxels, taxel_gain_spread): this explains what is left. No taxel_gain_map could be judged, "
+        f"as {', '.join(not_shared)} press{'es' if len(not_shared) == 1 else ''} other taxels than the fit recordings; record a "
+        "validation press at a place that a fit recording presses (excite --pads: rod_across)"
+    )
+
+
+def _motion(m: Measurement, config: TwinConfig) -> TouchMotion:
+    assert m.pressed is not None
+    return matched_contact(m, config, m.pressed)
+
+
+def _check_pads(motions: Sequence[TouchMotion]) -> None:
+    first = motions[0]
+    other = next((m for m in motions if m.pads != first.pads), None)
+    if other is not None:
+        raise TaccorlError(
+            f"{first.name} presses {' and '.join(first.pads)}, {other.name} {' and '.join(other.pads)}: one diagnosis takes "
+            "recordings of the same pads; put them into folders of their own, or correct position_m of what one pad misses"
+        )
+
+
+# the twin --------------------------------------------------------------------------------------------------------------
+
+
+def set_numbers(config: TwinConfig, base: Mapping[str, float]) -> None:
+    """Write fitted k_n and k_d into ``config``: they are those of all its pads."""
+    fields = {field: float(base[name]) for name, field in FIELDS.items()}
+    config.sensor = dataclasses.replace(config.sensor, **fields)
+
+
+def agreed(fitted: Mapping[str, tuple[Mapping[str, float], Mapping[str, Sequence[float]]]]) -> dict[str, float]:
+    """k_n and k_d that all parts can share: means of those fitted, each with the weight of its interval.
+
+    Args:
+        fitted: ``left pads`` → fitted numbers and their 95 % intervals.
+
+    Raises:
+        TaccorlError: two parts' intervals have nothing in common.
+    """
+    found = {}
+    for name in FIELDS:
+        values = {part: base[name] for part, (base, _) in fitted.items()}
+        ends = {part: _ends(values[part], intervals.get(name)) for part, (_, intervals) in fitted.items()}
+        if max(low for low, _ in ends.values()) > min(high for _, high in ends.values()):
+            told = ", ".join(
+                f"{part} {values[part]:.4g} ({low:.4g} … {high:.4g})" for part, (low, high) in ends.items()
+            )
+            arms = " or ".join(f"--pads={part.split()[0]}" for part in fitted)
+            raise TaccorlError(
+                f"{name} of {told}: they differ, and a twin has one for all its pads. Take one arm's, {arms}; tasks that touch "
+                "with both hands will be off on the other"
+            )
+        widths = np.array([max(high - low, 1e-9 * abs(low) + 1e-12) for low, high in ends.values()])
+        shares = widths**-2 / np.sum(widths**-2)
+        found[name] = float(np.array(list(values.values())) @ shares)
+    return found
+
+
+def _ends(value: float, interval: Sequence[float] | None) -> Range:
+    """An interval that is not known is the value alone."""
+    if interval is None or not np.isfinite(np.array(interval, float)).all():
+        return value, value
+    return float(interval[0]), float(interval[1])

@@ -1,0 +1,1 @@
+"""Report of a comparison and a diagnosis: verdicts, figures, HTML page, JSON."""

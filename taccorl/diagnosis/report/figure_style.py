@@ -1,0 +1,67 @@
+"""Common style of all figures: colours, readable units, label of the data's origin, and PNG encoding for a page.
+
+The measurement is black, the twin before a change orange, after it blue (Okabe and Ito's, apart for colour-blind eyes), the noise
+floor a grey band.
+"""
+
+import base64
+import io
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from taccorl.diagnosis.comparison.result import origin_words, shown, shown_unit
+
+MEASURED, BEFORE, AFTER, COMMAND, FLOOR = "#111111", "#d55e00", "#0072b2", "#7a7a7a", "#b8bec8"
+DOTS_PER_INCH = 110
+
+
+def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[str]) -> Figure:
+    """New empty figure with the origin of the data in its second title line."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained", dpi=DOTS_PER_INCH)
+    FigureCanvasAgg(figure)
+    figure.suptitle(f"{title}\n", fontsize=11, fontweight="bold", x=0.01, ha="left")
+    figure.text(
+        0.012, 0.997 - 0.24 / height_in, origin_words(origins), fontsize=8, color="#6b7280", ha="left", va="top"
+    )
+    return figure
+
+
+def floor_band(axes: Axes, floor: float, unit: str) -> None:
+    """± 2 floors: where 95 % of a perfect twin's residual would lie."""
+    high = 2 * floor * shown_unit(unit)[0]
+    axes.axhspan(-high, high, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor: ± 2 × {shown(floor, unit)}", zorder=0)
+
+
+def tidy(axes: Axes) -> None:
+    """Draw a faint grid and remove the box."""
+    axes.grid(True, color="#e5e7eb", lw=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.tick_params(labelsize=8)
+
+
+def legend(axes: Axes, columns: int = 4) -> None:
+    """Draw the legend above the axes on the right, where it covers no line."""
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, fontsize=7.5, frameon=False, borderpad=0.1)
+
+
+def png(figure: Figure) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", facecolor="white")
+    return stream.getvalue()
+
+
+def data_uri(picture: bytes) -> str:
+    """A PNG as a data URI, for a page that needs no other file."""
+    return f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
+
+
+def robust_limit(values: np.ndarray, least: float) -> float:
+    """Limit of a symmetric axis that shows all but the largest 0.1 % of residuals, and the noise floor."""
+    values = np.abs(values[np.isfinite(values)])
+    return 1.15 * max(float(np.quantile(values, 0.999)) if len(values) else 0.0, least)

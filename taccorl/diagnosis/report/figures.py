@@ -1,0 +1,165 @@
+"""Figures of a comparison: joint response with its residual and regimes, heat map, residual along variables."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from taccorl.diagnosis.comparison.along import Curve, variable_unit
+from taccorl.diagnosis.comparison.localise import REGIMES, Cell, motions_of
+from taccorl.diagnosis.comparison.result import Trace, shown_unit
+from taccorl.diagnosis.report.figure_style import (
+    AFTER,
+    BEFORE,
+    COMMAND,
+    MEASURED,
+    floor_band,
+    legend,
+    new_figure,
+    robust_limit,
+    tidy,
+)
+
+TWINS = ("twin", "twin, mended")
+LANES = ("near zero speed", "after a reversal", "high speed", "high load", "in contact")
+"""Regimes drawn as lanes under a residual."""
+
+
+def joint_response(before: Trace, after: Trace | None = None, names: tuple[str, str] = TWINS) -> Figure:
+    """Figure of one joint over time: commanded, measured and replayed position, tracking error, residual, and regimes.
+
+    Args:
+        after: the same signal of the same recording, replayed by another twin.
+        names: of the twins.
+    """
+    motion = motions_of([before])[0]
+    lanes = [(r.name, r.rows(motion)) for r in REGIMES if r.name in LANES]
+    lanes = [(name, rows) for name, rows in lanes if rows.any()]
+    effort = before.kind == "effort"
+    heights = [1.0] * (2 if effort else 3) + [0.2 + 0.14 * len(lanes)]
+    title = f"{before.signal} {before.kind}: {before.recording} ({before.use.replace('_', '-')})"
+    figure = new_figure(10.0, 1.2 + 2.0 * sum(heights), title, [before.origin])
+    *axes, below = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    twins = [(before, BEFORE, names[0])] + ([(after, AFTER, names[1])] if after is not None else [])
+    time_s, factor, unit = before.time_s, *shown_unit(before.unit)
+    if not effort:
+        axes[0].plot(time_s, before.target, color=COMMAND, lw=1.0, ls="--", label="command")
+        axes[1].plot(time_s, (before.measured - before.target) * factor, color=MEASURED, lw=2.4, label="measured")
+        axes[1].set_ylabel(f"tracking error\nq − q* [{unit}]", fontsize=8)
+    axes[0].plot(time_s, before.measured, color=MEASURED, lw=2.4, label="measured")
+    axes[0].set_ylabel(f"{before.kind} [{before.unit}]", fontsize=8)
+    for trace, color, name in twins:
+        axes[0].plot(time_s, trace.replayed, color=color, lw=1.0, label=name)
+        if not effort:
+            axes[1].plot(time_s, (trace.replayed - trace.target) * factor, color=color, lw=1.0, label=name)
+    _residuals(axes[-1], twins)
+    for axis in axes:
+        tidy(axis)
+        legend(axis)
+    _lanes(below, time_s, lanes)
+    return figure
+
+
+def _lanes(axes: Axes, time_s: np.ndarray, lanes: Sequence[tuple[str, np.ndarray]]) -> None:
+    """A bar wherever the joint is in a regime."""
+    for k, (_, rows) in enumerate(lanes):
+        axes.fill_between(time_s, -k - 0.4, np.where(rows, -k + 0.4, -k - 0.4), step="post", color="#64748b", lw=0)
+    axes.set_yticks([-k for k in range(len(lanes))], [name for name, _ in lanes])
+    axes.set_ylim(-len(lanes) + 0.5, 0.5)
+    tidy(axes)
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("time [s]", fontsize=8)
+
+
+def _residuals(axes: Axes, twins: Sequence[tuple[Trace, str, str]]) -> None:
+    """Measurement − replay, with the floor."""
+    first = twins[0][0]
+    factor, unit = shown_unit(first.unit)
+    floor_band(axes, first.floor.value, first.unit)
+    for trace, color, name in twins:
+        rmse = float(np.sqrt(np.nanmean(trace.residual**2)))
+        label = f"{name}: RMSE {rmse * factor:.3g} {unit}, {rmse / trace.floor.value:.3g} × floor"
+        axes.plot(trace.time_s, trace.residual * factor, color=color, lw=0.9, label=label)
+    limit = robust_limit(np.concatenate([t.residual for t, _, _ in twins]), 2.5 * first.floor.value) * factor
+    axes.set_ylim(-limit, limit)
+    axes.set_ylabel(f"residual\nmeasured − twin [{unit}]", fontsize=8)
+
+
+def heat_map_figure(cells: Sequence[Cell], origins: Sequence[str], title: str, most: float = 0.0) -> Figure:
+    """Heat map, signal × regime, of RMSE over the noise floor. Empty cells have too few rows.
+
+    Args:
+        most: floors that the colours reach, at least.
+    """
+    shown_ones = [r for r in REGIMES if any(c.regime == r.name for c in cells)]
+    figure = ratio_map(cells, [r.name for r in shown_ones], origins, title, most)
+    for k in range(1, len(shown_ones)):
+        if shown_ones[k].group != shown_ones[k - 1].group:
+            figure.axes[0].axvline(k - 0.5, color="white", lw=3)
+    return figure
+
+
+def ratio_map(
+    cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[str], title: str, most: float = 0.0
+) -> Figure:
+    """Signal × regime, each with its number."""
+    signals = list(dict.fromkeys(c.signal for c in cells))
+    ratio = np.full((len(signals), len(regimes)), np.nan)
+    for c in cells:
+        ratio[signals.index(c.signal), regimes.index(c.regime)] = c.ratio
+    figure = new_figure(max(7.0, 3.6 + 0.62 * len(regimes)), 3.0 + 0.34 * len(signals), title, origins)
+    axes = figure.subplots()
+    top = max(10.0, most, float(np.nanmax(ratio)))
+    image = axes.imshow(np.maximum(ratio, 1.0), cmap="YlOrRd", norm=LogNorm(1.0, top), aspect="auto")
+    for i, j in zip(*np.nonzero(np.isfinite(ratio)), strict=True):
+        color = "white" if ratio[i, j] > top**0.7 else "#111111"
+        axes.text(j, i, f"{ratio[i, j]:.3g}", ha="center", va="center", fontsize=7.5, color=color)
+    axes.set_xticks(range(len(regimes)), regimes, rotation=35, ha="right", fontsize=8)
+    axes.set_yticks(range(len(signals)), signals, fontsize=8)
+    bar = figure.colorbar(image, ax=axes, pad=0.02)
+    bar.set_label("RMSE / noise floor", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    axes.set_xlabel("where, not why: several causes show in the same regimes", fontsize=8)
+    return figure
+
+
+def residual_along_variables(
+    before: Sequence[Curve],
+    after: Sequence[Curve],
+    traces: Sequence[Trace],
+    names: tuple[str, str] = TWINS,
+) -> Figure:
+    """Figure of the mean or RMS residual along each variable, with its 95 % band.
+
+    Args:
+        traces: of the same signal, for its floor and units.
+    """
+    first = traces[0]
+    factor, unit = shown_unit(first.unit)
+    columns = 3
+    rows = -(-len(before) // columns)
+    title = f"{first.signal} {first.kind}: residual along what physical effects depend on, {len(traces)} recordings"
+    figure = new_figure(10.0, 1.2 + 2.5 * rows, title, list(dict.fromkeys(t.origin for t in traces)))
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    found = {c.variable: c for c in after}
+    position_unit = "m" if "gripper" in first.signal else "rad"
+    for axis, curve in zip(axes.flat, before, strict=False):
+        floor_band(axis, first.floor.value, first.unit)
+        shares = []
+        for one, color, name in ((curve, BEFORE, names[0]), (found.get(curve.variable), AFTER, names[1])):
+            if one is None:
+                continue
+            shares.append(f"{one.explained:.0%}" + ("" if one.beyond_chance else " (may be chance)"))
+            axis.fill_between(one.at, one.low * factor, one.high * factor, color=color, alpha=0.25, lw=0)
+            axis.plot(one.at, one.middle * factor, color=color, lw=1.4, marker="o", ms=2.5, label=f"{name}, 95 % band")
+        axis.set_title(f"explains {' → '.join(shares)} of the variance", fontsize=7.5, color="#4b5563", loc="right")
+        axis.set_xlabel(f"{curve.variable} [{variable_unit(curve.variable, position_unit)}]", fontsize=8)
+        axis.set_ylabel(f"{curve.measure} residual [{unit}]", fontsize=8)
+        tidy(axis)
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="upper right", ncols=3, fontsize=7.5, frameon=False, bbox_to_anchor=(1.0, 0.965))
+    for axis in list(axes.flat)[len(before) :]:
+        axis.set_visible(False)
+    return figure

@@ -1,0 +1,159 @@
+"""Figures of touch: histogram of readings and maps side by side, as the paper has them (App. B.2); sums and errors over time."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from taccorl.diagnosis.comparison.localise import Cell
+from taccorl.diagnosis.comparison.localise_touch import EVERYWHERE
+from taccorl.diagnosis.comparison.result import FELT_FLOORS, TouchTrace
+from taccorl.diagnosis.report.figure_style import AFTER, BEFORE, FLOOR, MEASURED, legend, new_figure, tidy
+from taccorl.diagnosis.report.figures import TWINS, ratio_map
+
+BINS = 48
+
+
+def touch_histogram(
+    before: Sequence[TouchTrace], after: Sequence[TouchTrace] = (), names: tuple[str, str] = TWINS
+) -> Figure:
+    """How often each reading comes, of taxels that read more than four noise floors."""
+    figure = new_figure(8.0, 4.0, f"readings of active taxels, {len(before)} recordings", _origins(before))
+    axes = figure.subplots()
+    least = FELT_FLOORS * float(np.median(before[0].floor))
+    series = [(np.concatenate([t.measured.ravel() for t in before]), MEASURED, "measured")]
+    series += [(np.concatenate([t.replayed.ravel() for t in before]), BEFORE, names[0])]
+    series += [(np.concatenate([t.replayed.ravel() for t in after]), AFTER, names[1])] if after else []
+    top = max(float(values.max()) for values, _, _ in series)
+    edges = np.linspace(least, max(top, 2 * least), BINS).tolist()
+    axes.axvspan(
+        0, least, color=FLOOR, alpha=0.45, lw=0, label=f"{FELT_FLOORS:g} × noise floor ({least:.2g} {before[0].unit})"
+    )
+    for values, color, name in series:
+        active = values[values > least]
+        label = f"{name}: n = {len(active)}, mean {active.mean() if len(active) else 0:.3g}"
+        axes.hist(active, edges, histtype="step", color=color, lw=1.4, label=label)
+    axes.set_yscale("log")
+    axes.set_xlim(0, edges[-1])
+    axes.set_xlabel(f"{before[0].unit} above baseline", fontsize=8)
+    axes.set_ylabel("readings", fontsize=8)
+    tidy(axes)
+    legend(axes, 2)
+    return figure
+
+
+def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
+    """The pads at the frame of the strongest touch: measured, twin, and RMS residual of every taxel over time."""
+    strength = before.measured.sum(axis=(1, 2, 3)).astype(float)
+    if before.touched is not None and before.touched.any():
+        strength[~before.touched.any(axis=1)] = -np.inf  # a zero that drifts is no touch
+    frame = int(np.argmax(strength))
+    rows = [("measured", before.measured[frame]), (names[0], before.replayed[frame])]
+    left = [(f"RMS residual, {names[0]}", before)]
+    if after is not None:
+        rows.append((names[1], after.replayed[frame]))
+        left.append((f"RMS residual, {names[1]}", after))
+    maps = rows + [(name, np.sqrt(np.mean(t.residual**2, axis=0))) for name, t in left]
+    tops = [max(float(v.max()) for _, v in part) for part in (maps[: len(rows)], maps[len(rows) :])]
+    where = f"{before.recording} ({before.use.replace('_', '-')}), strongest touch at {before.time_s[frame, 0]:.2f} s"
+    size_in = (1.7 * len(maps) + 0.8, 1.2 + 2.6 * len(before.pads))
+    figure = new_figure(*size_in, f"{before.unit} above baseline: {where}", [before.origin])
+    axes = figure.subplots(len(before.pads), len(maps), squeeze=False)
+    for j, (name, values) in enumerate(maps):
+        residual = j >= len(rows)
+        top = tops[residual] or 1.0
+        for p, pad in enumerate(before.pads):
+            axis = axes[p, j]
+            cmap = "magma" if residual else "turbo"
+            image = axis.imshow(values[p], cmap=cmap, vmin=0, vmax=top, aspect="equal")
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if p == 0:
+                axis.set_title(name, fontsize=7.5)
+            if j == 0:
+                axis.set_ylabel(f"{pad} ({before.thirds[0]} above)" if before.thirds else pad, fontsize=8)
+        if j in (len(rows) - 1, len(maps) - 1):
+            bar = figure.colorbar(image, ax=axes[:, j].tolist(), shrink=0.5, pad=0.02)
+            bar.ax.tick_params(labelsize=7)
+            noise = f"noise floor {np.median(before.floor):.2g}"
+            bar.set_label(before.unit if not residual else f"{before.unit}, RMS ({noise})", fontsize=7.5)
+    return figure
+
+
+def touch_over_time(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
+    """Sum over each pad: loading, hold, unloading, and what remains after release; below it the error of its taxels."""
+    title = f"sum of each pad, and RMS error of its taxels: {before.recording} ({before.use.replace('_', '-')})"
+    figure = new_figure(10.0, 1.4 + 3.0 * len(before.pads), title, [before.origin])
+    rows = figure.subplots(
+        2 * len(before.pads), 1, sharex=True, squeeze=False, height_ratios=[1.7, 1.3] * len(before.pads)
+    )
+    axes, below = rows[::2, 0], rows[1::2, 0]
+    for p, pad in enumerate(before.pads):
+        _error_over_time(below[p], before, after, p)
+        sums = [(before.measured, MEASURED, "measured"), (before.replayed, BEFORE, names[0])]
+        sums += [(after.replayed, AFTER, names[1])] if after is not None else []
+        floor = 2 * float(np.sqrt((before.floor[p] ** 2).sum()))
+        axes[p].axhspan(-floor, floor, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor ± {floor:.3g}")
+        for values, color, name in sums:
+            axes[p].plot(before.time_s[:, p], values[:, p].sum(axis=(1, 2)), color=color, lw=1.1, label=name)
+        axes[p].set_ylabel(f"{pad}, sum\n[{before.unit}]", fontsize=8)
+        tidy(axes[p])
+    legend(axes[0])
+    below[-1].set_xlabel("time [s]", fontsize=8)
+    return figure
+
+
+def reading_over_load(
+    before: Sequence[TouchTrace], after: Sequence[TouchTrace] = (), names: tuple[str, str] = TWINS
+) -> Figure:
+    """Reading of the most loaded cell over its load, measured and simulated: a bend is a law, a loop is memory."""
+    first = before[0]
+    assert first.load is not None
+    strongest = np.max([np.max(t.load, axis=0) for t in before if t.load is not None], axis=0)
+    cell = np.unravel_index(int(np.argmax(strongest)), strongest.shape)
+    where = f"{first.pads[cell[0]]}" + (f"[{cell[1]}, {cell[2]}]" if strongest.size > 1 else "")
+    figure = new_figure(8.0, 4.6, f"reading over load of {where}, {len(before)} recordings", _origins(before))
+    axes = figure.subplots()
+    series = [("measured", MEASURED, before, "measured"), ("replayed", BEFORE, before, names[0])]
+    series += [("replayed", AFTER, after, names[1])] if after else []
+    for field, color, traces, name in series:
+        for k, t in enumerate(traces):
+            assert t.load is not None
+            load, reading = t.load[:, *cell], getattr(t, field)[:, *cell]
+            axes.plot(load, reading, color=color, lw=0.8, alpha=0.7, label=name if k == 0 else None)
+    axes.set_xlabel(f"load [{first.load_unit}]", fontsize=8)
+    axes.set_ylabel(f"{first.unit} above baseline", fontsize=8)
+    tidy(axes)
+    legend(axes)
+    return figure
+
+
+def _error_over_time(axes: Axes, before: TouchTrace, after: TouchTrace | None, pad: int) -> None:
+    """RMS over the taxels that feel something at some time, in every frame; noise alone stays at the floor."""
+    felt = before.felt(pad)
+    floor = float(np.sqrt(np.mean(before.floor[pad][felt] ** 2))) if felt.any() else float(np.median(before.floor[pad]))
+    axes.axhspan(0, floor, color=FLOOR, alpha=0.45, lw=0)
+    for trace, color in ((before, BEFORE), (after, AFTER)):
+        if trace is not None and felt.any():
+            error = np.sqrt(np.mean(trace.residual[:, pad][:, felt] ** 2, axis=1))
+            axes.plot(trace.time_s[:, pad], error, color=color, lw=0.9)
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel(f"RMS error of\n{felt.sum()} cells [{before.unit}]", fontsize=8)
+    tidy(axes)
+
+
+def touch_heat_map_figure(
+    cells: Sequence[Cell],
+    origins: Sequence[str],
+    title: str = "pads: where the twin is off (RMSE / noise floor)",
+    most: float = 0.0,
+) -> Figure:
+    """Pad × regime: RMSE over the noise floor. An empty cell: too few readings."""
+    there = dict.fromkeys(c.regime for c in cells)
+    regimes = [*(name for name in EVERYWHERE if name in there), *(name for name in there if name not in EVERYWHERE)]
+    return ratio_map(cells, regimes, origins, title, most)
+
+
+def _origins(traces: Sequence[TouchTrace]) -> list[str]:
+    return list(dict.fromkeys(t.origin for t in traces))

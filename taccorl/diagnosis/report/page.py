@@ -1,0 +1,262 @@
+"""The page of a report: HTML with its pictures inside. Nothing is fetched when it is opened."""
+
+import html
+from collections.abc import Iterable, Sequence
+
+import taccorl
+from taccorl.diagnosis.comparison.along import curves
+from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell, worst_regime
+from taccorl.diagnosis.comparison.result import Comparison, Kind, Score, Trace, origin_words, shown, shown_unit
+from taccorl.diagnosis.report.evidence import diagnosis_section, first_read
+from taccorl.diagnosis.report.figure_style import data_uri, png
+from taccorl.diagnosis.report.figures import heat_map_figure, joint_response, residual_along_variables
+from taccorl.diagnosis.report.figures_touch import (
+    reading_over_load,
+    touch_heat_map_figure,
+    touch_histogram,
+    touch_maps,
+    touch_over_time,
+)
+from taccorl.diagnosis.report.html import figure, note, table
+from taccorl.diagnosis.report.report import GENERATOR, Report, cells_of
+from taccorl.diagnosis.search.result import SearchConfig
+
+STYLE = """
+:root{color-scheme:light}
+body{font:15px/1.5 system-ui,-apple-system,"Segoe UI",sans-serif;margin:0;color:#111827;background:#f8fafc}
+main{max-width:1240px;margin:0 auto;padding:24px 20px 80px}
+h1{font-size:26px;margin:8px 0}h2{font-size:20px;margin:40px 0 10px;border-bottom:2px solid #e5e7eb;padding-bottom:4px}
+h3{font-size:16px;margin:24px 0 6px}
+.data{background:#fef3c7;border:1px solid #f59e0b;border-radius:6px;padding:8px 12px;font-weight:600}
+.note{color:#4b5563;font-size:13.5px;margin:6px 0}
+.verdict{font-size:17px;background:#ecfeff;border:1px solid #06b6d4;border-radius:6px;padding:10px 14px;margin:12px 0}
+.verdict.moderate{background:#fffbeb;border-color:#f59e0b}.verdict.low{background:#fef2f2;border-color:#ef4444}
+.scroll{overflow-x:auto}
+table{border-collapse:collapse;background:#fff;font-size:13px;margin:8px 0}
+th,td{padding:5px 9px;border-bottom:1px solid #e5e7eb;text-align:left;vertical-align:top}
+th{background:#f1f5f9}td.n{text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums}
+tr.added td{background:#ecfdf5}tr.tie td{background:#fffbeb}
+img{max-width:100%;height:auto;background:#fff;border:1px solid #e5e7eb;border-radius:6px;margin:8px 0}
+figure{margin:12px 0}figcaption{color:#4b5563;font-size:13px}
+details{background:#fff;border:1px solid #e5e7eb;border-radius:6px;padding:6px 14px;margin:10px 0}
+summary{cursor:pointer;font-weight:600}
+details.small{border:0;padding:0;margin:2px 0;background:none;max-width:300px}
+details.small summary{font-weight:400;color:#6b7280;font-size:12px}td code{white-space:normal}
+.good{color:#047857;font-weight:600}.bad{color:#b45309;font-weight:600}
+code{background:#f1f5f9;padding:1px 4px;border-radius:3px}
+"""
+USE_WORDS = {"fit": "fit", "validation": "validation", "test": "test"}
+
+
+def page(report: Report) -> str:
+    """The whole page."""
+    c, after = report.without_effects, report.after
+    regimes = report.regimes()
+    parts = [
+        f"<h1>{html.escape(report.title)}</h1>",
+        f'<p class="data">{html.escape(origin_words(report.origins))}</p>',
+        *(first_read(v) for v in report.verdicts().values()),
+        _about(report),
+        *(
+            diagnosis_section(
+                part,
+                d,
+                report.can_tell.get(part),
+                report.origins,
+                known=report.known.get(part),
+                regimes=regimes.get(part),
+            )
+            for part, d in report.diagnoses.items()
+        ),
+        "<h2>How far off</h2>",
+        _score_table(report),
+        *_where(report),
+        *_pictures(report),
+        "<h2>Signal by signal</h2>" if c.signals else "",
+        *(_signal(c, after, signal, kind) for signal, kind in c.signals),
+        *_touch(c, after),
+        *_left_over(report),
+    ]
+    head = (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="generator" content="{GENERATOR}, taccorl {taccorl.__version__}">'
+        f'<meta name="viewport" content="width=device-width"><title>{html.escape(report.title)}</title>'
+        f"<style>{STYLE}</style></head><body><main>"
+    )
+    return head + "\n".join(parts) + "</main></body></html>\n"
+
+
+def _about(report: Report) -> str:
+    c = report.comparison
+    rows = [
+        ("twin" if k == 0 else "beside it", f"{one.twin}: {', '.join(one.effects) or 'no added effects'}")
+        for k, one in enumerate(_compared(report))
+    ]
+    names = {use: ", ".join(map(str, c.split.get(use) or ())) for use in USE_WORDS}  # pyright: ignore[reportArgumentType]
+    rows += [(f"recordings, {USE_WORDS[use]}", listed or "none") for use, listed in names.items()]
+    rows += [("split", str(c.split.get("rule", "")))]
+    rows += list(report.provenance.items())
+    return table((), [[html.escape(k), html.escape(v)] for k, v in rows])
+
+
+def _compared(report: Report) -> list[Comparison]:
+    """The twin as it was, with refitted numbers, and as it ends: those that there are."""
+    return [one for one in (report.comparison, report.refitted, report.after) if one is not None]
+
+
+def _score_table(report: Report) -> str:
+    """One line for each signal and use; beside each other the twin as it was, with refitted numbers, and as it ends."""
+    c, *others = _compared(report)
+    later = [{(s.signal, s.kind, s.use): s for s in (*o.scores(), *o.pad_scores())} for o in others]
+    heads = ["signal", "recordings", f"RMSE, {c.twin} (95 %)", "× floor"]
+    for other in others:
+        heads += [f"RMSE, {other.twin} (95 %)", "× floor", "change"]
+    heads += ["NRMSE", "noise floor", "n"]
+    rows = []
+    for s in (*c.scores(), *c.pad_scores()):
+        row = [
+            f"{s.signal} {'' if s.signal == 'touch' else s.kind}",
+            f"{USE_WORDS[s.use]} ({s.recordings})",
+            *_errors(s),
+        ]
+        before = s
+        for found in later:
+            other = found.get((s.signal, s.kind, s.use))
+            row += [*_errors(other), f"{other.rmse / before.rmse - 1:+.0%}"] if other is not None else [""] * 3
+            before = other or before
+        floor = f'<span title="{html.escape(s.floor_words)}">{shown(s.floor, s.unit)}{" (lower bound)" * s.lower_bound}</span>'
+        row += [f"{s.nrmse:.2%}", floor, f"{s.n:,}"]
+        rows.append(row)
+    text = note(
+        "RMSE of measurement − replay. × floor: RMSE over the noise floor; 1 is as good as any twin can be. change: against the "
+        "twin to its left. NRMSE: RMSE of the first twin over the standard deviation of what was measured. 95 %: interval from "
+        "half-second blocks drawn again. Validation recordings choose effects; test recordings were used for no choice."
+    )
+    if any(s.lower_bound for s in c.scores()):
+        text += note("A floor that is a lower bound makes the twin look worse than it may be: record one motion twice.")
+    return table(heads, rows, numbers=range(2, len(heads))) + text
+
+
+def _errors(s: Score) -> list[str]:
+    grade = "good" if s.ratio <= SearchConfig().stop_at else "bad"
+    low, high = (f"{x * shown_unit(s.unit)[0]:.3g}" for x in s.interval)
+    return [f"{shown(s.rmse, s.unit)} ({low} … {high})", f'<span class="{grade}">{s.ratio:.3g}</span>']
+
+
+def _where(report: Report) -> list[str]:
+    cells = report.cells()
+    found = ["<h2>Where it is off</h2>"]
+    if report.refitted is not None:
+        found.append(
+            note(
+                f"The first map of each kind is the {report.refitted.twin}: its gains (of pads: stiffness and damping) are "
+                "fitted, and no effect is added. The second is the twin with the effects: the difference is what they removed."
+            )
+        )
+    found.append(note(WHERE_NOT_WHY))
+    lines = []
+    for signal, kind in dict.fromkeys((cell.signal, cell.kind) for cell in cells):
+        worst = worst_regime(cells, signal, kind)
+        if worst is not None:
+            lines.append(
+                f"<li>{signal} {kind}: worst {html.escape(worst.regime)}, {worst.ratio:.3g} × floor; "
+                f"{worst.share_of_error:.0%} of its squared error in {worst.share_of_time:.0%} of its time</li>"
+            )
+    found.append(f"<ul>{''.join(lines)}</ul>")
+    drawn = [(report.without_effects, cells)]
+    if report.refitted is not None and report.after is not None:
+        drawn.append((report.after, cells_of(report.after)))
+    for kind in ("position", "effort", "touch"):
+        most = max((cell.ratio for _, own in drawn for cell in own if cell.kind == kind), default=0.0)
+        for one, all_cells in drawn:
+            own = [cell for cell in all_cells if cell.kind == kind]
+            if own:
+                found.append(_heat_map(own, kind, one.twin, report.origins, most))
+    return found
+
+
+def _heat_map(cells: Sequence[Cell], kind: str, twin: str, origins: Sequence[str], most: float) -> str:
+    """With colours up to ``most`` floors, the same for maps that are compared."""
+    if kind == "touch":
+        title = f"touch: where the {twin} is off (RMSE / noise floor)"
+        drawn = touch_heat_map_figure(cells, origins, title, most)
+        return figure(
+            data_uri(png(drawn)), "touch: pad × contact, phase, and third of the pad; all recordings together"
+        )
+    drawn = heat_map_figure(cells, origins, f"{kind}s: where the {twin} is off (RMSE / noise floor)", most)
+    return figure(data_uri(png(drawn)), f"{kind}: joint × regime, all recordings together")
+
+
+def _pictures(report: Report) -> list[str]:
+    if not report.pictures:
+        return []
+    return ["<h2>Pictures</h2>", *(figure(data_uri(picture), words) for words, picture in report.pictures.items())]
+
+
+def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind) -> str:
+    """The validation recording as curves, and all recordings along variables."""
+    shown_one = representative(c.of(signal, kind))
+    pairs = [t for t in after.of(signal, kind, shown_one.use) if t.recording == shown_one.recording] if after else []
+    later = pairs[0] if pairs else None
+    names = (c.twin, after.twin if after is not None else "")
+    drawn = joint_response(shown_one, later, names)
+    found = curves(c, signal, kind)
+    same = curves(after, signal, kind) if after is not None and after.of(signal, kind) else []
+    words = f"{shown_one.recording} ({USE_WORDS[shown_one.use]}): commanded, measured, replayed; below, the regimes"
+    figures = [figure(data_uri(png(drawn)), words)]
+    if found:
+        drawn = residual_along_variables(found, same, c.of(signal, kind), names)
+        figures.append(figure(data_uri(png(drawn)), f"all recordings of {signal}. {WHERE_NOT_WHY}"))
+    first = (signal, kind) == c.signals[0]
+    return f"<details{' open' if first else ''}><summary>{signal} {kind}</summary>{''.join(figures)}</details>"
+
+
+def representative(traces: Sequence[Trace]) -> Trace:
+    """Of the validation recordings (else test, else fit) the one with the median error."""
+    for use in ("validation", "test", "fit"):
+        own = sorted(
+            (t for t in traces if t.use == use), key=lambda t: float((t.residual**2)[t.residual == t.residual].mean())
+        )
+        if own:
+            return own[(len(own) - 1) // 2]
+    raise ValueError("no traces")
+
+
+def _touch(c: Comparison, after: Comparison | None) -> Iterable[str]:
+    if not c.touches:
+        return []
+    names = (c.twin, after.twin if after is not None else "")
+    later = after.touches if after is not None else ()
+    parts = ["<h2>Touch</h2>", figure(data_uri(png(touch_histogram(c.touches, later, names))), "all recordings")]
+    if all(t.load is not None for t in c.touches):
+        drawn = reading_over_load(c.touches, later, names)
+        parts.append(figure(data_uri(png(drawn)), "reading over load: a bend is a law, a loop is memory"))
+    for pads in dict.fromkeys(t.pads for t in c.touches):
+        own = [t for t in c.touches if t.pads == pads]
+        shown_one = next(t for use in ("validation", "test", "fit") for t in own if t.use == use)
+        other = next((t for t in later if t.recording == shown_one.recording), None)
+        maps, over_time = touch_maps(shown_one, other, names), touch_over_time(shown_one, other, names)
+        parts.append(
+            figure(
+                data_uri(png(maps)), f"{' and '.join(pads)}: measured beside simulated, and where on the pads it is off"
+            )
+        )
+        parts.append(figure(data_uri(png(over_time)), "loading, hold, unloading, release; the error of every frame"))
+    return parts
+
+
+def _left_over(report: Report) -> list[str]:
+    """What the checks said, and what was not compared."""
+    rows = [
+        [html.escape(name), f.severity, html.escape(f.check), html.escape(f.text)]
+        for name, found in report.findings.items()
+        for f in found
+    ]
+    parts = []
+    if rows:
+        parts += ["<h2>What the checks said</h2>", table(("recording", "severity", "check", "what"), rows)]
+    skipped = report.comparison.split.get("skipped") or ()
+    left = [*report.comparison.left_out, *(f"not read: {s}" for s in skipped)]  # pyright: ignore[reportGeneralTypeIssues]
+    if left:
+        parts += ["<h2>Not compared</h2>", f"<ul>{''.join(f'<li>{html.escape(str(line))}</li>' for line in left)}</ul>"]
+    return parts

@@ -1,0 +1,162 @@
+"""Content of the report of a comparison and a diagnosis, and all its numbers as JSON."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import taccorl
+from taccorl.data.finding import Finding
+from taccorl.diagnosis.comparison.along import curves
+from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell, heat_map
+from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
+from taccorl.diagnosis.comparison.regimes import RegimeErrors, regime_errors
+from taccorl.diagnosis.comparison.result import Comparison
+from taccorl.diagnosis.report.verdict import Verdict, verdict
+from taccorl.diagnosis.search.identifiability import Identifiability
+from taccorl.diagnosis.search.identifiable import Known
+from taccorl.diagnosis.search.result import Diagnosis
+
+PAGE, NUMBERS = "report.html", "report.json"
+GENERATOR = "taccorl report"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """The content of a page."""
+
+    title: str
+    comparison: Comparison
+    """Of the twin as it was."""
+    after: Comparison | None = None
+    """Of the mended twin, or of another one, on the same recordings."""
+    refitted: Comparison | None = None
+    """Of the twin with its always fitted numbers refitted and no further effect: what an effect is credited against."""
+    diagnoses: Mapping[str, Diagnosis] = field(default_factory=dict)
+    """Part ("left_joint5", "left pads") → what was found there."""
+    can_tell: Mapping[str, Identifiability] = field(default_factory=dict)
+    """Part → what its recordings can tell, whatever they say."""
+    known: Mapping[str, Known] = field(default_factory=dict)
+    """Part → the numbers that its recordings identify, and what they leave open of the others."""
+    options: Sequence[str] = ()
+    """Of commands that are suggested, such as ``--twin=twin.yaml``."""
+    findings: Mapping[str, Sequence[Finding]] = field(default_factory=dict)
+    """Recording → what the checks before said."""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    """Caption → PNG, such as the camera's overlay before and after."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """The command, the twin's file, digests: what was this made from?"""
+
+    @property
+    def origins(self) -> tuple[str, ...]:
+        return self.comparison.origins
+
+    @property
+    def without_effects(self) -> Comparison:
+        """Reference for the improvement by effects: the refitted twin, or the original one where nothing was refitted."""
+        return self.comparison if self.refitted is None else self.refitted
+
+    def cells(self) -> list[Cell]:
+        """Errors of the twin without further effects by regime: positions, efforts, pads."""
+        return cells_of(self.without_effects)
+
+    def regimes(self) -> dict[str, RegimeErrors]:
+        """Diagnosed joint → errors by recording and regime, of the final twin."""
+        last = self.comparison if self.after is None else self.after
+        return {part: regime_errors(traces) for part in self.diagnoses if (traces := last.of(part))}
+
+    def verdicts(self) -> dict[str, Verdict]:
+        """Diagnosed part → sentences of its verdict."""
+        regimes = self.regimes()
+        return {
+            part: verdict(
+                part,
+                d,
+                can_tell=self.can_tell.get(part),
+                known=self.known.get(part),
+                data=self.unsettled(part),
+                doubts=regimes[part].remarks if part in regimes else (),
+                options=self.options,
+            )
+            for part, d in self.diagnoses.items()
+        }
+
+    def unsettled(self, part: str) -> list[str]:
+        """Errors that the checks found in the recordings of one part; of a joint those that move it.
+
+        An offset of the clock counts if the fitted twin sees it at this part: one that lacks an effect may see an offset that is
+        not there.
+        """
+        last = self.comparison if self.after is None else self.after
+        moved = {t.recording for t in self.comparison.of(part)}
+        own = [
+            (name, f)
+            for name, found in self.findings.items()
+            for f in found
+            if f not in self.comparison.clock.get(name, ())
+        ]
+        own += [(name, f) for name, found in last.clock.items() for f in found if not moved or f.feature == part]
+        return [f"{name}: {f.text}" for name, f in own if f.severity == "error" and (not moved or name in moved)]
+
+
+def cells_of(c: Comparison) -> list[Cell]:
+    """Errors of positions, efforts and pads by regime."""
+    return [*heat_map(c, "position"), *heat_map(c, "effort"), *touch_heat_map(c.touches)]
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """All numbers of the page as JSON values."""
+    c, after, refitted = report.comparison, report.after, report.refitted
+    drawn = report.without_effects
+    return {
+        "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
+        "title": report.title,
+        "data": list(report.origins),
+        "provenance": dict(report.provenance),
+        "twin": {"name": c.twin, "effects": list(c.effects)},
+        "mended_twin": None if after is None else {"name": after.twin, "effects": list(after.effects)},
+        "recordings": c.split,
+        "findings": {name: [_plain(f) for f in found] for name, found in report.findings.items()},
+        "verdicts": {part: _plain(v) for part, v in report.verdicts().items()},
+        "identified": {part: _plain(known) for part, known in report.known.items()},
+        "scores": [_scored(s) for s in (*c.scores(), *c.pad_scores())],
+        "scores_refitted": []
+        if refitted is None
+        else [_scored(s) for s in (*refitted.scores(), *refitted.pad_scores())],
+        "scores_after": [] if after is None else [_scored(s) for s in (*after.scores(), *after.pad_scores())],
+        "where": {"note": WHERE_NOT_WHY, "twin": drawn.twin, "cells": [_plain(cell) for cell in report.cells()]},
+        "along": [_plain(curve) for signal, kind in drawn.signals for curve in curves(drawn, signal, kind)],
+        "regimes": {part: _plain(found) for part, found in report.regimes().items()},
+        "diagnoses": {part: _diagnosis(d) for part, d in report.diagnoses.items()},
+        "can_tell": {part: _plain(found) for part, found in report.can_tell.items()},
+        "not_compared": list(c.left_out),
+    }
+
+
+def _scored(score: Any) -> dict[str, Any]:
+    return _plain(score) | {"ratio": score.ratio}
+
+
+def _diagnosis(d: Diagnosis) -> dict[str, Any]:
+    """Without the fits, whose residuals are as long as the recordings."""
+    kept = {f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in ("before", "after", "effects")}
+    effects = [{"effect": e.name} | _plain(e) for e in d.effects]
+    return _plain(kept) | {"words": d.words, "effects": effects}
+
+
+def _plain(value: Any) -> Any:
+    """What JSON knows; a number that is none is null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

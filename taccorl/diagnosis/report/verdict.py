@@ -1,0 +1,235 @@
+"""Verdict of a diagnosis: what is missing, how certain that is, and what to record next. One sentence each.
+
+A pure function of what was found; the terminal and the page show the same sentences.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from taccorl.diagnosis.report.evidence_words import effect_class, excite_command, unjudged
+from taccorl.diagnosis.search.identifiability import Identifiability
+from taccorl.diagnosis.search.identifiable import Known
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+
+Kind = Literal[
+    "nothing_missing", "effects", "ties", "more", "something_else", "gains_moved", "not_converged", "data_first"
+]
+Level = Literal["high", "moderate", "low"]
+FLOOR, LITTLE = SearchConfig().stop_at, SearchConfig().little
+"""Noise floors up to which an error counts as at the floor."""
+_UNCERTAIN: tuple[Kind, ...] = ("more", "something_else", "gains_moved", "not_converged", "data_first")
+_MOST = 3  # names or reasons in one sentence
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Three sentences about one part."""
+
+    part: str
+    kind: Kind
+    level: Level
+    """How far the finding can be relied on."""
+    finding: str
+    confidence: str
+    record_next: str
+    command: str
+    """What plans that recording; empty where no command does."""
+    remarks: tuple[str, ...]
+    """What else must be known about the result, a sentence each."""
+
+
+def verdict(
+    part: str,
+    d: Diagnosis,
+    *,
+    can_tell: Identifiability | None = None,
+    known: Known | None = None,
+    data: Sequence[str] = (),
+    doubts: Sequence[str] = (),
+    options: Sequence[str] = (),
+) -> Verdict:
+    """Verdict on one part.
+
+    Args:
+        can_tell: what its recordings can show at all.
+        known: its numbers, if they were told apart into those that positions identify and others.
+        data: what is wrong with the recordings and must be settled before an effect can be named.
+        doubts: other reasons to rely on it less, such as ranges that no validation recording covers.
+        options: of the command, such as ``--twin=twin.yaml``.
+    """
+    kind = _kind(d, data)
+    told = (*d.remarks, *doubts[:_MOST])
+    reasons = [*_doubts(d, kind), *([f"see the {_counted(len(told), 'remark')} below"] if told else [])]
+    level: Level = "low" if kind in _UNCERTAIN else "moderate" if reasons or kind == "ties" else "high"
+    words, command = _record_next(part, kind, d, can_tell, known)
+    return Verdict(
+        part=part,
+        kind=kind,
+        level=level,
+        finding=_finding(part, kind, d, known, data),
+        confidence=_confidence(level, kind, d, reasons),
+        record_next=words,
+        command=" ".join([command, *options]) if command else "",
+        remarks=tuple(told),
+    )
+
+
+def refitted_words(d: Diagnosis) -> str:
+    """Label of the refit without effects: it changes the gains of a joint, and other numbers of pads and axes."""
+    return "gains refitted" if "kp" in d.base else "with the numbers refitted that every fit adjusts"
+
+
+def added(d: Diagnosis) -> tuple[str, ...]:
+    """Effects that the twin lacked."""
+    return tuple(name for name in d.names if name not in d.present)
+
+
+def _kind(d: Diagnosis, data: Sequence[str]) -> Kind:
+    if data:
+        return "data_first"
+    kinds: dict[str, Kind] = {
+        "not_converged": "not_converged",
+        "gains_moved": "gains_moved",
+        "nothing_missing": "nothing_missing",
+        "too_many": "more",
+    }
+    if d.status in kinds:
+        return kinds[d.status]
+    if d.status == "something_else":
+        return "more" if added(d) else "something_else"
+    return "ties" if any(d.rivals.get(name) for name in added(d)) else "effects"
+
+
+def _finding(part: str, kind: Kind, d: Diagnosis, known: Known | None, data: Sequence[str]) -> str:
+    fitted, after = (d.errors[stage]["validation"] for stage in ("fitted", "after"))
+    names = " and ".join(added(d))
+    if kind == "data_first":
+        more = f" (and {len(data) - 1} more)" if len(data) > 1 else ""
+        return f"{part}: settle the data before any effect is named: {data[0]}{more}."
+    if kind == "not_converged":
+        return f"{part}: the fit has not converged, so nothing follows from its error of {after:.2f} noise floors."
+    if kind == "gains_moved":
+        return f"{part}: no effect is needed, but only with gains far from the twin's: {_moved(d)}."
+    if kind == "nothing_missing":
+        return f"{part}: nothing is missing; the error is {after:.2f} noise floors ({refitted_words(d)})."
+    if kind == "something_else":
+        return f"{part}: no known effect explains what is missing; {after:.2f} noise floors remain."
+    fell = f"the error falls from {fitted:.2f} ({refitted_words(d)}) to {after:.2f} noise floors"
+    if kind == "more":
+        return f"{part} lacks {names}, and something more: {fell}, and the floor is not reached."
+    if kind == "ties":
+        either = "; ".join(" or ".join((name, *d.rivals.get(name, ()))) for name in added(d))
+        return f"{part} lacks {either}: {fell}, and these recordings do not tell which it is."
+    return f"{part} lacks {names}{_sizes(d, known)}: {fell}."
+
+
+def _sizes(d: Diagnosis, known: Known | None) -> str:
+    """The first number of each effect that was added: the absolute one where something fixes the scale of the torques."""
+    if known is None:
+        return ""
+    primary = known.absolute if known.pinned_by else known.identifiable
+    firsts = [next((n for n in primary if n.name.startswith(f"{name}.")), None) for name in added(d)]
+    told = [n.words() for n in firsts if n is not None]
+    return f" ({', '.join(told)})" if told else ""
+
+
+def _moved(d: Diagnosis) -> str:
+    pairs = [(g, d.start.get(g, 0.0), d.base[g]) for g in ("kp", "kd") if g in d.base]
+    return ", ".join(f"{g} {old:.4g} → {new:.4g} (× {new / old:.2g})" for g, old, new in pairs if old)
+
+
+def _doubts(d: Diagnosis, kind: Kind) -> list[str]:
+    found = []
+    if kind == "ties" and any(d.rivals.get(name) for name in added(d)):
+        others = [o for name in added(d) for o in d.rivals.get(name, ())]
+        found.append(f"{_some(others)} {'does' if len(others) == 1 else 'do'} as well")
+    test = d.errors["after"].get("test")
+    if test is None:
+        found.append("no test recording checks it: validation recordings chose the effects")
+    elif test > FLOOR and d.errors["after"]["validation"] <= LITTLE:
+        found.append(f"test recordings, which no choice has seen, keep {test:.2f} noise floors")
+    after = d.errors["after"]
+    if kind == "nothing_missing" and max(after["fit"], after["validation"]) > FLOOR:
+        found.append(
+            f"fit recordings keep {after['fit']:.2f} and validation recordings {after['validation']:.2f} noise floors, and no "
+            "effect explains that"
+        )
+    if unjudged(d):
+        found.append(unjudged(d))
+    if d.at_bound:
+        found.append(f"{_some(d.at_bound)} at the end of its range")
+    return found
+
+
+def _confidence(level: Level, kind: Kind, d: Diagnosis, reasons: Sequence[str]) -> str:
+    own: dict[Kind, str] = {
+        "data_first": "the recordings contradict themselves or the clock",
+        "not_converged": d.trouble or "the numbers were still moving",
+        "gains_moved": "wrong time stamps or gains explain the data as well as the fitted gains do",
+        "something_else": "every known effect was tried and refused",
+        "more": "what is still missing may change what was named",
+    }
+    first = [own[kind]] if kind in own else []
+    if not first and not reasons:
+        test = f"; test recordings, which no choice has seen, end at {d.errors['after']['test']:.2f} noise floors"
+        first = [f"validation recordings end at {d.errors['after']['validation']:.2f}{test}"]
+    told = [reason.rstrip(".") for reason in (*first, *reasons)]
+    more = f"; and {len(told) - _MOST} more" if len(told) > _MOST else ""
+    return f"Confidence {level}: {'; '.join(told[:_MOST])}{more}."
+
+
+def _record_next(
+    part: str, kind: Kind, d: Diagnosis, can_tell: Identifiability | None, known: Known | None
+) -> tuple[str, str]:
+    """In words, and the command that plans it."""
+    if kind == "data_first":
+        return "The same motions again, once the data is settled.", ""
+    if kind == "gains_moved":
+        return "Nothing yet: state the commanded gains (kp, kd in measurements.yaml) and check the time stamps.", ""
+    if kind == "more" and d.status == "too_many":
+        return "Nothing yet: let the search add effects until the noise floor is reached (--until=noise_floor).", ""
+    if kind in ("something_else", "more", "not_converged"):
+        best = [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names][:2]
+        command = excite_command(part, best) if len(best) == 2 else ""
+        between = f" between the nearest effects, {' and '.join(best)}" if command else ""
+        return f"One motion twice (repeat_of), for a better noise floor, and a motion that decides{between}.", command
+    if kind == "ties":
+        name = next(name for name in added(d) if d.rivals.get(name))
+        names = (name, *d.rivals[name])
+        command = excite_command(part, names)
+        how = (
+            ""
+            if command
+            else ": " + " ".join(cls.to_record for other in names if (cls := effect_class(other)) is not None)
+        )
+        return f"A motion that tells {_some(names)} apart{how or '.'}", command
+    if kind == "nothing_missing":
+        hidden = list(can_tell.invisible) if can_tell is not None else []
+        command = excite_command(part, hidden[:2]) if len(hidden) > 1 else ""
+        if not hidden:
+            return "Nothing: every effect of a typical strength would have shown.", ""
+        return f"Nothing, unless you suspect an effect that these recordings hardly show: {_some(hidden)}.", command
+    scale = ""
+    if known is not None and not known.pinned_by:
+        ends = known.intervals.get("kp")
+        scale = f" (K_p is known only to {ends[0]:.3g} … {ends[1]:.3g} N·m/rad)" if ends else ""
+    name = added(d)[0]
+    twins = [other for other in d.twins.get(name, {}) if effect_class(other) is not None]
+    command = excite_command(part, (name, *twins[:1])) if twins else ""
+    check = (
+        f"A motion that tells {name} from its near-twin {twins[0]}, as a check"
+        if command
+        else "A motion of another kind, as a test"
+    )
+    effort = f"; the motor's effort or a known payload, if absolute torques matter{scale}" if scale else ""
+    return f"{check}{effort}.", command
+
+
+def _counted(n: int, thing: str) -> str:
+    return f"{n} {thing}{'' if n == 1 else 's'}"
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST} more" if len(names) > _MOST else ""
+    return ", ".join(names[:_MOST]) + more

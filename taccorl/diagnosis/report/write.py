@@ -1,0 +1,76 @@
+"""Write a report: ``report.html`` for people, ``report.json`` with every number of it.
+
+An earlier report of ours is replaced, and the caller is told so; any other file of that name is left alone.
+"""
+
+import datetime
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from taccorl.diagnosis.report.report import GENERATOR, NUMBERS, PAGE, Report, as_json
+from taccorl.errors import TaccorlError
+
+HEAD_BYTES = 2048
+
+
+@dataclass(frozen=True)
+class Written:
+    """Paths of the files of a report."""
+
+    page: Path
+    numbers: Path
+    replaced: str
+    """When the report was made that stood there before; empty if there was none."""
+
+
+def check_folder(folder: Path, measurements: Path | None = None) -> str:
+    """Check that a report may be written there; returns the date of the report that it will replace, empty if there is none.
+
+    Args:
+        measurements: folder of recordings, which is read as a whole and so must hold no report.
+
+    Raises:
+        TaccorlError: a file of its name that is not ours, no folder can be there, or it is the folder of the recordings.
+    """
+    if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
+        raise TaccorlError(f"{folder}: holds the recordings; give another folder for the report")
+    if folder.exists() and not folder.is_dir():
+        raise TaccorlError(f"{folder}: is a file; give a folder for the report")
+    for name in (PAGE, NUMBERS):
+        path = folder / name
+        if path.exists() and GENERATOR not in _head(path):
+            raise TaccorlError(f"{path}: is there already and not a report of ours; give another folder, or remove it")
+    page = folder / PAGE
+    if not page.exists():
+        return ""
+    when = datetime.datetime.fromtimestamp(page.stat().st_mtime).astimezone()
+    return when.strftime("%Y-%m-%d %H:%M")
+
+
+def _head(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return file.read(HEAD_BYTES).decode("utf-8", "replace")
+
+
+def write_report(report: Report, folder: Path) -> Written:
+    """``report.html`` and ``report.json`` in ``folder``, which is made if it is not there.
+
+    Raises:
+        TaccorlError: as ``check_folder``, or the folder cannot be written to.
+    """
+    from taccorl.diagnosis.report.page import page  # matplotlib only where something is drawn
+
+    replaced = check_folder(folder)
+    texts = {NUMBERS: json.dumps(as_json(report), indent=1, ensure_ascii=False) + "\n", PAGE: page(report)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            part = folder / f".{name}.part"
+            part.write_text(text, encoding="utf-8")
+            part.replace(folder / name)
+    except OSError as error:
+        raise TaccorlError(f"{folder}: the report cannot be written: {error}") from error
+    return Written(folder / PAGE, folder / NUMBERS, replaced)

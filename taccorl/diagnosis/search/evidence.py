@@ -1,0 +1,65 @@
+"""Improvement of one model over another on recordings to which neither was fitted, block by block, with its uncertainty."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.diagnosis.search.correlation import block_of_rows, rate_of
+from taccorl.diagnosis.search.fit import Fit, residuals
+from taccorl.diagnosis.search.problem import Problem, Recording
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Squared residuals per block of time."""
+
+    squares: np.ndarray
+    """(B,) mean squared residual of each block, in floors²."""
+    weights: np.ndarray
+    """(B,) share of all measured entries that each block holds; they add up to 1."""
+
+    @property
+    def mean(self) -> float:
+        """Over all entries, in floors²."""
+        return float(self.weights @ self.squares)
+
+    def __sub__(self, other: "Blocks") -> "Blocks":
+        return Blocks(self.squares - other.squares, self.weights)
+
+
+def block_squares(problem: Problem, model: Fit, recordings: Sequence[Recording]) -> Blocks:
+    """Squared residuals of ``recordings`` in blocks of ``correlation.BLOCK_S``, all channels of a block together."""
+    sums, counts = [], []
+    for recording in recordings:
+        squares = np.square(residuals(problem, model.values, model.effects, recording))
+        seen = np.isfinite(squares)
+        edges = np.flatnonzero(np.diff(block_of_rows(len(squares), rate_of(recording.time_s)), prepend=-1))
+        sums.append(np.add.reduceat(np.where(seen, squares, 0.0).sum(1), edges))
+        counts.append(np.add.reduceat(seen.sum(1), edges))
+    total, count = np.concatenate(sums), np.concatenate(counts)
+    total, count = total[count > 0], count[count > 0]
+    return Blocks(total / count, count / max(int(count.sum()), 1))
+
+
+def standard_score(blocks: Blocks) -> float:
+    """Weighted mean over its standard error, blocks taken as independent: 2 is hardly chance. One block alone proves nothing."""
+    count = len(blocks.squares)
+    if count < 2:
+        return 0.0
+    scatter = (blocks.weights * (blocks.squares - blocks.mean)) ** 2
+    error = float(np.sqrt(scatter.sum() * count / (count - 1)))
+    return blocks.mean / error if error > 0 else 0.0
+
+
+def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
+    """Decrease of the Bayesian information criterion from ``parent`` to ``child``: 10 is strong evidence (Kass and
+    Raftery 1995).
+
+    The noise is known: residuals are in floors, and what ``child`` leaves above one floor counts as noise, too. Rows count as
+    often as those of ``child`` are independent.
+    """
+    rows = child.effective_rows
+    noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))
+    fallen = float(parent.residuals @ parent.residuals - child.residuals @ child.residuals) / noise
+    return fallen * rows / len(child.residuals) - more_parameters * float(np.log(rows))

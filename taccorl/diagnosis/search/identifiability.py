@@ -1,0 +1,73 @@
+"""Identifiability before any fit: which effects these recordings can show, and which they cannot separate.
+
+Every effect is simulated at a typical strength; the part that the always fitted numbers can reproduce does not count.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.diagnosis.search.fit import Fit, fit
+from taccorl.diagnosis.search.problem import Problem, Recording, Values
+from taccorl.diagnosis.search.screen import alike, probe
+
+VISIBLE = 0.75
+"""RMS of a signature in floors: √(1 + 0.75²) = 1.25, the error above which the search looks for an effect."""
+ALIKE = 0.95
+"""|cos| of two signatures above which recordings do not tell two effects apart; a choice."""
+RIDGE = 0.999
+"""|correlation| of two fitted numbers above which only a combination of them is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identifiability:
+    """Effects that a set of recordings can show and separate, independent of the measured values."""
+
+    visible: dict[str, float]
+    """Effect → RMS of what it would leave at a typical strength, in floors."""
+    pairs: tuple[tuple[str, str, float], ...]
+    """(one, other, |cos|) of visible effects that these recordings do not tell apart, most alike first."""
+    ridges: tuple[tuple[str, str, float], ...]
+    """(one, other, correlation) of always fitted numbers of which only a combination is known."""
+
+    @property
+    def invisible(self) -> tuple[str, ...]:
+        return tuple(name for name, size in self.visible.items() if size < VISIBLE)
+
+
+def identifiability(
+    problem: Problem, recordings: Sequence[Recording], start: Values, present: Sequence[str] = ()
+) -> Identifiability:
+    """Fit the always fitted numbers from ``start``, with the effects ``present``, and probe all candidates."""
+    here = fit(problem, recordings, present, start)
+    problem.learn(here.values)
+    typical = [
+        dataclasses.replace(c, starts=(c.starts[len(c.starts) // 2],))
+        for name, c in problem.candidates.items()
+        if name not in present
+    ]
+    probes = probe(problem, recordings, here, typical)
+    shown = [p for p in probes if p.visible >= VISIBLE]
+    pairs = [(a.name, b.name, alike(a, b)) for k, a in enumerate(shown) for b in shown[k + 1 :]]
+    return Identifiability(
+        visible={p.name: p.visible for p in probes},
+        pairs=tuple(sorted((p for p in pairs if p[2] > ALIKE), key=lambda p: -p[2])),
+        ridges=tuple(_ridges(here)),
+    )
+
+
+def _ridges(model: Fit) -> list[tuple[str, str, float]]:
+    spread = model.covariance()
+    size = np.sqrt(np.diag(spread))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = spread / np.outer(size, size)
+    names = [f.name for f in model.frees]
+    pairs = [
+        (names[i], names[j], float(correlation[i, j]))
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(correlation[i, j]) > RIDGE
+    ]
+    return sorted(pairs, key=lambda p: -abs(p[2]))

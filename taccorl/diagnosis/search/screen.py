@@ -1,0 +1,138 @@
+"""Screening: the signature that each effect would leave in these recordings, beyond what the fitted numbers can reproduce.
+
+One probe simulation for each start of each effect. Its difference from the fitted model, less what a change of the fitted numbers
+would do as well (projection), is the effect's *signature* on these recordings. A score test (Rao) then says how much of the
+residual the signature explains; the angle between two signatures says whether these recordings can tell the two effects apart.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.diagnosis.search.fit import Fit, stacked
+from taccorl.diagnosis.search.problem import Candidate, Problem, Recording, Values
+from taccorl.sim.effects.effect import Parameter
+
+INVISIBLE = 1e-6
+"""RMS of a signature, in floors, that is no more than rounding."""
+TOO_STRONG, WEAKENED = 3.0, 4
+"""A start whose signature is so many times what is left to be explained is weakened, at most so often: an arm that friction
+stops altogether says nothing about a little of it."""
+FAR_OFF = 10.0
+"""A multiple beyond this factor is no longer in proportion; 2 for effects that are absent at infinity."""
+WRONG_SIGN = 0.1
+"""An effect whose start would have to be subtracted is ranked as if it explained this share of what it does."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Signature of one start of one effect in the recordings."""
+
+    name: str
+    start: Values
+    signature: np.ndarray
+    """(n,) in floors, without what the fitted numbers take up."""
+    explained: float
+    """Share of the squared residual that goes away with the best multiple of it within reach, 0 … 1."""
+    multiple: float
+    """The best multiple: 1 is an effect as strong as the start."""
+
+    @property
+    def visible(self) -> float:
+        """RMS of the signature in noise floors."""
+        return float(np.sqrt(np.mean(np.square(self.signature))))
+
+
+def probe(
+    problem: Problem, recordings: Sequence[Recording], parent: Fit, candidates: Sequence[Candidate]
+) -> list[Probe]:
+    """Probe every start of every candidate, in addition to the effects of ``parent``.
+
+    Args:
+        recordings: those that ``parent`` was fitted to.
+    """
+    # A number at its bound makes up for half of what its slope says; it does not hide an effect of the other half (a delay of
+    # the loop is less inertia, an armature is more).
+    taken_up = _basis(parent.jacobian[:, [f.name not in parent.at_bound for f in parent.frees]])
+    left = parent.residuals - taken_up @ (taken_up.T @ parent.residuals)
+    power = float(left @ left)
+    probes = []
+    most = TOO_STRONG * max(parent.error, 1.0)
+    for c in candidates:
+        for start in c.starts:
+            signature = _signature(problem, recordings, parent, c, start, taken_up)
+            for _ in range(WEAKENED):
+                size = float(np.sqrt(np.mean(np.square(signature))))
+                weaker = _weaker(c, start, 0.5 * most / size) if size > most else None
+                if weaker is None:
+                    break
+                start = weaker
+                signature = _signature(problem, recordings, parent, c, start, taken_up)
+            own = float(signature @ signature)
+            if own <= len(signature) * INVISIBLE**2 or power == 0.0:
+                probes.append(Probe(c.name, start, np.zeros_like(signature), 0.0, 0.0))
+                continue
+            along = -float(signature @ left)
+            best = along / own
+            reach = FAR_OFF if can_fade(c) else 2.0
+            within = min(max(best, 1.0 / reach), reach)
+            share = (
+                (2.0 * within * along - within * within * own) / power
+                if best > 0
+                else WRONG_SIGN * best * along / power
+            )
+            probes.append(Probe(c.name, start, signature, max(share, 0.0), best))
+    return probes
+
+
+def _signature(
+    problem: Problem,
+    recordings: Sequence[Recording],
+    parent: Fit,
+    c: Candidate,
+    start: Values,
+    taken_up: np.ndarray,
+) -> np.ndarray:
+    values = parent.values | {f.name: f.start for f in c.frees} | start
+    effects = problem.prepare(values, [*parent.effects, c.make(values)], recordings)
+    change = stacked(problem, values, effects, recordings) - parent.residuals
+    return change - taken_up @ (taken_up.T @ change)
+
+
+def _weaker(c: Candidate, start: Values, share: float) -> Values | None:
+    """The start with so much less of the effect; None for one that is absent at infinity, or hardly there already."""
+    strength = _strength(c)
+    if strength.absent is None or not can_fade(c):
+        return None
+    name = f"{c.name}.{strength.name}"
+    free = next(f for f in c.frees if f.name == name)
+    now = start.get(name, free.start)
+    less = strength.absent + max(share, 0.03) * (now - strength.absent)
+    return start | {name: less} if abs(free.value(free.coordinate(less)) - less) < 1e-9 * abs(less) + 1e-15 else None
+
+
+def _strength(c: Candidate) -> Parameter:
+    return next(p for p in c.cls.parameters() if p.absent is not None)
+
+
+def can_fade(c: Candidate) -> bool:
+    """Whether the effect can be weaker than at its start, down to its absent value."""
+    absent = _strength(c).absent
+    return bool(c.frees) and absent is not None and bool(np.isfinite(absent))
+
+
+def alike(one: Probe, other: Probe) -> float:
+    """|cos| of the angle between two signatures: 1 where these recordings cannot tell the effects apart."""
+    norms = float(np.linalg.norm(one.signature) * np.linalg.norm(other.signature))
+    return abs(float(one.signature @ other.signature)) / norms if norms > 0 else 0.0
+
+
+def _basis(jacobian: np.ndarray) -> np.ndarray:
+    """Orthonormal columns (n, r) of what the fitted numbers can do."""
+    size = np.linalg.norm(jacobian, axis=0)
+    columns = jacobian[:, size > 0] / size[size > 0]
+    if columns.shape[1] == 0:
+        return columns
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, singular > 1e-6 * singular[0]]

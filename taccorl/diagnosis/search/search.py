@@ -1,0 +1,527 @@
+"""Search for missing effects: fit, screen, refit, judge on validation recordings, accept or report "something else".
+
+    1. The numbers that are always fitted are fitted to the fit recordings.
+    2. While the validation error is above ``stop_at`` noise floors, or the fit error above ``stop_fit_at``:
+       a. every effect is probed once (``screen``); the likeliest are refitted together with all numbers;
+       b. they are ranked by their error on the validation recordings;
+       c. an effect is accepted if it takes away enough of what lies above the floor, more than chance and more than its
+          parameters explain (BIC), and if it was not fitted to nothing. The best of those is added. Those that do as
+          well are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else;
+       d. if none is accepted, the search ends with "something else".
+    3. Where that ends above the floor, it is done again from the ties of the first effect. Effects that others have made
+       superfluous go; each is tried against its ties once more, now that the others are in. An
+       effect that contains a simpler one (Stribeck contains Coulomb friction) must do better than the simpler one and another.
+    4. The test recordings, which no choice has seen, give the final figures.
+
+Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
+"""
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
+from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit, moved_by, rms, stacked
+from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
+from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round, SearchConfig, Status
+from taccorl.diagnosis.search.screen import Probe, can_fade, probe
+from taccorl.sim.effects.effect import Effect
+
+MOST_TIES = 3
+"""Of one round, from which the search is done again where it ended above the floor."""
+BESIDE = (0.9, 0.97, 1.03, 1.1)
+"""Factors to an effect's numbers from which it is fitted once more."""
+GAINS_MOVED = 2.0
+"""Factor to the twin's gains from which a refit of them is a finding of its own: late positions, a wrong unit of time, or gains
+other than the commanded ones cause it."""
+
+
+def diagnose(
+    problem: Problem,
+    fit_to: Sequence[Recording],
+    validation: Sequence[Recording],
+    test: Sequence[Recording] = (),
+    *,
+    start: Mapping[str, float] | None = None,
+    present: Sequence[str] = (),
+    without: Sequence[str] = (),
+    config: SearchConfig | None = None,
+    progress: Progress = lambda _: None,
+) -> Diagnosis:
+    """Search for the effects that are missing.
+
+    Args:
+        start: numbers to start from.
+        present: effects that the twin has already: they are refitted and stay.
+        without: effects that are not considered.
+    """
+    search = _Search(problem, fit_to, validation, config or SearchConfig(), progress)
+    return search.run(test, dict(start or {}), tuple(present), without)
+
+
+class _Search:
+    def __init__(
+        self,
+        problem: Problem,
+        fit_to: Sequence[Recording],
+        validation: Sequence[Recording],
+        config: SearchConfig,
+        progress: Progress,
+    ) -> None:
+        self.problem, self.fit_to, self.validation = problem, list(fit_to), list(validation)
+        self.config, self.progress = config, progress
+        self.evaluations = 0
+        self.removed: list[str] = []
+        self.swapped: list[tuple[str, str]] = []
+
+    def run(
+        self, test: Sequence[Recording], start: Values, present: tuple[str, ...], without: Sequence[str]
+    ) -> Diagnosis:
+        began = time.process_time()
+        c = self.config
+        self.present = present
+        there = chosen(self.problem, present)
+        given = {f.name: start.get(f.name, f.start) for f in (*self.problem.base, *(f for x in there for f in x.frees))}
+        self.given = given
+        self.progress("fitting the numbers that are always fitted")
+        self.first = first = self._fitted(present, [given], most=60)
+        self.problem.learn(first.values)
+        names = [name for name in self.problem.candidates if name not in without]
+        model, rounds = self._search(first, names, c.max_effects)
+        model, rounds = self._from_ties(model, rounds, names)
+        model, rounds, contained = self._with_simpler(model, rounds, names)
+        steps = [("", self.error(first)), *((r.added, r.validation_error) for r in rounds if r.added)]
+        model = self._without_superfluous(model)
+        model, rivals = self._against_ties(model, rounds)
+        rivals |= {name: (*others, *rivals.get(name, ())) for name, others in contained.items() if name in model.names}
+        model = self._finished(model)
+        return Diagnosis(
+            status=self._status(model),
+            effects=tuple(self._described(model, first)),
+            present=present,
+            base={f.name: model.values[f.name] for f in self.problem.base},
+            start=given,
+            intervals=model.intervals(),
+            rounds=tuple(rounds),
+            rivals=rivals,
+            twins={n: dict(self.problem.candidates[n].cls.near_twins) for n in model.names if n not in present},
+            removed=tuple(self.removed),
+            swapped=tuple(self.swapped),
+            errors={
+                "before": self._errors(given, [x.make(given) for x in there], test),
+                "fitted": self._errors(first.values, first.effects, test),
+                "after": self._errors(model.values, model.effects, test),
+            },
+            steps=tuple(steps),
+            remarks=tuple(self._remarks(model)),
+            at_bound=tuple(f.name for f in model.frees if f.name in model.at_bound and not _untouched(f, model)),
+            trouble=model.trouble,
+            evaluations=self.evaluations,
+            cpu_s=time.process_time() - began,
+            before=first,
+            after=model,
+        )
+
+    def _search(self, model: Fit, names: Sequence[str], most: int) -> tuple[Fit, list[Round]]:
+        """``model`` with up to ``most`` effects more, one a round, until its error is at the floor or none is accepted."""
+        rounds: list[Round] = []
+        while not self._at_floor(model) and len(rounds) < most:
+            found, better = self._round(model, names)
+            rounds.append(found)
+            if better is None:
+                break
+            model = better
+        return model, rounds
+
+    # one more effect -------------------------------------------------------------------------------------------------
+
+    def _round(self, parent: Fit, names: Sequence[str]) -> tuple[Round, Fit | None]:
+        c = self.config
+        free = [name for name in names if name not in parent.names]
+        self.progress(f"probing {len(free)} effects")
+        probes = probe(self.problem, self.fit_to, parent, chosen(self.problem, free))
+        self.evaluations += len(probes)
+        best: dict[str, list[Probe]] = {}
+        for p in sorted(probes, key=lambda p: -p.explained):
+            best.setdefault(p.name, []).append(p)
+        order = sorted(best, key=lambda name: -best[name][0].explained)
+        before = block_squares(self.problem, parent, self.validation)
+        self.progress("refitting with the likeliest")
+        starts = {
+            name: [parent.values | _scaled(p, self.problem.candidates[name]) for p in self._likely(best[name])]
+            for name in order
+        }
+        short = {name: self._short(parent, name, starts[name][0]) for name in order[: c.num_refitted]}
+        by_error = sorted(short, key=lambda name: short[name].error)
+        rows = []
+        for place, name in enumerate(by_error):
+            model = short[name]
+            likely = place < c.num_finished or name in order[: c.num_likely]
+            if likely or model.error <= c.near_best * short[by_error[0]].error:
+                self.progress(f"refitting with {name}")
+                model = self._child(parent, name, [model.values, *starts[name][1:]])
+            rows.append(_Row(self, parent, before, model, best[name][0]))
+        rows.sort(key=lambda row: row.squares.mean)
+        accepted = [row for row in rows if not row.refused()]
+        if not accepted:
+            return self._told(parent, rows, order, None, []), None
+        best_row = accepted[0]
+        tied = [row for row in accepted if row is best_row or self._tie(row, best_row, before)]
+        as_good = [row for row in tied if self._as_good(row, best_row)]
+        pick = min(as_good, key=lambda row: (row.num_parameters, row.squares.mean))
+        pick.model = self._polished(pick.model)
+        return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
+
+    def _likely(self, probes: list[Probe]) -> list[Probe]:
+        """The best start, and others that explain half as much."""
+        return [p for p in probes[:3] if p.explained >= 0.5 * probes[0].explained]
+
+    def _frees(self, name: str) -> tuple[Free, ...]:
+        return self.problem.candidates[name].frees
+
+    def _short(self, parent: Fit, name: str, start: Values) -> Fit:
+        """``parent`` with one effect more, after a few steps; from where the numbers began if those of ``parent``, which have
+        made up for the effect, do not go with it."""
+        model = self._fitted((*parent.names, name), [start], self.config.first_steps)
+        if model.error > 1.001 * parent.error:
+            again = self._fitted((*parent.names, name), [start | self.given], self.config.first_steps)
+            model = min((model, again), key=lambda m: m.error)
+        return model
+
+    def _child(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
+        """``parent`` with one effect more; never worse than ``parent``, which it contains."""
+        frees = self._frees(name)
+        model = self._fitted((*parent.names, name), starts, self.config.steps)
+        more = []
+        if model.error > 1.001 * parent.error:  # stuck: from where the effect is hardly there
+            faint = {f.name: f.start for f in frees} | {frees[0].name: frees[0].low if frees[0].log else 0.0}
+            more.append(parent.values | faint)
+        if (
+            model.error > self.config.stop_at
+        ):  # the numbers may have gone far to make up for the effect: from where they began
+            more.append(starts[0] | self.given)
+        if more:
+            model = min((model, self._fitted((*parent.names, name), more, self.config.steps)), key=lambda m: m.error)
+        return model
+
+    def _polished(self, model: Fit) -> Fit:
+        """The same hypothesis from a little beside where it ended: what one effect's fit has left over, the next must not find.
+        Limits and dry friction have no smooth way to their best values."""
+        if self.error(model) <= self.config.stop_at:
+            return model
+        own = [f for f in self._frees(model.names[-1]) if f.log]
+        beside = [model.values | {f.name: model.values[f.name] * factor} for f in own for factor in BESIDE]
+        again = self._fitted(model.names, [model.values, *beside], self.config.steps)
+        return min((model, again), key=lambda m: m.error)
+
+    def _finished(self, model: Fit) -> Fit:
+        """The same hypothesis to its very end, with slopes that its intervals can be told from. Numbers that go on moving while
+        χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
+        fine = self._fine(model)
+        if fine.trouble:
+            further = self._fine(fine)
+            fell = (fine.error**2 - further.error**2) / further.error**2 * further.effective_rows
+            fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
+        if not fine.frees or not self.validation:
+            return fine
+        return dataclasses.replace(fine, moved=moved_by(self.problem, fine, self.fit_to, self.validation))
+
+    def _fine(self, model: Fit) -> Fit:
+        fine = fit(self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)
+        self.evaluations += fine.evaluations
+        return fine
+
+    def _tie(self, row: "_Row", best: "_Row", before: Blocks) -> bool:
+        """Whether validation recordings do not tell the two apart."""
+        lost = above_floor(row.squares) - above_floor(best.squares)
+        won = before.mean - best.squares.mean
+        c = self.config
+        close = lost <= c.tie_share * won and lost <= c.tie_rise * best.squares.mean
+        unclear = lost < c.wide_tie_share * won and standard_score(row.squares - best.squares) < c.min_score
+        return close or unclear
+
+    def _as_good(self, row: "_Row", best: "_Row") -> bool:
+        """Whether a simpler effect may stand for the best one."""
+        return above_floor(row.squares) <= self.config.simpler * above_floor(best.squares)
+
+    def _told(
+        self, parent: Fit, rows: "list[_Row]", order: list[str], pick: "_Row | None", ties: "list[_Row]"
+    ) -> Round:
+        def verdict(row: "_Row") -> str:
+            if row is pick:
+                return "added"
+            if row in ties:
+                return f"tied with {pick.name}" if pick else ""
+            return row.refused() or (f"explains less than {pick.name}" if pick else "")
+
+        after = pick.model if pick else parent
+        return Round(
+            evidence=tuple(row.evidence(verdict(row)) for row in rows),
+            not_refitted=tuple(order[len(rows) :]),
+            added=pick.name if pick else None,
+            ties=tuple(row.name for row in ties),
+            validation_error=self.error(after),
+            fit_error=after.error,
+        )
+
+    # are they all needed, and are they the right ones? ---------------------------------------------------------------
+
+    def _from_ties(self, model: Fit, rounds: list[Round], names: Sequence[str]) -> tuple[Fit, list[Round]]:
+        """What is found from a tie of the first added effect that has any, if the search ended above the floor.
+
+        Effects that explain as much alone need not do so together with what else is missing. Of a sensor with creep and a voltage
+        divider, logarithmic creep explained as much as creep; beside it, only hysteresis was accepted.
+        """
+        k = next((k for k, r in enumerate(rounds) if r.added and r.ties), None)
+        if self._at_floor(model) or k is None or k + 1 >= self.config.max_effects:
+            return model, rounds
+        before = tuple(n for r in rounds[:k] if (n := r.added))
+        here = above_floor(block_squares(self.problem, model, self.validation))
+        for tie in rounds[k].ties[:MOST_TIES]:
+            self.progress(f"looking for more with {tie} in place of {rounds[k].added}")
+            ended = [e for e in rounds[k].evidence if e.name == tie]
+            parent = self._fitted((*self.present, *before, tie), [e.base | e.values for e in ended], self.config.steps)
+            other, more = self._search(parent, names, self.config.max_effects - k - 1)
+            there = above_floor(block_squares(self.problem, other, self.validation))
+            if there < self.config.from_tie * here:
+                retold = self._taken_instead(rounds[k], tie, parent)
+                return other, [*rounds[:k], retold, *more]
+        return model, rounds
+
+    def _taken_instead(self, found: Round, tie: str, model: Fit) -> Round:
+        """The round with one of its ties added."""
+        ties = tuple(found.added if name == tie else name for name in found.ties if found.added)
+        verdicts = {tie: "added"} | dict.fromkeys(ties, f"tied with {tie}")
+        evidence = tuple(dataclasses.replace(e, verdict=verdicts.get(e.name, e.verdict)) for e in found.evidence)
+        return dataclasses.replace(
+            found, evidence=evidence, added=tie, ties=ties, validation_error=self.error(model), fit_error=model.error
+        )
+
+    def _without_superfluous(self, model: Fit) -> Fit:
+        """Effects that would not be accepted if they were to be added now go again."""
+        for name in [n for n in model.names if n not in self.present][:-1]:
+            rest = tuple(other for other in model.names if other != name)
+            smaller = self._fitted(rest, [model.values], self.config.steps)
+            before = block_squares(self.problem, smaller, self.validation)
+            better = before - block_squares(self.problem, model, self.validation)
+            if self.config.too_little(gain_of(better, before), standard_score(better)):
+                self.removed.append(name)
+                model = smaller
+        return model
+
+    def _with_simpler(
+        self, model: Fit, rounds: list[Round], names: Sequence[str]
+    ) -> tuple[Fit, list[Round], dict[str, tuple[str, ...]]]:
+        """What is found without an effect that contains a simpler one, if that is at the floor with no more numbers.
+
+        Two effects often look like one with many numbers: Coulomb friction and a soft gear like Stribeck friction.
+
+        Returns:
+            model, its rounds, and added effect → the effect with more numbers that does as well.
+        """
+        if not self._at_floor(model):
+            return model, rounds, {}
+        for k, name in enumerate(r.added for r in rounds):
+            if name is None or not self.problem.candidates[name].cls.reduces_to:
+                continue
+            self.progress(f"looking for simpler effects than {name}")
+            before = tuple(n for r in rounds[:k] if (n := r.added))
+            parent = self._fitted((*self.present, *before), [model.values], self.config.steps) if before else self.first
+            allowed = self.config.max_effects - k
+            other, found = self._search(parent, [n for n in names if n != name], allowed)
+            here, there = (block_squares(self.problem, m, self.validation) for m in (model, other))
+            if (
+                self._at_floor(other)
+                and self._num_parameters(other) <= self._num_parameters(model)
+                and above_floor(there) <= self.config.simpler * above_floor(here)
+            ):
+                first = next(r.added for r in found if r.added)
+                return other, [*rounds[:k], *found], {first: (name,)}
+        return model, rounds, {}
+
+    def _num_parameters(self, model: Fit) -> int:
+        return sum(c.num_parameters for c in chosen(self.problem, model.names))
+
+    def _against_ties(self, model: Fit, rounds: Sequence[Round]) -> tuple[Fit, dict[str, tuple[str, ...]]]:
+        """Each effect against its ties, with the others in place: the better one stays, those that do as well are rivals."""
+        ties = {r.added: r.ties for r in rounds if r.added}
+        rivals: dict[str, tuple[str, ...]] = {}
+        for name in model.names:
+            here = block_squares(self.problem, model, self.validation)
+            found = []
+            for other in (t for t in ties.get(name, ()) if t not in model.names):
+                self.progress(f"trying {other} in place of {name}")
+                others = tuple(other if n == name else n for n in model.names)
+                # From where its round ended; some effects have a hundred starts, nearly all of them far off.
+                ended = [e.values for r in rounds if r.added == name for e in r.evidence if e.name == other]
+                starts = [model.values | start for start in (*ended, *self.problem.candidates[other].starts[:3])]
+                swapped = self._fitted(others, starts, self.config.steps)
+                found.append((other, swapped, block_squares(self.problem, swapped, self.validation)))
+            found.sort(key=lambda item: item[2].mean)
+            kept = name
+            if found:
+                other, swapped, squares = found[0]
+                better = here - squares
+                fewer = len(swapped.frees) <= len(model.frees) + 1
+                above = here.mean > 1.0 or len(swapped.frees) < len(model.frees)
+                if fewer and above and better.mean > 0.03 * here.mean and standard_score(better) > 1.5:
+                    self.swapped.append((name, other))
+                    found[0] = (name, model, here)
+                    model, here, kept = swapped, squares, other
+            as_good = [
+                o
+                for o, _, squares in found
+                if squares.mean < 1.5 * here.mean and standard_score(squares - here) < self.config.min_score
+            ]
+            if as_good:
+                rivals[kept] = tuple(as_good)
+        return model, rivals
+
+    # helpers ---------------------------------------------------------------------------------------------------------
+
+    def _fitted(self, names: Sequence[str], starts: Sequence[Mapping[str, float]], most: int) -> Fit:
+        model = best_fit(self.problem, self.fit_to, names, starts, most)
+        self.evaluations += model.evaluations
+        return model
+
+    def _at_floor(self, model: Fit) -> bool:
+        """Whether neither the validation nor the fit recordings have an error that another effect could explain."""
+        return self.error(model) <= self.config.stop_at and model.error <= self.config.stop_fit_at
+
+    def error(self, model: Fit) -> float:
+        """RMS on the validation recordings, in floors."""
+        return rms(stacked(self.problem, model.values, model.effects, self.validation))
+
+    def _errors(self, values: Values, effects: Sequence[Effect], test: Sequence[Recording]) -> dict[str, float]:
+        uses = {"fit": self.fit_to, "validation": self.validation, "test": list(test)}
+        return {use: rms(stacked(self.problem, values, effects, recs)) for use, recs in uses.items() if recs}
+
+    def _status(self, model: Fit) -> Status:
+        if model.trouble:
+            return "not_converged"
+        if self._at_floor(model):
+            if len(model.names) > len(self.present):
+                return "at_floor"
+            return "gains_moved" if self._moved(self.first) else "nothing_missing"
+        if len(model.names) == len(self.present) and max(self.error(model), model.error) <= self.config.little:
+            return "gains_moved" if self._moved(self.first) else "nothing_missing"
+        full = len(model.names) - len(self.present) >= self.config.max_effects
+        return "too_many" if full else "something_else"
+
+    def _moved(self, model: Fit) -> dict[str, tuple[float, float]]:
+        """Gain → (the twin's, fitted) of those that are more than ``GAINS_MOVED`` times off."""
+        pairs = {g: (self.given[g], model.values[g]) for g in ("kp", "kd") if g in model.values and self.given.get(g)}
+        return {g: (old, new) for g, (old, new) in pairs.items() if not 1 / GAINS_MOVED <= new / old <= GAINS_MOVED}
+
+    def _remarks(self, model: Fit) -> list[str]:
+        """Sentences on what the error does not show."""
+        units = {f.name: f.unit for f in model.frees}
+        fits = {
+            "with the effects added": self._moved(model),
+            "before any effect was considered": self._moved(self.first),
+        }
+        moved = {gain: (when, *change) for when, found in fits.items() for gain, change in found.items()}
+        return [
+            f"{gain} had to move from the twin's {old:.4g} to {new:.4g} {units[gain]} (× {new / old:.2g}) {when}. Check the time "
+            "stamps (positions reported late, wrong unit of time) and which gains were commanded (kp, kd of the recording in "
+            "measurements.yaml)."
+            for gain, (when, old, new) in moved.items()
+        ]
+
+    def _described(self, model: Fit, first: Fit) -> list[Effect]:
+        """Effects with their intervals and why they are believed."""
+        intervals = model.intervals()
+        before, after = self.error(first), self.error(model)
+        for effect in model.effects:
+            prefix = f"{effect.name}."
+            effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}
+            effect.evidence = (
+                f"validation error {before:.2f} to {after:.2f} noise floors with {', '.join(model.names)}; recordings "
+                f"{', '.join(r.name for r in self.validation)}"
+            )
+        return list(model.effects)
+
+
+def _untouched(f: Free, model: Fit) -> bool:
+    """Whether a number is at the end of its range because it starts there and nothing moves it: absent, not far off."""
+    return f.start in (f.low, f.high) and abs(f.coordinate(model.values[f.name]) - f.coordinate(f.start)) < 0.01
+
+
+def gain_of(better: Blocks, before: Blocks) -> float:
+    """Share of the validation squared error above the floor that goes away: how much better, and the error before."""
+    return better.mean / max(before.mean - 1.0, 1e-12)
+
+
+def above_floor(squares: Blocks) -> float:
+    """Mean squared validation error in floors², at least that of one floor: below it no model is better than another."""
+    return max(squares.mean, 1.0)
+
+
+class _Row:
+    """One refitted effect beside its parent, on the validation recordings."""
+
+    def __init__(self, search: _Search, parent: Fit, before: Blocks, model: Fit, seen: Probe) -> None:
+        self.name, self.model, self.seen, self._config = model.names[-1], model, seen, search.config
+        self.squares = block_squares(search.problem, model, search.validation)
+        self.validation_error = search.error(model)
+        better = before - self.squares
+        self.gain = gain_of(better, before)
+        self.score = standard_score(better)
+        self.candidate = search.problem.candidates[self.name]
+        self.num_parameters = self.candidate.num_parameters
+        self.bic = bic_gain(parent, model, self.num_parameters)
+
+    def refused(self) -> str:
+        """Why it is not believed; empty if it is."""
+        return self._at_its_end() or self._config.refusal(self.gain, self.score, self.bic)
+
+    def _at_its_end(self) -> str:
+        """Why the fitted numbers are those of no effect, or of another one; empty if they are not."""
+        cls = self.candidate.cls
+        for name, shape in cls.reduces_to.items():
+            if self._at_bound(shape) == "low":
+                return f"with {shape} at {self.model.values[f'{cls.name}.{shape}']:.3g} it is {name}"
+        for p in cls.parameters():
+            side = self._at_bound(p.name)
+            if (side and p.absent == (p.low if side == "low" else p.high)) or (side == "high" and p.absent == np.inf):
+                value = self.model.values[f"{cls.name}.{p.name}"]
+                return f"fitted to nothing: {p.name} is at {value:.3g} {p.unit}, where the effect is absent"
+        return ""
+
+    def _at_bound(self, parameter: str) -> Literal["", "low", "high"]:
+        """At which end of its range a parameter of the effect was fitted."""
+        name = f"{self.candidate.name}.{parameter}"
+        if name not in self.model.at_bound:
+            return ""
+        free = next(f for f in self.model.frees if f.name == name)
+        place, low, high = (free.coordinate(x) for x in (self.model.values[name], free.low, free.high))
+        return "low" if place - low < high - place else "high"
+
+    def evidence(self, verdict: str) -> Evidence:
+        own = f"{self.name}."
+        return Evidence(
+            name=self.name,
+            values={k: v for k, v in self.model.values.items() if k.startswith(own)},
+            base={k: v for k, v in self.model.values.items() if not k.startswith(own)},
+            explained=self.seen.explained,
+            fit_error=self.model.error,
+            validation_error=self.validation_error,
+            gain=self.gain,
+            score=self.score,
+            bic=self.bic,
+            at_bound=tuple(name for name in self.model.at_bound if name.startswith(own)),
+            trouble=self.model.trouble,
+            verdict=verdict,
+            units={f.name: f.unit for f in self.model.frees if f.name.startswith(own)},
+        )
+
+
+def _scaled(seen: Probe, c: Candidate) -> Values:
+    """The probe's start with its strength multiplied as the score test suggests."""
+    values = {f.name: f.start for f in c.frees} | seen.start
+    if can_fade(c) and c.frees[0].log and seen.multiple > 0:
+        values[c.frees[0].name] *= min(max(seen.multiple, 0.1), 10.0)
+    return values

@@ -1,0 +1,74 @@
+"""What every part of a machine goes through: which rows judge, what they can tell, and the search."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.search.problem import Problem, Recording, Values, split_rows
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.search import diagnose
+from taccorl.errors import TaccorlError
+
+
+class Startable(Problem, Protocol):
+    """A problem that knows where its search starts."""
+
+    start: Values
+    """Numbers from which the search starts."""
+    present: tuple[str, ...]
+    """Names of the effects that the machine's file has already."""
+
+
+class Solved(NamedTuple):
+    """Result of ``solve``."""
+
+    diagnosis: Diagnosis
+    can_tell: Identifiability
+    """What the fit recordings can show and tell apart, whatever they say."""
+    fit_to: Sequence[Recording]
+    validation: Sequence[Recording]
+    """Recordings, or their last rows, that effects were chosen by."""
+    rows_split: bool
+    """No recording was marked for validation: the last rows of each were used."""
+
+
+def solve(
+    part: str,
+    problem: Startable,
+    fit_to: Sequence[Recording],
+    validation: Sequence[Recording],
+    test: Sequence[Recording],
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+) -> Solved:
+    """Search for the effect that is missing in one part's problem.
+
+    Args:
+        part: its name, for messages.
+        without: effects that are not considered.
+
+    Raises:
+        TaccorlError: nothing was measured in the validation rows.
+    """
+    rows_split = not validation
+    if rows_split:
+        fit_to, validation = split_rows(fit_to)
+    if not any(np.isfinite(r.measured).any() for r in validation):
+        raise TaccorlError(
+            f"{part}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so no effect "
+            "can be judged; record a motion that is measured to its end, or mark another one with use: validation"
+        )
+    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
+    found = diagnose(
+        problem,
+        fit_to,
+        validation,
+        test,
+        start=problem.start,
+        present=problem.present,
+        without=without,
+        config=search,
+    )
+    return Solved(found, can_tell, fit_to, validation, rows_split)

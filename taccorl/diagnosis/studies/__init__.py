@@ -1,0 +1,1 @@
+"""How often the search is right, on surrogate robots with known hidden effects."""

@@ -1,0 +1,397 @@
+"""A surrogate robot drawn at random: which joint, which drive, what is hidden in it, and the twin that its user starts from.
+
+How strong a hidden effect is, is said by what it leaves on the recordings after the gains have been refitted: 1 to 30 noise
+floors. Its severity is searched for that, within what a robot could have.
+
+Letters in shapes: T rows, J signals.
+"""
+
+import dataclasses
+import math
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, lfilter
+
+from taccorl.alignment.measurements.motions import CHIRP, JUDGED_ON, POSES, RATE_HZ, Motion, Room, joint_number
+from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+from taccorl.sim.controller import ControllerConfig
+from taccorl.sim.robot import RobotConfig
+from taccorl.sim.twin import TwinConfig
+from taccorl.surrogate.hidden import (
+    KINDS,
+    NOT_FITTED,
+    OUTSIDE,
+    REGISTERED,
+    Change,
+    Hidden,
+    Kind,
+    Scale,
+    Values,
+    kind,
+    selectors,
+    within_bounds,
+)
+from taccorl.surrogate.plant import STEP_S, Run
+from taccorl.surrogate.robot import NOISE_RAD, PAYLOAD_LINK6_M, PAYLOAD_OFF_M, Robot, free_inertia, inertia_and_weight
+from taccorl.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop, draw_loop, is_stable
+
+SEVERITY_FLOORS = (1.0, 30.0)
+SEARCHES, CLOSE_ENOUGH = 6, 0.15
+"""Tries for a severity; log of the ratio to what was wanted."""
+OMEGA_RAD_PER_S, ZETA = (11.0, 24.0), (0.7, 1.5)
+"""Natural frequency and damping of soft drives (MIT mode)."""
+LOOP_FLOORS = 0.5
+"""What a sampled loop may leave by itself, gains refitted: a slower one is an effect of its own (``slow_velocity_filter``)."""
+LOOP_DRAWS, GAIN_DRAWS, SLOWEST_S = 8, 5, PERIODS_STEPS[-1] * STEP_S + FILTER_S[1]
+PAYLOAD_KG = (0.1, 0.5)
+"""Of a weighed mass that is held in every recording."""
+COLOUR_S = (0.01, 0.1)
+"""Time constants of coloured encoder noise."""
+_RUNAWAY_RAD = 3.0
+_GEARED = ("backlash", "joint_compliance")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One surrogate robot."""
+
+    seed: int
+    signal: str
+    """``left_joint5``: the joint under test."""
+    gains: tuple[float, float, float]
+    """True K_p, K_d, T_ref of its drive, as a continuous controller's (``sampled_loop``)."""
+    hidden: tuple[Hidden, ...]
+    twin: TwinConfig
+    """What the user starts from: without the hidden effects, and with wrong gains where those are unknown."""
+    gains_known: bool
+    """K_p and K_d were commanded, and the drive keeps them."""
+    room: Room
+    pose: tuple[float, ...]
+    """(6,) rad of the arm under test, its joint in the middle."""
+    floor_rad: float
+    """Noise floor as expected: sensor, and disturbance through the drive."""
+    left_floors: float = 0.0
+    """What the hidden effects leave of an error once K_p, K_d, T_ref have been refitted, in floors."""
+    design: str = "pack"
+    loop: SampledLoop | None = None
+    """None: the velocity loop is continuous."""
+    loop_floors: float = 0.0
+    """What the loop's sampling alone leaves once the gains have been refitted."""
+    payload_kg: float = 0.0
+    """Known mass that is held in every recording; a design may have recordings with one besides."""
+    payload_m: tuple[float, float, float] = PAYLOAD_LINK6_M
+    """Where masses are really held, in link 6."""
+    colour_s: float = 0.0
+    """Time constant of the encoder's noise; 0 is white."""
+
+    @property
+    def name(self) -> str:
+        return f"{'+'.join(h.name for h in self.hidden) or 'none'} on {self.signal}, seed {self.seed}"
+
+    def truth(self) -> dict[str, object]:
+        """For the sealed file."""
+        return {
+            "seed": self.seed,
+            "signal": self.signal,
+            "hidden": [dataclasses.asdict(h) for h in self.hidden],
+            "gains": dict(zip(("kp_nm_per_rad", "kd_nms_per_rad", "torque_ff_nm"), self.gains, strict=True)),
+            "gains_known": self.gains_known,
+            "floor_rad": self.floor_rad,
+            "left_floors": self.left_floors,
+            "design": self.design,
+            "loop_hz": None if self.loop is None else 1.0 / self.loop.period_s,
+            "velocity_filter_s": None if self.loop is None else self.loop.filter_s,
+            "loop_floors": self.loop_floors,
+            "payload_kg": self.payload_kg,
+            "payload_link6_m": list(self.payload_m),
+            "noise_colour_s": self.colour_s,
+            "ratios": self.ratios(),
+        }
+
+    def values(self) -> dict[str, float]:
+        """``kp``, ``kd``, ``coulomb_friction.torque_nm`` → the true number. K_d as it is set in the drive:
+        more than a continuous controller's, by what the loop's timing takes of it."""
+        numbers = {"kp": self.gains[0], "kd": self.robot.drive.kd, "torque_ff": self.gains[2]}
+        return numbers | {f"{h.name}.{name}": value for h in self.hidden for name, value in h.values.items()}
+
+    def ratios(self) -> dict[str, float]:
+        """True values of what angles alone identify: torques, stiffnesses, dampings, inertias and masses over K_p; others
+        unchanged."""
+        own = {n: v for n, v in self.values().items() if n != "kp"}
+        return {f"{n}/kp" if _is_torque(n) else n: v / self.gains[0] if _is_torque(n) else v for n, v in own.items()}
+
+    def motion(self, motion: Motion) -> Motion:
+        """``motion`` with what this robot holds."""
+        return dataclasses.replace(motion, payload_kg=motion.payload_kg + self.payload_kg)
+
+    @cached_property
+    def robot(self) -> "Robot":
+        changes = [h.change for h in self.hidden]
+        return Robot(self.signal, self.gains, changes, self.pose, loop=self.loop, payload_m=self.payload_m)
+
+
+def _is_torque(name: str) -> bool:
+    """By its unit, which is in its name."""
+    if name in ("kd", "torque_ff"):
+        return True
+    return "per_nm" not in name and bool({"nm", "nms", "nms2", "kg", "kgm2"} & set(name.split("_")))
+
+
+def draw_case(
+    effect_names: Sequence[str],
+    seed: int,
+    *,
+    signal: str | None = None,
+    strength: float | None = None,
+    gains_known: bool = False,
+    design: str = "pack",
+    sampled: bool = False,
+    loaded: bool = False,
+    coloured: bool = False,
+) -> Case:
+    """A robot in which these effects are hidden; none of them is a robot as the twin has it.
+
+    Args:
+        effect_names: of ``hidden.KINDS``.
+        signal: joint under test; drawn among those on which the effects can be seen.
+        strength: noise floors that each of them leaves after a refit of the gains; drawn from 1 to 30.
+        gains_known: the twin has the true K_p and K_d, and recordings say so.
+        design: which recordings will be made, and strength is measured on: ``chirp`` or ``pack``.
+        sampled: the drive's whole loop is sampled, at 0.5 to 4 kHz with a low-pass of the velocity.
+        loaded: a weighed mass is held in every recording.
+        coloured: the encoder's noise is correlated over time.
+
+    Raises:
+        TaccorlError: nothing of that name can be hidden, a joint on which it cannot be seen, or no such joint.
+    """
+    if design not in JUDGED_ON:
+        raise TaccorlError(f"surrogate: no design {design!r}; {nearest(design, JUDGED_ON)}")
+    rng = np.random.default_rng([seed, zlib.crc32("+".join(effect_names).encode())])
+    kinds = [kind(name) for name in effect_names]
+    possible = [j for j in range(1, ROBOT.num_joints + 1) if all(j in k.joints for k in kinds)]
+    drawn = f"{rng.choice(ROBOT.arms)}_joint{rng.choice(possible or [1])}"
+    signal = drawn if signal is None else signal
+    if signal not in ROBOT.action_names or signal.endswith("gripper"):
+        raise TaccorlError(f"surrogate: {signal!r} is no joint of the arms; {nearest(signal, ROBOT.action_names)}")
+    joint = joint_number(signal)
+    for name, k in zip(effect_names, kinds, strict=True):
+        if joint not in k.joints:
+            seen_on = ", ".join(f"joint{j}" for j in k.joints)
+            raise TaccorlError(f"surrogate: {name} cannot be seen on {signal}; take one of {seen_on}")
+    pose = list(POSES[joint - 1])
+    pose[joint - 1] += rng.uniform(-0.1, 0.1)
+    inertia, weight = inertia_and_weight(np.array(pose), joint)
+    gains = _draw_gains(rng, joint, inertia, stiff=all(k.stiff for k in kinds))
+    dice = np.random.default_rng([seed, zlib.crc32(b"conditions")])  # apart, so that they change nothing else
+    case = Case(
+        seed=seed,
+        signal=signal,
+        gains=gains,
+        hidden=(),
+        twin=TwinConfig(),
+        gains_known=gains_known,
+        room=Room.of(joint, pose[joint - 1], inertia, weight),
+        pose=tuple(pose),
+        floor_rad=0.0,
+        design=design,
+        payload_m=_about(PAYLOAD_LINK6_M, dice),
+        payload_kg=float(dice.uniform(*PAYLOAD_KG)) * loaded,
+        colour_s=float(np.exp(dice.uniform(*np.log(COLOUR_S)))) * coloured,
+    )
+    case, quiet = _quiet(case)
+    if sampled:
+        case, quiet = _with_sampled_loop(case, quiet, dice, geared=any(n in _GEARED for n in effect_names))
+    plain = case.robot
+    scale = Scale(
+        kp=case.gains[0],
+        kd=case.gains[1],
+        inertia=inertia,
+        torque=max(float(np.abs(run.effort[:, joint - 1] + plain.carried_nm(run)).max()) for run in quiet),
+        speed=float(np.abs(np.diff(CHIRP.target(case.room))).max() * RATE_HZ),
+        centre=case.room.middle_rad,
+        sweep=case.room.sweep_rad,
+        reach=max(float(np.abs(m.target(case.room) - case.room.middle_rad).max()) for m in JUDGED_ON[design]),
+    )
+    case = dataclasses.replace(case, twin=_twin(rng, joint, case.gains, gains_known))
+    refit = _Refit(case, plain, quiet)
+    hidden = []
+    for name, k in zip(effect_names, kinds, strict=True):
+        wanted = math.exp(rng.uniform(*np.log(SEVERITY_FLOORS))) if strength is None else strength
+        if name in NOT_FITTED:  # as often as it happens, whatever that leaves
+            severity = math.exp(rng.uniform(*np.log(k.severity(scale))))
+            where = selectors(name, signal)
+            values = k.values(severity, scale, {})
+            hidden.append(Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where))
+            continue
+        hidden.append(_as_strong_as(wanted, refit, name, k, scale, k.shape(rng, scale)))
+    left = refit.left_floors([h.change for h in hidden])
+    return dataclasses.replace(case, hidden=tuple(hidden), left_floors=left)
+
+
+def _about(middle_m: tuple[float, float, float], rng: np.random.Generator) -> tuple[float, float, float]:
+    x, y, z = (float(m + PAYLOAD_OFF_M * n) for m, n in zip(middle_m, rng.standard_normal(3), strict=True))
+    return x, y, z
+
+
+def _quiet(case: Case) -> tuple[Case, list[Run]]:
+    """The case with its noise floor, and its undisturbed runs without what is hidden."""
+    plain = case.robot
+    quiet = [plain.run(case.motion(motion), case.room) for motion in JUDGED_ON[case.design]]
+    noisy = plain.run(case.motion(CHIRP), case.room, np.random.default_rng([case.seed, 1]))
+    moved = (plain.reported(noisy) - plain.reported(quiet[0]))[:, plain.joint]
+    return dataclasses.replace(case, floor_rad=math.hypot(NOISE_RAD, float(np.sqrt(np.mean(moved**2))))), quiet
+
+
+def _with_sampled_loop(
+    case: Case, quiet: list[Run], rng: np.random.Generator, *, geared: bool
+) -> tuple[Case, list[Run]]:
+    """With a loop that is stable with these gains or, if none is, with other ones, and which alone leaves next to nothing.
+
+    Args:
+        geared: there will be play or a spring between motor and link. K_d of a heavy link over the rotor's inertia is then more
+            than any of these loops can damp on some joints: their velocity loop stays continuous.
+    """
+    as_drawn = case, quiet
+    joint = joint_number(case.signal)
+    inertia, _ = inertia_and_weight(np.array(case.pose), joint)
+    inertias = [inertia, free_inertia(np.array(case.pose), joint), *([RobotConfig().armature_kgm2] if geared else [])]
+    for _ in range(GAIN_DRAWS):
+        refit, most_late_s = _Refit(case, case.robot, quiet), SLOWEST_S
+        for _ in range(LOOP_DRAWS):
+            loop = draw_loop(rng, most_late_s)
+            most_late_s *= 0.7
+            if not is_stable(loop, *case.gains[:2], inertias):
+                continue
+            sampled = dataclasses.replace(case, loop=loop)
+            left = refit.left_of(sampled.robot)
+            if left <= LOOP_FLOORS:
+                return _quiet(dataclasses.replace(sampled, loop_floors=left))
+        case, quiet = _quiet(dataclasses.replace(case, gains=_draw_gains(rng, joint, inertia, stiff=False)))
+    if geared:
+        return as_drawn
+    raise TaccorlError(
+        f"surrogate: no sampled loop of {case.signal}, seed {case.seed}, is stable and hardly seen; take another seed"
+    )
+
+
+def _draw_gains(rng: np.random.Generator, joint: int, inertia: float, *, stiff: bool) -> tuple[float, float, float]:
+    """From a soft drive to, one time in four, something between that and the paper's."""
+    omega, zeta = rng.uniform(*OMEGA_RAD_PER_S), rng.uniform(*ZETA)
+    share = rng.uniform(0.0, 1.0) * (rng.random() < 0.25) * stiff
+    kp = (inertia * omega**2) ** (1 - share) * ROBOT.kp_nm_per_rad[joint - 1] ** share
+    kd = (2 * zeta * omega * inertia) ** (1 - share) * ROBOT.kd_nms_per_rad[joint - 1] ** share
+    return float(kp), float(kd), float(kp * rng.uniform(-0.02, 0.02))
+
+
+def _twin(rng: np.random.Generator, joint: int, gains: tuple[float, float, float], known: bool) -> TwinConfig:
+    """The paper's gains on the other joints, which are right; wrong ones on this."""
+    control = ControllerConfig()
+    wrong = np.exp(rng.uniform(-math.log(2), math.log(2), 2)) if not known else np.ones(2)
+    control.kp_nm_per_rad[joint - 1] = gains[0] * float(wrong[0])
+    control.kd_nms_per_rad[joint - 1] = gains[1] * float(wrong[1])
+    control.torque_ff_nm[joint - 1] = 0.0
+    return TwinConfig(controller=control)
+
+
+class _Refit:
+    """What hidden effects leave once K_p, K_d, T_ref have been refitted.
+
+    Without effects a joint is J q̈ = K_p (q* − q) − K_d q̇ + T_ref, its weight being carried: what other gains change is
+    computed from that, and added to what the plant does with the true ones.
+    """
+
+    def __init__(self, case: Case, plain: Robot, quiet: Sequence[Run]) -> None:
+        self.case, self.motions = case, [case.motion(m) for m in JUDGED_ON[case.design]]
+        pose, joint = np.array(case.pose), plain.joint + 1
+        self._inertias = [inertia_and_weight(pose, joint, m.payload_kg)[0] for m in self.motions]
+        self._plain = self._reports(plain, quiet)
+        self._linear = self._swung(0.0, 0.0)
+        self._softness = np.concatenate([np.full(len(m.target(case.room)), 1 / m.gain) for m in self.motions])
+
+    def _reports(self, robot: Robot, runs: Sequence[Run]) -> np.ndarray:
+        """Reports of the joint under test, motion after motion."""
+        return np.concatenate([robot.reported(run)[:, robot.joint] for run in runs])
+
+    def _swung(self, log_kp: float, log_kd: float) -> np.ndarray:
+        """The same by the linear joint, with gains that are off by these."""
+        kp, kd, _ = self.case.gains
+        out = []
+        for motion, inertia in zip(self.motions, self._inertias, strict=True):
+            stiffness, damping = (f * motion.gain / inertia for f in (kp * math.exp(log_kp), kd * math.exp(log_kd)))
+            discrete: Any = cont2discrete(([stiffness], [1.0, damping, stiffness]), 1 / RATE_HZ)
+            target = motion.target(self.case.room)
+            out.append(target[0] + lfilter(np.ravel(discrete[0]), discrete[1], target - target[0]))
+        return np.concatenate(out)
+
+    def left_floors(self, changes: Sequence[Change]) -> float:
+        """RMS of the rest, in floors."""
+        case = self.case
+        return self.left_of(
+            Robot(case.signal, case.gains, changes, case.pose, loop=case.loop, payload_m=case.payload_m)
+        )
+
+    def left_of(self, robot: Robot) -> float:
+        """The same of a robot in the place of this case's; a loop that runs away leaves more than anything."""
+        error = self._reports(robot, [robot.run(m, self.case.room) for m in self.motions]) - self._plain
+        scale = self.case.floor_rad * math.sqrt(len(error))
+        if not np.abs(error).max() < _RUNAWAY_RAD:  # nor is NaN
+            return math.inf
+
+        def rest(x: np.ndarray) -> np.ndarray:
+            log_kp, log_kd = (0.0, 0.0) if self.case.gains_known else x[1:]
+            return (error - x[0] * self._softness - (self._swung(log_kp, log_kd) - self._linear)) / scale
+
+        start = np.zeros(1 if self.case.gains_known else 3)
+        found = least_squares(rest, start, x_scale=np.array([0.01, 0.1, 0.1])[: len(start)], max_nfev=20)
+        return math.sqrt(2 * found.cost)
+
+
+def _as_strong_as(wanted: float, refit: _Refit, name: str, k: Kind, scale: Scale, shape: Values) -> Hidden:
+    """The effect at the severity, of those that a robot could have, that leaves ``wanted`` floors, or is nearest to it."""
+
+    def of(severity: float) -> Hidden:
+        values = within_bounds(name, k.values(severity, scale, shape))
+        where = selectors(name, refit.case.signal)
+        return Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where)
+
+    return of(find_severity(wanted, k.severity(scale), lambda severity: refit.left_floors([of(severity).change])))
+
+
+def find_severity(wanted: float, ends: tuple[float, float], left: Callable[[float], float]) -> float:
+    """Severity within ``ends`` at which ``left`` (what it leaves, in floors) is ``wanted``, or nearest to it."""
+    low, high = np.log(ends)
+    found: list[tuple[float, float]] = []  # log severity, log of what is left over what is wanted
+    at = 0.5 * (low + high)
+    for _ in range(SEARCHES):
+        found.append((at, math.log(min(max(left(math.exp(at)), 1e-6), 1e6) / wanted)))
+        below = max((f for f in found if f[1] < 0), default=None)
+        above = min((f for f in found if f[1] >= 0), default=None)
+        if abs(found[-1][1]) < CLOSE_ENOUGH or (below is None and at <= low) or (above is None and at >= high):
+            break
+        if below and above and below[0] < above[0]:
+            at = below[0] - below[1] * (above[0] - below[0]) / (above[1] - below[1])
+        else:  # most errors grow in proportion
+            at = min(max(at - found[-1][1], low), high)
+    return math.exp(min(found, key=lambda f: abs(f[1]))[0])
+
+
+def draw_secret(seed: int) -> tuple[str, ...]:
+    """Names of what a robot of this seed hides: mostly one effect of the registry, or two, none, one from outside of it."""
+    rng = np.random.default_rng([seed, zlib.crc32(b"secret")])
+    fate = rng.random()
+    if fate < 0.1:
+        return ()
+    if fate < 0.25:
+        return (str(rng.choice(OUTSIDE)),)
+    drawn = [str(name) for name in rng.permutation(REGISTERED)]
+    if fate < 0.75:
+        return (drawn[0],)
+    fitting = (name for name in drawn[1:] if set(KINDS[name].joints) & set(KINDS[drawn[0]].joints))
+    return drawn[0], next(fitting)

@@ -1,0 +1,262 @@
+"""A simulated sensor of force cells that is pressed, held and released; hidden effects act at 1 kHz by equations of their own.
+
+    f → material → wires → gain, offset → temperature, drift → noise → converter (0 … 1023 counts)
+
+The load that is recorded has noise of its own, stamps jitter by 1 ms, and half of the sensors have noise that is coloured. All
+files say that they are simulated.
+
+Letters in shapes: M milliseconds, T rows, K cells, R × C the grid.
+"""
+
+import csv
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taccorl.alignment.machines.cell_tables import CellMeasurement
+from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading, save_cells
+from taccorl.alignment.measurements.folder import INDEX, Measurements
+from taccorl.errors import TaccorlError, nearest
+from taccorl.surrogate.touch_hidden import MILLISECOND, Values, material, spread
+from taccorl.surrogate.writing import seal
+
+ORIGIN = "simulated force cells"
+PRESSES, SENSOR = "presses", "taxel.yaml"
+RATE_HZ = 100.0
+RATED_N = 20.0
+HIGHEST_COUNT = 1023
+LOAD_NOISE = 5e-4
+"""Share of the rated load: the noise of the load cell."""
+HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
+    "taxel_saturation": lambda rng: {"limit": _between(rng, 8, 60)},
+    "taxel_power_law": lambda rng: {"exponent": float(_between(rng, 1.1, 1.6) ** rng.choice([-1.0, 1.0]))},
+    "taxel_threshold": lambda rng: {"threshold": _between(rng, 0.15, 1.0)},
+    "taxel_hysteresis": lambda rng: {"half_width": _between(rng, 0.02, 0.15)},
+    "taxel_creep": lambda rng: {
+        "share": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.05, 0.4),
+        "time_constant_s": _between(rng, 0.3, 4.0),
+    },
+    "touch_lag": lambda rng: {"time_constant_s": _between(rng, 0.02, 0.15)},
+    "touch_delay": lambda rng: {"delay_s": _between(rng, 0.02, 0.1)},
+    "baseline_drift": lambda rng: {"rate_per_min": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.1, 1.0)},
+    "taxel_log_creep": lambda rng: {"share": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.02, 0.08)},
+    "taxel_temperature": lambda rng: {
+        "gain_per_k": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.003, 0.02),
+        "zero_per_k": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.01, 0.1),
+    },
+    "taxel_crosstalk": lambda rng: {"share": _between(rng, 0.05, 0.4)},
+    "taxel_ghosting": lambda rng: {"share": _between(rng, 0.005, 0.05)},
+}
+"""Name → its numbers, in the units of the registry; a reading of 10 is the rated load."""
+OF_GRIDS = ("taxel_crosstalk", "taxel_ghosting")
+Knots = tuple[tuple[float, float], ...]
+"""(s, share of the rated load), straight lines between."""
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    """Evenly on a logarithmic scale."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _presses(*each: tuple[float, float, float], rest_s: float = 3.0) -> Knots:
+    """Presses one after the other: (share of the rated load, seconds of loading and unloading, seconds of hold)."""
+    now, knots = rest_s, [(0.0, 0.0), (rest_s, 0.0)]
+    for share, ramp_s, hold_s in each:
+        knots += [(now + ramp_s, share), (now + ramp_s + hold_s, share), (now + 2 * ramp_s + hold_s, 0.0)]
+        now += 2 * ramp_s + hold_s + rest_s
+        knots.append((now, 0.0))
+    return tuple(knots)
+
+
+_LOOPS: Knots = (
+    *((0.0, 0.0), (2.0, 0.0), (6.0, 0.6), (8.0, 0.3), (10.0, 0.8), (12.0, 0.5), (14.0, 0.95)),
+    *((34.0, 0.95), (36.0, 0.4), (38.0, 0.7), (42.0, 0.0), (52.0, 0.0)),
+)
+RECORDINGS: dict[str, tuple[str, Knots]] = {
+    "presses": ("fit", _presses((0.3, 0.15, 3), (0.6, 0.4, 4), (0.95, 0.15, 4), (0.5, 2.0, 2))),
+    "presses_again": ("fit", _presses((0.3, 0.15, 3), (0.6, 0.4, 4), (0.95, 0.15, 4), (0.5, 2.0, 2))),
+    "loops": ("fit", _LOOPS),
+    "other_presses": ("validation", _presses((0.85, 0.25, 3), (0.2, 0.1, 2), (0.7, 1.0, 5), (0.4, 0.15, 2))),
+    "long_hold": ("validation", _presses((0.5, 3.0, 15), (0.9, 0.2, 2))),
+    "last_presses": ("test", _presses((0.45, 0.2, 4), (0.9, 0.6, 6), (0.15, 0.5, 2))),
+}
+"""Name → use and load; presses_again repeats presses."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellsCase:
+    """One simulated sensor with what is hidden in it."""
+
+    seed: int
+    shape: tuple[int, int] = (1, 1)
+    hidden: str = ""
+    """A key of ``HIDDEN``; empty for a sensor that the nominal model describes."""
+    values: Values = field(default_factory=dict)
+
+    def config(self) -> CellsConfig:
+        """The sensor as its user knows it."""
+        rows, columns = self.shape
+        grid: dict[str, Any] = {"cells": ["thumb"]} if self.shape == (1, 1) else {"rows": rows, "columns": columns}
+        return CellsConfig(
+            name="fingertip",
+            **grid,
+            load=Load(unit="N", rated=RATED_N, shared=self.shape == (1, 1)),
+            reading=Reading(unit="count", lowest=0.0, highest=float(HIGHEST_COUNT)),
+            rate_hz=RATE_HZ,
+        )
+
+
+def draw_cells(hidden: str, seed: int) -> CellsCase:
+    """A sensor with ``hidden`` in it (empty: with nothing); a grid of 3 × 4 cells where only neighbours show it.
+
+    Raises:
+        TaccorlError: nothing of that name can be hidden.
+    """
+    if hidden and hidden not in HIDDEN:
+        raise TaccorlError(f"simulated cells: no hidden effect {hidden!r}; {nearest(hidden, HIDDEN)}")
+    rng = np.random.default_rng([seed, 77])
+    shape = (3, 4) if hidden in OF_GRIDS else (1, 1)
+    return CellsCase(seed=seed, shape=shape, hidden=hidden, values=HIDDEN[hidden](rng) if hidden else {})
+
+
+def simulated(case: CellsCase) -> Measurements:
+    """Its recordings (``RECORDINGS``)."""
+    sides: dict[str, list[CellMeasurement]] = {"fit": [], "validation": [], "test": []}
+    for name, (use, _) in RECORDINGS.items():
+        sides[use].append(record(case, name))
+    return Measurements(*(tuple(sides[use]) for use in ("fit", "validation", "test")), rule="by name")
+
+
+def record(case: CellsCase, name: str) -> CellMeasurement:
+    """One recording: 100 rows a second, the load as a load cell gives it, readings in counts."""
+    board = np.random.default_rng([case.seed, 1])
+    cells = math.prod(case.shape)
+    gain = board.uniform(45, 85) * np.exp(0.15 * board.standard_normal(cells))  # counts for 1/10 of the rated load
+    offset = board.uniform(5, 60, cells)
+    noise_count = board.uniform(0.5, 1.5)
+    coloured_count = noise_count if board.random() < 0.5 else 0.0
+    rng = np.random.default_rng([case.seed, 2, list(RECORDINGS).index(name)])
+
+    knots = np.array(RECORDINGS[name][1])
+    stretched = knots[:, 0] * (1.0 + 0.002 * rng.standard_normal())  # no two presses are alike
+    time_ms = np.arange(0.0, stretched[-1], MILLISECOND)
+    load = _rounded(np.interp(time_ms, stretched, knots[:, 1] * (1.0 + 0.005 * rng.standard_normal())))
+    places = np.linspace(0, 2 * np.pi, cells, endpoint=False)
+    moves = (
+        0.5 + 0.5 * np.sin(2 * np.pi * time_ms[:, None] / 11.0 + places) if cells > 1 else np.ones((len(time_ms), 1))
+    )
+    pressed = 10.0 * load[:, None] * moves  # (M, K)
+    warm_k = 5.0 + 6.0 * np.sin(2 * np.pi * time_ms / 37.0 + rng.uniform(0, 6))
+
+    true = _hidden(case, pressed, time_ms, warm_k)
+    rows = np.round(
+        (np.arange(0.005, time_ms[-1] - 0.01, 1 / RATE_HZ) + 1e-3 * rng.uniform(-1, 1)) / MILLISECOND
+    ).astype(int)
+    rows = np.clip(np.unique(rows), 0, len(time_ms) - 1)
+    noise = noise_count * rng.standard_normal((len(rows), cells)) + coloured_count * _coloured(rng, len(rows), cells)
+    count = np.clip(np.round(gain * true[rows] + offset + noise), 0, HIGHEST_COUNT)
+    force = pressed[rows] / 10.0 * RATED_N + LOAD_NOISE * RATED_N * rng.standard_normal((len(rows), cells))
+    config = case.config()
+    measured = CellMeasurement(
+        name=name,
+        time_s=time_ms[rows] - time_ms[rows[0]],
+        target=force,
+        measured=count,
+        signals=config.names,
+        units=("count",) * cells,
+        quantum=np.ones(cells),
+        origin=ORIGIN,
+        repeat_of="presses" if name == "presses_again" else None,
+        temperature_c=20.0 + warm_k[rows],
+    )
+    even = measured.resampled(RATE_HZ)
+    return dataclasses.replace(even, temperature_c=np.interp(even.time_s, measured.time_s, measured.temperature_c))
+
+
+def write_cells(case: CellsCase, folder: Path) -> int:
+    """Write a sensor as files, and what is hidden sealed beside them, as ``taccorl.surrogate.writing`` does robots.
+
+    FOLDER/presses/*.csv, measurements.yaml, columns.yaml    for ``taccorl compare`` and ``diagnose``
+    FOLDER/taxel.yaml                                        the sensor as its user knows it
+
+    Returns:
+        How many recordings there are.
+
+    Raises:
+        FileExistsError: the folder is there already.
+    """
+    config = case.config()
+    presses = folder / PRESSES
+    folder.mkdir(parents=True)
+    presses.mkdir()
+    load = ["force_n"] if config.load.shared else [f"{name}.force_n" for name in config.names]
+    for name in RECORDINGS:
+        m = record(case, name)
+        columns = [m.time_s, *m.target.T[: len(load)], *m.measured.T, m.temperature_c]
+        with (presses / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["t", *load, *(f"{cell}.reading" for cell in config.names), "temperature_c"])
+            writer.writerows([[f"{x:.6g}" for x in row] for row in zip(*columns, strict=True)])
+    uses = [f"  {name}.csv: {{use: {use}}}" for name, (use, _) in RECORDINGS.items() if name != "presses_again"]
+    uses.append("  presses_again.csv: {use: fit, repeat_of: presses.csv}")
+    columns = ["time: {column: t, unit: s}", "temperature: {column: temperature_c}", f"origin: {ORIGIN}"]
+    columns += ["load: {column: force_n, unit: N}"] if config.load.shared else []
+    columns.append("cells:")
+    for cell in config.names:
+        own = "" if config.load.shared else f", load: {{column: {cell}.force_n, unit: N}}"
+        columns.append(f"  {cell}: {{reading: {{column: {cell}.reading, unit: count}}{own}}}")
+    (presses / "columns.yaml").write_text("\n".join(columns) + "\n", encoding="utf-8")
+    text = ["columns: columns.yaml", "recordings:", *uses]
+    (presses / INDEX).write_text("\n".join(text) + "\n", encoding="utf-8")
+    save_cells(config, folder / SENSOR)
+    seal(folder, {"data": ORIGIN, "seed": case.seed, "hidden": case.hidden, "values": case.values})
+    return len(RECORDINGS)
+
+
+def _hidden(case: CellsCase, pressed: np.ndarray, time_s: np.ndarray, warm_k: np.ndarray) -> np.ndarray:
+    """(M, K) what the cells read, in tenths of the rated load, with the hidden effect."""
+    match case.hidden:
+        case "":
+            return pressed
+        case "baseline_drift":
+            return pressed + case.values["rate_per_min"] * (time_s / 60.0)[:, None]
+        case "taxel_temperature":
+            warmer = warm_k[:, None]
+            return pressed * (1 + case.values["gain_per_k"] * warmer) + case.values["zero_per_k"] * warmer
+        case "taxel_log_creep":
+            return _boltzmann(pressed, case.values["share"])
+        case "taxel_crosstalk" | "taxel_ghosting":
+            frames = pressed.reshape(-1, *case.shape)
+            return spread(case.hidden, case.values, frames).reshape(pressed.shape)
+    return material(case.hidden, case.values, pressed, np.gradient(pressed, MILLISECOND, axis=0))
+
+
+def _boltzmann(pressed: np.ndarray, share: float) -> np.ndarray:
+    """Every step of the load adds 1 + a log₁₀(1 + t / 0.06 s) times itself (Boltzmann's superposition)."""
+    kernel = 1.0 + share * np.log10(1.0 + np.arange(len(pressed)) * MILLISECOND / 0.06)
+    steps = np.diff(pressed, axis=0, prepend=0.0)
+    size = 2 * len(pressed)
+    product = np.fft.rfft(steps, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
+    return np.maximum(np.fft.irfft(product, size, axis=0)[: len(pressed)], 0.0)
+
+
+def _rounded(load: np.ndarray) -> np.ndarray:
+    """Corners rounded over 50 ms: nothing presses with a kink."""
+    width = 50
+    padded = np.concatenate([np.full(width, load[0]), load, np.full(width, load[-1])])
+    kernel = np.hanning(width + 2)[1:-1]
+    return np.convolve(padded, kernel / kernel.sum(), mode="same")[width:-width]
+
+
+def _coloured(rng: np.random.Generator, rows: int, cells: int) -> np.ndarray:
+    """(T, K) of standard deviation 1 that is correlated over 0.1 s."""
+    keep = math.exp(-1 / (0.1 * RATE_HZ))
+    drawn, out = rng.standard_normal((rows, cells)), np.zeros((rows, cells))
+    for k in range(1, rows):
+        out[k] = keep * out[k - 1] + math.sqrt(1 - keep**2) * drawn[k]
+    return out

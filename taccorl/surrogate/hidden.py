@@ -1,0 +1,494 @@
+"""Effects that can be hidden in the surrogate robot: those of the registry by name and parameters, and some outside of it.
+
+Each kind says how large it may be (``severity``, from subtle to absurd), what numbers a severity stands for in the registry's
+terms, and what they are in the surrogate's own plant. The registry's classes (``taccorl.sim.effects``) define what the names
+mean; nothing of their code computes anything here.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.effect import Effect
+from taccorl.surrogate.plant import Drive
+
+Values = dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """Reference values of the joint under test (gains, inertia, torque, speed, centre), by which effects are sized."""
+
+    kp: float
+    kd: float
+    inertia: float
+    """kg·m², rotor included."""
+    torque: float
+    """N·m: the most that the drive gives on the recordings, weight included."""
+    speed: float
+    """rad/s: of the chirp's target, at most."""
+    centre: float
+    """rad: about which it is moved."""
+    sweep: float = 0.35
+    """rad: amplitude of the chirp."""
+    reach: float = 0.35
+    """rad: as far as it is moved from there on the recordings."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """Change of the plant by a hidden effect."""
+
+    drive: Values = field(default_factory=dict)
+    """Fields of ``Drive``. Torques, inertias, delays add up, ``torque_scale`` multiplies, the others replace."""
+    carried: float = 1.0
+    """Times the share of the weight that the controller carries."""
+    ball: tuple[float, float, float, float] | None = None
+    """Mass fixed to link 6: kg, x, y, z [m]."""
+    report_delay_s: float = 0.0
+    dropped: float = 0.0
+    """Share of commands that never arrive, in each recording others."""
+
+
+_ADD = frozenset(
+    ("viscous", "quadratic", "coulomb", "stribeck", "motor_inertia", "cogging", "delay", "integral", "encoder_bias")
+)
+
+
+def changed(drive: Drive, changes: list[Change]) -> Drive:
+    """``drive`` with all that is hidden in it."""
+    for change in changes:
+        for name, value in change.drive.items():
+            before = getattr(drive, name)
+            if name in _ADD:
+                value = before + value
+            elif name in ("torque_scale", "encoder_scale"):
+                value = before * value
+            drive = drive._replace(**{name: value})
+    return drive
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """One kind of hidden effect."""
+
+    severity: Callable[[Scale], tuple[float, float]]
+    """From hardly there to the most that a robot could have; the error grows with it."""
+    values: Callable[[float, Scale, Values], Values]
+    """Severity and shape → numbers, by the registry's parameter names where it has the effect."""
+    plant: Callable[[Values], Change]
+    shape: Callable[[np.random.Generator, Scale], Values] = lambda rng, scale: {}
+    """Numbers that say what it is like and not how strong it is."""
+    joints: tuple[int, ...] = tuple(range(1, ROBOT.num_joints + 1))
+    """Joints on which it can be seen."""
+    stiff: bool = True
+    """Whether it can be seen on drives that are as stiff and as damped as the paper's."""
+    registered: bool = True
+    near: tuple[str, ...] = ()
+    """Of those outside the registry: its effects that do nearly the same by nature, so that either may be named."""
+    whole_arm: bool = False
+    """It acts on every joint of the arm under test."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hidden:
+    """One hidden effect, as it is in the sealed truth."""
+
+    name: str
+    values: Values
+    severity: float
+    registered: bool
+    """Outside of it there is nothing to find; a diagnosis should say so."""
+    selectors: Mapping[str, Any] = field(default_factory=dict)
+    """Arm and joints."""
+
+    @property
+    def change(self) -> Change:
+        return KINDS[self.name].plant(self.values)
+
+    def effect(self) -> Effect:
+        """The hidden effect as an effect of the registry.
+
+        Raises:
+            TaccorlError: it lies outside the registry.
+        """
+        if not self.registered:
+            raise TaccorlError(f"{self.name} lies outside the registry of effects; nothing of that name can be built")
+        return make_effect(self.name, **self.selectors, **self.values)
+
+
+def kind(name: str) -> Kind:
+    """Raises:
+    TaccorlError: nothing of that name can be hidden.
+    """
+    if name not in KINDS:
+        raise TaccorlError(f"surrogate: no hidden effect {name!r}; {nearest(name, KINDS)}")
+    return KINDS[name]
+
+
+def selectors(name: str, signal: str) -> dict[str, Any]:
+    """Selectors with which the registry's effect ``name`` acts on ``signal``; empty for effects outside of it."""
+    if not KINDS[name].registered:
+        return {}
+    arm, _, joint = signal.partition("_")
+    return {"arm": arm} if KINDS[name].whole_arm else {"arm": arm, "joints": [joint]}
+
+
+def within_bounds(name: str, values: Values) -> Values:
+    """``values`` clipped to what the registry admits; nothing is known of effects outside of it."""
+    if not KINDS[name].registered:
+        return values
+    known = {p.name: p for p in effects.get(name).parameters()}
+    return {key: min(max(value, known[key].low), known[key].high) for key, value in values.items()}
+
+
+def _range(low: float, high: float) -> Callable[[Scale], tuple[float, float]]:
+    return lambda scale: (low, high)
+
+
+def _sign(rng: np.random.Generator) -> float:
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def _uniform(**ranges: tuple[float, float]) -> Callable[[np.random.Generator, Scale], Values]:
+    return lambda rng, scale: {name: float(rng.uniform(*ends)) for name, ends in ranges.items()}
+
+
+def _signed(**ranges: tuple[float, float]) -> Callable[[np.random.Generator, Scale], Values]:
+    return lambda rng, scale: {"sign": _sign(rng)} | _uniform(**ranges)(rng, scale)
+
+
+_SLIP = _range(2e-4, 0.1)  # rad by which a torque turns the joint against its K_p
+_PHASE = (-math.pi, math.pi)
+
+KINDS: dict[str, Kind] = {
+    # friction
+    "viscous_friction": Kind(
+        severity=_range(0.02, 1.0),
+        values=lambda s, c, shape: {"damping_nms_per_rad": s * c.kd},
+        plant=lambda v: Change(drive={"viscous": v["damping_nms_per_rad"]}),
+    ),
+    "coulomb_friction": Kind(
+        severity=_SLIP,
+        values=lambda s, c, shape: {"torque_nm": s * c.kp},
+        plant=lambda v: Change(drive={"coulomb": v["torque_nm"]}),
+    ),
+    "stribeck_friction": Kind(
+        severity=_SLIP,
+        shape=_uniform(stiction_share=(1.0, 3.0), stribeck_rad_per_s=(0.05, 0.25), presliding_rad=(2e-4, 1e-3)),
+        values=lambda s, c, shape: {"torque_nm": s * c.kp / (1.0 + shape["stiction_share"]), **shape},
+        plant=lambda v: Change(
+            drive={
+                "coulomb": v["torque_nm"],
+                "stribeck": v["torque_nm"] * v["stiction_share"],
+                "stribeck_speed": v["stribeck_rad_per_s"],
+                "presliding": v["presliding_rad"],
+            }
+        ),
+    ),
+    "asymmetric_friction": Kind(
+        severity=_SLIP,
+        shape=_signed(asymmetry=(0.3, 0.7)),
+        values=lambda s, c, shape: {"torque_nm": s * c.kp, "asymmetry": shape["sign"] * shape["asymmetry"]},
+        plant=lambda v: Change(drive={"coulomb": v["torque_nm"], "asymmetry": v["asymmetry"]}),
+    ),
+    "load_friction": Kind(
+        severity=_range(0.005, 0.5),
+        values=lambda s, c, shape: {"share": s},
+        plant=lambda v: Change(drive={"load_share": v["share"]}),
+    ),
+    "quadratic_drag": Kind(
+        severity=_range(0.01, 1.0),
+        values=lambda s, c, shape: {"drag_nms2_per_rad2": s * c.kd / c.speed},
+        plant=lambda v: Change(drive={"quadratic": v["drag_nms2_per_rad2"]}),
+    ),
+    "position_dependent_friction": Kind(
+        severity=_SLIP,
+        shape=_uniform(place=(-0.6, 0.6), width_rad=(0.05, 0.3)),
+        values=lambda s, c, shape: {
+            "torque_nm": s * c.kp,
+            "angle_rad": c.centre + shape["place"] * c.sweep,
+            "width_rad": shape["width_rad"],
+        },
+        plant=lambda v: Change(
+            drive={"spot": v["torque_nm"], "spot_angle": v["angle_rad"], "spot_width": v["width_rad"]}
+        ),
+        registered="position_dependent_friction" in effects,
+        near=("coulomb_friction", "stribeck_friction"),
+    ),
+    # bodies and torques that hang on the angle
+    "end_stop": Kind(
+        severity=lambda c: (0.02, 1.0 - 0.5 * c.sweep / c.reach),  # test motions start 0.4 of the sweep from the middle
+        shape=_signed(stiffness=(3.0, 30.0)),
+        values=lambda s, c, shape: {
+            "angle_rad": c.centre + shape["sign"] * (1.0 - s) * c.reach,
+            "stiffness_nm_per_rad": shape["stiffness"] * c.kp,
+        },
+        plant=lambda v: Change(drive={"stop": v["stiffness_nm_per_rad"], "stop_angle": v["angle_rad"]}),
+        registered="end_stop" in effects,
+        near=("torque_saturation", "cable_spring"),
+    ),
+    "armature": Kind(
+        severity=_range(0.02, 3.0),
+        values=lambda s, c, shape: {"added_kgm2": s * c.inertia},
+        plant=lambda v: Change(drive={"motor_inertia": v["added_kgm2"]}),
+        stiff=False,
+    ),
+    "gravity_mismatch": Kind(
+        severity=_range(0.005, 1.0),
+        shape=_signed(),
+        values=lambda s, c, shape: {"share": 1.0 + shape["sign"] * s},
+        plant=lambda v: Change(carried=v["share"]),
+        whole_arm=True,
+        joints=(2, 3, 5),
+    ),
+    "payload": Kind(
+        severity=_range(0.01, 1.5),
+        shape=_uniform(x_link6_m=(-0.03, 0.03), y_link6_m=(-0.03, 0.03), z_link6_m=(0.05, 0.2)),
+        values=lambda s, c, shape: {"mass_kg": s, **shape},
+        plant=lambda v: Change(ball=(v["mass_kg"], v["x_link6_m"], v["y_link6_m"], v["z_link6_m"])),
+        whole_arm=True,
+        joints=(2, 3, 5),
+    ),
+    "cable_spring": Kind(
+        severity=_range(0.003, 1.0),
+        shape=_signed(off=(0.3, 1.2)),
+        values=lambda s, c, shape: {
+            "stiffness_nm_per_rad": s * c.kp,
+            "rest_rad": c.centre + shape["sign"] * shape["off"],
+        },
+        plant=lambda v: Change(drive={"spring": v["stiffness_nm_per_rad"], "spring_rest": v["rest_rad"]}),
+    ),
+    "cogging": Kind(
+        severity=_SLIP,
+        shape=lambda rng, c: {"periods": float(rng.integers(8, 33)), "phase_rad": float(rng.uniform(*_PHASE))},
+        values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
+        plant=lambda v: Change(
+            drive={
+                "cogging": v["torque_nm"],
+                "cogging_periods": v["periods"],
+                "cogging_phase": v["phase_rad"],
+            }
+        ),
+    ),
+    # the command's way
+    "command_delay": Kind(
+        severity=_range(5e-4, 0.1),
+        values=lambda s, c, shape: {"delay_s": s},
+        plant=lambda v: Change(drive={"delay": v["delay_s"]}),
+    ),
+    "command_lag": Kind(
+        severity=_range(1e-3, 0.2),
+        values=lambda s, c, shape: {"time_constant_s": s},
+        plant=lambda v: Change(drive={"lag": v["time_constant_s"]}),
+    ),
+    "slew_limit": Kind(
+        severity=_range(0.02, 0.85),
+        values=lambda s, c, shape: {"speed_rad_per_s": (1.0 - s) * c.speed},
+        plant=lambda v: Change(drive={"slew": v["speed_rad_per_s"]}),
+    ),
+    "velocity_feedforward": Kind(
+        severity=_range(0.02, 1.0),
+        values=lambda s, c, shape: {"share": s},
+        plant=lambda v: Change(drive={"feedforward": v["share"]}),
+    ),
+    "dropped_commands": Kind(
+        severity=_range(0.01, 0.1),
+        values=lambda s, c, shape: {"probability": s},
+        plant=lambda v: Change(dropped=v["probability"]),
+        registered="dropped_commands" in effects,
+    ),
+    # the loop
+    "error_deadband": Kind(
+        severity=_range(2e-4, 0.05),
+        values=lambda s, c, shape: {"width_rad": s},
+        plant=lambda v: Change(drive={"deadband": v["width_rad"]}),
+    ),
+    "integral_action": Kind(
+        severity=_range(0.02, 5.0),
+        values=lambda s, c, shape: {"rate_per_s": s},
+        plant=lambda v: Change(drive={"integral": v["rate_per_s"]}),
+    ),
+    "torque_lag": Kind(
+        severity=lambda c: (2e-4, 0.5 * c.kd / c.kp),  # from K_d / K_p on it would oscillate
+        values=lambda s, c, shape: {"time_constant_s": s},
+        plant=lambda v: Change(drive={"torque_lag": v["time_constant_s"]}),
+        stiff=False,
+    ),
+    "torque_scale": Kind(
+        severity=_range(0.02, 0.5),
+        shape=_signed(),
+        values=lambda s, c, shape: {"factor": 1.0 + shape["sign"] * s},
+        plant=lambda v: Change(drive={"torque_scale": v["factor"]}),
+        joints=(2, 3, 5),  # without weight it is a factor of all gains
+    ),
+    "torque_saturation": Kind(
+        severity=_range(0.02, 0.7),
+        values=lambda s, c, shape: {"torque_max_nm": (1.0 - s) * c.torque},
+        plant=lambda v: Change(drive={"torque_max": v["torque_max_nm"]}),
+        stiff=False,
+    ),
+    "torque_speed_limit": Kind(
+        severity=_range(0.3, 1.6),
+        shape=_uniform(stall=(1.0, 1.5)),
+        values=lambda s, c, shape: {"stall_nm": shape["stall"] * c.torque, "no_load_rad_per_s": c.speed / s},
+        plant=lambda v: Change(drive={"stall": v["stall_nm"], "no_load": v["no_load_rad_per_s"]}),
+        stiff=False,
+        registered="torque_speed_limit" in effects,
+        near=("torque_saturation", "quadratic_drag"),
+    ),
+    "torque_fade": Kind(
+        severity=_range(5e-4, 0.049),
+        values=lambda s, c, shape: {"rate_per_min": 60.0 * s},
+        plant=lambda v: Change(drive={"fade": v["rate_per_min"] / 60.0}),
+    ),
+    # the gear
+    "backlash": Kind(
+        severity=_range(3e-4, 0.03),
+        values=lambda s, c, shape: {"play_rad": s},
+        plant=lambda v: Change(drive={"play": v["play_rad"]}),
+        joints=(1, 2, 3),  # behind it there must be more than the rotor
+        stiff=False,
+    ),
+    "joint_compliance": Kind(
+        severity=_range(0.005, 2.0),
+        shape=_uniform(damping_s=(0.001, 0.004)),
+        values=lambda s, c, shape: {"compliance_rad_per_nm": s / c.kp, **shape},
+        plant=lambda v: Change(drive={"compliance": v["compliance_rad_per_nm"], "compliance_damping": v["damping_s"]}),
+        joints=(1, 2, 3),
+        stiff=False,
+    ),
+    # the encoder
+    "encoder_scale": Kind(
+        severity=_range(5e-4, 0.1),
+        shape=_signed(),
+        values=lambda s, c, shape: {"factor": 1.0 + shape["sign"] * s},
+        plant=lambda v: Change(drive={"encoder_scale": v["factor"]}),
+    ),
+    "encoder_bias": Kind(
+        severity=_range(1e-3, 0.2),
+        shape=_signed(),
+        values=lambda s, c, shape: {"bias_rad": shape["sign"] * s},
+        plant=lambda v: Change(drive={"encoder_bias": v["bias_rad"]}),
+    ),
+    "encoder_eccentricity": Kind(
+        severity=_range(5e-4, 0.05),
+        shape=_uniform(phase_rad=_PHASE),
+        values=lambda s, c, shape: {"amplitude_rad": s, **shape},
+        plant=lambda v: Change(
+            drive={"encoder_wave": v["amplitude_rad"], "encoder_waves": 1.0, "encoder_phase": v["phase_rad"]}
+        ),
+    ),
+    "sensor_delay": Kind(
+        severity=_range(5e-4, 0.1),
+        values=lambda s, c, shape: {"delay_s": s},
+        plant=lambda v: Change(report_delay_s=v["delay_s"]),
+    ),
+    # outside the registry
+    "loop_delay": Kind(
+        severity=lambda c: (1e-4, 0.5 * c.inertia / c.kd),  # from about J / K_d on it would oscillate
+        values=lambda s, c, shape: {"delay_s": s},
+        plant=lambda v: Change(drive={"loop_delay": v["delay_s"]}),
+        stiff=False,
+        registered=False,
+        near=("torque_lag",),
+    ),
+    "angle_friction": Kind(
+        severity=_SLIP,
+        shape=_uniform(share=(0.6, 0.95), phase_rad=_PHASE),
+        values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
+        plant=lambda v: Change(
+            drive={"coulomb": v["torque_nm"], "angle_share": v["share"], "angle_phase": v["phase_rad"]}
+        ),
+        registered=False,
+        near=("position_dependent_friction", "coulomb_friction"),
+    ),
+    "gear_error": Kind(
+        severity=_range(5e-4, 0.05),
+        shape=lambda rng, c: {"periods": float(rng.integers(5, 12)), "phase_rad": float(rng.uniform(*_PHASE))},
+        values=lambda s, c, shape: {"amplitude_rad": s, **shape},
+        plant=lambda v: Change(
+            drive={"encoder_wave": v["amplitude_rad"], "encoder_waves": v["periods"], "encoder_phase": v["phase_rad"]}
+        ),
+        registered=False,
+        near=("encoder_eccentricity", "cogging"),
+    ),
+    "magnetic_hysteresis": Kind(
+        severity=_SLIP,
+        shape=_uniform(width_rad=(0.04, 0.2)),
+        values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
+        plant=lambda v: Change(drive={"hysteresis": v["torque_nm"], "hysteresis_width": v["width_rad"]}),
+        registered=False,
+        near=("coulomb_friction", "stribeck_friction"),  # which slide only after some travel, too
+    ),
+    "warming_friction": Kind(
+        severity=_SLIP,
+        shape=_uniform(rate_per_s=(0.04, 0.065)),
+        values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
+        plant=lambda v: Change(drive={"coulomb": v["torque_nm"], "warm_up": v["rate_per_s"]}),
+        registered=False,
+        near=("coulomb_friction", "torque_fade"),
+    ),
+    "slow_velocity_filter": Kind(
+        severity=lambda c: (1e-3, 2.0 * c.inertia / c.kd),
+        values=lambda s, c, shape: {"time_constant_s": s},
+        plant=lambda v: Change(drive={"loop_steps": 8, "velocity_filter": v["time_constant_s"]}),
+        stiff=False,
+        registered=False,
+        near=("torque_lag", "armature"),  # at low frequencies it is an inertia of −K_d τ
+    ),
+    "hung_mass": Kind(  # a tool or cable that swings on the link
+        severity=_range(0.02, 1.0),
+        shape=_uniform(hz=(3.0, 9.0), damping=(0.02, 0.1)),
+        values=lambda s, c, shape: {"inertia_kgm2": s * c.inertia, **shape},
+        plant=lambda v: Change(
+            drive={
+                "hung_inertia": v["inertia_kgm2"],
+                "hung_rad_per_s": 2 * math.pi * v["hz"],
+                "hung_damping": v["damping"],
+            }
+        ),
+        stiff=False,
+        registered=False,
+        near=("armature", "payload", "joint_compliance"),
+    ),
+    "voltage_sag": Kind(
+        severity=_range(0.05, 5.0),
+        shape=_uniform(time_s=(0.02, 0.1)),
+        values=lambda s, c, shape: {"per_w": s / (c.torque * c.speed), **shape},
+        plant=lambda v: Change(drive={"sag": v["per_w"], "sag_time": v["time_s"]}),
+        stiff=False,
+        registered=False,
+        near=("torque_speed_limit", "torque_saturation"),
+    ),
+    "encoder_interpolation": Kind(  # between the lines of its disc
+        severity=_range(1e-4, 5e-3),
+        shape=lambda rng, c: {"periods": float(rng.integers(40, 121)), "phase_rad": float(rng.uniform(*_PHASE))},
+        values=lambda s, c, shape: {"amplitude_rad": s, **shape},
+        plant=lambda v: Change(
+            drive={"encoder_wave": v["amplitude_rad"], "encoder_waves": v["periods"], "encoder_phase": v["phase_rad"]}
+        ),
+        registered=False,
+        near=("encoder_eccentricity", "cogging"),
+    ),
+    "one_way_gains": Kind(
+        severity=_range(0.01, 0.5),
+        shape=_signed(),
+        values=lambda s, c, shape: {"share": shape["sign"] * s},
+        plant=lambda v: Change(drive={"one_way": v["share"]}),
+        stiff=False,
+        registered=False,
+        near=("asymmetric_friction",),
+    ),
+}
+"""Name → kind."""
+NOT_FITTED = ("dropped_commands",)
+"""Not repeated by any recording: no fit finds it, a finding about the recordings may."""
+REGISTERED = tuple(name for name, k in KINDS.items() if k.registered and name not in NOT_FITTED)
+OUTSIDE = tuple(name for name, k in KINDS.items() if not k.registered and name not in NOT_FITTED)

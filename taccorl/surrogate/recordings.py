@@ -1,0 +1,115 @@
+"""Recordings of a surrogate robot, in memory: what the drivers would have logged, with noise, quantisation and metadata.
+
+Letters in shapes: T rows, J signals.
+"""
+
+import math
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.signal import lfilter
+
+from taccorl.alignment.measurements.folder import Measurements, split
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.motions import DESIGNS, OPENING_M, RATE_HZ, REST_POSE, TEST, VALIDATION, Motion
+from taccorl.errors import TaccorlError, nearest
+from taccorl.robots import ROBOT
+from taccorl.surrogate.cases import Case
+from taccorl.surrogate.plant import COMMAND_MS
+from taccorl.surrogate.robot import NOISE_RAD, QUANTUM_RAD
+
+ORIGIN = "surrogate robot, simulated; not a robot"
+SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
+EFFORT_NOISE_SHARE, EFFORT_NOISE_NM, EFFORT_QUANTUM_NM = 0.01, 0.005, 1e-3
+"""Noise of efforts, a choice: share of the largest in the recording, and at least. PiPER reports steps of 1 mN·m."""
+OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
+
+
+def recordings(case: Case, design: str | None = None) -> Measurements:
+    """All recordings of one robot: those of the design for fitting, and others for validation and for the test.
+
+    Args:
+        design: ``chirp`` (the paper's 10 s sweep, twice) or ``pack`` (with triangle, steps, small chirp, 2× gain, payload);
+            the case's by default.
+
+    Raises:
+        TaccorlError: no such design.
+    """
+    design = case.design if design is None else design
+    if design not in DESIGNS:
+        raise TaccorlError(f"surrogate: no design {design!r}; {nearest(design, DESIGNS)}")
+    uses: dict[str, Sequence[Motion]] = {"fit": DESIGNS[design], "validation": VALIDATION, "test": TEST}
+    made = [record(case, motion) for motions in uses.values() for motion in motions]
+    return split(made, validation=[m.name for m in VALIDATION], test=[m.name for m in TEST])
+
+
+def record(case: Case, motion: Motion) -> Measurement:
+    """One recording. The same case and motion give the same numbers, bit for bit."""
+    rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(motion.name.encode())])
+    robot, motion = case.robot, case.motion(motion)
+    run = robot.run(motion, case.room, rng)
+    own = ROBOT.joint_slice(ROBOT.arms[robot.arm])
+    num_rows = len(run.angle) // COMMAND_MS
+    target = np.tile([*REST_POSE, OPENING_M] * len(ROBOT.arms), (num_rows, 1))
+    target[:, own] = robot.pose
+    target[:, own.start + robot.joint] = motion.target(case.room)
+    measured, velocity, effort = target.copy(), np.zeros_like(target), np.zeros_like(target)
+    rest = [k for k in ROBOT.joint_indices if not own.start <= k < own.stop]
+    # The other arm rests where its T_ref turns it; its weight is carried.
+    measured[:, rest] += np.array(ROBOT.torque_ff_nm) / np.array(ROBOT.kp_nm_per_rad)
+    measured[:, own] = robot.reported(run)
+    velocity[:, own], effort[:, own] = run.velocity[::COMMAND_MS], run.effort[::COMMAND_MS]
+    stated = _stated(case, motion)
+    return Measurement(
+        name=motion.name,
+        time_s=np.arange(num_rows) / RATE_HZ,
+        target=_rounded(target, QUANTUM_RAD, OPENING_QUANTUM_M),
+        measured=_rounded(
+            _noisy(rng, measured, NOISE_RAD, OPENING_NOISE_M, case.colour_s), QUANTUM_RAD, OPENING_QUANTUM_M
+        ),
+        velocity=_rounded(_noisy(rng, velocity, SPEED_NOISE_RAD_PER_S, 0.0), SPEED_QUANTUM_RAD_PER_S, 1e-3),
+        effort=_rounded(_noisy(rng, effort, _effort_noise(effort), 0.0), EFFORT_QUANTUM_NM, 1e-3),
+        origin=f"{ORIGIN}; {case.signal} under test",
+        instruction=f"sweep of {case.signal}: {motion.name}",
+        repeat_of=motion.repeat_of,
+        payload_kg={ROBOT.arms[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
+        # A mass that is held in every recording is one whose place was measured, too.
+        payload_position_m={ROBOT.arms[robot.arm]: case.payload_m} if case.payload_kg else {},
+        kp=stated.get("kp", {}),
+        kd=stated.get("kd", {}),
+        gain_scale=stated.get("gain_scale", {}),
+    )
+
+
+def _stated(case: Case, motion: Motion) -> dict[str, dict[str, float]]:
+    """What is written down of the gains: known ones in every recording, else only by what factor one is driven differently."""
+    if not case.gains_known:
+        return {"gain_scale": {case.signal: motion.gain}} if motion.gain != 1.0 else {}
+    control, joint = case.twin.controller, case.robot.joint
+    gains = {"kp": control.kp_nm_per_rad[joint], "kd": control.kd_nms_per_rad[joint]}
+    return {name: {case.signal: gain * motion.gain} for name, gain in gains.items()}
+
+
+def _noisy(
+    rng: np.random.Generator, values: np.ndarray, joints: float | np.ndarray, grippers: float, colour_s: float = 0.0
+) -> np.ndarray:
+    size = np.broadcast_to(np.asarray(joints, dtype=float), ROBOT.num_actions).copy()
+    size[ROBOT.gripper_indices] = grippers
+    noise = rng.standard_normal(values.shape)
+    if colour_s > 0.0:
+        keep = math.exp(-1.0 / (colour_s * RATE_HZ))
+        noise[0] /= math.sqrt(1.0 - keep**2)
+        noise = math.sqrt(1.0 - keep**2) * np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
+    return values + size * noise
+
+
+def _effort_noise(effort: np.ndarray) -> np.ndarray:
+    """(J,) N·m."""
+    return np.maximum(EFFORT_NOISE_SHARE * np.abs(effort).max(axis=0), EFFORT_NOISE_NM)
+
+
+def _rounded(values: np.ndarray, joints: float, grippers: float) -> np.ndarray:
+    """To the drivers' steps, of joints and of grippers."""
+    step = ROBOT.per_action(joints, grippers)
+    return np.round(values / step) * step

@@ -1,0 +1,146 @@
+"""Settings of a stand-in recording: contents, behaviour of the imitated drivers, and faults."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.surrogate.stand_in.frame_id import SMALLEST_PICTURE
+from taccorl.surrogate.stand_in.kinematics import ARMS
+from taccorl.surrogate.stand_in.messages import ENCODINGS
+from taccorl.surrogate.stand_in.scene import CAMERAS
+from taccorl.surrogate.stand_in.story import PADS, SHORTEST_EPISODE_S
+
+START_UNIX_NS = 1_780_000_000 * 10**9  # wall clock when every stand-in recording begins
+
+STATE_TOPICS = {arm: f"/joint_states_{arm}" for arm in ARMS}
+COMMAND_TOPICS = {arm: f"/joint_states_ctrl_{arm}" for arm in ARMS}
+CAMERA_TOPICS = {
+    "front": "/camera_f/color/image_raw/compressed",
+    "left_wrist": "/camera_l/color/image_raw/compressed",
+    "right_wrist": "/camera_r/color/image_raw/compressed",
+}
+PAD_TOPICS = {pad: f"/{pad}" for pad in PADS}
+EPISODE_TOPIC = "/episode"
+SPEC_TOPICS = (
+    *STATE_TOPICS.values(),
+    *COMMAND_TOPICS.values(),
+    *CAMERA_TOPICS.values(),
+    *PAD_TOPICS.values(),
+    EPISODE_TOPIC,
+)
+EXTRA_TOPICS_HZ = {"/arm_status_left": 50, "/tf": 30, "/enable_srv/_service_event": 2}  # no data spec names these
+
+JOINT_HZ, CAMERA_HZ, PAD_HZ = 200, 30, 100
+PIPER_RAD_PER_DEG = 0.017444  # in piper_ros; π/180 would be 0.0174533, so published positions are 0.053 % too small
+SCAN_S = 0.010  # a FlexiTac frame is read row by row during its whole period
+OUTCOMES = ("success", "failure", "discard")
+
+Taxels = dict[str, list[tuple[int, int]]]  # pad name -> (row, column) in wire order
+Gap = tuple[str, float, float]  # topic, from, to [s since the start]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StandInConfig:
+    """Settings of a stand-in recording. Faults are absent by default."""
+
+    duration_s: float = 6.0
+    seed: int = 0
+    episodes: int = 1
+    """Equal time slots, each one attempt between its markers; at least 2 s each."""
+    outcomes: tuple[str, ...] = ("success",)
+    """Closing markers, repeated over the episodes; in a ``failure`` the tube misses the hole."""
+    instruction: str = "insert the test tube into the rack"
+    camera_size: tuple[int, int] = (480, 640)
+    """Rows, columns."""
+    jpeg_quality: int = 85
+    encoding: Literal["ros2", "json", "protobuf"] = "ros2"
+    compression: Literal["none", "lz4", "zstd"] = "lz4"
+    """Of MCAP chunks. JPEG does not shrink, so the cheap one."""
+    chunk_size_bytes: int = 1 << 20
+    hdf5_jpeg: bool = True
+    """HDF5 only: pictures as padded JPEG (attribute ``compress``) or as raw RGB."""
+
+    # How arms and drivers behave. "Jitter" is the standard deviation of a normal draw; a latency adds its magnitude.
+    command_lead_s: float = 0.08
+    """Time constant with which the arms follow their command."""
+    contact_delay_s: float = 0.03
+    """From the fingers' stop to the pads' first count."""
+    camera_stamp_jitter_s: float = 0.0006
+    camera_latency_s: float = 0.030
+    """Log time − stamp."""
+    camera_latency_jitter_s: float = 0.004
+    camera_loss_probability: float = 0.004
+    """Per picture."""
+    joint_latency_s: float = 0.0012
+    joint_latency_jitter_s: float = 0.0004
+    joint_repeat_probability: float = 0.02
+    """The 200 Hz loop found no new CAN frame and publishes the last values and stamp again."""
+    command_silence_s: float = 0.04
+    """Until a command is seen on CAN, its messages have stamp 0 and zeros."""
+    pad_latency_s: float = 0.004
+    """From the end of a scan to the end of the host's read, the only time a pad message has."""
+    pad_latency_jitter_s: float = 0.0005
+    pad_noise_counts: float = 1.3
+    """Standard deviation per taxel and frame."""
+    pad_gain_spread: float = 0.10
+    """Standard deviation of the taxels' gains."""
+
+    # Faults
+    joints_in_degrees: bool = False
+    swap_arms: bool = False
+    """Joint topics of one arm carry the other's messages (CAN adapters swapped); cameras and pads are right."""
+    sim_time_stamps: bool = False
+    """Header stamps count from 0 while log times are wall clock."""
+    clock_offset_s: dict[str, float] = field(default_factory=dict)
+    """Topic -> how far its clock is ahead: moves the header stamp, or the log time where there is no header."""
+    gap: Gap | list[Gap] | tuple[()] = ()
+    """Messages missing: (topic, from, to) or several of them, in seconds since the start."""
+    frozen_camera: str | None = None
+    """After a third of the recording this camera repeats one picture with new stamps."""
+    dead_taxels: Taxels = field(default_factory=dict)
+    """Always 0."""
+    stuck_taxels: Taxels = field(default_factory=dict)
+    """Always the same count between 60 and 120."""
+    saturated_taxels: Taxels = field(default_factory=dict)
+    """Always 255."""
+    swap_pads: tuple[str, str] | None = None
+    """Two pads whose messages come under each other's topic."""
+    baseline_drift_counts_per_s: float = 0.0
+    noise_only_touch: bool = False
+    """The pads never feel contact."""
+    tactile_lag_s: float = 0.0
+    """The pads feel everything this much later."""
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """``gap`` as a list, whichever way it was given."""
+        given = self.gap
+        return [given] if isinstance(given, tuple) and len(given) == 3 else list(given)
+
+    def __post_init__(self) -> None:
+        slot_s = self.duration_s / self.episodes
+        if slot_s < SHORTEST_EPISODE_S:
+            raise TaccorlError(
+                f"stand-in: {self.episodes} episodes in {self.duration_s:g} s leave {slot_s:g} s each, and the story "
+                f"takes {SHORTEST_EPISODE_S:g} s. Raise duration_s or lower episodes."
+            )
+        if self.camera_size[0] < SMALLEST_PICTURE[0] or self.camera_size[1] < SMALLEST_PICTURE[1]:
+            raise TaccorlError(
+                f"stand-in: camera_size {self.camera_size} has no room for the frame id in its corner. "
+                f"Take at least {SMALLEST_PICTURE} (rows, columns)."
+            )
+        _check_names("encoding", [self.encoding], ENCODINGS)
+        _check_names("compression", [self.compression], ("none", "lz4", "zstd"))
+        _check_names("outcomes", self.outcomes, OUTCOMES)
+        _check_names("clock_offset_s", self.clock_offset_s, SPEC_TOPICS)
+        _check_names("gap", [topic for topic, _, _ in self.gaps], SPEC_TOPICS)
+        _check_names("frozen_camera", [self.frozen_camera] if self.frozen_camera else [], CAMERAS)
+        for name in ("swap_pads", "dead_taxels", "stuck_taxels", "saturated_taxels"):
+            _check_names(name, getattr(self, name) or (), PADS)
+
+
+def _check_names(setting: str, given: Iterable[str], known: Iterable[str]) -> None:
+    for name in given:
+        if name not in known:
+            raise TaccorlError(f"stand-in: {setting} has {name!r}; {nearest(name, known)}")

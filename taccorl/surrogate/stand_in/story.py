@@ -1,0 +1,318 @@
+"""True signals of a stand-in recording: the left arm holds a rack, the right arm puts a tube into it. No physics.
+
+command q*(t)   minimum-jerk between solved key poses, plus a hand's tremor
+state q(t)      q̇ = (q* − q) / τ with τ = ``command_lead_s``; a gripper stops where it meets its part
+grip(t)         how far the gripper would have gone on into the part, one contact delay later, 0 to 1
+touch(t)        grip × footprint of the part on the pad (tube: a stripe; rack: a patch), moved by the insertion load
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.robots import ROBOT
+from taccorl.surrogate.stand_in.kinematics import ARMS, link_poses, solve_joints
+
+PADS = ("left_robot_left_finger", "left_robot_right_finger", "right_robot_left_finger", "right_robot_right_finger")
+PAD_WIRE_SHAPE = (12, 32)  # rows across the finger, columns from palm to finger tip, as FlexiTac's board sends them
+
+GRIPPER_OPEN_M = 0.065  # of PiPER's 0.070 m stroke
+SQUEEZE_M = 0.008  # how far past first touch the closing command goes
+PART_WIDTH_M = {"left": 0.040, "right": 0.018}  # rack, tube
+
+# Positions of parts are those of the middle of their lower face.
+GRASP_FROM_RACK_M = np.array([0.0, 0.048, 0.036])
+GRASP_FROM_TUBE_M = np.array([0.0, 0.0, 0.085])
+HOLE_FROM_RACK_M = np.array([0.0, -0.045, 0.010])  # where the tube's lower end comes to rest
+STAND_HEIGHT_M = 0.012  # the tube waits in a small stand
+MISSED_BY_M = 0.038  # a failed insertion stops this much too high
+
+_GRID_HZ = 500
+SHORTEST_EPISODE_S = 2.0  # else the pads would touch within half a second of the start marker
+_MARKER_MARGIN_S = 0.1  # between the edge of an episode's time slot and its marker
+_TREMOR_RAD = 0.002  # times three sines
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodePlan:
+    """Plan of one episode; times in seconds from the start of the recording."""
+
+    start_s: float
+    end_s: float
+    outcome: str
+    rack_start_world: np.ndarray
+    tube_start_world: np.ndarray
+    place_world: np.ndarray
+
+    def at(self, fraction: float) -> float:
+        """Time at which this fraction of the episode is over."""
+        return self.start_s + fraction * (self.end_s - self.start_s)
+
+    def closing_s(self, arm: str) -> tuple[float, float]:
+        """Start and end of the gripper's closing command."""
+        begin = self.at(0.30 if arm == "left" else 0.35)
+        return begin, begin + min(0.5, 0.06 * (self.end_s - self.start_s))
+
+    def opening_s(self, arm: str) -> tuple[float, float]:
+        begin = self.at(0.92 if arm == "left" else 0.82)
+        return begin, begin + min(0.4, 0.04 * (self.end_s - self.start_s))
+
+    def insertion_s(self) -> tuple[float, float]:
+        return self.at(0.68), self.at(0.77)
+
+
+def plan_episodes(duration_s: float, episodes: int, outcomes: tuple[str, ...], seed: int) -> list[EpisodePlan]:
+    """Equal time slots; the parts start a little elsewhere in each."""
+    plans, slot_s = [], duration_s / episodes
+    for i in range(episodes):
+        shift = np.random.default_rng([seed, 1, i]).uniform(-0.02, 0.02, (3, 2))
+        plans.append(
+            EpisodePlan(
+                start_s=i * slot_s + _MARKER_MARGIN_S,
+                end_s=(i + 1) * slot_s - _MARKER_MARGIN_S,
+                outcome=outcomes[i % len(outcomes)],
+                rack_start_world=np.array([0.36 + shift[0, 0], 0.17 + shift[0, 1], 0.0]),
+                tube_start_world=np.array([0.38 + shift[1, 0], -0.20 + shift[1, 1], STAND_HEIGHT_M]),
+                place_world=np.array([0.38 + shift[2, 0] / 2, 0.02 + shift[2, 1] / 2, 0.0]),
+            )
+        )
+    return plans
+
+
+def _ramp(x: np.ndarray, start: float | np.ndarray, end: float | np.ndarray) -> np.ndarray:
+    """0 before ``start``, 1 after ``end``, minimum jerk between."""
+    s = np.clip((x - start) / np.maximum(end - start, 1e-9), 0.0, 1.0)
+    return s * s * s * (10 - 15 * s + 6 * s * s)
+
+
+def _follow(command: np.ndarray, time_constant_s: float) -> np.ndarray:
+    """Steps q̇ = (q* − q) / τ along the grid, exactly for a command that stays at the mean of its two ends."""
+    keep = math.exp(-1.0 / (_GRID_HZ * time_constant_s))
+    drive = 0.5 * (1 - keep) * (command[1:] + command[:-1])
+    state = np.empty_like(command)
+    state[0] = command[0]
+    for n in range(len(drive)):  # scipy.signal would do it too, and takes a second to import
+        state[n + 1] = keep * state[n] + drive[n]
+    return state
+
+
+class Story:
+    """One recording's truth as functions of the time since its start. State and command are left arm first, (N, 14)."""
+
+    def __init__(
+        self, plans: list[EpisodePlan], duration_s: float, command_lead_s: float, contact_delay_s: float, seed: int
+    ) -> None:
+        self.plans, self.contact_delay_s = plans, contact_delay_s
+        self.time_s = np.arange(-_GRID_HZ, math.ceil((duration_s + 1.0) * _GRID_HZ) + 1) / _GRID_HZ  # −1 s to end + 1 s
+        self._command = np.empty((len(self.time_s), ROBOT.num_actions))
+        for a, arm in enumerate(ARMS):
+            self._command[:, ROBOT.joint_slice(arm)] = self._joint_commands(arm, np.random.default_rng([seed, 2, a]))
+            self._command[:, ROBOT.gripper_index(arm)] = self._gripper_commands(arm)
+        self._state = _follow(self._command, command_lead_s)
+        self._velocity = (self._command - self._state) / command_lead_s
+        self._squeeze_m = np.empty((len(self.time_s), len(ARMS)))
+        for a, arm in enumerate(ARMS):
+            opening_m = self._state[:, ROBOT.gripper_index(arm)]
+            self._squeeze_m[:, a] = np.maximum(PART_WIDTH_M[arm] - opening_m, 0.0)
+            np.maximum(opening_m, PART_WIDTH_M[arm], out=opening_m)  # the part is in the way
+            self._velocity[self._squeeze_m[:, a] > 0, ROBOT.gripper_index(arm)] = 0.0
+        self._load = self._insertion_load()
+        self._holds = {arm: self._hold_times(arm) for arm in ARMS}
+        self._parts = [self._part_anchors(i) for i in range(len(plans))]
+
+    def _joint_commands(self, arm: str, rng: np.random.Generator) -> np.ndarray:
+        times, points = _key_poses(arm, self.plans)
+        poses = solve_joints(arm, points)
+        i = np.clip(np.searchsorted(times, self.time_s, side="right") - 1, 0, len(times) - 2)
+        command = poses[i] + _ramp(self.time_s, times[i], times[i + 1])[:, None] * (poses[i + 1] - poses[i])
+        for _ in range(3):  # a hand is never still
+            hz, phase = rng.uniform(0.3, 2.2, ROBOT.num_joints), rng.uniform(0, 2 * np.pi, ROBOT.num_joints)
+            command += _TREMOR_RAD * np.sin(2 * np.pi * hz * self.time_s[:, None] + phase)
+        return command
+
+    def _gripper_commands(self, arm: str) -> np.ndarray:
+        opening_m = np.full(len(self.time_s), GRIPPER_OPEN_M)
+        for plan in self.plans:
+            closed = _ramp(self.time_s, *plan.closing_s(arm)) - _ramp(self.time_s, *plan.opening_s(arm))
+            opening_m -= (GRIPPER_OPEN_M - PART_WIDTH_M[arm] + SQUEEZE_M) * closed
+        return opening_m
+
+    def _insertion_load(self) -> np.ndarray:
+        """0 to 1: how hard the tube is pushed against the rack. A missed hole pushes harder, and until release."""
+        load = np.zeros(len(self.time_s))
+        for plan in self.plans:
+            begin, seated = plan.insertion_s()
+            release = plan.opening_s("right")[0]
+            pushed = _ramp(self.time_s, 0.5 * (begin + seated), seated)
+            if plan.outcome == "failure":
+                load += pushed * (self.time_s < release)
+            else:
+                load += 0.8 * pushed * (1.0 - _ramp(self.time_s, seated, release))
+        return load
+
+    def _sample(self, grid: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+        """Linear interpolation of a grid array: shape time_s.shape + grid.shape[1:]."""
+        x = np.clip((np.asarray(time_s, float) - self.time_s[0]) * _GRID_HZ, 0, len(self.time_s) - 1.001)
+        i = x.astype(np.int64)
+        weight = (x - i).reshape(x.shape + (1,) * (grid.ndim - 1))
+        return (1 - weight) * grid[i] + weight * grid[i + 1]
+
+    def state(self, time_s: np.ndarray) -> np.ndarray:
+        """Six joints [rad] and gripper opening [m] of each arm, (N, 14)."""
+        return self._sample(self._state, time_s)
+
+    def command(self, time_s: np.ndarray) -> np.ndarray:
+        """Commands of the leader arms, same order, (N, 14)."""
+        return self._sample(self._command, time_s)
+
+    def velocity(self, time_s: np.ndarray) -> np.ndarray:
+        """Rate of the state, rad/s and m/s, (N, 14)."""
+        return self._sample(self._velocity, time_s)
+
+    def effort(self, time_s: np.ndarray) -> np.ndarray:
+        """Plausible efforts (N, 14) [N·m]: gravity on the long links, tracking error, the grippers' squeeze."""
+        joints = self.state(time_s)
+        effort = 6.0 * (self.command(time_s) - joints)
+        for arm in ARMS:
+            own, own_effort = (rows[:, ROBOT.joint_slice(arm)] for rows in (joints, effort))
+            shoulder, elbow = own[:, 1], own[:, 2]
+            own_effort[:, 1] += 5.0 * np.cos(shoulder)
+            own_effort[:, 2] += 2.5 * np.cos(shoulder + elbow)
+            effort[:, ROBOT.gripper_index(arm)] = 1.2 * self.grip(arm, time_s)
+        return effort
+
+    def grip(self, arm: str, time_s: np.ndarray) -> np.ndarray:
+        """Grip at the pads, 0 to 1, any shape."""
+        felt_m = self._sample(self._squeeze_m, np.asarray(time_s, float) - self.contact_delay_s)
+        return felt_m[..., ARMS.index(arm)] / SQUEEZE_M
+
+    def _hold_times(self, arm: str) -> list[tuple[float, float]]:
+        """From when to when the fingers are stopped by the part, one interval per episode."""
+        stopped = np.diff((self._squeeze_m[:, ARMS.index(arm)] > 0).astype(np.int8))
+        begins_s = self.time_s[:-1][stopped > 0]  # the last instant before, so that interpolation stays inside
+        ends_s = self.time_s[1:][stopped < 0]
+        return [(float(a), float(b)) for a, b in zip(begins_s, ends_s, strict=True)]
+
+    def contact_s(self, arm: str) -> list[tuple[float, float]]:
+        """Interval in which the pads of an arm are in contact with its part, one per episode."""
+        return [(a + self.contact_delay_s, b + self.contact_delay_s) for a, b in self._holds[arm]]
+
+    def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
+        """Counts above baseline in wire order, (N, 12, 32), before taxel gains, noise and rounding.
+
+        ``time_s`` is (N,) for one instant, or (N, 12) where every row is scanned at its own time.
+        """
+        arm = pad.split("_")[0]
+        row_time_s = np.broadcast_to(np.asarray(time_s, float).reshape(len(time_s), -1), (len(time_s), 12))
+        grip = self.grip(arm, row_time_s)[..., None]
+        load = np.where(grip > 0, self._sample(self._load, row_time_s)[..., None], 0.0)
+        row, col = np.arange(12.0)[:, None], np.arange(32.0)
+        if pad.endswith("right_finger"):
+            row = 11.0 - row  # the two pads of a gripper face each other
+        if arm == "right":  # tube: a stripe along the finger; pushing tilts it and digs its upper end in
+            middle = 5.2 + 1.4 * load + (0.02 + 0.07 * load) * (col - 18)
+            stripe = np.exp(-0.5 * ((row - middle) / 1.25) ** 2) / (1 + np.exp((9.0 - col) / 0.8))
+            ridge = 0.50 * load * np.exp(-0.5 * ((col - 11.0) / 1.1) ** 2 - 0.5 * ((row - middle) / 2.2) ** 2)
+            counts = 105.0 * grip**0.9 * (stripe + ridge)
+        else:  # rack: a patch at the finger tip with a firmer edge; pushing shears it towards the tip
+            top = 14.0 + 2.0 * load
+            inside = 1 / (1 + np.exp((top - col) / 0.7)) / (1 + np.exp((np.abs(row - 5.5) - 5.0) / 0.6))
+            ridge = np.exp(-0.5 * ((col - top - 1.5) / 1.0) ** 2) * (0.3 + 0.5 * load)
+            counts = 75.0 * grip**0.9 * inside * (0.8 + ridge + 0.15 * load)
+        return np.where(grip > 0, counts, 0.0).astype(np.float32)
+
+    def _world_from_gripper(self, arm: str, time_s: np.ndarray) -> np.ndarray:
+        return link_poses(arm, self.state(time_s)[:, ROBOT.joint_slice(arm)])[:, -1]
+
+    def _part_anchors(self, episode: int) -> dict[str, np.ndarray]:
+        """Constant poses of one episode: where parts start, how they sit in the grippers, where they end."""
+        plan = self.plans[episode]
+        taken = {arm: np.array(self._holds[arm][episode]) for arm in ARMS}
+        rack, tube = _upright(plan.rack_start_world), _upright(plan.tube_start_world)
+        left_take, left_give = self._world_from_gripper("left", taken["left"])
+        right_take, right_give = self._world_from_gripper("right", taken["right"])
+        left_from_rack = np.linalg.inv(left_take) @ rack
+        right_from_tube = np.linalg.inv(right_take) @ tube
+        left_at_give = self._world_from_gripper("left", taken["right"][1:])[0]
+        rack_from_tube = np.linalg.inv(left_at_give @ left_from_rack) @ right_give @ right_from_tube
+        fallen = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
+        fallen[:3, 3] = plan.place_world + np.array([0.10, -0.10, 0.008])
+        return {
+            "rack_start": rack,
+            "tube_start": tube,
+            "left_from_rack": left_from_rack,
+            "right_from_tube": right_from_tube,
+            "rack_end": left_give @ left_from_rack,
+            "rack_from_tube": rack_from_tube,
+            "tube_fallen": fallen,
+        }
+
+    def part_poses(self, time_s: float, left_gripper: np.ndarray, right_gripper: np.ndarray) -> dict[str, np.ndarray]:
+        """World poses (4, 4) of rack, tube and stand, given those of the two link-6 frames at that time."""
+        starts = [plan.start_s - _MARKER_MARGIN_S for plan in self.plans]
+        i = max(int(np.searchsorted(starts, time_s, side="right")) - 1, 0)
+        parts, plan = self._parts[i], self.plans[i]
+        (rack_taken, rack_given), (tube_taken, tube_given) = self._holds["left"][i], self._holds["right"][i]
+        if time_s < rack_taken:
+            rack = parts["rack_start"]
+        else:
+            rack = left_gripper @ parts["left_from_rack"] if time_s < rack_given else parts["rack_end"]
+        if time_s < tube_taken:
+            tube = parts["tube_start"]
+        elif time_s < tube_given:
+            tube = right_gripper @ parts["right_from_tube"]
+        else:
+            tube = parts["tube_fallen"] if plan.outcome == "failure" else rack @ parts["rack_from_tube"]
+        return {"rack": rack, "tube": tube, "stand": _upright(plan.tube_start_world * [1.0, 1.0, 0.0])}
+
+
+def _upright(pos_world: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = pos_world
+    return pose
+
+
+def _key_poses(arm: str, plans: list[EpisodePlan]) -> tuple[np.ndarray, np.ndarray]:
+    """Times (K,) and pad-middle positions (K, 3) an arm passes through; equal neighbours are rests."""
+    times, points = [-1.0], [np.array([0.28, 0.24 if arm == "left" else -0.24, 0.22])]
+
+    def rest(until_s: float) -> None:
+        times.append(until_s)
+        points.append(points[-1])
+
+    def go(arrive_s: float, point: np.ndarray) -> None:
+        times.append(arrive_s)
+        points.append(point)
+
+    for plan in plans:
+        rest(plan.at(0.04 if arm == "left" else 0.07))
+        if arm == "left":
+            grasp, put = plan.rack_start_world + GRASP_FROM_RACK_M, plan.place_world + GRASP_FROM_RACK_M
+            go(plan.at(0.21), grasp + 0.08 * _UP)
+            go(plan.at(0.28), grasp)
+            rest(plan.at(0.38))
+            go(plan.at(0.46), grasp + 0.05 * _UP)
+            go(plan.at(0.57), put + 0.03 * _UP)
+            rest(plan.at(0.86))
+            go(plan.at(0.90), put)
+            rest(plan.at(0.96))
+            go(plan.at(1.00), put + 0.06 * _UP)
+        else:
+            grasp = plan.tube_start_world + GRASP_FROM_TUBE_M
+            seated = plan.place_world + 0.03 * _UP + HOLE_FROM_RACK_M + GRASP_FROM_TUBE_M
+            over = seated + 0.05 * _UP
+            stop = seated + MISSED_BY_M * _UP if plan.outcome == "failure" else seated
+            go(plan.at(0.24), grasp + 0.06 * _UP)
+            go(plan.at(0.33), grasp)
+            rest(plan.at(0.43))
+            go(plan.at(0.51), grasp + 0.08 * _UP)
+            go(plan.at(0.63), over)
+            rest(plan.at(0.68))
+            go(plan.at(0.77), stop)
+            rest(plan.at(0.86))
+            go(plan.at(0.93), stop + 0.05 * _UP)
+            go(plan.at(1.00), over + np.array([-0.02, -0.10, 0.02]))
+    rest(times[-1] + 10.0)
+    return np.array(times), np.array(points)

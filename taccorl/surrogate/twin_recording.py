@@ -1,0 +1,152 @@
+"""A demonstration in the twin as the robot's drivers would have recorded it: MCAP with their rates and jitter.
+
+The same streams as the stand-in's, computed from a trajectory of the twin: joints at 200 Hz, pads at 100 Hz with their rolling
+scan, pictures at 30 Hz from the state at their own stamps. No picture is lost on the way: two lost in a row would split the
+episode. Lost pictures are a fault, which the stand-in's recordings show. Nothing here comes from a robot, and the file says so.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from taccorl.sim.rendering import Renderer
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.trajectory import SAMPLE_HZ, Trajectory
+from taccorl.surrogate.stand_in.backdrop import sensor_noise
+from taccorl.surrogate.stand_in.config import StandInConfig
+from taccorl.surrogate.stand_in.files import publish
+from taccorl.surrogate.stand_in.story import PADS, EpisodePlan
+from taccorl.surrogate.stand_in.streams import Streams
+
+LEAD_S = 1.0
+"""The arms rest this long before and after: the first frames of a pad are its baseline."""
+
+
+class TwinStory:
+    """Signals of the trajectory at any time of the recording. Before and after the trajectory everything is at rest."""
+
+    def __init__(self, sim: Simulation, trajectory: Trajectory, outcome: str) -> None:
+        self.sim, self.trajectory = sim, trajectory
+        self.duration_s = float(trajectory.time_s[-1]) + 2 * LEAD_S
+        nowhere = np.zeros(3)
+        self.plans = [
+            EpisodePlan(
+                start_s=LEAD_S / 2,
+                end_s=self.duration_s - LEAD_S / 2,
+                outcome=outcome,
+                rack_start_world=nowhere,
+                tube_start_world=nowhere,
+                place_world=nowhere,
+            )
+        ]
+        self._velocity = np.gradient(trajectory.reported, 1 / SAMPLE_HZ, axis=0)
+        # (T, 4, 12, 32) counts above baseline, without noise and rounding, in wire order
+        self._counts = self.sim.sensor.clean_counts(trajectory.reading).swapaxes(2, 3)
+
+    def state(self, time_s: np.ndarray) -> np.ndarray:
+        """State (N, 14) [rad, m] as the encoders report it."""
+        return self._at(self.trajectory.reported, time_s)
+
+    def command(self, time_s: np.ndarray) -> np.ndarray:
+        """Commands (N, 14) [rad, m]."""
+        return self._at(self.trajectory.targets, time_s)
+
+    def velocity(self, time_s: np.ndarray) -> np.ndarray:
+        """Velocities (N, 14) [rad/s, m/s]."""
+        return self._at(self._velocity, time_s)
+
+    def effort(self, time_s: np.ndarray) -> np.ndarray:
+        """Efforts (N, 14) [N·m, N]."""
+        return self._at(self.trajectory.effort, time_s)
+
+    def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
+        """Counts (N, 12, 32) above baseline in wire order: the pad's columns are the wire's rows."""
+        counts = self._counts[:, PADS.index(pad)]
+        rows = np.broadcast_to(np.asarray(time_s, float).reshape(len(time_s), -1), (len(time_s), 12))
+        before, share = self._place(rows)
+        row = np.arange(12)
+        low, high = counts[before, row], counts[np.minimum(before + 1, len(counts) - 1), row]
+        return low + share[..., None] * (high - low)
+
+    def _place(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sample before an instant, and the share of the way to the next."""
+        at = np.clip((np.asarray(time_s) - LEAD_S) * SAMPLE_HZ, 0, len(self.trajectory.time_s) - 1)
+        before = np.minimum(at.astype(int), max(len(self.trajectory.time_s) - 2, 0))
+        return before, at - before
+
+    def _at(self, values: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+        before, share = self._place(time_s)
+        low, high = values[before], values[np.minimum(before + 1, len(values) - 1)]
+        return low + share[:, None] * (high - low)
+
+    def data_at(self, time_s: float, data: mujoco.MjData) -> None:
+        """Positions at an instant: from the sample before, moved on with its velocity."""
+        before, share = self._place(np.array(time_s))
+        data.qpos[:] = self.trajectory.qpos[before]
+        mujoco.mj_integratePos(self.sim.model, data.qpos, self.trajectory.qvel[before], float(share) / SAMPLE_HZ)
+        data.mocap_pos[:], data.mocap_quat[:] = self.trajectory.mocap[:, :3], self.trajectory.mocap[:, 3:]
+        mujoco.mj_kinematics(self.sim.model, data)
+        mujoco.mj_comPos(self.sim.model, data)
+        mujoco.mj_camlight(self.sim.model, data)
+
+
+class TwinScene:
+    """The twin's cameras, with a colour sensor's noise."""
+
+    def __init__(self, story: TwinStory, camera_size: tuple[int, int]) -> None:
+        self.story, self.size = story, camera_size
+        self._data = mujoco.MjData(story.sim.model)
+        self._renderers: dict[str, Renderer] = {}
+
+    def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
+        """One uint8 picture (rows, columns, 3), blue first, per time."""
+        if camera not in self._renderers:
+            self._renderers[camera] = Renderer(self.story.sim.model, (camera,), *self.size)
+        rows, columns = self.size
+        sim = self.story.sim
+        age_s = sim.effects.picture_age_s(camera)
+        config = next(c for c in sim.config.cameras if c.name == camera)
+        noise = sensor_noise(rows, columns)
+        for when, k in zip(time_s.tolist(), frame_ids.tolist(), strict=True):
+            self.story.data_at(when - age_s, self._data)
+            picture = sim.effects.picture(self._renderers[camera].render([self._data])[0], config)[0, :, :, ::-1]
+            piece = noise[k * 7 % 32 :, k * 13 % 32 :][:rows, :columns]
+            yield np.clip(picture.astype(np.int16) + piece - 9, 0, 255).astype(np.uint8)
+
+    def close(self) -> None:
+        """Free OpenGL contexts."""
+        for renderer in self._renderers.values():
+            renderer.close()
+
+
+def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, success: bool, origin: str) -> None:
+    """One episode as a recording of its own; replaces the file if there is one.
+
+    Args:
+        sim: the simulation that the trajectory is of.
+        origin: what this is, e.g. "surrogate: …"; goes into the file and every dataset made of it.
+    """
+    story = TwinStory(sim, trajectory, "success" if success else "failure")
+    config = StandInConfig(
+        duration_s=story.duration_s,
+        seed=int(sim.seeds[0]),
+        instruction=sim.task.instruction,
+        camera_loss_probability=0.0,
+        pad_gain_spread=0.0,
+    )
+    scene = TwinScene(story, config.camera_size)
+    try:
+        label = {
+            "origin": origin,
+            "task": sim.task.name,
+            "seed": str(int(sim.seeds[0])),
+            "instruction": sim.task.instruction,
+        }
+        label["drivers"] = json.dumps({k: v for k, v in asdict(config).items() if isinstance(v, int | float)})
+        publish(path, Streams(config, story, scene), label)
+    finally:
+        scene.close()

@@ -1,0 +1,264 @@
+"""A surrogate robot as files: MCAP as the drivers write it, the twin that its user starts from, and the sealed truth.
+
+FOLDER/sweeps/*.mcap, measurements.yaml    for ``taccorl compare`` and ``diagnose``
+FOLDER/twin.yaml                           without the hidden effects
+FOLDER/sealed_truth.json                   beside the measurements and not among them: nothing that reads them reads it
+
+Surrogate pads are written in the same way; what was pressed stands in their measurements.yaml.
+"""
+
+import base64
+import dataclasses
+import json
+import math
+import shutil
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from taccorl.alignment.measurements.folder import INDEX, Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.shapes import Capsule, Cylinder
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import save_twin
+from taccorl.surrogate.cases import Case
+from taccorl.surrogate.recordings import recordings
+from taccorl.surrogate.stand_in import messages
+from taccorl.surrogate.stand_in.config import COMMAND_TOPICS, PAD_TOPICS, SCAN_S, STATE_TOPICS, StandInConfig
+from taccorl.surrogate.stand_in.files import publish
+from taccorl.surrogate.stand_in.story import PAD_WIRE_SHAPE, PADS, EpisodePlan
+from taccorl.surrogate.stand_in.streams import Event, Streams
+from taccorl.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
+from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
+
+SWEEPS, TWIN, TRUTH = "sweeps", "twin.yaml", "sealed_truth.json"
+FINGERS_LAG_S = 0.03
+"""Time constant with which surrogate fingers follow their command. A choice."""
+_NOTE = "What is hidden in this surrogate robot. Compare and diagnose do not read it; `taccorl surrogate --reveal` prints it."
+
+
+class _Rows:
+    """A measurement as the drivers' story: what stands in its rows, between which nobody asks. A driver that measures no
+    velocity or effort sends zeros."""
+
+    def __init__(self, measurement: Measurement) -> None:
+        self.measurement = measurement
+        self.plans: list[EpisodePlan] = []
+        self.duration_s = measurement.num_rows / measurement.rate_hz
+
+    def _at(self, values: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+        row = np.rint(np.asarray(time_s) * self.measurement.rate_hz).astype(int)
+        return values[np.clip(row, 0, len(values) - 1)]
+
+    def state(self, time_s: np.ndarray) -> np.ndarray:
+        """(N, 14)."""
+        return self._at(self.measurement.measured, time_s)
+
+    def command(self, time_s: np.ndarray) -> np.ndarray:
+        """(N, 14)."""
+        return self._at(self.measurement.target, time_s)
+
+    def velocity(self, time_s: np.ndarray) -> np.ndarray:
+        """(N, 14)."""
+        return self._at(np.nan_to_num(self.measurement.velocity), time_s)
+
+    def effort(self, time_s: np.ndarray) -> np.ndarray:
+        """(N, 14)."""
+        return self._at(np.nan_to_num(self.measurement.effort), time_s)
+
+    def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
+        """(N, 12, 32) in wire order: nothing is touched."""
+        return np.zeros((len(time_s), *PAD_WIRE_SHAPE))
+
+
+class _Dark:
+    """No camera looks at a sweep."""
+
+    def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
+        """None."""
+        return iter(())
+
+
+class _Sweep(Streams):
+    """Joints, commands and pads."""
+
+    def __init__(self, config: StandInConfig, rows: _Rows) -> None:
+        super().__init__(config, rows, _Dark())
+        self._touch = rows.measurement.touch
+
+    def _pad(self, topic: str, pad: str) -> Iterator[Event]:
+        """The frames that were measured, byte for byte, logged when they had been scanned: no time is lost on the wire."""
+        if self._touch is None:
+            yield from super()._pad(topic, pad)
+            return
+        wire = (self._touch.counts + self._touch.baseline).reshape(-1, len(PADS), *ROBOT.pad.shape)[:, PADS.index(pad)]
+        rows, columns = PAD_WIRE_SHAPE
+        dim = [
+            {"label": "rows", "size": rows, "stride": rows * columns},
+            {"label": "cols", "size": columns, "stride": columns},
+        ]
+        for stamp, frame in zip(
+            self._touch.time_s[:, PADS.index(pad)].tolist(), wire.swapaxes(1, 2).astype(np.uint8), strict=True
+        ):
+            message = {"layout": {"dim": dim, "data_offset": 0}, "data": frame.tobytes()}
+            yield Event(stamp, stamp - SCAN_S / 2, topic, messages.UINT8_ARRAY, message)
+
+    def all(self) -> list[Iterator[Event]]:
+        """One stream per topic, each in order of log time."""
+        return [
+            *(self._joints(STATE_TOPICS[arm], arm, command=False) for arm in ROBOT.arms),
+            *(self._joints(COMMAND_TOPICS[arm], arm, command=True) for arm in ROBOT.arms),
+            *(self._pad(PAD_TOPICS[pad], pad) for pad in PAD_TOPICS),
+        ]
+
+
+def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: str | None) -> None:
+    """One recording as the robot's drivers write it; replaces the file if there is one."""
+    story = _Rows(measurement)
+    config = StandInConfig(
+        duration_s=story.duration_s, seed=seed, instruction=measurement.instruction, pad_gain_spread=0.0
+    )
+    label = {"origin": measurement.origin, "instruction": measurement.instruction, "repeat_of": repeat_of or ""}
+    label |= {key: json.dumps(getattr(measurement, key)) for key in ("kp", "kd", "gain_scale", "payload_kg")}
+    publish(path, _Sweep(config, story), label)
+
+
+def write_recordings(case: Case, folder: Path) -> Measurements:
+    """The whole robot as files, and what was written.
+
+    Raises:
+        TaccorlError: the folder holds something that is no surrogate's.
+    """
+    made = recordings(case)
+    uses = [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
+    _write(Path(folder), case.truth(), case.twin, uses, {})
+    return made
+
+
+def write_touch_recordings(case: TouchCase, folder: Path) -> TouchRecordings:
+    """Surrogate pads as files: as ``write_recordings``, and what was pressed in each recording.
+
+    Raises:
+        TaccorlError: the folder holds something that is no surrogate's.
+    """
+    made = touch_recordings(case)
+    uses = [(use, _commanded(m, case.arm)) for use in ("fit", "validation", "test") for m in getattr(made, use)]
+    pressed = {name: _pressed(of) for name, of in made.pressed.items()}
+    _write(Path(folder), case.truth(), case.twin, uses, pressed)
+    return made
+
+
+def _write(
+    folder: Path,
+    truth: dict[str, object],
+    twin: TwinConfig,
+    uses: Sequence[tuple[str, Measurement]],
+    pressed: dict[str, dict[str, Any]],
+) -> None:
+    """All of it beside ``folder`` first, then in its place: half a robot never stands there.
+
+    Raises:
+        TaccorlError: the folder holds something that is no surrogate's, or there is no room.
+    """
+    _check_is_surrogate(folder)
+    part = folder.with_name(f"{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
+    try:
+        _fill(part, truth, twin, uses, pressed)
+    except OSError as error:
+        shutil.rmtree(part, ignore_errors=True)
+        raise TaccorlError(
+            f"{folder}: {error.strerror or error}; nothing was written or replaced there: make room, or give another --out="
+        ) from error
+    folder.mkdir(exist_ok=True)
+    shutil.rmtree(folder / SWEEPS, ignore_errors=True)
+    for name in (SWEEPS, TRUTH, TWIN):
+        (part / name).replace(folder / name)
+    part.rmdir()
+
+
+def _fill(
+    folder: Path,
+    truth: dict[str, object],
+    twin: TwinConfig,
+    uses: Sequence[tuple[str, Measurement]],
+    pressed: dict[str, dict[str, Any]],
+) -> None:
+    files = {m.name: f"{k:02d}_{m.name}.mcap" for k, (_, m) in enumerate(uses, 1)}
+    (folder / SWEEPS).mkdir(parents=True)
+    seal(folder, truth)
+    for k, (_, m) in enumerate(uses):
+        write_recording(folder / SWEEPS / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
+    notes: dict[str, dict[str, Any]] = {files[m.name]: {"use": use} for use, m in uses}
+    for name, of in pressed.items():
+        notes[files[name]]["pressed"] = of
+    text = yaml.safe_dump({"recordings": notes}, sort_keys=False, default_flow_style=None, width=120)
+    (folder / SWEEPS / INDEX).write_text(text, encoding="utf-8")
+    save_twin(twin, folder / TWIN)
+
+
+def _commanded(m: Measurement, arm: str) -> Measurement:
+    """Made presses know where the fingers are, not what they were told: a command that they follow with a lag and a row late."""
+    gripper, target = m.column(f"{arm}_gripper"), m.target.copy()
+    opening = target[:, gripper]
+    told = opening + FINGERS_LAG_S * np.gradient(opening, m.period_s)
+    target[:, gripper] = np.append(told[1:], told[-1])
+    return dataclasses.replace(m, target=target)
+
+
+def _pressed(of: PressedObject) -> dict[str, Any]:
+    """As measurements.yaml has it. Surrogate rods lie across the pads."""
+    (solid,) = of.solids
+    assert isinstance(solid, Capsule | Cylinder)
+    rod = (
+        {"length_m": 2 * solid.half_height_m, "rpy_rad": [0.0, math.pi / 2, 0.0]} if isinstance(solid, Cylinder) else {}
+    )
+    return {
+        "shape": "rod" if rod else "sphere",
+        "radius_m": solid.radius_m,
+        "arm": of.arm,
+        "position_m": of.pose[:3, 3].tolist(),
+    } | rod
+
+
+def draw_touch_secret(seed: int) -> tuple[str, ...]:
+    """Names of what pads of this seed hide: mostly one effect of the registry, or none, or one from outside of it."""
+    rng = np.random.default_rng([seed, zlib.crc32(b"secret pads")])
+    fate = rng.random()
+    if fate < 0.1:
+        return ()
+    outside = [name for name in TOUCH_KINDS if name not in REGISTERED_TOUCH]
+    return (str(rng.choice(outside if fate < 0.25 else REGISTERED_TOUCH)),)
+
+
+def _check_is_surrogate(folder: Path) -> None:
+    if folder.exists() and any(folder.iterdir()) and not (folder / TRUTH).is_file():
+        raise TaccorlError(f"{folder}: it holds something that is no surrogate robot; give another --out=")
+
+
+def seal(folder: Path, truth: dict[str, object]) -> None:
+    """Write the truth into its file in encoded form, so that nobody reads it by mistake."""
+    text = base64.b64encode(json.dumps(truth, ensure_ascii=False).encode()).decode()
+    (folder / TRUTH).write_text(json.dumps({"note": _NOTE, "sealed": text}, indent=1), encoding="utf-8")
+
+
+def reveal(folder: Path) -> dict[str, object]:
+    """Read the sealed truth of ``folder``.
+
+    Raises:
+        TaccorlError: there is no sealed truth, or it is damaged.
+    """
+    path = Path(folder) / TRUTH
+    if not path.is_file():
+        raise TaccorlError(f"{path}: no such file; give the folder that `taccorl surrogate --out=` wrote")
+    try:
+        return json.loads(base64.b64decode(json.loads(path.read_text(encoding="utf-8"))["sealed"]))
+    except (ValueError, KeyError, TypeError) as error:
+        raise TaccorlError(f"{path}: its truth cannot be read ({error}); make the robot again") from error

@@ -1,0 +1,57 @@
+"""A real measured drive (EMPS benchmark): its floor and its checks. Skipped where the data is not at hand."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from taccorl.alignment.checks.clock import check_clock
+from taccorl.alignment.checks.telemetry import check_measurement
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import noise_floor
+
+DATA = Path(__file__).parents[4] / "shared" / "data" / "emps" / "DATA_EMPS.mat"
+pytestmark = pytest.mark.skipif(
+    not DATA.is_file(), reason=f"the EMPS benchmark is not at {DATA}; see nonlinearbenchmark.org"
+)
+
+
+@pytest.fixture(scope="module")
+def emps() -> Measurement:
+    data = scipy.io.loadmat(DATA)
+    return Measurement(
+        name="emps",
+        time_s=data["t"][:, 0],
+        target=data["qg"],
+        measured=data["qm"],
+        effort=data["gtau"] * data["vir"],
+        signals=("drive",),
+        units=("m",),
+        source=DATA,
+    )
+
+
+def test_floor_of_the_real_encoder_is_microns_and_never_zero(emps):
+    floor = noise_floor([emps])["drive"]
+    # The article's position error of a good model is a few µm; one encoder step is below that.
+    assert 1e-9 < floor.value < 5e-6
+    assert floor.lower_bound
+
+
+def test_the_real_recording_passes_the_checks(emps):
+    assert not [f for f in check_measurement(emps, joints=["drive"]) if f.severity == "error"]
+
+
+def test_real_positions_one_millisecond_early_are_found_or_said_to_be_unknowable(emps):
+    floor = {"drive": noise_floor([emps])["drive"].value}
+    early = Measurement(
+        name="early",
+        time_s=emps.time_s[:-5],
+        target=emps.target[:-5],
+        measured=emps.measured[5:],
+        signals=("drive",),
+        units=("m",),
+    )
+    assert {f.check for f in check_clock(early, floor)} <= {"measured_before_command", "not_judged"}
+    assert np.isfinite(early.measured).all()

@@ -1,0 +1,538 @@
+"""Planted faults are caught and named; clean sweeps stay clean, whatever the seed, the friction and the noise."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
+from scipy.signal import lfilter
+
+from taccorl.alignment.checks.clock import check_against_twin, check_clock
+from taccorl.alignment.checks.first_order import fit_first_order
+from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.data.episode import ChannelTiming
+from taccorl.errors import TaccorlError
+from taccorl.sim.bench import Bench
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.effect import JointEffect
+from taccorl.sim.replay import replay
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.twin import TwinConfig
+
+
+@pytest.fixture(scope="module")
+def clean() -> Measurement:
+    return sweep(0)
+
+
+def found(m: Measurement, **kwargs) -> dict[str, list[str]]:
+    """check → features."""
+    by: dict[str, list[str]] = {}
+    for f in check_measurement(m, **kwargs):
+        by.setdefault(f.check, []).append(f.feature)
+    return by
+
+
+def text_of(m: Measurement, check: str) -> str:
+    return next(f.text for f in check_measurement(m) if f.check == check)
+
+
+def with_column(m: Measurement, name: str, values: np.ndarray, field: str = "measured") -> Measurement:
+    columns = getattr(m, field).copy()
+    columns[:, m.column(name)] = values
+    return dataclasses.replace(m, **{field: columns})
+
+
+def floors(m: Measurement) -> dict[str, float]:
+    return {name: f.value for name, f in noise_floor([m]).items()}
+
+
+# clean data ------------------------------------------------------------------------------------------------------------
+
+
+# The first six have every choice of joints with every resolution.
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=[pytest.mark.slow] * (k >= 6)) for k in range(12)])
+def test_clean_sweeps_stay_clean(seed):
+    rng = np.random.default_rng(seed)
+    joints = [[4], ARMS_JOINTS[:6], ARMS_JOINTS][seed % 3]
+    step = (0.0, math.radians(0.001))[seed % 2]
+    m = sweep(seed, joints=joints, noise_rad=10 ** rng.uniform(-5, -3), quantum_rad=step, seconds=5.0)
+    assert found(m) == {}
+
+
+@pytest.mark.parametrize("friction_nm", [*(pytest.param(f, marks=pytest.mark.slow) for f in (0.3, 1.0)), 3.0])
+def test_friction_is_no_fault_of_the_telemetry(friction_nm):
+    for seed in range(3):
+        m = sweep(seed, friction_nm=friction_nm, seconds=6.0)
+        assert set(found(m)) <= {"not_judged", "late_answer"}
+        assert not any(f.severity != "note" for f in check_measurement(m))
+
+
+def test_steps_and_holds_are_clean_too():
+    target = np.tile(HOME, (1400, 1))
+    for k, start in enumerate(range(200, 1400, 200)):
+        target[start:, 3] += 0.1 * (-1) ** k
+    m = measured(target, answer(target), np.random.default_rng(0), 2e-4)
+    assert found(m) == {}
+
+
+# clocks ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
+def test_positions_one_row_early_are_an_error_at_every_joint(seed, rows):
+    m = shifted(sweep(seed), rows)
+    leads = found(m)["measured_before_command"]
+    assert len(leads) == len(ARMS_JOINTS)
+    assert all(f.severity == "error" for f in check_measurement(m) if f.check == "measured_before_command")
+
+
+def test_lead_names_joint_time_and_way_out(clean):
+    recorded = text_of(shifted(clean, 2), "measured_before_command")
+    assert "answers" in recorded and "ms" in recorded
+    assert "latency_s" in recorded and "target_rows_late" not in recorded
+    table = text_of(dataclasses.replace(shifted(clean, 2), source=Path("a.csv")), "measured_before_command")
+    assert "target_rows_late: 2" in table and "latency_s" not in table
+
+
+def test_exchanged_columns_of_target_and_position_are_no_latency():
+    clean = sweep(0, joints=[2, 4], seconds=5.0)
+    for m in (clean, sweep(0, joints=[2, 4], friction_nm=0.3, seconds=5.0)):
+        swapped = dataclasses.replace(m, target=m.measured, measured=m.target, source=Path("a.csv"))
+        errors = [f for f in check_measurement(swapped) if f.severity == "error"]
+        assert {f.check for f in errors} == {"measured_before_command"}
+        assert len(errors) == 2
+        assert all("exchanged" in f.text and f"{f.feature}.q_target" in f.text for f in errors)
+    for rows in (1, 5, 20):  # a clock that is off is none
+        assert not any("exchanged" in f.text for f in check_measurement(shifted(clean, rows)))
+
+
+def test_positions_one_row_late_could_be_a_delay_and_the_note_says_that_it_cannot_be_told(clean):
+    # A late clock and a real delay give the same rows: both get the same note, and no error.
+    late, delayed = shifted(clean, -1), sweep(0, delay_s=0.005)
+    for m in (late, delayed):
+        assert set(found(m)) == {"late_answer"}
+        assert "cannot tell apart" in text_of(m, "late_answer")
+        assert {f.severity for f in check_measurement(m)} == {"note"}
+
+
+def test_a_step_from_rest_shows_one_row_under_any_friction():
+    # The step's own row must still be at rest. Friction keeps the lag from describing the joint; the step does not care.
+    target = np.tile(HOME, (1200, 1))
+    for k, start in enumerate(range(200, 1200, 200)):
+        target[start:, 4] += 0.15 * (-1) ** k
+    m = measured(target, answer(target, friction_nm=1.0), np.random.default_rng(0), 2e-4)
+    assert "measured_before_command" not in found(m)
+    early = [f for f in check_measurement(shifted(m, 1)) if f.check == "measured_before_command"]
+    assert [f.feature for f in early] == ["left_joint5"]
+    assert early[0].rows == (200, 201)
+    assert "row 200 (1.000 s)" in early[0].text
+
+
+def test_where_nothing_can_be_known_it_says_so():
+    m = shifted(sweep(2, friction_nm=3.0, joints=[4, 5]), 1)
+    findings = check_clock(m, floors(m))
+    assert [f.check for f in findings] == ["not_judged"]
+    assert "an offset of one row (5.0 ms) not judged: left_joint5, left_joint6 do not answer" in findings[0].text
+    # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.
+    least = 8 * max(floors(m)[s] for s in ("left_joint5", "left_joint6")) * 0.12 / 0.005
+    assert f"jumps by {least:.2g} rad or more" in findings[0].text
+
+
+def test_first_order_fit_recovers_lag_and_delay_within_its_interval():
+    # τ = 90 ms, d = 3.7 ms, gain 0.98: q(t) in closed form for held commands, from a fine grid.
+    rng, fine = np.random.default_rng(0), 50
+    target = rested(chirp(6.0, np.full(14, 0.2), np.zeros(14)))[:, 0]
+    target = target - target[0]
+    held, keep = np.repeat(target, fine), math.exp(-1 / RATE_HZ / fine / 0.09)
+    q = np.zeros(len(held) + 1)
+    for k, u in enumerate(held):
+        q[k + 1] = u + (q[k] - u) * keep
+    late = round(0.0037 * RATE_HZ * fine)
+    true = 0.98 * np.concatenate([np.zeros(late), q])[: len(held) : fine] + 0.01
+    hits = []
+    for _ in range(20):
+        fit = fit_first_order(target, true + 2e-4 * rng.normal(size=len(true)), 1 / RATE_HZ)
+        assert fit.delay_s == pytest.approx(0.0037, abs=2e-4)
+        assert fit.time_constant_s == pytest.approx(0.09, rel=0.01)
+        assert fit.gain == pytest.approx(0.98, abs=1e-3)
+        hits.append(abs(fit.delay_s - 0.0037) < 3 * fit.delay_sd_s)
+    assert np.mean(hits) >= 0.9
+
+
+def test_of_many_rows_an_even_selection_begins_the_fit_and_all_of_them_end_it():
+    """25 s at 1 kHz, τ = 50 ms exactly for held targets, 12 rows late, noise of 10 µm."""
+    keep, time_s = math.exp(-1e-3 / 0.05), np.arange(25_000) / 1000
+    target = 0.1 * np.sin(0.5 * time_s**1.5)
+    answers = lfilter([0.0, 1 - keep], [1, -keep], np.concatenate([np.zeros(12), target[:-12]]))
+    fit = fit_first_order(target, answers + 1e-5 * np.random.default_rng(0).standard_normal(25_000), 1e-3)
+    assert fit.time_constant_s == pytest.approx(0.05, rel=1e-3)
+    assert abs(fit.delay_s - 0.012) < 3 * fit.delay_sd_s < 1e-4
+    assert fit.rms == pytest.approx(1e-5, rel=0.02)
+
+
+def test_rows_of_a_dataset_are_read_as_commands_that_moved_on():
+    # 30 Hz rows of a 180 Hz command: held for a whole row it would look 17 ms early.
+    target = rested(chirp(6.0, np.where(np.isin(np.arange(14), ARMS_JOINTS), 0.2, 0.0), np.zeros(14)))
+    at = np.arange(len(target) * 30 // RATE_HZ)
+    rows = np.stack([np.interp(at / 30, np.arange(len(target)) / RATE_HZ, c) for c in target.T], axis=1)
+    share = np.arange(1, 7)[:, None] / 6
+    following = np.concatenate([rows[1:], rows[-1:]])
+    sub = (rows[:, None] + share * (following - rows)[:, None]).reshape(-1, 14)
+    m = measured(rows, _at_180(sub)[::6], np.random.default_rng(0), 2e-4, rate_hz=30)
+    assert not {"measured_before_command", "late_answer"} & set(found(m))
+    assert "measured_before_command" in found(shifted(m, 1))
+
+
+def _at_180(target: np.ndarray) -> np.ndarray:
+    """(T, 14) first-order answers with τ = 0.1 s, exact for held commands."""
+    keep, q, rows = math.exp(-1 / 180 / 0.1), target[0], []
+    for u in target:
+        rows.append(q)
+        q = u + (q - u) * keep
+    return np.array(rows)
+
+
+# against the twin ------------------------------------------------------------------------------------------------------
+
+
+def test_one_row_off_the_twin_is_found_even_when_its_gains_are_wrong(clean):
+    slower = answer(clean.target, damping=1.3)
+    for rows, severity in ((1, "error"), (-1, "warning")):
+        m = shifted(clean, rows)
+        keep = slice(max(-rows, 0), max(-rows, 0) + m.num_rows)
+        findings = [f for f in check_against_twin(m, slower[keep], floors(m)) if f.check == "shifted_from_twin"]
+        assert len(findings) == len(ARMS_JOINTS), rows
+        assert {f.severity for f in findings} == {severity}
+        rows_off = [float(f.text.split(" rows)")[0].split("(")[-1]) for f in findings]
+        assert rows_off == pytest.approx([1.0] * 12, abs=0.21)
+    assert check_against_twin(clean, slower, floors(clean)) == []
+
+
+def test_a_lead_is_a_warning_where_the_drive_s_numbers_are_uncertain(clean):
+    early = shifted(clean, 1)
+    twin = answer(clean.target, damping=1.3)[: early.num_rows]
+    one, *others = [clean.signals[j] for j in ARMS_JOINTS]
+    findings = check_against_twin(early, twin, floors(early), uncertain=[one])
+    assert {f.feature: f.severity for f in findings} == dict.fromkeys(others, "error") | {one: "warning"}
+    assert [f.feature for f in findings if "numbers in the file" in f.text] == [one]
+
+
+def test_a_missing_effect_keeps_the_shift_from_the_twin_unjudged(clean):
+    m = sweep(0, friction_nm=3.0, joints=[4])
+    twin = answer(m.target)
+    findings = check_against_twin(shifted(m, 1), twin[:-1], floors(m))
+    assert [f.check for f in findings] == ["not_judged"]
+    assert "look for the missing effect first" in findings[0].text
+
+
+# wiring and units ------------------------------------------------------------------------------------------------------
+
+
+def test_swapped_joints_are_named(clean):
+    # The chirps differ in sign and size only, so joint 1 gets a motion of its own.
+    target = clean.target.copy()
+    target[:, 0] = rested(chirp(8.0, np.full(14, 0.2), np.zeros(14), high_hz=1.1))[:, 0]
+    own = measured(target, answer(target), np.random.default_rng(0), 2e-4)
+    m = with_column(with_column(own, "left_joint1", own.measured[:, 3]), "left_joint4", own.measured[:, 0])
+    swaps = [f for f in check_measurement(m) if f.check == "swapped_joints"]
+    assert "left_joint1" in {f.feature for f in swaps}
+    assert "measured_before_command" not in found(m)
+    assert "their columns are exchanged" in swaps[0].text
+
+
+def test_one_joint_s_sweep_in_another_joint_s_column_is_named():
+    m = sweep(0, joints=[4])
+    swapped = with_column(with_column(m, "left_joint5", m.measured[:, 5]), "left_joint6", m.measured[:, 4])
+    text = text_of(swapped, "swapped_joints")
+    assert text.startswith("left_joint5 does not follow its command, left_joint6 does")
+
+
+def test_swapped_arms_are_one_finding():
+    m = sweep(0, joints=[0, 1, 2, 3, 4, 5])
+    swapped = dataclasses.replace(m, measured=np.roll(m.measured, 7, axis=1))
+    assert found(swapped)["swapped_arms"] == ["left_joint1"]
+    assert "left and right are exchanged" in text_of(swapped, "swapped_arms")
+
+
+def test_both_arms_moving_alike_is_no_swap():
+    target = rested(chirp(6.0, np.tile(np.where(np.arange(7) == 6, 0.0, 0.2), 2), np.zeros(14)))
+    assert found(measured(target, answer(target), np.random.default_rng(0), 2e-4)) == {}
+
+
+def test_reversed_sign_is_named(clean):
+    m = with_column(clean, "right_joint6", 2 * HOME[12] - clean.measured[:, 12])
+    assert found(m)["reversed"] == ["right_joint6"]
+    assert "right_joint6 moves against its command" in text_of(m, "reversed")
+
+
+@pytest.mark.parametrize("field", ["measured", "target"])
+def test_degrees_are_named(clean, field):
+    m = with_column(clean, "left_joint2", np.degrees(getattr(clean, field)[:, 1]), field)
+    assert "left_joint2" in found(m)["unit"]
+    assert "degrees" in text_of(m, "unit")
+
+
+def test_degrees_near_zero_are_seen_by_the_gain():
+    # ±0.5° about zero lies within the joint's limits even when it is read as radians.
+    m = sweep(0, joints=[0])
+    target = HOME + (m.target - HOME) * 0.15
+    small = measured(target, answer(target), np.random.default_rng(0), 1e-5)
+    wrong = with_column(small, "left_joint1", np.degrees(small.measured[:, 0]))
+    assert found(wrong)["unit"] == ["left_joint1"]
+    assert "goes 59.5 times" in text_of(wrong, "unit")  # 57.3, and a lag of 88 ms where 100 were assumed
+
+
+def test_both_in_degrees_is_seen_where_the_robot_cannot_be(clean):
+    m = dataclasses.replace(clean, measured=np.degrees(clean.measured), target=np.degrees(clean.target))
+    assert "left_joint2" in found(m)["unit"]
+
+
+def test_gripper_in_millimetres_is_named(clean):
+    m = with_column(
+        with_column(clean, "left_gripper", clean.measured[:, 6] * 1e3),
+        "left_gripper",
+        clean.target[:, 6] * 1e3,
+        "target",
+    )
+    assert "left_gripper" in found(m)["unit"]
+    assert "in mm?" in text_of(m, "unit")
+
+
+def test_velocity_in_rpm_is_named(clean):
+    slope = np.gradient(clean.measured, 1 / RATE_HZ, axis=0)
+    assert "velocity_unit" not in found(dataclasses.replace(clean, velocity=slope))
+    rpm = dataclasses.replace(clean, velocity=slope * 60 / (2 * math.pi))
+    assert "rpm?" in text_of(rpm, "velocity_unit")
+
+
+# channels --------------------------------------------------------------------------------------------------------------
+
+
+def test_dead_channel(clean):
+    m = with_column(clean, "left_joint3", np.full(clean.num_rows, HOME[2]))
+    assert found(m)["dead_channel"] == ["left_joint3"]
+    assert "the same number all the time while its command goes" in text_of(m, "dead_channel")
+
+
+def test_frozen_channel_is_placed(clean):
+    values = clean.measured[:, 1].copy()
+    values[600:700] = values[600]
+    m = with_column(clean, "left_joint2", values)
+    assert found(m)["frozen_channel"] == ["left_joint2"]
+    assert next(f for f in check_measurement(m) if f.check == "frozen_channel").rows == (600, 700)
+
+
+def stuck(m: Measurement, width: float) -> Measurement:
+    """A joint that dry friction holds until its target is ``width`` away: it stands still, then follows without a jump."""
+    values = m.measured[:, 1].copy()
+    at = values[0]
+    for k, goal in enumerate(m.target[:, 1]):
+        at = values[k] = min(max(at, goal - width), goal + width)
+    step = math.radians(0.001)
+    quantum = m.quantum.copy()
+    quantum[1] = step
+    return dataclasses.replace(with_column(m, "left_joint2", np.round(values / step) * step), quantum=quantum)
+
+
+def test_a_joint_that_sticks_is_a_warning_and_a_driver_that_repeats_old_values_an_error(clean):
+    m = stuck(clean, 0.06)
+    by = {f.check: f for f in check_measurement(m) if f.feature == "left_joint2"}
+    assert "frozen_channel" not in by and "saturated_channel" not in by
+    assert by["sticking_joint"].severity == "warning"
+    assert "dry friction" in by["sticking_joint"].text
+    values = stuck(clean, 0.0).measured[:, 1].copy()
+    values[600:700] = values[600]
+    again = with_column(stuck(clean, 0.0), "left_joint2", values)
+    assert found(again)["frozen_channel"] == ["left_joint2"]
+
+
+def test_an_accepted_error_is_a_warning_that_stays(clean):
+    values = clean.measured[:, 1].copy()
+    values[600:700] = values[600]
+    m = with_column(clean, "left_joint2", values)
+    (finding,) = [f for f in check_measurement(m, accept=["frozen_channel"]) if f.check == "frozen_channel"]
+    assert finding.severity == "warning"
+    assert "accepted by --accept=frozen_channel" in finding.text
+    with pytest.raises(TaccorlError, match=r"--accept=frozen_chanel: no check.*frozen_channel"):
+        check_names(["frozen_chanel"])
+    check_names(ERRORS)
+
+
+def test_saturated_channel_is_placed(clean):
+    top = np.quantile(clean.measured[:, 0], 0.9)
+    m = with_column(clean, "left_joint1", np.minimum(clean.measured[:, 0], top))
+    assert found(m)["saturated_channel"] == ["left_joint1"]
+    assert f"reads {top:.4f} rad without change" in text_of(m, "saturated_channel")
+
+
+def test_joint_against_its_stop_is_a_warning(clean):
+    rng = np.random.default_rng(0)
+    top = np.quantile(clean.measured[:, 0], 0.7)
+    stopped = np.minimum(clean.measured[:, 0], top + 2e-4 * rng.normal(size=clean.num_rows))
+    m = with_column(clean, "left_joint1", stopped)
+    assert found(m)["blocked"] == ["left_joint1"]
+
+
+@pytest.mark.parametrize("end", ["upper", "lower"])
+def test_a_stop_is_a_warning_that_names_its_effect_and_an_end_of_the_readings_an_error(clean, end):
+    """Both give equal readings at one end; only the joint at a stop moves as soon as its command is back."""
+    high = np.quantile(clean.measured, 0.75, axis=0)
+    step = 2 * math.pi / 4096
+    at_stop, cut = answer(clean.target, highest_rad=high), np.minimum(answer(clean.target), high)
+    sign = {"upper": 1.0, "lower": -1.0}[end]  # mirrored about the home pose, so that joints stay within their limits
+    seen = {}
+    for name, true in (("stop", at_stop), ("cut", cut)):
+        columns = {"target": clean.target, "measured": step * np.round(true / step)}
+        mirrored = {key: HOME + sign * (values - HOME) for key, values in columns.items()}
+        seen[name] = check_measurement(dataclasses.replace(clean, **mirrored))
+    joints = {clean.signals[j] for j in ARMS_JOINTS}
+    assert {f.feature for f in seen["stop"] if f.check == "blocked"} == joints
+    assert not [f for f in seen["stop"] if f.severity == "error"]
+    assert all("end_stop" in f.text for f in seen["stop"] if f.check == "blocked")
+    assert {f.feature for f in seen["cut"] if f.check == "saturated_channel"} == joints
+    assert not [f for f in seen["cut"] if f.check == "blocked"]
+
+
+def test_effort_at_its_limit_is_a_note_and_dead_effort_a_warning(clean):
+    effort = np.full(clean.measured.shape, np.nan)
+    effort[:, 4] = np.clip(20 * (clean.target - clean.measured)[:, 4], -0.5, 0.5)
+    effort[:, 5] = 7.0
+    m = dataclasses.replace(clean, effort=effort)
+    assert found(m)["effort_limit"] == ["left_joint5"]
+    assert "exactly ±0.5" in text_of(m, "effort_limit")
+    assert found(m)["dead_effort"] == ["left_joint6"]
+
+
+def test_a_sweep_that_never_moves_the_joint():
+    m = sweep(0, joints=[4])
+    assert found(m, joints=["left_joint4", "left_joint5"])["no_motion"] == ["left_joint4"]
+    still = dataclasses.replace(m, target=np.tile(HOME, (m.num_rows, 1)))
+    assert "record a sweep" in text_of(still, "no_motion")
+    with pytest.raises(TaccorlError, match="did you mean 'left_joint5'"):
+        check_measurement(m, joints=["left_joint_5"])
+
+
+def test_too_short(clean):
+    rows = slice(180, 320)
+    cut = {k: getattr(clean, k)[rows] for k in ("time_s", "target", "measured", "velocity", "effort")}
+    m = dataclasses.replace(clean, **cut)
+    assert "of motion in 140 rows" in text_of(m, "too_short")
+    assert found(sweep(0, seconds=2.0))["short"] == [""]
+
+
+# start and time --------------------------------------------------------------------------------------------------------
+
+
+def test_not_at_rest_at_the_start(clean):
+    cut = {k: getattr(clean, k)[900:] for k in ("time_s", "target", "measured", "velocity", "effort")}
+    m = dataclasses.replace(clean, **(cut | {"time_s": cut["time_s"] - cut["time_s"][0]}))
+    assert "not_at_rest" in found(m)
+    assert "begin the recording a second before the motion" in text_of(m, "not_at_rest")
+
+
+def test_far_from_its_command_at_the_start(clean):
+    m = with_column(clean, "right_joint2", clean.measured[:, 8] + 0.2)
+    assert found(m)["start_offset"] == ["right_joint2"]
+    assert "stands +0.2" in text_of(m, "start_offset") or "stands +0.199" in text_of(m, "start_offset")
+
+
+def test_time_that_runs_backwards_stops_everything_else(clean):
+    time_s = clean.time_s.copy()
+    time_s[500] = time_s[498]
+    m = dataclasses.replace(clean, time_s=time_s)
+    assert found(m) == {"time_backwards": ["time"]}
+    assert "at row 500" in text_of(m, "time_backwards")
+
+
+def test_time_in_milliseconds(clean):
+    m = dataclasses.replace(clean, time_s=clean.time_s * 1e3)
+    assert found(m) == {"time_unit": ["time"]}
+
+
+def test_dropped_rows_are_counted_and_placed(clean):
+    keep = np.delete(np.arange(clean.num_rows), [*range(700, 712), 900])
+    m = dataclasses.replace(
+        clean, **{k: getattr(clean, k)[keep] for k in ("time_s", "target", "measured", "velocity", "effort")}
+    )
+    text = text_of(m, "dropped_rows")
+    assert text.startswith("13 rows are missing in 2 gaps, the longest 65.0 ms after row 699 (3.495 s)")
+
+
+@pytest.mark.parametrize(("jitter_s", "caught"), [(1e-5, False), (2e-3, True)])
+def test_jitter_of_row_times(clean, jitter_s, caught):
+    time_s = clean.time_s + jitter_s * np.random.default_rng(0).uniform(-0.5, 0.5, clean.num_rows)
+    m = dataclasses.replace(clean, time_s=time_s - time_s[0])
+    assert ("jitter" in found(m)) is caught
+
+
+def test_holes_and_nan_are_errors_with_their_place(clean):
+    m = with_column(clean, "left_joint5", np.where(np.arange(clean.num_rows) // 50 == 12, np.nan, clean.measured[:, 4]))
+    hole = next(f for f in check_measurement(m) if f.check == "lost_samples")
+    assert (hole.feature, hole.rows) == ("left_joint5", (600, 650))
+    bad = with_column(clean, "left_joint5", np.full(clean.num_rows, np.nan), "target")
+    assert found(bad)["not_finite"] == ["left_joint5"]
+
+
+def test_channels_of_a_recording_speak_for_themselves(clean):
+    base = ChannelTiming("left_command", "action", "line", 100.0, 0, 0.01, 0.0, 0.0, nominal_hz=200.0)
+    m = dataclasses.replace(
+        clean, timing=(base, dataclasses.replace(base, channel="left_state", rate_hz=200.0, out_of_order=3))
+    )
+    assert found(m) == {"low_rate": ["left_command"], "out_of_order": ["left_state"]}
+    apart = dataclasses.replace(base, rate_hz=200.0, age_median_s=0.002)
+    assert found(dataclasses.replace(clean, timing=(apart,))) == {"jitter": ["left_command"]}
+    assert found(dataclasses.replace(clean, time_error_s=0.005)) == {"row_times": ["time"]}
+
+
+@pytest.mark.slow
+def test_an_untold_repeat_is_pointed_out(clean):
+    again = dataclasses.replace(sweep(0), name="again")
+    other = dataclasses.replace(sweep(3), name="other")
+    by = check_measurements([clean, again, other], joints=["left_joint5"])
+    assert [f.check for f in by["again"]] == ["same_motion"]
+    assert "repeat_of: sweep" in by["again"][0].text
+    assert by["other"] == []
+    assert [f.check for f in by["sweep"]] == ["not_judged"]  # what does not repeat, without repeats
+    told = dataclasses.replace(again, repeat_of="sweep")
+    assert check_measurements([clean, told]) == {"sweep": [], "again": []}
+
+
+def test_same_commands_with_another_answer_ask_about_gains_and_payload_not_for_repeat_of(clean):
+    slower = np.apply_along_axis(lambda c: np.interp(clean.time_s - 0.02, clean.time_s, c), 0, clean.measured)
+    found = check_measurements([clean, dataclasses.replace(clean, name="other", measured=slower)])["other"]
+    assert "same_motion" not in {f.check for f in found}
+    (f,) = [f for f in found if f.check == "same_commands"]
+    assert f.severity == "warning"
+    assert "other: {gain_scale: {left_joint" in f.text and "payload_kg: {left" in f.text
+    assert "Only if nothing was changed" in f.text
+
+
+JOINT_EFFECTS = [name for name in effects if issubclass(effects.get(name), JointEffect)]
+
+
+def test_the_registry_has_joint_effects_to_check():
+    assert len(JOINT_EFFECTS) >= 11
+
+
+# A joint at its stop deserves a warning, for the motion beyond is not in the recording; one that names the effect.
+@pytest.mark.slow
+@pytest.mark.parametrize("name", JOINT_EFFECTS)
+def test_no_joint_effect_of_the_registry_is_taken_for_a_fault_of_the_telemetry(name):
+    effect = make_effect(name, **{p.name: p.typical for p in effects.get(name).parameters()})
+    amplitude = np.where(np.isin(np.arange(14), ARMS_JOINTS), 0.12, 0.0)
+    motion = rested(chirp(6.0, amplitude, np.pi * (np.arange(14) % 2))) - HOME
+    sim = Simulation(Bench(), TwinConfig(effects=[effect]))
+    sim.reset([0])
+    target = sim.targets[0] + motion
+    for _ in range(40):
+        sim.advance(target[0][None, None], 30)
+    done = replay(sim, target, float(RATE_HZ), sim.proprioception()[0])
+    m = measured(target, done.reported, np.random.default_rng(0), 2e-4, effort=done.effort)
+    worse = [f for f in check_measurement(m) if f.severity != "note"]
+    assert [f for f in worse if f.severity == "error" or name not in f.text] == []

@@ -1,0 +1,157 @@
+"""Dropped commands are found where they are known to be, and what else does not repeat is not called dropped commands."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.checks.telemetry import check_measurements
+from taccorl.alignment.checks.unrepeated import check_repeatability, unrepeated
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import noise_floor
+
+NOISE_RAD = 1e-4
+SUBSTEPS = 8
+
+
+def sweep(rate_hz: float, seconds: float = 10.0) -> np.ndarray:
+    """(T,) rad: 0.1 to 2 Hz, at rest for a second at both ends."""
+    t = np.arange(round(seconds * rate_hz)) / rate_hz
+    angle = 2 * np.pi * (0.1 * t + 1.9 * t**2 / (2 * seconds))
+    wave = 0.3 * np.sin(angle) * np.clip(t, 0, 1) * np.clip(seconds - t, 0, 1)
+    rest = np.zeros(round(rate_hz))
+    return np.concatenate([rest, wave, rest])
+
+
+def held(target: np.ndarray, rate: float, longest: int, rng: np.random.Generator) -> np.ndarray:
+    """``target`` as the drive has it when it misses a share ``rate`` of the commands, 1 to ``longest`` in a row."""
+    out, k = target.copy(), 1
+    while k < len(out):
+        missed = int(rng.integers(1, longest + 1)) if rng.random() < rate * 2 / (1 + longest) else 0
+        out[k : k + missed] = out[k - 1]
+        k += max(missed, 1)
+    return out
+
+
+def joint(
+    applied: np.ndarray, rate_hz: float, rng: np.random.Generator, *, disturbed=0.0, friction=0.0, omega=16.0, zeta=1.0
+) -> np.ndarray:
+    """(T,) q̈ = ω² (q* − q) − 2 ζ ω q̇ − friction + disturbance [rad/s²], with an encoder's noise."""
+    h = 1 / (rate_hz * SUBSTEPS)
+    keep = math.exp(-2 * math.pi * 3.0 * h)  # disturbance of 3 Hz
+    q, v, d, out = float(applied[0]), 0.0, 0.0, np.empty(len(applied))
+    kicks = disturbed * math.sqrt(1 - keep**2) * rng.normal(size=(len(applied), SUBSTEPS))
+    for k, goal in enumerate(applied.tolist()):
+        out[k] = q
+        for kick in kicks[k].tolist():
+            d = keep * d + kick
+            v += h * (omega**2 * (goal - q) - 2 * zeta * omega * v - friction * math.tanh(v / 2e-3) + d)
+            q += h * v
+    return out + NOISE_RAD * rng.normal(size=len(out))
+
+
+def recording(name: str, seed: int, *, drop=0.0, longest=1, rate_hz=200.0, repeat_of=None, **physics) -> Measurement:
+    rng = np.random.default_rng(seed)
+    target = sweep(rate_hz)
+    measured = joint(held(target, drop, longest, rng), rate_hz, rng, **physics)
+    return Measurement(
+        name=name,
+        time_s=np.arange(len(target)) / rate_hz,
+        target=target[:, None],
+        measured=measured[:, None],
+        signals=("left_joint5",),
+        units=("rad",),
+        repeat_of=repeat_of,
+    )
+
+
+def pair(seed: int, **how) -> list[Measurement]:
+    return [recording("a", 2 * seed, **how), recording("b", 2 * seed + 1, repeat_of="a", **how)]
+
+
+def said(measurements: list[Measurement]) -> set[str]:
+    return {f.check for found in check_repeatability(measurements).values() for f in found}
+
+
+@pytest.mark.parametrize("how", [
+    {"drop": 0.02, "longest": 8},
+    {"drop": 0.03, "longest": 4},
+    {"drop": 0.05, "longest": 3, "rate_hz": 100.0},
+    {"drop": 0.05, "longest": 2, "rate_hz": 60.0, "omega": 25.0},
+    {"drop": 0.03, "longest": 3, "omega": 60.0, "zeta": 3.0},
+])  # fmt: skip
+def test_dropped_commands_are_reported(how):
+    for seed in range(2):
+        assert "dropped_commands" in said(pair(seed, **how)), seed
+
+
+def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recording():
+    m = recording("a", 3, drop=0.05, longest=4)
+    (signal,) = unrepeated([m])
+    assert signal.dropped is not None
+    assert signal.dropped.certain
+    assert 0.01 < signal.dropped.rate < 0.10  # 5 % were dropped; slow parts do not show it
+    findings = {f.check: f for f in check_repeatability([m])["a"]}
+    assert "previous target" in findings["dropped_commands"].text
+    assert "repeat_of" in findings["not_judged"].text
+
+
+def test_a_single_long_hold_is_found_where_it_was():
+    target = sweep(200.0)
+    applied = target.copy()
+    truth = [500, 900, 1100, 1300, 1500, 1700, 1900]
+    for row in truth:
+        applied[row : row + 6] = applied[row - 1]
+    m = recording("a", 0)
+    measured = joint(applied, 200.0, np.random.default_rng(0))
+    (signal,) = unrepeated([dataclasses.replace(m, measured=measured[:, None])])
+    assert signal.dropped is not None
+    found = np.array(signal.dropped.times_s["a"])
+    near = [np.abs(found - row / 200.0).min() < 0.03 for row in truth]
+    assert sum(near) >= 6  # one may lie where the sweep turns back
+
+
+@pytest.mark.parametrize("how", [{}, {"disturbed": 3.0}, {"friction": 2.0}, {"friction": 2.0, "disturbed": 1.5}])
+def test_robots_that_drop_nothing_are_not_said_to(how):
+    for seed in range(3):
+        assert "dropped_commands" not in said(pair(seed, **how)), seed
+
+
+def test_disturbance_torque_does_not_repeat_and_nothing_else():
+    found = check_repeatability(pair(0, disturbed=3.0))
+    (finding,) = [f for findings in found.values() for f in findings]
+    assert finding.check == "does_not_repeat"
+    assert "all the time" in finding.text
+    assert "do not explain it" in finding.text
+
+
+def test_a_robot_that_repeats_is_silent():
+    assert said(pair(0)) == set()
+
+
+def test_rare_bursts_are_left_out_of_the_floor_and_reported_with_their_times():
+    first, second = pair(1)
+    bump = 8e-3 * np.exp(-(((first.time_s - 6.0) / 0.05) ** 2))
+    second = dataclasses.replace(second, measured=second.measured + bump[:, None])
+    floor = noise_floor([first, second])["left_joint5"]
+    assert floor.used.method == "repeats"
+    assert floor.used.without_bursts
+    assert floor.value == pytest.approx(NOISE_RAD, rel=0.2)  # with the burst: 0.4 mrad
+    assert "bursts left out" in floor.words()
+    (finding,) = [f for found in check_repeatability([first, second]).values() for f in found]
+    assert finding.check == "does_not_repeat"
+    assert "in bursts" in finding.text
+    assert "5.5" in finding.text or "6.0" in finding.text  # begin of the half second that holds it
+
+
+def test_what_does_not_repeat_all_the_time_stays_in_the_floor():
+    floor = noise_floor(pair(0, disturbed=3.0))["left_joint5"]
+    assert not floor.used.without_bursts
+    assert floor.value > 5 * NOISE_RAD
+
+
+def test_the_checks_before_a_diagnosis_say_it():
+    found = check_measurements(pair(0, drop=0.05, longest=4))
+    (finding,) = [f for findings in found.values() for f in findings if f.check == "dropped_commands"]
+    assert finding.severity == "warning"

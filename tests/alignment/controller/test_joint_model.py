@@ -1,0 +1,356 @@
+"""The compiled one-joint model against MuJoCo, joint by joint and effect by effect, and against the whole twin."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
+
+from taccorl.alignment.controller import arm_bench
+from taccorl.alignment.controller.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_recording import joint_motion, motion_of
+from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.sim.bench import Bench
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
+from taccorl.sim.replay import replay
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.twin import TwinConfig
+
+STEP_S = TWIN.physics.timestep_s
+
+
+def _on_joints(name: str) -> bool:
+    """An effect of arms or joints, and not of grippers only."""
+    cls = effects.get(name)
+    return issubclass(cls, ArmEffect) and (not issubclass(cls, JointEffect) or "joint2" in cls.possible)
+
+
+KNOWN = [name for name in effects if _on_joints(name) and effects.get(name)().drive() is not None]
+START_MRAD = {"torque_scale": 0.1}  # the twin's first physics step after it is built still carries the whole weight
+IN_REACH = {  # of the motion below: limits of torque and speed, and a place in the range
+    "left_joint2": {"torque_max_nm": 8.0, "stall_nm": 8.0, "no_load_rad_per_s": 2.0, "angle_rad": 1.85},
+    "left_joint5": {"torque_max_nm": 0.6, "stall_nm": 0.6, "no_load_rad_per_s": 2.0, "angle_rad": 0.1},
+}
+
+
+def typical(name: str, signal: str) -> Effect:
+    """At three times its typical strength, where that is within its bounds: nonlinear terms must show."""
+    cls = effects.get(name)
+    values = {}
+    for p in cls.parameters():
+        value = p.typical
+        if p.absent is not None and np.isfinite(p.absent):
+            value = min(max(p.absent + 3 * (p.typical - p.absent), p.low), p.high)
+        values[p.name] = IN_REACH[signal].get(p.name, value)
+    arm, joint = signal.split("_")
+    where = {"arm": arm, "joints": [joint]} if issubclass(cls, JointEffect) else {"arm": arm}
+    return make_effect(name, **where, **values)
+
+
+@pytest.mark.parametrize("joint", ROBOT.joints)
+def test_a_plain_joint_moves_as_in_mujoco(joint: str) -> None:
+    signal = f"right_{joint}"
+    model = JointModel(TWIN, signal)
+    motion = at_rest(joint_motion(chirp(signal, 4.0), TWIN, signal), model.gains)
+    quick, exact = model.simulate(motion, model.gains), in_mujoco(motion, signal, model.gains)
+    np.testing.assert_allclose(quick.reported, exact.reported, atol=1e-12)
+    np.testing.assert_allclose(quick.effort, exact.effort, atol=1e-9)
+    assert np.ptp(exact.reported) > 0.3
+
+
+@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("signal", ["left_joint2", pytest.param("left_joint5", marks=pytest.mark.slow)])
+def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: str) -> None:
+    model, effect = JointModel(TWIN, signal), typical(name, signal)
+    gains = model.gains._replace(torque_ff=0.0)  # so that a motion from rest is in balance
+    motion = at_rest(joint_motion(chirp(signal, 3.0, high_hz=3.0), TWIN, signal), gains)
+    plain = model.simulate(motion, gains)
+    quick, exact = model.simulate(motion, gains, [effect]), in_mujoco(motion, signal, gains, effect)
+    away = np.abs(quick.reported - exact.reported)
+    assert away[:100].max() < 1e-3 * START_MRAD.get(name, 1e-3)
+    assert away[100:].max() < 1e-6
+    shown = np.abs(exact.reported - plain.reported).max()
+    assert shown > 1e-5 or name == "encoder_bias", (
+        "it shows, or the comparison means nothing; a bias does not, by its nature"
+    )
+
+
+def test_every_effect_of_joints_is_known_to_the_model() -> None:
+    unknown = [name for name in effects if _on_joints(name) and name not in KNOWN]
+    assert unknown == [], "identification would run MuJoCo for these, fifty times slower"
+    assert len(KNOWN) >= 18
+
+
+def test_effects_act_together_as_in_mujoco() -> None:
+    signal = "left_joint5"
+    model = JointModel(TWIN, signal)
+    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    at = {"arm": "left", "joints": ["joint5"]}
+    together = [
+        make_effect("coulomb_friction", torque_nm=0.3, **at),
+        make_effect("asymmetric_friction", torque_nm=0.2, asymmetry=0.5, **at),
+        make_effect("command_delay", delay_s=0.0123, **at),
+        make_effect("velocity_feedforward", share=0.5, **at),
+        make_effect("joint_compliance", **at, compliance_rad_per_nm=0.01),
+    ]
+    quick, exact = model.simulate(motion, model.gains, together), in_mujoco(motion, signal, model.gains, *together)
+    np.testing.assert_allclose(quick.reported, exact.reported, atol=1e-5)
+    # In the twin's own config they do the same.
+    own = JointModel(TwinConfig(effects=together), signal).simulate(motion, model.gains)
+    np.testing.assert_array_equal(own.reported, quick.reported)
+
+
+def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
+    """−K_d (q̇ − τ q̈) on a free mass: what the motor gives is J q̈, not (J − K_d τ) q̈, which is 5 % less here."""
+    joint = JointModel.axis("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), timestep_s=1e-3)
+    time_s = np.arange(2000) * 1e-3
+    m = Measurement(
+        name="made",
+        time_s=time_s,
+        target=(0.3 * np.sin(2 * np.pi * 2.0 * time_s) * np.clip(time_s, 0.0, 1.0))[:, None],
+        measured=np.zeros((2000, 1)),
+        signals=("mass",),
+        units=("rad",),
+    )
+    late = make_effect("speed_delay", delay_s=1.5e-3)
+    answer = joint.simulate(motion_of(m, "mass", joint.joint), joint.gains, [late])
+    q = answer.reported
+    acceleration = (q[2:] - 2 * q[1:-1] + q[:-2]) / 1e-3**2  # of the physics step that ends at q[2:]
+    np.testing.assert_allclose(answer.effort[2:], 0.05 * acceleration, rtol=0, atol=1e-9 * np.abs(answer.effort).max())
+
+
+def test_an_effect_takes_the_place_of_the_config_s_own() -> None:
+    signal = "left_joint4"
+    motion = joint_motion(chirp(signal, 2.0), TWIN, signal)
+    weak, strong = (make_effect("coulomb_friction", torque_nm=f) for f in (0.1, 2.0))
+    refitted = JointModel(TwinConfig(effects=[weak]), signal).simulate(motion, JointModel(TWIN, signal).gains, [strong])
+    plain = JointModel(TWIN, signal).simulate(motion, JointModel(TWIN, signal).gains, [strong])
+    np.testing.assert_array_equal(refitted.reported, plain.reported)
+
+
+def test_of_an_effect_of_all_joints_the_model_takes_what_acts_on_its_own() -> None:
+    signal = "left_joint6"
+    motion = joint_motion(chirp(signal, 2.0), TWIN, signal)
+    gains = JointModel(TWIN, signal).gains
+    plain = JointModel(TWIN, signal).simulate(motion, gains)
+    other = JointModel(TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=1.0, arm="right")]), signal)
+    np.testing.assert_array_equal(other.simulate(motion, gains).reported, plain.reported)
+
+
+@dataclasses.dataclass(kw_only=True)
+class _Late(JointEffect):
+    """An outsider's effect that the one-joint model has never heard of: each command arrives one sending late, and the
+    encoder reads 2 mrad too much."""
+
+    name = "test_late"
+    late: float = dataclasses.field(
+        default=0.0,
+        metadata={
+            "parameter": {
+                "unit": "1",
+                "symbol": "n",
+                "absent": 0.0,
+                "low": 0.0,
+                "high": 1.0,
+                "typical": 1.0,
+                "source": "a test",
+            }
+        },
+    )
+
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> dict[str, np.ndarray]:
+        return {"last": np.full((num_sims, 14), np.nan)}
+
+    def command(self, targets: np.ndarray, memory: dict[str, np.ndarray], dt_s: np.ndarray) -> np.ndarray:
+        last = np.where(np.isnan(memory["last"]), targets, memory["last"])
+        memory["last"][:] = targets
+        arriving = targets.copy()
+        arriving[:, self.columns] = last[:, self.columns]
+        return arriving
+
+    def encoder(self, values: np.ndarray) -> np.ndarray:
+        values = values.copy()
+        values[:, self.columns] += 0.002
+        return values
+
+
+def test_an_effect_that_only_has_hooks_runs_in_mujoco() -> None:
+    signal = "left_joint5"
+    model = JointModel(TWIN, signal)
+    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    plain = model.simulate(motion, model.gains)
+    late = model.simulate(motion, model.gains, [_Late(late=1.0, arm="left", joints=["joint5"])])
+    # Where it starts it reports what was measured, so it stands 2 mrad lower and comes up from there within K_d / K_p.
+    np.testing.assert_allclose(late.reported[150:], 0.002 + plain.reported[149:-1], atol=1e-4)
+    assert late.reported[0] == pytest.approx(motion.start, abs=1e-12)
+
+
+def test_rows_below_150_hz_are_sent_in_straight_lines_as_in_a_replay() -> None:
+    signal = "left_joint5"
+    model = JointModel(TWIN, signal)
+    slow = at_rest(joint_motion(chirp(signal, 3.0, rate_hz=30.0), TWIN, signal), model.gains)
+    late = _Late(late=1e-9, arm="left", joints=["joint5"])  # forces MuJoCo; it delays and shifts as above
+    assert len(model.simulate(slow, model.gains).reported) == len(slow.target) == 90
+    sent = model.simulate(slow, model.gains, [late])
+    assert len(sent.reported) == 90
+    # By hand: 30 Hz are five commands a row, on the line to the next row.
+    line = np.interp(np.arange(90 * 5) + 1.0, 5 * np.arange(90), slow.target)
+    fine = dataclasses.replace(slow, target=line, rate_hz=150.0, coupling_nm=np.zeros(450))
+    np.testing.assert_allclose(
+        model.simulate(slow, model.gains).reported, model.simulate(fine, model.gains).reported[::5], atol=1e-12
+    )
+
+
+def test_row_k_is_before_command_k_acts() -> None:
+    signal = "left_joint4"
+    model = JointModel(TWIN, signal)
+    m = chirp(signal, 2.0, amplitude=0.0)
+    m.target[10:, 3] += 0.02
+    answer = model.simulate(at_rest(joint_motion(m, TWIN, signal), model.gains), model.gains).reported
+    np.testing.assert_allclose(answer[:11], answer[0], atol=1e-12)
+    lag_s = model.gains.kd / model.gains.kp
+    assert answer[15] - answer[0] == pytest.approx(0.02 * (1 - np.exp(-5 * 0.005 / lag_s)), rel=0.02)
+
+
+def test_the_whole_twin_agrees_with_its_joints_one_by_one() -> None:
+    # All joints of an arm move at once; each alone, with the others' measured motion as a known torque, does the same.
+    m = chirp("left_joint1", 4.0, amplitude=0.0)
+    rng = np.random.default_rng(0)
+    fade = np.clip((m.time_s - 0.5) / 0.5, 0, 1)
+    for j in range(6):
+        m.target[:, j] += 0.25 * fade * np.sin(2 * np.pi * (0.3 + 0.25 * j) * m.time_s + rng.uniform(0, 6))
+    sim = Simulation(Bench())
+    sim.reset([0])
+    offset = np.array([*(np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad), 0.0] * 2)
+    done = replay(sim, m.target, 200.0, HOME + offset)
+    effort = np.concatenate([done.effort[:1], done.effort[:-1]])  # of the row before: the time of this one
+    measured = dataclasses.replace(m, measured=done.reported, effort=effort)
+    for j in range(6):
+        signal = ROBOT.action_names[j]
+        model, motion = JointModel(TWIN, signal), joint_motion(measured, TWIN, signal)
+        answer = model.simulate(motion, model.gains)
+        away = answer.reported - done.reported[:, j]
+        assert np.sqrt(np.mean(away**2)) < 2e-5, signal
+        without = dataclasses.replace(motion, coupling_nm=np.zeros(m.num_rows))
+        apart = model.simulate(without, model.gains).reported - done.reported[:, j]
+        assert np.sqrt(np.mean(apart**2)) > 10 * np.sqrt(np.mean(away**2)), "the others' motion matters"
+        # Torques agree less: a row's is what is left, 5 ms on, of the command's jump, and that hangs on how the others give way.
+        assert np.corrcoef(answer.effort[10:], effort[10:, j])[0, 1] > 0.7
+
+
+def test_a_known_payload_is_carried_and_weighs() -> None:
+    # 0.5 kg at the TCP, 0.168 m along the hand's z: its weight turns the joint by torque / K_p.
+    signal = "left_joint5"
+    model = JointModel(TWIN, signal)
+    m = chirp(signal, 4.0, amplitude=0.0)
+    m.target[3:, 4] += 1e-3  # so that it does not only rest
+    bare, loaded = (joint_motion(dataclasses.replace(m, payload_kg=kg), TWIN, signal) for kg in ({}, {"left": 0.5}))
+    sag = model.simulate(loaded, model.gains).reported[-1] - model.simulate(bare, model.gains).reported[-1]
+    hidden = model.simulate(bare, model.gains, [make_effect("payload", mass_kg=0.5, z_link6_m=0.168)]).reported
+    np.testing.assert_allclose(model.simulate(loaded, model.gains).reported, hidden, atol=1e-12)
+    torque_nm = 0.5 * 9.81 * 0.168
+    assert 0.3 * torque_nm / model.gains.kp < abs(sag) <= 3 * torque_nm / model.gains.kp
+    both = model.simulate(loaded, model.gains, [make_effect("payload", mass_kg=0.5, z_link6_m=0.168)]).reported
+    assert both[-1] - hidden[-1] == pytest.approx(sag, rel=0.05), "a hidden one adds to a known one"
+
+
+def test_a_payload_s_position_sets_its_lever_arm() -> None:
+    # The same weight further out: joint 5's axis is 0.091 m behind the flange.
+    signal = "left_joint5"
+    pose = np.array([0.0, 1.2, -1.4, 0.0, 0.0, 0.0, 0.02])
+    masses = {at: arm_bench.rigid(TWIN, signal, pose, 0.5, [], (0.0, 0.0, at)) for at in (0.0, 0.1, 0.168)}
+    bare = arm_bench.rigid(TWIN, signal, pose, 0.0, [])
+    assert arm_bench.rigid(TWIN, signal, pose, 0.5, []) == masses[0.168]
+    for at, body in masses.items():
+        weight_nm = np.hypot(body.gravity_sin - bare.gravity_sin, body.gravity_cos - bare.gravity_cos)
+        assert weight_nm == pytest.approx(0.5 * 9.81 * (0.091 + at), rel=0.01)
+
+
+def test_commanded_gains_scale_what_the_model_is_given() -> None:
+    signal = "left_joint5"
+    m = dataclasses.replace(chirp(signal, 2.0), kp={signal: 302.2}, kd={signal: 17.1})
+    motion = joint_motion(m, TWIN, signal)
+    assert (motion.kp_scale, motion.kd_scale) == pytest.approx((2.0, 1.0))
+    assert motion.kp_known and motion.kd_known
+    model = JointModel(TWIN, signal)
+    plain = dataclasses.replace(motion, kp_scale=1.0)
+    np.testing.assert_array_equal(
+        model.simulate(motion, model.gains).reported, model.simulate(plain, Gains(302.2, 17.1, 1.73)).reported
+    )
+
+
+def test_a_sliding_axis_follows_its_closed_form() -> None:
+    # 95 kg, K_p 1e4 N/m, K_d 4e3 N s/m: overdamped, poles at −2.7 and −39.4 1/s.
+    model = JointModel.axis("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", timestep_s=1e-4)
+    time_s = np.arange(5000) / 1000
+    m = dataclasses.replace(
+        chirp("left_joint1", 10.0),
+        time_s=time_s,
+        **{name: np.zeros((5000, 1)) for name in ("measured", "velocity", "effort")},
+        target=np.full((5000, 1), 0.02),
+        signals=("slide",),
+        units=("m",),
+        quantum=np.zeros(1),
+    )
+    answer = model.simulate(joint_motion(m, None, "slide"), model.gains).reported
+    fast, slow = np.sort(np.roots([95.0, 4e3, 1e4]))
+    expected = 0.02 * (1 - (slow * np.exp(fast * time_s) - fast * np.exp(slow * time_s)) / (slow - fast))
+    np.testing.assert_allclose(answer, expected, atol=2e-5)
+    with_friction = model.simulate(
+        joint_motion(m, None, "slide"), model.gains, [make_effect("coulomb_friction", torque_nm=20)]
+    )
+    assert 0.02 - with_friction.reported[-1] == pytest.approx(20 / 1e4, rel=0.02)  # F / K_p before its target
+    with pytest.raises(TaccorlError, match="test_late cannot be had"):
+        model.simulate(joint_motion(m, None, "slide"), model.gains, [_Late(late=1.0)])
+
+
+def test_a_joint_starts_in_balance() -> None:
+    # Rest for ever with friction, bristles, integrator, gear and encoder at once: nothing moves until the command does.
+    drive = Drive(150.0, 17.0, 1.0, 0.03, 0.01, gravity_sin=2.0, gravity_cos=0.5)
+    target = np.full(400, 0.3)
+    for change in (
+        {"integral_rate": 1.0, "compliance": 0.01, "compliance_damping": 0.002},
+        {"integral_rate": 1.0, "backlash": 0.01},
+        {"coulomb": 5.0},
+        {"stribeck_torque": 4.0, "stribeck_share": 0.5, "encoder_scale": 1.05, "encoder_wave": 0.01},
+    ):
+        start = 0.3 if "integral_rate" in change else 0.29  # an integral has had for ever to take the error away
+        reported, _ = simulate(
+            drive._replace(**change),
+            target,
+            np.zeros(400),
+            np.ones(400),
+            np.ones(400),
+            np.zeros(400),
+            start,
+            6,
+            1,
+            STEP_S,
+        )
+        assert reported[0] == pytest.approx(start, abs=1e-12)
+        assert np.ptp(reported) < 2e-5, change  # dry friction creeps at 6 µrad/s
+
+
+def test_what_cannot_be_replayed_is_refused_by_name() -> None:
+    m = chirp("left_joint5", 2.0)
+    with pytest.raises(TaccorlError, match="left_gripper: a gripper"):
+        JointModel(TWIN, "left_gripper")
+    with pytest.raises(TaccorlError, match="no joint of the arms"):
+        JointModel(TWIN, "left_joint7")
+    model = JointModel(TWIN, "left_joint5")
+    with pytest.raises(TaccorlError, match=r"125 Hz is 9\.600 physics steps.*resampled"):
+        model.simulate(joint_motion(chirp("left_joint5", 2.0, rate_hz=125.0), TWIN, "left_joint5"), model.gains)
+    jumpy = dataclasses.replace(m, time_s=np.where(np.arange(400) > 200, m.time_s + 0.1, m.time_s))
+    with pytest.raises(TaccorlError, match=r"not even, 105\.0 ms at 1\.000 s"):
+        joint_motion(jumpy, TWIN, "left_joint5")
+    hole = dataclasses.replace(m, target=np.where(np.arange(400)[:, None] == 100, np.nan, m.target))
+    with pytest.raises(TaccorlError, match=r"no target at 0\.500 s"):
+        joint_motion(hole, TWIN, "left_joint5")
+    late = dataclasses.replace(m, measured=np.where(np.arange(400)[:, None] < 40, np.nan, m.measured))
+    with pytest.raises(TaccorlError, match="not measured in its first 20 rows"):
+        joint_motion(late, TWIN, "left_joint5")

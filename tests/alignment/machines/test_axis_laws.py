@@ -1,0 +1,190 @@
+"""Control laws of an axis against this test's own integration of their equations (10 µs steps), not the kernel's."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse
+from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
+from taccorl.alignment.measurements.measurement import Measurement, TargetKind
+from taccorl.errors import TaccorlError
+
+RATE_HZ, DT_S = 200, 1e-5
+SERVO = AxisConfig(
+    name="servo",
+    unit="rad",
+    inertia=0.02,
+    law="pwm",
+    kp=6.0,
+    supply_v=12.0,
+    resistance_ohm=4.0,
+    torque_nm_per_a=1.0,
+    emf_v_s_per_rad=1.1,
+    lever_m=0.15,
+)
+
+
+def recording(target: np.ndarray, kind: TargetKind = "position", payload_kg: float = 0.0) -> Measurement:
+    return Measurement(
+        name="made",
+        time_s=np.arange(len(target)) / RATE_HZ,
+        target=target[:, None],
+        measured=np.zeros((len(target), 1)),
+        signals=("servo",),
+        units=("rad",),
+        target_kinds=(kind,),
+        payload_kg={"servo": payload_kg},
+    )
+
+
+def answer(axis: AxisConfig, m: Measurement) -> JointResponse:
+    model = JointModel.of(DrivenAxis(axis))
+    return model.simulate(motion_of(m, "servo", DrivenAxis(axis)), model.gains)
+
+
+def integrated(target: np.ndarray, torque, inertia: float, weight_nm: float = 0.0) -> np.ndarray:
+    """(T,) position of inertia · q̈ = torque(target, q, v) − weight sin q from rest at 0, targets held."""
+    q = v = 0.0
+    found = []
+    for goal in target.tolist():
+        found.append(q)
+        for _ in range(round(1 / (RATE_HZ * DT_S))):
+            v += DT_S * (torque(goal, q, v) - weight_nm * math.sin(q)) / inertia
+            q += DT_S * v
+    return np.array(found)
+
+
+def test_a_pwm_servo_with_a_pendulum_clips_its_duty_and_loses_the_back_emf():
+    """τ = k_t (V d − k_e q̇) / R, d = kp (q* − q) within ± 1: at a step of 0.8 rad d is clipped, and the speed is k_e's."""
+    target = np.where(np.arange(400) < 10, 0.0, 0.8)
+
+    def torque(goal: float, q: float, v: float) -> float:
+        duty = min(max(6.0 * (goal - q), -1.0), 1.0)
+        return 1.0 * (12.0 * duty - 1.1 * v) / 4.0
+
+    inertia, weight = 0.02 + 0.3 * 0.15**2, 0.3 * 9.81 * 0.15
+    truth = integrated(target, torque, inertia, weight)
+    m = recording(target, payload_kg=0.3)
+    found = answer(SERVO, m)
+    assert np.abs(found.reported - truth).max() < 2e-4  # the model's steps are 1 ms
+    # At the end it stands: 12 V · kp · e / R holds the weight.
+    assert 3.0 * 6.0 * (0.8 - found.reported[-1]) == pytest.approx(weight * math.sin(found.reported[-1]), rel=0.03)
+    assert found.effort[-1] == pytest.approx(weight * math.sin(found.reported[-1]), rel=0.03)
+    stiff = dataclasses.replace(SERVO, emf_v_s_per_rad=1e-6)
+    assert np.abs(answer(stiff, m).reported - truth).max() > 0.05, "without back-EMF it is much faster"
+
+
+def test_a_velocity_loop_reaches_its_velocity_as_a_lag_of_inertia_over_gain():
+    """J q̈ = kd (v* − q̇): q = v* (t − T (1 − e^(−t/T))), T = J / kd = 0.1 s."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
+    time_s = np.arange(200) / RATE_HZ
+    found = answer(axis, recording(np.full(200, 1.5), "velocity"))
+    np.testing.assert_allclose(found.reported, 1.5 * (time_s - 0.1 * (1 - np.exp(-time_s / 0.1))), atol=3e-3)
+
+
+def test_a_torque_accelerates_and_none_lets_the_axis_coast():
+    """0.01 N·m on 0.02 kg·m² for 0.5 s: 0.0625 rad and 0.25 rad/s, kept with the motor off."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")
+    target = np.where(np.arange(200) < 100, 0.01, 0.0)
+    found = answer(axis, recording(target, "torque")).reported
+    assert found[100] == pytest.approx(0.0625, rel=0.01)
+    assert found[-1] == pytest.approx(0.0625 + 0.25 * 99 / RATE_HZ, rel=0.01)
+
+
+def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_recorded():
+    """Off from 0.5 to 0.9 s: no duty, no back-EMF. Else the supply falls from 12 to 8 V: duty · 8 / 12, back-EMF as before.
+    A row reads what its motor got until then."""
+    rows = np.arange(400)
+    target, off = np.where(rows < 10, 0.0, 0.8), (rows >= 100) & (rows < 180)
+    volts = np.where(rows < 50, 12.0, 8.0)
+    inertia, weight = 0.02 + 0.3 * 0.15**2, 0.3 * 9.81 * 0.15
+    q = v = 0.0
+    truth = []
+    for k in rows:
+        truth.append(q)
+        for _ in range(round(1 / (RATE_HZ * DT_S))):
+            duty = min(max(6.0 * (target[k] - q), -1.0), 1.0)
+            torque = 0.0 if off[k] else (volts[k] * duty - 1.1 * v) / 4.0
+            v += DT_S * (torque - weight * math.sin(q)) / inertia
+            q += DT_S * v
+    m = dataclasses.replace(
+        recording(target, payload_kg=0.3),
+        supply_v=np.append(12.0, volts[:-1])[:, None],
+        enabled=np.where(off, 0.0, 1.0)[:, None],
+    )
+    assert np.abs(answer(SERVO, m).reported - np.array(truth)).max() < 5e-4
+    assert answer(SERVO, m).effort[off] == pytest.approx(np.zeros(80))
+    with pytest.raises(
+        TaccorlError, match="made: a supply voltage of servo is stated, and law torque has no use for it"
+    ):
+        torque_axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")
+        answer(torque_axis, dataclasses.replace(m, target_kinds=("torque",), payload_kg={}))
+
+
+def test_targets_act_at_their_own_times_and_late_by_what_the_file_states():
+    """J q̈ = τ from rest: 0.01 N·m from 0.1037 s on give τ t² / 2 J. The row is at 0.1 s; its target came
+    2.2 ms later, and the file states 1.5 ms."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque", target_late_s=1.5e-3)
+    time_s = np.arange(200) / RATE_HZ
+    target = np.where(time_s < 0.0999, 0.0, 0.01)
+    m = dataclasses.replace(recording(target, "torque"), command_s=time_s + 2.2e-3)
+    truth = 0.5 * 0.5 * np.clip(time_s - 0.1037, 0.0, None) ** 2
+    np.testing.assert_allclose(answer(axis, m).reported, truth, atol=2e-7)
+
+
+def test_a_torque_that_the_controller_adds_moves_the_axis_and_is_in_its_effort():
+    """J = 0.02: 0.01 N·m from 0.5 s on beside a velocity loop whose target is 0: q̇ → 0.01 / 0.2 rad/s, and no effort is left."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
+    m = recording(np.zeros(200), "velocity")
+    added = np.where(np.arange(200) < 100, 0.0, 0.01)[:, None]
+    found = answer(axis, dataclasses.replace(m, torque_ff=added))
+    assert np.diff(found.reported)[-1] * RATE_HZ == pytest.approx(0.05, rel=0.02)
+    assert found.effort[101] == pytest.approx(0.01, rel=0.06) and abs(found.effort[-1]) < 2e-4
+
+
+def test_the_effort_of_a_row_is_before_its_target_or_after_it_as_the_file_says():
+    """At rest 18 N·m/rad times a step of 0.01 rad: 0.18 N·m in the step's row, or in the next."""
+    m = recording(np.where(np.arange(50) < 20, 0.0, 0.01))
+    before, after = (
+        answer(dataclasses.replace(SERVO, effort_after_target=own), m).effort[19:21] for own in (False, True)
+    )
+    assert before == pytest.approx([0.0, 0.0]) and after == pytest.approx([0.0, 0.18])
+
+
+def test_a_recording_s_own_lever_and_arm_are_those_of_its_pendulum():
+    """0.3 kg at 0.2 m on a rod of 0.06 kg: J + 0.3 · 0.04 + 0.06 · 0.04 / 3 kg·m², and 9.81 (0.06 + 0.006) N·m at 90°."""
+    m = dataclasses.replace(recording(np.zeros(50), payload_kg=0.3), lever_m={"servo": 0.2}, arm_kg={"servo": 0.06})
+    axis = DrivenAxis(SERVO)
+    rigid = axis.rigid(motion_of(m, "servo", axis), [])
+    assert rigid.inertia == pytest.approx(0.02 + 0.012 + 0.0008)
+    assert (rigid.gravity_sin, rigid.gravity_cos) == pytest.approx((9.81 * 0.066, 0.0))
+    nowhere = DrivenAxis(dataclasses.replace(SERVO, lever_m=0.0))
+    with pytest.raises(TaccorlError, match=r"made: payload_kg or arm_kg of servo is stated.*write `lever_m"):
+        motion_of(recording(np.zeros(50), payload_kg=0.3), "servo", nowhere)
+
+
+def test_a_gain_s_register_is_worth_its_factor():
+    """800 steps of 0.0075 / rad are 6 / rad: 18 N·m/rad at 12 V, 4 Ω and 1 N·m/A."""
+    assert dataclasses.replace(SERVO, kp=800.0, kp_factor=0.0075).loop_gains == pytest.approx(SERVO.loop_gains)
+    assert SERVO.loop_gains.kp == pytest.approx(18.0)
+    fitted = AxisConfig(name="servo", unit="rad", inertia=0.02, kp=400.0, kp_factor=0.02, kd=10.0, kd_factor=0.1)
+    again = fitted.with_numbers({"kp": 9.0, "kd": 1.1})
+    assert (again.kp, again.kd) == pytest.approx((450.0, 11.0)), "the file keeps its register's steps"
+
+
+def test_a_target_that_the_law_does_not_take_is_refused():
+    with pytest.raises(TaccorlError, match=r"servo is commanded by velocity, its law takes a position; .*q_target"):
+        answer(SERVO, recording(np.zeros(50), "velocity"))
+
+
+def test_targets_of_the_rate_of_the_rows_are_held_although_stamps_are_rounded():
+    """60 Hz with stamps of 0.1 ms: 239 steps in 3.9834 s are 59.999 Hz, and command_hz 60 is no faster than that."""
+    target = 0.2 * np.sin(2 * np.pi * np.arange(240) / 60)
+    m = dataclasses.replace(recording(target), time_s=np.linspace(0.0, 3.9834, 240))
+    assert 59.9 < m.rate_hz < 60.0
+    held, stated, faster = (answer(dataclasses.replace(SERVO, command_hz=hz), m).reported for hz in (None, 60.0, 120.0))
+    np.testing.assert_array_equal(held, stated)
+    assert np.abs(faster - held).max() > 1e-3

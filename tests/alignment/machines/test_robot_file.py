@@ -1,0 +1,248 @@
+"""Robot files: rigid bodies of MJCF and URDF against arithmetic, and what is refused."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.checks.robot import check_robot
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.machines.robot_draft import robot_draft
+from taccorl.alignment.machines.robot_file import Robot, load_robot
+from taccorl.alignment.machines.robot_model import load_robot_model
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.cli import init_robot
+from taccorl.errors import SpecError, TaccorlError
+
+# Two links that turn about y and hang in gravity: point masses 2 kg at 0.3 m and 1 kg at 0.2 m beyond the elbow at 0.5 m.
+TWO_LINKS = """
+<mujoco><compiler angle="radian"/>
+<asset><mesh name="cover" file="not_there.stl"/></asset>
+<worldbody><body name="base"><freejoint/><inertial pos="0 0 0" mass="9" diaginertia="1 1 1"/><geom type="mesh" mesh="cover"/>
+<body name="upper"><joint name="shoulder" axis="0 1 0" range="-2 2"/>
+<inertial pos="0.3 0 0" mass="2" diaginertia="1e-9 1e-9 1e-9"/><geom type="mesh" mesh="cover"/>
+<body name="lower" pos="0.5 0 0"><joint name="elbow" axis="0 1 0" range="-2 2" damping="0.2" frictionloss="0.1"/>
+<inertial pos="0.2 0 0" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body></body></body></worldbody>
+<actuator><position name="servo" joint="elbow" kp="80" kv="4" gear="2" forcerange="-10 10"/></actuator>
+<keyframe><key qpos="0 0 0 1 0 0 0 0 0"/></keyframe></mujoco>
+"""
+ROBOT_YAML = """\
+kind: robot
+model: arm.xml
+joints:
+  shoulder: {kp: 50.0, kd: 5.0}
+  elbow: {kp: 20.0, kd: 1.0, rotor_inertia: 2.0e-5, gear: 50.0, effort_limit: 100.0}
+"""
+
+
+def robot(folder: Path, text: str = ROBOT_YAML, model: str = TWO_LINKS) -> Robot:
+    (folder / "arm.xml").write_text(model)
+    (folder / "robot.yaml").write_text(text)
+    return load_robot(folder / "robot.yaml")
+
+
+def swept(**motions: np.ndarray) -> Measurement:
+    """Joints at 200 Hz exactly where these angles (T,) are."""
+    angles = np.column_stack(list(motions.values()))
+    return Measurement(
+        name="sweep",
+        time_s=np.arange(len(angles)) / 200,
+        target=angles,
+        measured=angles.copy(),
+        signals=tuple(motions),
+        units=("rad",) * len(motions),
+    )
+
+
+def test_inertia_and_weight_are_those_of_the_point_masses(tmp_path: Path) -> None:
+    made = robot(tmp_path)
+    bent = swept(shoulder=np.zeros(400), elbow=np.full(400, 0.5 * np.pi))
+    shoulder, elbow = (JointModel(made, name) for name in ("shoulder", "elbow"))
+    seen = motion_of(bent, "shoulder", shoulder.joint)
+    # 2 · 0.3² + 1 · (0.5² + 0.2²): the lower link hangs straight down.
+    assert shoulder.inertia_kgm2(seen) == pytest.approx(0.18 + 0.29, rel=1e-6)
+    # About +y a positive angle lowers the mass: the joint must hold − g (2 · 0.3 + 1 · 0.5) at 0.
+    assert shoulder.weight_nm(seen, np.zeros(1))[0] == pytest.approx(-9.81 * 1.1, rel=1e-6)
+    bent_elbow = motion_of(bent, "elbow", elbow.joint)
+    assert elbow.inertia_kgm2(bent_elbow) == pytest.approx(0.04 + 2e-5 * 50**2, rel=1e-6)  # with its rotor
+    assert elbow.weight_nm(bent_elbow, np.array([0.0]))[0] == pytest.approx(-9.81 * 0.2, rel=1e-6)
+    np.testing.assert_allclose(elbow.weight_nm(bent_elbow, np.array([np.pi / 2])), 0.0, atol=1e-6)
+
+
+def test_coupling_is_the_torque_that_the_other_joints_motion_costs(tmp_path: Path) -> None:
+    made = robot(tmp_path, model=TWO_LINKS.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>', 1))
+    time_s = np.arange(1000) / 200
+    elbow = 0.5 * np.pi + 0.2 * np.sin(2 * np.pi * 0.5 * time_s)
+    seen = motion_of(swept(shoulder=np.zeros(1000), elbow=elbow), "shoulder", JointModel(made, "shoulder").joint)
+    # Two links of l = 0.5, c = 0.2, m = 1: (m c² + m l c cos q2) q̈2 − m l c sin q2 q̇2², the shoulder at rest.
+    speed, acceleration = np.gradient(elbow, 1 / 200), np.gradient(np.gradient(elbow, 1 / 200), 1 / 200)
+    expected = (0.04 + 0.1 * np.cos(elbow)) * acceleration - 0.1 * np.sin(elbow) * speed**2
+    inner = slice(100, -100)
+    np.testing.assert_allclose(seen.coupling_nm[inner], expected[inner], atol=0.02 * np.abs(expected).max())
+
+
+def test_a_slide_holds_its_weight_and_has_no_angle(tmp_path: Path) -> None:
+    lift = TWO_LINKS.replace('name="shoulder" axis="0 1 0"', 'name="shoulder" type="slide" axis="0 0 1"')
+    made = robot(tmp_path, model=lift)
+    m = dataclasses.replace(swept(shoulder=np.zeros(300), elbow=np.zeros(300)), units=("m", "rad"))
+    model = JointModel(made, "shoulder")
+    seen = motion_of(m, "shoulder", model.joint)
+    np.testing.assert_allclose(seen.coupling_nm, 3 * 9.81, rtol=1e-6)
+    assert model.inertia_kgm2(seen) == pytest.approx(3.0)
+    answer = model.simulate(dataclasses.replace(seen, start=-3 * 9.81 / 50), model.gains)
+    np.testing.assert_allclose(answer.reported, -3 * 9.81 / 50, atol=1e-9)  # it hangs m g / K_p below its target
+
+
+def test_carried_weight_is_no_load_for_the_controller_and_is_in_the_effort(tmp_path: Path) -> None:
+    made = robot(tmp_path, ROBOT_YAML.replace("joints:", "gravity_compensation: 1.0\njoints:"))
+    model = JointModel(made, "elbow")
+    seen = motion_of(swept(shoulder=np.zeros(300), elbow=np.zeros(300)), "elbow", model.joint)
+    answer = model.simulate(seen, model.gains)
+    np.testing.assert_allclose(answer.reported, 0.0, atol=1e-9)
+    np.testing.assert_allclose(answer.effort, -9.81 * 0.2, rtol=1e-6)
+
+
+def test_a_draft_says_all_that_the_model_says_and_loads_once_its_todos_are_written(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(TWO_LINKS)
+    out = tmp_path / "arm_robot.yaml"
+    assert init_robot.main([str(tmp_path / "arm.xml"), f"--out={out}"]) == 0
+    text = out.read_text()
+    assert all(f"#   {law}:" in text for law in ("impedance", "cascade", "velocity", "torque", "pwm"))
+    for line in ("kp: 320", "kd: 16", "effort_limit: 20", "damping_nms_per_rad: 0.2", "torque_nm: 0.1", "free joint"):
+        assert line in text, line  # a gear of 2 turns 80 N·m/rad into 320, and 10 N·m into 20
+    with pytest.raises(
+        SpecError, match=r"arm_robot\.yaml:\d+: TODO is left.*gravity_compensation \(1\.0 if.*shoulder/kp \(N·m/rad"
+    ):
+        load_robot(out)
+    written = text.replace("gravity_compensation: TODO", "gravity_compensation: 0.0").replace(
+        "gains: TODO", "gains: commanded"
+    )
+    out.write_text(written.replace(": TODO", ": 10.0"))
+    made = load_robot(out)
+    assert made.config.joints["elbow"].kp == 320.0
+    again = tmp_path / "again.yaml"
+    again.write_text(made.text(again))
+    assert load_robot(again).config == made.config
+    with pytest.raises(TaccorlError, match="is there already"):
+        init_robot.main([str(tmp_path / "arm.xml"), f"--out={out}"])
+
+
+def test_a_velocity_actuator_becomes_a_velocity_loop(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        TWO_LINKS.replace(
+            '<position name="servo" joint="elbow" kp="80" kv="4"', '<velocity name="servo" joint="elbow" kv="4"'
+        )
+    )
+    text, _ = robot_draft(tmp_path / "arm.xml", tmp_path / "robot.yaml")
+    elbow = text[text.index("  elbow:") :]
+    assert "law: velocity" in elbow and "kd: 16" in elbow and "kp:" not in elbow  # through a gear of 2: 4 · 2²
+
+
+def test_targets_that_move_between_rows_lead_held_ones_by_half_a_row(tmp_path: Path):
+    ramp = swept(
+        shoulder=np.zeros(400), elbow=np.clip(np.arange(400) / 200 - 0.5, 0, 1)
+    )  # 1 rad/s from 0.5 s on, 200 Hz
+    fast = ROBOT_YAML.replace("kd: 1.0", "kd: 1.0, command_hz: 1000")
+    assert fast != ROBOT_YAML
+    reached = []
+    for text in (ROBOT_YAML, fast):
+        model = JointModel(robot(tmp_path, text), "elbow")
+        motion = dataclasses.replace(motion_of(ramp, "elbow", model.joint), start=0.0)
+        reached.append(model.simulate(motion, model.gains).reported)
+    # Held for 5 ms a target is 2.5 ms late on average, in steps of 1 ms along the line to the next row 0.5 ms.
+    lead_s = float(np.median((reached[1] - reached[0])[250:290]))
+    assert lead_s == pytest.approx(0.0025 - 0.0005, abs=2e-4)
+
+
+URDF = """<robot name="r"><link name="base"/>
+<link name="a"><visual><geometry><mesh filename="package://x/a.stl"/></geometry></visual>{inertial}</link>
+<joint name="j1" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="5" velocity="3"/><dynamics damping="0.3" friction="0.2"/></joint></robot>"""
+INERTIAL = (
+    '<inertial><origin xyz="0.1 0 0"/><mass value="2"/>'
+    '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+def test_a_joint_that_mimics_another_is_told_of(tmp_path: Path):
+    path = tmp_path / "gripper.urdf"
+    text = URDF.format(inertial=INERTIAL).replace("<axis", '<mimic joint="thumb"/><axis', 1)
+    assert "<mimic" in text
+    path.write_text(text)
+    assert any("mimic" in remark and "thumb" in remark for remark in load_robot_model(path).remarks)
+
+
+def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
+    path = tmp_path / "r.urdf"
+    path.write_text(URDF.format(inertial=INERTIAL))
+    facts = load_robot_model(path).joints["j1"]
+    assert facts.inertia == pytest.approx(0.01 + 2 * 0.1**2)
+    assert (facts.limits, facts.effort_limit, facts.damping, facts.friction) == ((-1.0, 1.0), 5.0, 0.3, 0.2)
+    assert "effort_limit: 5" in robot_draft(path, tmp_path / "out.yaml")[0]
+    path.write_text(URDF.format(inertial=""))
+    with pytest.raises(TaccorlError, match=r'link a moves and has no mass.*write <inertial>.*<link name="a">'):
+        load_robot_model(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("<keyframe>", '<equality><connect name="loop" body1="lower" body2="base" anchor="0 0 0"/></equality><keyframe>'),
+         "closed chain: connect loop between lower and base"),
+        (('<inertial pos="0.3 0 0" mass="2" diaginertia="1e-9 1e-9 1e-9"/>', ""),
+         r'body upper has its inertia from mesh .cover.*Write it down: <inertial.*in <body name="upper">'),
+        (("<mujoco>", "<mujoco"), "is not XML"),
+        (("mujoco", "sdf"), "neither MJCF.*nor URDF"),
+    ],
+)  # fmt: skip
+def test_models_that_cannot_be_used_are_refused_with_what_to_write(
+    change: tuple[str, str], says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(TaccorlError, match=says):
+        robot(tmp_path, model=TWO_LINKS.replace(*change))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("shoulder:", "sholder:"), r"robot\.yaml:4: joints → sholder: arm.xml has no joint 'sholder'.*shoulder"),
+        (("model: arm.xml", "model: leg.xml"), r"robot\.yaml:2: model: no file 'leg.xml' beside it"),
+        (("kp: 50.0", "kp: -50.0"), r"robot\.yaml:4.*kp"),
+        (("kd: 5.0}", "kd: 5.0, effects: [{effect: backlash, play_rad: 0.01}]}"),
+         r"backlash needs the inertia of the motor: write rotor_inertia \(kg·m²\) and gear of shoulder"),
+        (("kd: 5.0}", "kd: 5.0, effects: [{effect: payload, mass_kg: 0.1}]}"), "payload cannot act on one joint"),
+    ],
+)  # fmt: skip
+def test_robot_files_that_are_wrong_are_refused_with_their_line(
+    change: tuple[str, str], says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(TaccorlError, match=says):
+        robot(tmp_path, ROBOT_YAML.replace(*change))
+
+
+def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path) -> None:
+    made = robot(tmp_path, model=TWO_LINKS.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>', 1))
+    time_s = np.arange(1200) / 200
+    angle = 0.4 * np.sin(2 * np.pi * (0.2 + 0.2 * time_s) * time_s)
+    plain = swept(shoulder=np.zeros(1200), elbow=angle)
+    torque = 0.09 * np.gradient(np.gradient(angle, 1 / 200), 1 / 200) + 0.1 * np.gradient(angle, 1 / 200)
+
+    def checks(m: Measurement) -> dict[str, str]:
+        return {f.check: f.text for f in check_robot(made, m, made.joint("elbow").whole(m), ["elbow"])}
+
+    def with_effort(factor: float) -> Measurement:
+        return dataclasses.replace(plain, effort=np.column_stack([np.zeros(1200), factor * torque]))
+
+    assert checks(with_effort(1.0)) == {}
+    degrees = dataclasses.replace(plain, target=np.degrees(plain.target), measured=np.degrees(plain.measured))
+    assert "Write `unit: deg` for elbow.q and elbow.q_target" in checks(degrees)["beyond_limits"]
+    assert "`factor: -1` for elbow.tau" in checks(with_effort(-1.0))["reversed_effort"]
+    assert "8 times" in checks(with_effort(8.0))["wrong_inertia"]
+    assert "mA" in checks(with_effort(1000.0))["beyond_effort"]
+    lacking = swept(elbow=angle)
+    assert "it lacks shoulder" in checks(lacking)["pose_unknown"]
+    renamed = dataclasses.replace(plain, signals=("shoulder", "elbo"))
+    with pytest.raises(TaccorlError, match=r"arm\.xml has no joint 'elbo'; .*elbow.*Rename its columns"):
+        checks(renamed)

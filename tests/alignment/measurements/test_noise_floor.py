@@ -1,0 +1,260 @@
+"""Noise floors: a known noise is found again, whichever way it can be; and nothing is ever exact."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from made_sweep import ARMS_JOINTS, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
+
+from taccorl.alignment.measurements.measurement import Measurement, Touch
+from taccorl.alignment.measurements.noise_floor import motion_hz, noise_floor, rest_stretches, touch_floor
+from taccorl.alignment.measurements.quantisation import find_quantum
+from taccorl.alignment.measurements.repeats import overlay, repeats
+from taccorl.errors import TaccorlError
+
+NOISE = 2e-4
+
+
+@pytest.fixture(scope="module")
+def motion() -> tuple[np.ndarray, np.ndarray]:
+    """Targets and true answers of a 6 s sweep of all arm joints, with 2 s of rest before and 3 s after."""
+    target = rested(chirp(6.0, np.where(np.isin(np.arange(14), ARMS_JOINTS), 0.2, 0.0), np.zeros(14)), 2.0, 3.0)
+    return target, answer(target)
+
+
+def by_method(floor) -> dict[str, float]:
+    return {e.method: e.value for e in floor.estimates}
+
+
+def test_rest_residue_and_repeats_each_recover_a_known_noise(motion):
+    rng = np.random.default_rng(0)
+    first, second = (measured(*motion, rng, NOISE, name=name) for name in "ab")
+    floors = noise_floor([first, dataclasses.replace(second, repeat_of="a")])
+    found = {method: [] for method in ("repeats", "rest", "residue")}
+    for signal in first.signals:
+        assert floors[signal].used.method == "repeats"
+        assert not floors[signal].lower_bound
+        for method, value in by_method(floors[signal]).items():
+            found[method].append(value)
+    # 14 independent signals each; a block of 48 white samples knows σ to 10 %, 80 of them to 1 %.
+    for method, values in found.items():
+        assert np.mean(values) == pytest.approx(NOISE, rel=0.03), method
+        assert np.max(np.abs(np.array(values) / NOISE - 1)) < 0.15, method
+
+
+def test_interval_holds_the_truth_about_as_often_as_it_says(motion):
+    held, total = {"rest": 0, "residue": 0}, 0
+    for seed in range(20):
+        floors = noise_floor([measured(*motion, np.random.default_rng(seed), NOISE)])
+        total += len(floors)
+        for floor in floors.values():
+            for e in floor.estimates:
+                held[e.method] += e.low <= NOISE <= e.high
+    for method, count in held.items():
+        assert 0.90 <= count / total <= 0.995, (method, count, total)  # n = 280
+
+
+def test_without_repeats_the_floor_is_a_lower_bound_and_says_so(motion):
+    floor = noise_floor([measured(*motion, np.random.default_rng(0), NOISE)])["left_joint5"]
+    assert floor.lower_bound
+    assert floor.used.method in ("rest", "residue")
+    assert "record the motion twice" in floor.words()
+    assert "mrad" in floor.words()
+
+
+def test_repeats_see_what_the_robot_does_not_repeat(motion):
+    # A slow disturbance of 1 mrad, another one each time: neither rest nor residue can tell it from motion.
+    target, true = motion
+    rng = np.random.default_rng(1)
+    time_s = np.arange(len(target)) / RATE_HZ
+
+    def once(name: str) -> Measurement:
+        wave = 1e-3 * math.sqrt(2) * np.sin(2 * np.pi * 0.7 * time_s + rng.uniform(0, 6.28))
+        return measured(target, true + wave[:, None], rng, NOISE, name=name)
+
+    alone = noise_floor([once("a")])["left_joint2"].value
+    pairs = [noise_floor([once("a"), dataclasses.replace(once("b"), repeat_of="a")])["left_joint2"] for _ in range(12)]
+    # ⟨(A sin(x + φ₁) − A sin(x + φ₂))²⟩ / 2 over phases is A² / 2 = 1 mrad², plus the noise.
+    rms = math.sqrt(np.mean([f.value**2 for f in pairs]))
+    assert rms == pytest.approx(math.sqrt(1e-6 + NOISE**2), rel=0.35)
+    assert alone < 0.5e-3
+
+
+def test_noise_far_below_the_encoder_s_step_leaves_the_rounding(motion):
+    step = math.radians(0.01)
+    floors = noise_floor([measured(*motion, np.random.default_rng(2), 1e-7, step)])
+    moving, resting = floors["left_joint1"], floors["left_gripper"]
+    assert moving.value == pytest.approx(step / math.sqrt(12), rel=0.1)
+    assert by_method(moving)["residue"] == pytest.approx(
+        step / math.sqrt(12), rel=0.1
+    )  # rounding is noise while it moves
+    assert by_method(moving)["rest"] < 0.1 * step / math.sqrt(12)  # and a constant while it rests
+    assert resting.value > 0
+
+
+def test_noise_and_rounding_add_as_squares(motion):
+    step = math.radians(0.05)
+    floor = noise_floor([measured(*motion, np.random.default_rng(3), 5e-4, step)])["right_joint3"]
+    assert floor.value == pytest.approx(math.sqrt(5e-4**2 + step**2 / 12), rel=0.06)
+
+
+def test_floor_is_above_zero_for_perfect_numbers(motion):
+    target, _ = motion
+    perfect = Measurement(
+        name="p", time_s=np.arange(len(target)) / RATE_HZ, target=target, measured=np.tile(target[:1], (len(target), 1))
+    )
+    assert all(f.value > 0 for f in noise_floor([perfect]).values())
+    assert noise_floor([perfect])["left_joint1"].used.method == "number"
+
+
+def test_residue_is_not_made_of_motion(motion):
+    # Noise of 5 µrad under a motion of 0.2 rad, 40 000 times as large.
+    floor = noise_floor([measured(*motion, np.random.default_rng(4), 5e-6)])["left_joint1"]
+    assert by_method(floor)["residue"] == pytest.approx(5e-6, rel=0.1)
+
+
+def test_residue_is_refused_where_rows_are_too_slow_for_the_motion(motion):
+    # At 20 rows a second the smooth follows up to 6.1 Hz; a fifth of that is 1.2 Hz, and the sweep goes to 2 Hz.
+    target, true = (x[::10] for x in motion)
+    slow = measured(target, true, np.random.default_rng(5), NOISE, rate_hz=20)
+    assert motion_hz(slow)[0] > 1.22
+    methods = by_method(noise_floor([slow])["left_joint1"])
+    assert "residue" not in methods
+    assert methods["rest"] == pytest.approx(NOISE, rel=0.35)
+    assert "residue" in by_method(noise_floor([slow])["left_gripper"])  # which rests
+
+
+def test_rest_begins_after_the_joints_have_arrived():
+    target = np.zeros((1000, 14))
+    target[400:, 0] = 0.1
+    m = measured(target, target, np.random.default_rng(0), NOISE)
+    assert rest_stretches(m) == [(0, 400), (700, 1000)]  # 1.5 s at 200 Hz
+
+
+def test_effort_has_a_floor_where_it_was_recorded(motion):
+    rng = np.random.default_rng(6)
+    m = measured(*motion, rng, NOISE)
+    effort = np.full(m.measured.shape, np.nan)
+    effort[:, 1] = 3.0 + np.sin(np.arange(m.num_rows) / 200) + 0.02 * rng.normal(size=m.num_rows)
+    floors = noise_floor([dataclasses.replace(m, effort=effort)], "effort")
+    assert list(floors) == ["left_joint2"]
+    assert floors["left_joint2"].value == pytest.approx(0.02, rel=0.1)
+    assert floors["left_joint2"].unit == "N·m"
+
+
+def test_touch_floor_of_every_taxel():
+    rng = np.random.default_rng(7)
+    sigma = np.where(np.arange(1536) < 768, 1.3, 0.0)
+    counts = np.round(rng.normal(size=(1000, 1536)) * sigma).astype(np.int16)
+    counts[300:500] += 80  # a touch
+    touch = Touch(time_s=np.repeat(np.arange(1000)[:, None] / 100, 4, axis=1), counts=counts, baseline=np.zeros(1536))
+    m = dataclasses.replace(sweep(0, seconds=1.0), touch=touch)
+    floor = touch_floor([m])
+    assert floor is not None
+    assert floor[:768].mean() == pytest.approx(math.sqrt(1.3**2 + 1 / 12), rel=0.05)
+    np.testing.assert_allclose(floor[768:], 1 / math.sqrt(12))
+
+
+# repeats ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("parts", [0.0, 0.25, 0.5])
+def test_repeats_that_began_at_another_time_are_laid_over_each_other(parts):
+    # The same motion 0.3 s and ``parts`` of a row later; sampled from the closed form, so the shift is exact.
+    late_s = 0.3 + parts / RATE_HZ
+    time_s = np.arange(1600) / RATE_HZ
+
+    def at(start_s: float, seed: int, name: str) -> Measurement:
+        x = np.clip(time_s - start_s, 0, 6.0)
+        motion = 0.2 * (1 - np.cos(2 * np.pi * x / 2)) * np.ones((1, 14)).T
+        return measured(motion.T, motion.T, np.random.default_rng(seed), NOISE, name=name)
+
+    first, second = at(0.5, 0, "a"), at(0.5 + late_s, 1, "b")
+    laid = overlay(first, second)
+    assert laid.shift_s == pytest.approx(late_s, abs=2e-5)
+    floors = noise_floor([first, dataclasses.replace(second, repeat_of="a")])
+    values = [by_method(f)["repeats"] for f in floors.values()]
+    assert np.mean(values) == pytest.approx(NOISE, rel=0.04)  # without the weights' correction 10 % less at half a row
+
+
+def test_what_does_not_repeat_is_refused(motion):
+    rng = np.random.default_rng(0)
+    first = measured(*motion, rng, NOISE, name="a")
+    target, true = 2 * motion[0] - motion[0][0], motion[1]
+    other = measured(target, true, rng, NOISE, name="b", repeat_of="a")
+    with pytest.raises(TaccorlError, match="b does not repeat a: their commands differ by"):
+        noise_floor([first, other])
+
+
+def test_two_repeats_of_a_recording_that_is_not_at_hand_are_repeats_of_each_other(motion):
+    rng = np.random.default_rng(0)
+    pair = [measured(*motion, rng, NOISE, name=name, repeat_of="elsewhere") for name in "ab"]
+    assert noise_floor(pair)["left_joint1"].used.method == "repeats"
+    assert noise_floor(pair[:1])["left_joint1"].lower_bound
+
+
+def test_a_cut_repeat_still_counts(motion):
+    rng = np.random.default_rng(8)
+    first = measured(*motion, rng, NOISE, name="a")
+    second = shifted(measured(*motion, rng, NOISE, name="b", repeat_of="a"), 0)
+    short = dataclasses.replace(
+        second, **{k: getattr(second, k)[100:1500] for k in ("time_s", "target", "measured", "velocity", "effort")}
+    )
+    assert overlay(first, short).shift_s == pytest.approx(0.0, abs=1e-6)
+
+
+# quantisation ----------------------------------------------------------------------------------------------------------
+
+
+def test_step_of_readings_is_found_and_noise_has_none():
+    rng = np.random.default_rng(0)
+    smooth = 0.3 * np.sin(np.arange(3000) / 300) + 1e-4 * rng.normal(size=3000)
+    step = math.radians(0.001)
+    assert find_quantum(np.round(smooth / step) * step) == pytest.approx(step, rel=1e-6)
+    assert find_quantum((np.round(smooth / step) * step).astype(np.float32)) == pytest.approx(step, rel=1e-3)
+    assert find_quantum(0.7 + np.round(smooth / 0.01) * 0.01) == pytest.approx(0.01, rel=1e-9)
+    assert find_quantum(smooth) == 0.0
+    assert find_quantum(np.full(100, 1.5)) == 0.0
+    assert find_quantum(np.array([0.0, 0.1] * 50)) == pytest.approx(0.1)
+    assert sum(find_quantum(np.random.default_rng(k).normal(size=500)) > 0 for k in range(50)) == 0
+
+
+def test_a_joint_that_began_elsewhere_does_not_raise_the_floor_nor_does_one_late_slip(motion):
+    """With dry friction a joint rests 10 mrad off until it first moves. A rare slip is reported by ``alignment.unrepeated``; it
+    does not raise the floor of the whole motion."""
+    rng = np.random.default_rng(5)
+    first, second = (measured(*motion, rng, NOISE, name=name) for name in "ab")
+    again = dataclasses.replace(second, repeat_of="a")
+    plain = noise_floor([first, again])["left_joint1"].value
+    j = first.column("left_joint1")
+    rows = round(3.0 * first.rate_hz)
+    elsewhere = again.measured.copy()
+    elsewhere[:rows, j] += 0.01
+    assert noise_floor([first, dataclasses.replace(again, measured=elsewhere)])["left_joint1"].value == pytest.approx(
+        plain, rel=0.2
+    )
+    slipped = again.measured.copy()
+    slipped[-rows:, j] += 0.01
+    floor = noise_floor([first, dataclasses.replace(again, measured=slipped)])["left_joint1"]
+    assert floor.used.without_bursts
+    assert floor.value == pytest.approx(plain, rel=0.2)
+    half = again.measured.copy()
+    half[len(half) // 2 :, j] += 0.01
+    often = noise_floor([first, dataclasses.replace(again, measured=half)])["left_joint1"]
+    assert often.value > 3 * plain  # half of the time is no burst
+
+
+@pytest.mark.parametrize(
+    "changed", [{"kp": {"left_joint1": 80.0}}, {"gain_scale": {"left_joint1": 2.0}}, {"payload_kg": {"left": 0.3}}]
+)
+def test_the_same_commands_with_other_gains_or_a_payload_are_no_repeat(motion, changed):
+    first, second = (
+        dataclasses.replace(measured(*motion, np.random.default_rng(k), NOISE, name=name), kp={"left_joint1": 40.0})
+        for k, name in enumerate("ab")
+    )
+    assert repeats(first, second)
+    other = dataclasses.replace(second, **changed)
+    assert not repeats(first, other)
+    with pytest.raises(TaccorlError, match=f"b does not repeat a: {next(iter(changed))}"):
+        noise_floor([first, dataclasses.replace(other, repeat_of="a")])

@@ -1,0 +1,197 @@
+"""CSV and parquet: units are converted as written, never guessed; errors name file, line and column."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from taccorl.alignment.measurements.tables import load_table_spec, read_table
+from taccorl.errors import RecordingError, SpecError, TaccorlError
+from taccorl.robots import ROBOT
+
+COLUMNS = """\
+time: {column: stamp, unit: ms}
+signals:
+  left_joint5:
+    q: {column: pos, unit: deg}
+    q_target: {column: cmd, unit: deg}
+    qd: {column: speed, unit: rpm}
+    tau: {column: torque, unit: Nmm}
+  left_gripper:
+    q: {column: open, unit: mm}
+    q_target: {column: open_cmd, unit: mm}
+"""
+TABLE = "stamp,pos,cmd,speed,torque,open,open_cmd,note\n" + "".join(
+    f"{1000 + 5 * k},{10 + k},{20 + k},{30},{400 + k},{k},{k + 1},\n" for k in range(4)
+)
+
+
+def written(folder: Path, table: str = TABLE, columns: str = COLUMNS) -> tuple[Path, Path]:
+    (folder / "run.csv").write_text(table)
+    (folder / "columns.yaml").write_text(columns)
+    return folder / "run.csv", folder / "columns.yaml"
+
+
+def test_every_unit_is_converted_by_its_own_factor(tmp_path):
+    path, columns = written(tmp_path)
+    m = read_table(path, load_table_spec(columns))
+    assert (m.signals, m.units) == (("left_joint5", "left_gripper"), ("rad", "m"))
+    np.testing.assert_allclose(m.time_s, [0, 0.005, 0.010, 0.015], atol=1e-12)
+    assert m.start_ns == 1_000_000_000
+    np.testing.assert_allclose(m.measured[:, 0], np.radians([10, 11, 12, 13]))
+    np.testing.assert_allclose(m.target[:, 0], np.radians([20, 21, 22, 23]))
+    np.testing.assert_allclose(m.velocity[:, 0], 30 * 2 * math.pi / 60)
+    np.testing.assert_allclose(m.effort[:, 0], [0.4, 0.401, 0.402, 0.403])
+    np.testing.assert_allclose(m.measured[:, 1], [0, 0.001, 0.002, 0.003])
+    assert np.isnan(m.effort[:, 1]).all()
+
+
+def test_parquet_with_the_same_columns_file_is_the_same(tmp_path):
+    path, columns = written(tmp_path)
+    spec = load_table_spec(columns)
+    numbers = np.loadtxt(path, delimiter=",", skiprows=1, usecols=range(7))
+    names = TABLE.split("\n")[0].split(",")[:7]
+    pq.write_table(pa.table(dict(zip(names, numbers.T, strict=True))), tmp_path / "run.parquet")
+    a, b = read_table(path, spec), read_table(tmp_path / "run.parquet", spec)
+    for field in ("time_s", "target", "measured", "velocity", "effort"):
+        np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+
+
+@pytest.mark.parametrize(
+    ("late", "rows", "targets"), [(0, 4, [20, 21, 22, 23]), (1, 3, [21, 22, 23]), (-1, 3, [20, 21, 22])]
+)
+def test_targets_that_the_file_shows_rows_late_are_put_in_their_place(tmp_path, late, rows, targets):
+    # late = 1: row k holds the target in force from row k − 1 on, so row 0's stands in row 1. −1: row 1's stands in row 0.
+    path, columns = written(tmp_path, columns=COLUMNS + f"target_rows_late: {late}\n")
+    m = read_table(path, load_table_spec(columns))
+    assert m.num_rows == rows
+    np.testing.assert_allclose(np.degrees(m.target[:, 0]), targets)
+    np.testing.assert_allclose(
+        np.degrees(m.measured[:, 0]), [10, 11, 12, 13][:3] if late == 1 else [10, 11, 12, 13][-rows:]
+    )
+    assert m.time_s[0] == 0
+
+
+def test_semicolons_and_blank_lines(tmp_path):
+    path, columns = written(tmp_path, TABLE.replace(",", ";") + "\n", COLUMNS + "separator: semicolon\n")
+    assert read_table(path, load_table_spec(columns)).num_rows == 4
+    with pytest.raises(RecordingError, match="parted by semicolon; write `separator: semicolon`"):
+        read_table(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("1005,11,21", "1005,,21"), r"run.csv:3: column 'pos': is empty; leave the row out"),
+        (("1005,11,21", "1005,abc,21"), r"run.csv:3: column 'pos': 'abc' is no number"),
+        (("1005,11,21", '1005,"1,1",21'), r"run.csv:3: column 'pos': '1,1' is no number \(a decimal comma"),
+        (("1005,11,21", "1005,nan,21"), r"run.csv:3: column 'pos': nan is not finite"),
+        (("1005,11,21", "1005,11,99,21"), r"run.csv:3: 9 cells, the header has 8"),
+        (("stamp,pos", "stamp,poss"), r"run.csv: no column 'pos'; did you mean 'poss'"),
+        (("speed,torque", "pos,torque"), r"run.csv: column 'pos' stands there twice|no column 'speed'"),
+    ],
+)
+def test_wrong_cells_are_named_by_line_and_column(tmp_path, change, message):
+    path, columns = written(tmp_path, TABLE.replace(*change, 1))
+    with pytest.raises(RecordingError, match=message):
+        read_table(path, load_table_spec(columns))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            ("unit: deg", "unit: degree"),
+            r"columns.yaml:4: signals → left_joint5 → q → unit: 'degree' is no unit of q; did you mean 'deg'",
+        ),
+        (
+            ("unit: rpm", "unit: mm/s"),
+            r"columns.yaml:3: signals → left_joint5: q in deg and qd in mm/s: does it turn or slide\?",
+        ),
+        (("unit: Nmm", "unit: mA"), r"columns.yaml:7: .*'mA' is no unit of tau.*torque constant"),
+        (("unit: ms", "unit: msec"), r"columns.yaml:1: time → unit: 'msec' is no unit of time"),
+        (("column: speed", "column: pos"), r"column 'pos' is used twice"),
+        (("left_gripper", "right_joint1"), r"right_joint1 is in rad"),
+        (("    q_target: {column: cmd, unit: deg}\n", ""), r"key 'q_target' is missing"),
+        (("signals:", "signal:"), r"unknown key 'signal'; did you mean 'signals'"),
+        (("time:", "separator: colon\ntime:"), r"columns.yaml:1: separator: 'colon'"),
+    ],
+)
+def test_wrong_columns_files_are_named_by_line(tmp_path, change, message):
+    _, columns = written(tmp_path, columns=COLUMNS.replace(*change, 1))
+    with pytest.raises(SpecError, match=message):
+        load_table_spec(columns)
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("time,left_joint5.q,left_joint5.q_target", "no column 't'"),
+        ("t,left_joint5.q", "column 'left_joint5.q_target' is missing; left_joint5 has q"),
+        ("t,left_joint5.pos", "column 2 'left_joint5.pos' is not NAME.q"),
+        ("t,left_joint7.q,left_joint7.q_target", "the robot has no 'left_joint7' .did you mean 'left_joint"),
+        ("t", "it holds times and no signal"),
+    ],
+)
+def test_a_table_in_our_own_words_must_have_all_of_them(tmp_path, header, message):
+    (tmp_path / "x.csv").write_text(header + "\n" + ",".join("0" for _ in header.split(",")) + "\n")
+    with pytest.raises(RecordingError, match=message):
+        read_table(tmp_path / "x.csv")
+
+
+def test_a_signal_of_another_machine_needs_no_robot_name(tmp_path):
+    columns = (
+        "time: {column: t, unit: s}\nsignals: {drive: {q: {column: a, unit: m}, q_target: {column: b, unit: m}}}\n"
+    )
+    path, spec = written(tmp_path, "t,a,b\n0,1,2\n0.001,1,2\n", columns)
+    m = read_table(path, load_table_spec(spec))
+    assert (m.signals, m.units) == (("drive",), ("m",))
+    with pytest.raises(Exception, match="the robot has no signal 'drive'"):
+        m.on_robot(np.zeros(14))
+
+
+def test_empty_and_missing_files(tmp_path):
+    (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "broken.parquet").write_bytes(b"PAR1 but no more")
+    (tmp_path / "short.csv").write_text("t,left_joint5.q,left_joint5.q_target\n0,0,0\n")
+    for name, message in (
+        ("empty.csv", "is empty"),
+        ("broken.parquet", "cannot be read as parquet"),
+        ("short.csv", "1 rows are no"),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            read_table(tmp_path / name)
+
+
+def test_supply_and_enabled_of_an_axis_are_read_and_a_robot_refuses_them(tmp_path: Path):
+    """Ticks of 2π / 4096 rad, tenths of a volt, and a motor that is off in the last row."""
+    path = tmp_path / "swing.csv"
+    path.write_text("stamp,pos,goal,volts,torque\n0,2048,2048,74,1\n10,2148,2248,73,1\n20,2248,2248,72,0\n")
+    (tmp_path / "columns.yaml").write_text(
+        "time: {column: stamp, unit: ms}\nsignals:\n  servo:\n    q: {column: pos, unit: rad, factor: 0.00153398}\n"
+        "    q_target: {column: goal, unit: rad, factor: 0.00153398}\n    supply: {column: volts, unit: V, factor: 0.1}\n"
+        '    enabled: {column: torque, unit: "1"}\n'
+    )
+    m = read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    np.testing.assert_allclose(m.supply_v[:, 0], [7.4, 7.3, 7.2])
+    np.testing.assert_array_equal(m.enabled[:, 0], [1, 1, 0])
+    with pytest.raises(RecordingError, match=r"swing\.csv: row 2: servo\.enabled is 0\.5; write 0"):
+        path.write_text("stamp,pos,goal,volts,torque\n0,2048,2048,74,1\n10,2148,2248,73,0.5\n20,2248,2248,72,0\n")
+        read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    path.write_text("stamp,pos,goal,volts\n0,2048,2048,74\n10,2148,2248,73\n20,2248,2248,72\n")
+    with pytest.raises(RecordingError, match="no column 'torque'"):
+        read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    columns = (tmp_path / "columns.yaml").read_text().replace('unit: "1"', 'unit: "1", if_missing: 1')
+    (tmp_path / "columns.yaml").write_text(columns)
+    np.testing.assert_array_equal(read_table(path, load_table_spec(tmp_path / "columns.yaml")).enabled, np.ones((3, 1)))
+    for change, message in (
+        ({}, "left_joint5 has a supply voltage"),
+        ({"supply_v": np.empty(0)}, r"left_joint5 has a motor that is off at 0\.020 s"),
+    ):
+        robots = dataclasses.replace(m, signals=("left_joint5",), **change)
+        with pytest.raises(TaccorlError, match=message):
+            robots.on_robot(np.zeros(len(ROBOT.action_names)))

@@ -1,0 +1,243 @@
+"""Control laws of a robot file's joints: recordings by this test's own integration (20 µs steps), not by the kernel.
+
+A link of 1 kg whose centre hangs 0.2 m below its hinge: 0.05 kg·m² q̈ = τ(target, q, q̇) − F sign q̇ − 1.962 N·m sin q.
+"""
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.checks.clock import check_clock
+from taccorl.alignment.checks.effort_time import target_share
+from taccorl.alignment.checks.robot import check_robot
+from taccorl.alignment.machines.robot_file import Robot, load_robot
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement, TargetKind
+from taccorl.cli.measured import far_off
+from taccorl.diagnosis.machines.robot import RobotMachine
+from taccorl.diagnosis.problems.joint_problem import JointProblem
+from taccorl.diagnosis.search.fit import Fit, best_fit, rms, stacked
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.errors import SpecError, TaccorlError
+
+RATE_HZ, DT_S, NOISE_RAD = 200, 2e-5, 1e-4
+INERTIA, WEIGHT_NM, FRICTION_NM = 0.05, 9.81 * 0.2, 0.15
+MODEL = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="swing" axis="0 1 0" range="-3 3"/>
+<inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody></mujoco>"""
+FILES = {
+    "impedance": "kp: 20.0, kd: 1.5",
+    "cascade": "kp: 12.0, kd: 1.5",
+    "velocity": "kd: 1.5",
+    "torque": "effort_limit: 30.0",
+    "pwm": "kp: 6.0, supply_v: 12.0, resistance_ohm: 4.0, torque_nm_per_a: 0.8",
+}
+
+
+def torque(law: str, goal: float, q: float, v: float) -> float:
+    """N·m of the motor, law by law; of pwm by Ohm's law with the current as a step between."""
+    if law == "impedance":
+        return 20.0 * (goal - q) - 1.5 * v
+    if law == "cascade":
+        return 1.5 * (12.0 * (goal - q) - v)
+    if law == "velocity":
+        return 1.5 * (goal - v)
+    if law == "torque":
+        return goal
+    volts = 12.0 * min(max(6.0 * (goal - q), -1.0), 1.0)
+    current_a = (volts - 0.8 * v) / 4.0
+    return 0.8 * current_a
+
+
+@functools.cache
+def recording(
+    law: str, name: str, high_hz: float, seed: int, friction_nm: float = FRICTION_NM, *, after: bool = False
+) -> Measurement:
+    """8 s of a sweep of about ± 0.4 rad; under torques below the pendulum's 1 Hz, which friction alone damps."""
+    high_hz *= 0.4 if law == "torque" else 1.0
+    time_s = np.arange(8 * RATE_HZ) / RATE_HZ
+    fade = np.clip(np.minimum(time_s - 0.3, 7.5 - time_s) / 0.5, 0, 1)
+    phase = 2 * np.pi * (0.2 * time_s + (high_hz - 0.2) * time_s**2 / 16.0)
+    target = {"velocity": 2.5, "torque": 0.8}.get(law, 0.4) * fade * np.sin(phase)
+    q = v = goal = 0.0
+    steps, rows = round(1 / (RATE_HZ * DT_S)), []
+    slows = DT_S * friction_nm / INERTIA
+    for following in target.tolist():
+        rows.append((q, torque(law, following if after else goal, q, v)))
+        goal = following
+        for _ in range(steps):
+            free = v + DT_S * (torque(law, goal, q, v) - WEIGHT_NM * math.sin(q)) / INERTIA
+            v = math.copysign(max(abs(free) - slows, 0.0), free)
+            q += DT_S * v
+    rng, found = np.random.default_rng(seed), np.array(rows)
+    kinds: dict[str, TargetKind] = {"velocity": "velocity", "torque": "torque"}
+    return Measurement(
+        name=name,
+        time_s=time_s,
+        target=target[:, None],
+        measured=found[:, :1] + NOISE_RAD * rng.normal(size=(len(found), 1)),
+        effort=found[:, 1:] + 2e-3 * np.abs(found[:, 1]).max() * rng.normal(size=(len(found), 1)),
+        signals=("swing",),
+        units=("rad",),
+        target_kinds=(kinds.get(law, "position"),),
+    )
+
+
+def robot(folder: Path, drive: str) -> Robot:
+    (folder / "swing.xml").write_text(MODEL)
+    (folder / "robot.yaml").write_text(f"kind: robot\nmodel: swing.xml\njoints:\n  swing: {{{drive}}}\n")
+    return load_robot(folder / "robot.yaml")
+
+
+def fitted(made: Robot, measurements: Measurements, *names: str) -> tuple[JointProblem, Fit, float]:
+    """Problem, fit with the effects ``names``, and its validation error in noise floors."""
+    problem = JointProblem(made, "swing", measurements)
+    faint = {f.name: f.start for name in names for f in problem.candidates[name].frees}
+    model = best_fit(problem, problem.fit, names, [problem.start | faint], 60)
+    return problem, model, rms(stacked(problem, model.values, model.effects, problem.validation))
+
+
+def swept(law: str, friction_nm: float = FRICTION_NM) -> Measurements:
+    return Measurements(
+        (recording(law, "sweep", 1.5, 1, friction_nm),), (recording(law, "other", 1.0, 2, friction_nm),)
+    )
+
+
+@pytest.mark.parametrize("law", FILES)
+def test_friction_hidden_under_each_law_is_recovered_beside_commanded_gains(law: str, tmp_path: Path) -> None:
+    made = robot(tmp_path, f"law: {law}, {FILES[law]}")
+    measurements = swept(law)
+    _, _, without = fitted(made, measurements)
+    _, model, error = fitted(made, measurements, "coulomb_friction")
+    assert error < 0.02 * without and error < 5.0, (without, error)
+    assert model.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_NM, rel=0.005)
+
+
+def test_stall_torque_and_back_emf_of_a_servo_are_found_from_a_wrong_data_sheet(tmp_path: Path) -> None:
+    made = robot(tmp_path, "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.8, torque_nm_per_a: 1.0")
+    _, model, error = fitted(made, swept("pwm"), "coulomb_friction")
+    assert error < 1.5
+    assert model.values["stall_nm"] == pytest.approx(12.0 * 0.8 / 4.0, rel=0.005)
+    assert model.values["back_emf"] == pytest.approx(0.8 * 0.8 / 4.0, rel=0.03)
+    config = made.config.joints["swing"]
+    mended = dataclasses.replace(config, **config.law_numbers(model.values))
+    assert mended.stall_nm == pytest.approx(model.values["stall_nm"])
+    assert mended.back_emf == pytest.approx(model.values["back_emf"])
+
+
+@pytest.mark.parametrize("law", ["impedance", "velocity", "torque"])
+def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str, tmp_path: Path) -> None:
+    after = tuple(recording(law, name, hz, 1, after=True) for name, hz in (("sweep", 1.5), ("other", 1.0)))
+    before = recording(law, "sweep", 1.5, 1)
+    plain, declared = (
+        robot(tmp_path, f"law: {law}, {FILES[law]}{more}") for more in ("", ", effort_after_target: true")
+    )
+
+    def checks(made: Robot, m: Measurement) -> list[str]:
+        return [f.text for f in check_robot(made, m, made.joint("swing").whole(m), ["swing"]) if f.severity == "error"]
+
+    assert checks(plain, before) == [] and checks(declared, after[0]) == []
+    assert (
+        len(checks(plain, after[0])) == 1
+        and "Write `effort_after_target: true` for swing" in checks(plain, after[0])[0]
+    )
+    assert "Remove effort_after_target of swing" in checks(declared, before)[0]
+    share, sd = target_share(plain.config.joints["swing"], after[0], "swing") or (0.0, 1.0)
+    assert share == pytest.approx(1.0, abs=0.05) and sd < 0.1
+    measurements = Measurements(after[:1], after[1:])
+    errors = [fitted(made, measurements, "coulomb_friction")[2] for made in (plain, declared)]
+    assert errors[1] < min(5.0, 0.9 * errors[0]), errors
+
+
+@pytest.mark.parametrize(
+    ("drive", "line", "words"),
+    [
+        ("kp: 20.0", 4, "kd: law impedance needs it; write `kd: …`"),
+        ("law: cascade, kp: 12.0", 4, "kd: law cascade needs it"),
+        ("law: velocity, kp: 12.0, kd: 1.0", 4, "kp: law velocity has none; remove it"),
+        ("law: torque, kd: 1.0", 4, "kd: law torque has none"),
+        ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", 4, "resistance_ohm: law pwm needs it"),
+        ("kp: 20.0, kd: 1.0, supply_v: 12.0", 4, "supply_v: law impedance has none"),
+        (
+            "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.0, torque_nm_per_a: 1.0, gains: fitted",
+            4,
+            "write those that the servo has, and `gains: commanded`",
+        ),
+        ("law: velocity, kd: 1.0, effects: [{effect: integral_action, rate_per_s: 1.0}]", 4, "acts in a position loop"),
+        ("law: pd, kp: 1.0, kd: 1.0", 4, "'pd' is none of 'impedance'"),
+    ],
+)
+def test_numbers_that_a_law_lacks_or_has_none_of_are_refused_with_their_line(
+    drive: str, line: int, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SpecError) as error:
+        robot(tmp_path, drive)
+    assert f"robot.yaml:{line}" in str(error.value) and words in str(error.value), error.value
+
+
+def test_targets_that_a_law_does_not_take_are_refused_with_the_column_to_give(tmp_path: Path) -> None:
+    made = robot(tmp_path, f"law: velocity, {FILES['velocity']}")
+    position = dataclasses.replace(recording("velocity", "a", 1.0, 1), target_kinds=("position",))
+    with pytest.raises(TaccorlError, match=r"swing is commanded by position, its law takes a velocity.*qd_target"):
+        JointProblem(made, "swing", Measurements((position,)))
+
+
+@pytest.mark.parametrize("law", ["velocity", "torque"])
+def test_a_motion_that_is_no_position_command_is_compared_by_what_was_measured(law: str, tmp_path: Path) -> None:
+    machine = RobotMachine(robot(tmp_path, f"law: {law}, {FILES[law]}"), "robot")
+    plain = Measurements((recording(law, "sweep", 1.5, 1, friction_nm=0.0),))
+    assert machine.parts(plain) == ("swing",)
+    trace = machine.compare(plain).of("swing")[0]
+    assert float(np.sqrt(np.mean(trace.residual**2))) < 3 * NOISE_RAD
+    assert float(np.ptp(trace.target)) == pytest.approx(float(np.ptp(trace.position)), rel=0.05)
+
+
+@pytest.mark.parametrize("law", ["impedance", "cascade", "pwm"])
+def test_exchanged_columns_of_target_and_position_are_told_from_early_stamps(law: str) -> None:
+    m = recording(law, "sweep", 1.5, 1)
+    exchanged = dataclasses.replace(m, target=m.measured, measured=m.target)
+    early = dataclasses.replace(m, measured=np.roll(m.measured, -40, axis=0))  # 0.2 s; it rests at both ends
+    ways_out = ("swing.q the column that swing.q_target has", "target_rows_late")
+    for one, expected in ((m, ()), (exchanged, ways_out[:1]), (early, ways_out[1:])):
+        one = dataclasses.replace(one, source=Path("sweep.csv"))
+        said = [f.text for f in check_clock(one, {"swing": NOISE_RAD}) if f.check == "measured_before_command"]
+        assert len(said) == len(expected) and all(word in text for word, text in zip(expected, said, strict=True)), said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("", "", False),
+        ("supply_v: 12.0", "supply_v: 12000.0", True),
+        ("kp: 6.0", "kp: 343.8", True),
+        ("kp: 6.0", "kp: 0.105", True),
+    ],
+)
+def test_millivolts_and_gains_per_degree_are_suspected_and_hidden_friction_is_not(
+    old: str, new: str, expected: bool, tmp_path: Path
+) -> None:
+    made = robot(tmp_path, f"law: pwm, {FILES['pwm'].replace(old, new)}")
+    lines = far_off(RobotMachine(made, "robot").compare(Measurements((recording("pwm", "sweep", 1.5, 1),))))
+    assert len(lines) == expected and all("swing" in line and "supply_v" in line for line in lines), lines
+
+
+@pytest.mark.slow
+def test_a_servo_that_clips_its_duty_under_law_impedance_is_suspected_to_be_one(tmp_path: Path) -> None:
+    """kp V k_t / R = 6 · 2.4 N·m/rad and k_t k_e / R = 0.16 N·m·s/rad below a clip at 1/6 rad, which 30 % of the rows exceed."""
+    recorded = Measurements((recording("pwm", "sweep", 3.0, 1),), (recording("pwm", "other", 2.1, 2),))
+    assert np.mean(np.abs(recorded.fit[0].target - recorded.fit[0].measured) > 1 / 6) > 0.2
+    machine = RobotMachine(robot(tmp_path, "kp: 14.4, kd: 0.16"), "robot")
+    found = machine.diagnose("swing", recorded, search=SearchConfig(max_effects=1)).diagnosis
+    assert any("swing" in remark and "law: pwm" in remark for remark in found.remarks), found.remarks
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", FILES)
+def test_the_search_names_the_friction_under_each_law(law: str, tmp_path: Path) -> None:
+    machine = RobotMachine(robot(tmp_path, f"law: {law}, {FILES[law]}"), "robot")
+    found = machine.diagnose("swing", swept(law), search=SearchConfig(max_effects=1)).diagnosis
+    assert found.names and found.names[0] in ("coulomb_friction", "asymmetric_friction")
+    assert machine.diagnose("swing", swept(law, 0.0), search=SearchConfig(max_effects=1)).diagnosis.names == ()

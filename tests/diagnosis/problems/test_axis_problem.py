@@ -1,0 +1,254 @@
+"""Driven axes that are no joint of the robot: a slide whose friction is known here, and a real one (EMPS benchmark)."""
+
+import dataclasses
+import math
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.machines.axis_file import AxisConfig, axis_text, load_axis
+from taccorl.alignment.measurements.folder import Measurements, read_measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.diagnosis.problems.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
+from taccorl.diagnosis.search.fit import Fit
+from taccorl.diagnosis.search.problem import Recording
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.search.search import diagnose
+from taccorl.diagnosis.search.solve import solve
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects.scaled import scaled
+
+ROOT = Path(__file__).parents[3]
+EMPS = ROOT.parent / "shared" / "data" / "emps"
+MASS_KG, FRICTION_N, KP, KD = 100.0, 20.0, 4e4, 2800.0
+NOISE_M, NOISE_N = 2e-5, 2.0
+AXIS = AxisConfig(name="drive", unit="m", inertia=80.0, kp=KP, kd=KD, force_unit_n=10.0, length_unit_m=0.25)
+
+
+def simulated(name: str, amplitude_m: float, hz: float, seed: int, repeat_of: str | None = None) -> Measurement:
+    """A mass with dry friction on a slide, in N and m, at a tenth of a millisecond: equations of this test, not the twin's."""
+    rate_hz, parts = 1000, 10
+    time_s = np.arange(6 * rate_hz) / rate_hz
+    fade = np.clip(np.minimum(time_s - 0.5, 5.5 - time_s) / 0.5, 0, 1)
+    target = amplitude_m * fade**2 * (3 - 2 * fade) * np.sin(2 * np.pi * hz * (time_s - 0.5))
+    dt_s, at, speed, goal = 1.0 / (rate_hz * parts), 0.0, 0.0, 0.0
+    stops = dt_s * FRICTION_N / MASS_KG  # speed that friction takes away in one step
+    rows = []
+    for following in target.tolist():
+        rows.append((at, KP * (goal - at) - KD * speed))  # as it is before the row's command acts
+        goal = following
+        for _ in range(parts):
+            free = speed + dt_s * (KP * (goal - at) - KD * speed) / MASS_KG
+            speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+            at += dt_s * speed
+    position, force = np.array(rows).T
+    rng = np.random.default_rng(seed)
+    return Measurement(
+        name=name,
+        time_s=time_s,
+        target=target[:, None],
+        measured=position[:, None] + NOISE_M * rng.standard_normal((len(target), 1)),
+        effort=force[:, None] + NOISE_N * rng.standard_normal((len(target), 1)),
+        signals=("drive",),
+        units=("m",),
+        repeat_of=repeat_of,
+        origin="simulated by the test, not a drive",
+    )
+
+
+@pytest.fixture(scope="module")
+def slide() -> Measurements:
+    fit = simulated("sine", 0.1, 0.6, 1), simulated("again", 0.1, 0.6, 2, repeat_of="sine")
+    return Measurements(fit, (simulated("held", 0.12, 0.45, 3),))
+
+
+@pytest.fixture(scope="module")
+def problem(slide: Measurements) -> AxisProblem:
+    return AxisProblem(AXIS, slide)
+
+
+@pytest.mark.slow
+def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
+    found = diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
+    first = found.rounds[0]
+    assert "coulomb_friction" in (first.added, *first.ties)
+    assert found.errors["fitted"]["validation"] > 5.0
+    assert found.errors["after"]["validation"] < 0.4 * found.errors["fitted"]["validation"]
+    best = next(e for e in first.evidence if e.name == "coulomb_friction")
+    assert best.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.2)  # steps of 1 ms cost some
+    assert best.base["inertia"] == pytest.approx(MASS_KG, rel=0.1)
+
+
+def test_floors_are_those_of_the_noise(problem: AxisProblem):
+    assert problem.effort
+    assert problem.fit[0].floor == pytest.approx([NOISE_M, NOISE_N], rel=0.1)
+    assert problem.fit[0].channels == ("drive [m]", "drive effort [N]")
+
+
+def test_words_of_a_floor_are_in_the_axis_s_units(problem: AxisProblem):
+    """0.02 mm of noise, and not 0.08."""
+    assert float(problem.floors[0].words().split()[0]) == pytest.approx(1e3 * NOISE_M, rel=0.1)
+
+
+def test_effects_have_the_size_and_the_units_of_the_axis():
+    """10 N and 0.25 m are 1: stiffness 40 N/m, damping 40 N·s/m, mass 40 kg."""
+    factors = {"N·m": 10.0, "rad": 0.25, "rad/s": 0.25, "N·m/rad": 40.0, "N·m·s/rad": 40.0, "kg·m²": 40.0}
+    factors |= {"N·m·s²/rad²": 160.0, "rad/(N·m)": 0.025, "s": 1.0, "1": 1.0, "1/s": 1.0}
+    scale = AXIS.scale
+    assert {unit: scale.factor(unit) for unit in factors} == pytest.approx(factors)
+    words = {"N·m": "N", "rad": "m", "rad/s": "m/s", "N·m/rad": "N/m", "N·m·s/rad": "N·s/m", "kg·m²": "kg"}
+    words |= {"rad/(N·m)": "m/N", "s": "s"}
+    assert {unit: scale.unit_of(unit) for unit in words} == words
+    assert dataclasses.replace(scale, unit="rad").unit_of("N·m/rad") == "N·m/rad"
+    (friction,) = scaled("coulomb_friction", scale).parameters()
+    assert (friction.unit, friction.absent, friction.high, friction.typical) == ("N", 0.0, 200.0, 4.0)
+    (limit,) = scaled("torque_saturation", scale).parameters()
+    assert limit.absent == math.inf
+
+
+def test_an_effect_of_another_size_survives_a_process_and_refuses_what_is_beyond_its_bounds():
+    effect = scaled("coulomb_friction", AXIS.scale)(torque_nm=150.0, interval={"torque_nm": (149.0, 151.0)})
+    back = pickle.loads(pickle.dumps(effect))
+    assert back == effect and back.drive() == {"coulomb": 150.0}
+    with pytest.raises(TaccorlError, match=r"250 N, outside of 0 … 200 N"):
+        scaled("coulomb_friction", AXIS.scale)(torque_nm=250.0)
+
+
+def test_searches_start_at_the_same_effects_whatever_the_size(slide: Measurements, problem: AxisProblem):
+    """Starts of an arm's effects at a tenth of the force, times ten."""
+    (first, *_) = problem.candidates["slew_limit"].starts
+    peak = np.abs(np.gradient(slide.fit[0].target[:, 0], 1e-3)).max()
+    assert first["slew_limit.speed_rad_per_s"] == pytest.approx(0.35 * peak, rel=1e-6)
+
+
+def test_a_known_external_force_moves_the_axis_by_force_over_stiffness(slide: Measurements, problem: AxisProblem):
+    pushed = dataclasses.replace(slide.fit[0], load=np.full_like(slide.fit[0].target, 40.0))
+    recording = AxisProblem(AXIS, Measurements((pushed,))).fit[0]
+    before = problem.simulate(problem.start, [], problem.fit[0])
+    moved = (problem.simulate(problem.start, [], recording) - before)[-1]
+    assert moved == pytest.approx([40.0 / KP, -40.0], rel=1e-3)
+
+
+def test_gains_that_a_recording_states_are_those_it_is_simulated_with(slide: Measurements):
+    twice = dataclasses.replace(slide.fit[0], kp={"drive": 2 * KP}, kd={"drive": 0.5 * KD})
+    motion = axis_motion(AXIS, twice)
+    assert (motion.kp_scale, motion.kd_scale) == pytest.approx((2.0, 0.5))
+    cascade = dataclasses.replace(AXIS, law="cascade", kp=KP / KD)
+    assert cascade.loop_gains == pytest.approx(AXIS.loop_gains)
+    stated = dataclasses.replace(slide.fit[0], kp={"drive": 2 * KP / KD}, kd={"drive": 0.5 * KD})
+    motion = axis_motion(cascade, stated)
+    assert (motion.kp_scale, motion.kd_scale) == pytest.approx((1.0, 0.5)), "K_p is the product of both"
+
+
+def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(
+    slide: Measurements, problem: AxisProblem
+):
+    free = {f.name: f for f in problem.base}
+    assert list(free) == ["inertia", "torque_ff", "target_late_s", "kp", "kd"]
+    assert free["kp"].high / free["kp"].start == pytest.approx(GAINS_WITHIN)
+    silent = tuple(dataclasses.replace(m, effort=np.full_like(m.effort, np.nan)) for m in slide.fit)
+    assert [f.name for f in AxisProblem(AXIS, Measurements(silent)).base] == ["inertia", "torque_ff", "target_late_s"]
+
+
+def test_more_inertia_is_no_candidate_and_effects_of_the_arm_s_bodies_are_none(problem: AxisProblem):
+    assert "armature" not in problem.candidates and "payload" not in problem.candidates
+    assert {"coulomb_friction", "viscous_friction"} <= set(problem.candidates)
+
+
+def test_play_is_looked_for_only_where_the_motor_s_inertia_is_known(slide: Measurements, problem: AxisProblem):
+    assert not {"backlash", "joint_compliance"} & set(problem.candidates)
+    known = dataclasses.replace(AXIS, rotor_inertia=30.0)
+    assert {"backlash", "joint_compliance"} <= set(AxisProblem(known, slide).candidates)
+    assert known.with_numbers({"inertia": 160.0}).rotor_inertia == pytest.approx(60.0), "the same share of it"
+    with pytest.raises(TaccorlError, match=r"rotor_inertia: 90 is more than inertia, 80"):
+        dataclasses.replace(AXIS, rotor_inertia=90.0)
+
+
+def test_without_repeats_a_stiff_loop_s_position_is_judged_to_what_the_force_is_known(slide: Measurements):
+    """2 N over 4e5 N/m are 5 µm, above an encoder's noise of 1 µm."""
+    stiff = dataclasses.replace(AXIS, kp=4e5)
+    once = dataclasses.replace(slide.fit[0], measured=np.round(slide.fit[0].target / 1e-6) * 1e-6)
+    problem = AxisProblem(stiff, Measurements((once,)))
+    assert problem.floors[0].value < 1e-6
+    assert problem.fit[0].floor == pytest.approx([problem.floors[1].value / 4e5, NOISE_N], rel=0.1)
+
+
+def test_recordings_in_another_unit_or_of_another_axis_are_refused(slide: Measurements):
+    turned = dataclasses.replace(slide.fit[0], units=("rad",))
+    with pytest.raises(TaccorlError, match="sine: drive is in rad, the axis's file says m"):
+        AxisProblem(AXIS, Measurements((turned,)))
+    with pytest.raises(TaccorlError, match=r"sine has no signal 'drvie'.*drive"):
+        AxisProblem(dataclasses.replace(AXIS, name="drvie"), Measurements(slide.fit[:1]))
+
+
+def test_a_file_of_an_axis_is_strict(tmp_path: Path):
+    good = (ROOT / "configs" / "diagnose" / "emps.yaml").read_text() + (
+        "effects:\n- {effect: coulomb_friction, torque_nm: 20.0, interval: {torque_nm: [19.0, 21.0]}, evidence: by hand}\n"
+    )
+    path = tmp_path / "axis.yaml"
+    for old, new, message in (
+        ("inertia: 80.0", "inertia: -1.0", r"axis\.yaml:6: inertia: -1.0"),
+        ("unit: m", "unit: feet", "feet"),
+        ("inertia: 80.0", "mass: 80.0", "mass"),
+        ("law: cascade", "law: pwm", r"axis\.yaml:3: supply_v: law pwm needs it"),
+        ("law: cascade", "law: torque", r"axis\.yaml:8: kp: law torque has none"),
+        ("loop_hz: 1000.0", "limits: [0.25, 0.0]", r"axis\.yaml:10: limits: .*must rise"),
+        ("loop_hz: 1000.0", "weight_sin: 3.0", "weight_sin: a slide has none"),
+        ("coulomb_friction", "coulombfriction", "did you mean 'coulomb_friction'"),
+        ("coulomb_friction", "taxel_creep", "taxel_creep cannot act on an axis"),
+        ("torque_nm: 20.0", "torque_nm: 2000.0", r"axis\.yaml:\d+: .*2000 N, outside of 0 … 200 N"),
+        ("torque_nm: 20.0", "force_n: 20.0", "no parameter 'force_n'"),
+    ):
+        assert old in good
+        path.write_text(good.replace(old, new))
+        with pytest.raises(TaccorlError, match=message):
+            load_axis(path)
+    path.write_text(good)
+    axis = load_axis(path)
+    # the cascade's own numbers: g k_v k_p and g k_v
+    assert axis.loop_gains.kp == pytest.approx(35.15 * 243.45 * 160.18, rel=1e-4)
+    assert axis.loop_gains.kd == pytest.approx(35.15 * 243.45, rel=1e-4)
+    again = tmp_path / "again.yaml"
+    again.write_text(axis_text(axis))
+    assert load_axis(again) == axis
+
+
+# a real drive ----------------------------------------------------------------------------------------------------------
+
+
+COLUMNS = """\
+time: {column: t, unit: s}
+signals: {drive: {q: {column: qm, unit: m}, q_target: {column: qg, unit: m}, tau: {column: vir, unit: N, factor: 35.15065},
+  torque_ff: {column: pulses_N, unit: N, factor: 35.15065, if_missing: 0}}}
+"""
+"""The control signal in V holds the pulses of the second file, in V."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not EMPS.is_dir(), reason=f"the EMPS benchmark is not at {EMPS}; see nonlinearbenchmark.org")
+def test_a_real_drive_s_dry_friction_is_found_and_that_something_remains(tmp_path: Path):
+    """Janot, Gautier and Brunot 2019 identify 95.1 kg, 20.4 N of dry friction, offset −3.16 N. All candidates are considered."""
+    for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"):
+        (tmp_path / name).symlink_to(EMPS / name)
+    (tmp_path / "columns.yaml").write_text(COLUMNS)
+    (tmp_path / "measurements.yaml").write_text(
+        "columns: columns.yaml\nrecordings: {DATA_EMPS_PULSES.mat: {use: test}}\n"
+    )
+    measurements = read_measurements(tmp_path, units={"drive": "m"})
+    problem = AxisProblem(load_axis(ROOT / "configs" / "diagnose" / "emps.yaml"), measurements)
+    solved = solve("drive", problem, problem.fit, problem.validation, problem.test, SearchConfig(max_effects=1))
+    found = solved.diagnosis
+    assert found.names[0] in ("coulomb_friction", "asymmetric_friction")
+    row = next(e for e in found.rounds[0].evidence if e.name == "coulomb_friction")
+    assert 18.0 < row.values["coulomb_friction.torque_nm"] < 23.0 and 85.0 < row.base["inertia"] < 105.0
+
+    def force_n(model: Fit, recordings: Sequence[Recording]) -> float:
+        off = [problem.simulate(model.values, model.effects, r)[:, 1] - r.measured[:, 1] for r in recordings]
+        return float(np.sqrt(np.nanmean(np.square(off))))
+
+    for held_out in (problem.test, solved.validation):  # 10.4 → 3.5 N and 10.1 → 2.6 N
+        assert force_n(found.after, held_out) < 0.5 * force_n(found.before, held_out)
+    assert found.status != "at_floor", "one effect does not explain a real drive to the encoder's last step"

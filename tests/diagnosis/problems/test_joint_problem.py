@@ -1,0 +1,230 @@
+"""One joint as a problem for the search: which numbers are free, what is a candidate, what residuals are counted in."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from imagined_motions import NOISE_NM, NOISE_RAD, SIGNAL, recorded
+
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.motions import AGAIN, CHIRP, HELD_STEPS, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
+from taccorl.diagnosis.problems.joint_problem import GainsAre, JointProblem
+from taccorl.diagnosis.search.fit import fit, rms, stacked
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.search.search import diagnose
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.twin import TwinConfig
+
+KP, KD = 151.1, 17.1  # of joint 5, paper App. B.1
+NOMINAL = TwinConfig()
+
+
+def friction(torque_nm: float, joints: tuple[str, ...] = ("joint5",), arm: str = "left") -> Effect:
+    return make_effect("coulomb_friction", torque_nm=torque_nm, arm=arm, joints=list(joints))
+
+
+def names(problem: JointProblem) -> list[str]:
+    return [free.name for free in problem.base]
+
+
+@pytest.fixture(scope="module")
+def chirps():
+    """Stated gains, with effort."""
+    return tuple(recorded(NOMINAL, motion, seed, effort=True) for seed, motion in enumerate((CHIRP, AGAIN)))
+
+
+# what fixes the scale of the torques ----------------------------------------------------------------------------------
+
+
+def test_commanded_gains_efforts_or_known_weight_pin_the_torques_and_nothing_else_does(chirps):
+    def pinned(recordings, gains: GainsAre = "fitted", effort=False, names=()):
+        return JointProblem(NOMINAL, SIGNAL, Measurements(recordings), gains=gains, effort=effort).pinned_by(names)
+
+    assert pinned(chirps) == ()
+    assert pinned(chirps, gains="auto") == ("commanded gains",)
+    assert pinned(chirps, effort=True) == ("recorded effort",)
+    # Slowly with 0.5 kg: weight varies by 0.14 N·m (standard deviation; 4.7 floors × K_p), J q̈ by 0.02 N·m.
+    loaded = recorded(NOMINAL, dataclasses.replace(WIDE_TRIANGLE, payload_kg=0.5), 3)
+    assert pinned((loaded,)) == ("known weight",)
+    assert pinned((recorded(NOMINAL, WIDE_TRIANGLE, 3),)) == (), "the arm's own weight is carried: nothing to be held"
+    assert pinned((loaded,), names=("payload",)) == (), "an unknown mass beside it: the weight is not known"
+
+
+# which numbers are free ------------------------------------------------------------------------------------------------
+
+
+def test_commanded_gains_stay_fixed_where_every_recording_states_them(chirps):
+    problem = JointProblem(NOMINAL, SIGNAL, Measurements(chirps), effort=False)
+    assert problem.commanded
+    assert names(problem) == ["torque_ff", "speed_delay_s"]
+    model = fit(problem, problem.fit, (), problem.start)
+    assert set(model.values) == {"torque_ff", "speed_delay_s"}
+    assert model.error == pytest.approx(1.0, abs=0.05)  # the twin's gains are those that were commanded
+
+
+def test_gains_are_fitted_if_one_recording_is_silent_or_they_are_not_believed(chirps):
+    silent = dataclasses.replace(chirps[1], kp={}, kd={})
+    for problem in (
+        JointProblem(NOMINAL, SIGNAL, Measurements((chirps[0], silent)), effort=False),
+        JointProblem(NOMINAL, SIGNAL, Measurements(chirps), gains="fitted", effort=False),
+        JointProblem(NOMINAL, SIGNAL, Measurements(chirps[:1], validation=(silent,)), effort=False),
+    ):
+        assert not problem.commanded
+        assert names(problem) == ["kp", "kd", "torque_ff"]
+
+
+def test_fitted_gains_find_what_the_robot_has():
+    config = TwinConfig()
+    config.controller.kp_nm_per_rad[4], config.controller.kd_nms_per_rad[4] = 60.0, 6.0
+    made = Measurements(tuple(recorded(config, m, k, stated=False) for k, m in enumerate((CHIRP, AGAIN))))
+    problem = JointProblem(NOMINAL, SIGNAL, made)
+    assert problem.start["kp"] == KP
+    model = fit(problem, problem.fit, (), problem.start)
+    low, high = model.intervals()["kp"]
+    assert low < 60.0 < high and high / low < 1.1
+    assert model.values["kd"] == pytest.approx(6.0, rel=0.02)
+    assert model.error == pytest.approx(1.0, abs=0.05)
+
+
+def test_commanded_gains_that_nobody_stated_are_refused_with_the_way_out(chirps):
+    silent = dataclasses.replace(chirps[1], kd={})
+    with pytest.raises(TaccorlError, match=r"chirp_again: .*left_joint5 are not stated; .*measurements.yaml.*fitted"):
+        JointProblem(NOMINAL, SIGNAL, Measurements((chirps[0], silent)), gains="commanded")
+
+
+def test_a_gain_twice_as_high_acts_whether_it_is_stated_or_only_its_factor():
+    stiffer = recorded(NOMINAL, STIFFER_CHIRP, 1, stated=False)
+    assert stiffer.gain_scale == {SIGNAL: 2.0} and not stiffer.kp
+    problem = JointProblem(NOMINAL, SIGNAL, Measurements((recorded(NOMINAL, CHIRP, 0, stated=False), stiffer)))
+    plain, scaled = problem.fit
+    once = {"kp": KP, "kd": KD, "torque_ff": 1.73}
+    twice = once | {"kp": 2 * KP, "kd": 2 * KD}
+    same_command = dataclasses.replace(plain, data=dataclasses.replace(scaled.data, kp_scale=1.0, kd_scale=1.0))
+    np.testing.assert_array_equal(problem.simulate(once, [], scaled), problem.simulate(twice, [], same_command))
+    assert rms(stacked(problem, once, [], problem.fit)) == pytest.approx(1.0, abs=0.1)
+    forgotten = dataclasses.replace(scaled, data=same_command.data)
+    assert rms(stacked(problem, once, [], [forgotten])) > 3.0
+    # stated gains are believed before a factor: 1 × the twin's, whatever gain_scale says
+    both = dataclasses.replace(stiffer, kp={SIGNAL: KP}, kd={SIGNAL: KD})
+    motion = JointProblem(NOMINAL, SIGNAL, Measurements((both,))).fit[0].data
+    assert (motion.kp_scale, motion.kd_scale) == (1.0, 1.0)
+
+
+# candidates ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_scale_of_all_torques_is_no_candidate_where_gains_are_fitted(chirps):
+    """K_p, K_d and T_ref take it up: τ = s (K_p e − K_d q̇ + T_ref)."""
+    fitted = JointProblem(NOMINAL, SIGNAL, Measurements(chirps), gains="fitted")
+    commanded = JointProblem(NOMINAL, SIGNAL, Measurements(chirps))
+    assert set(commanded.candidates) - set(fitted.candidates) == {"torque_scale"}
+
+
+def test_candidates_are_effects_of_this_joint_alone(chirps):
+    problem = JointProblem(NOMINAL, SIGNAL, Measurements(chirps))
+    assert "taxel_gain_map" not in problem.candidates and "camera_latency" not in problem.candidates
+    c = problem.candidates["coulomb_friction"]
+    assert c.make({"coulomb_friction.torque_nm": 0.3}).acts_on() == [SIGNAL]
+    assert problem.candidates["payload"].selectors == {"arm": "left"}
+
+
+def test_a_friction_s_starts_hang_on_what_the_motor_gives(chirps):
+    """3, 10 and 30 % of the peak effort (Effect.starts)."""
+    problem = JointProblem(NOMINAL, SIGNAL, Measurements(chirps))
+    peak = max(float(np.abs(problem.model.simulate(r.data, problem.model.gains).effort).max()) for r in problem.fit)
+    starts = [start["coulomb_friction.torque_nm"] for start in problem.candidates["coulomb_friction"].starts]
+    assert starts == pytest.approx([0.03 * peak, 0.1 * peak, 0.3 * peak])
+
+
+def test_an_effect_that_the_twin_has_is_refitted_and_is_no_candidate_twice():
+    truth = TwinConfig(effects=[friction(0.8)])
+    fit_to = tuple(recorded(truth, m, k) for k, m in enumerate((CHIRP, AGAIN)))
+    made = Measurements(fit_to, (recorded(truth, VALIDATION[0], 5),))
+    # the twin has it in all joints of both arms, and too little of it
+    twin = TwinConfig(effects=[friction(0.3, ("joint4", "joint5"), "both")])
+    problem = JointProblem(twin, SIGNAL, made)
+    assert problem.present == ("coulomb_friction",)
+    assert problem.start["coulomb_friction.torque_nm"] == 0.3
+    keep = ("coulomb_friction", "backlash", "cogging")
+    found = diagnose(
+        problem,
+        problem.fit,
+        problem.validation,
+        start=problem.start,
+        present=problem.present,
+        without=[name for name in problem.candidates if name not in keep],
+        config=SearchConfig(max_effects=1),
+    )
+    assert found.names == ("coulomb_friction",) and found.status == "nothing_missing"
+    assert found.errors["before"]["validation"] > 5.0 and found.errors["after"]["validation"] < 1.25
+    assert found.after.values["coulomb_friction.torque_nm"] == pytest.approx(0.8, abs=0.02)
+    assert not [e for r in found.rounds for e in r.evidence if e.name == "coulomb_friction"]
+
+
+def test_the_model_beneath_lacks_what_the_problem_adds_so_that_nothing_acts_twice(chirps):
+    twin = TwinConfig(effects=[friction(0.8, ("joint4", "joint5"), "both")])
+    problem = JointProblem(twin, SIGNAL, Measurements(chirps), effort=False)
+    bare = JointProblem(NOMINAL, SIGNAL, Measurements(chirps), effort=False)
+    r = problem.fit[0]
+    np.testing.assert_array_equal(problem.simulate(problem.start, [], r), bare.simulate(bare.start, [], r))
+    once = problem.candidates["coulomb_friction"].make(problem.start)
+    whole = JointProblem(TwinConfig(effects=[friction(0.8)]), SIGNAL, Measurements(chirps), effort=False)
+    np.testing.assert_array_equal(
+        problem.simulate(problem.start, [once], r),
+        whole.model.simulate(r.data, whole.model.gains, [once]).reported[:, None],
+    )
+    assert np.abs(problem.simulate(problem.start, [once], r) - bare.simulate(bare.start, [], r)).max() > 1e-3
+
+
+def test_an_effect_of_another_joint_is_not_present_here(chirps):
+    twin = TwinConfig(effects=[friction(0.8, arm="right"), friction(0.8, ("joint4",))])
+    assert JointProblem(twin, SIGNAL, Measurements(chirps)).present == ()
+
+
+# what residuals are counted in -----------------------------------------------------------------------------------------
+
+
+def test_a_repeated_motion_is_judged_by_its_own_noise_floor():
+    """Chirps with 0.2 mrad of noise and steps with 0.8 mrad, both made twice; a triangle was made once."""
+    loud = 4 * NOISE_RAD
+    again = dataclasses.replace(HELD_STEPS, name="held_steps_again", repeat_of="held_steps")
+    fit_to = [recorded(NOMINAL, m, k) for k, m in enumerate((CHIRP, AGAIN, WIDE_TRIANGLE))]
+    held = [recorded(NOMINAL, m, 10 + k, noise_rad=loud) for k, m in enumerate((HELD_STEPS, again))]
+    problem = JointProblem(NOMINAL, SIGNAL, Measurements(tuple(fit_to), tuple(held)))
+    floor = {r.name: float(r.floor[0]) for r in (*problem.fit, *problem.validation)}
+    assert floor["chirp"] == floor["chirp_again"] == pytest.approx(NOISE_RAD, rel=0.1)
+    assert floor["held_steps"] == floor["held_steps_again"] == pytest.approx(loud, rel=0.1)
+    assert floor["wide_triangle"] == problem.floors[0].value
+    assert NOISE_RAD < floor["wide_triangle"] < loud
+    assert rms(stacked(problem, problem.start, [], problem.validation)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_joint_that_was_never_measured_is_refused(chirps):
+    blind = dataclasses.replace(chirps[0], measured=np.full_like(chirps[0].measured, np.nan))
+    with pytest.raises(TaccorlError, match="left_joint5: its position was not measured in any recording"):
+        JointProblem(NOMINAL, SIGNAL, Measurements((blind,)))
+
+
+# effort ----------------------------------------------------------------------------------------------------------------
+
+
+def test_effort_is_a_second_channel_and_its_scale_is_found(chirps):
+    """Some firmware reports four times the torque (piper_sdk issue 73)."""
+    four = tuple(dataclasses.replace(m, effort=4.0 * m.effort) for m in chirps)
+    problem = JointProblem(NOMINAL, SIGNAL, Measurements(four))
+    assert names(problem) == ["torque_ff", "effort_scale", "speed_delay_s"]
+    assert problem.fit[0].channels == ("left_joint5 [rad]", "left_joint5 effort [N·m]")
+    assert problem.fit[0].floor == pytest.approx([NOISE_RAD, 4 * NOISE_NM], rel=0.15)
+    model = fit(problem, problem.fit, (), problem.start)
+    assert model.values["effort_scale"] == pytest.approx(4.0, rel=0.01)
+    assert model.error == pytest.approx(1.0, abs=0.1)
+
+
+def test_effort_that_one_recording_lacks_is_not_used(chirps):
+    silent = dataclasses.replace(chirps[1], effort=np.full_like(chirps[1].effort, np.nan))
+    problem = JointProblem(NOMINAL, SIGNAL, Measurements((chirps[0], silent)))
+    assert not problem.effort
+    assert problem.fit[0].measured.shape[1] == 1
+    assert names(problem) == ["torque_ff", "speed_delay_s"]

@@ -1,0 +1,237 @@
+"""One page that needs no other file and says what it was made from; its numbers are those of the comparison."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_traces import ORIGIN, comparison, swing, trace
+from simulated_sweeps import SIGNAL, friction, sweeps
+
+from taccorl.data.finding import Finding
+from taccorl.diagnosis.comparison.compare import compare
+from taccorl.diagnosis.machines.piper import PiperTwin
+from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint
+from taccorl.diagnosis.report.report import NUMBERS, PAGE, Report
+from taccorl.diagnosis.report.write import Written, check_folder, write_report
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects
+from taccorl.sim.twin import TwinConfig
+
+_, POSITION = swing(seconds=6.0)
+
+
+def small(**fields) -> Report:
+    before = comparison(trace(5e-3 * np.sign(POSITION), POSITION))
+    return Report(**{"title": "made twin beside made traces", "comparison": before} | fields)
+
+
+class Tags(HTMLParser):
+    """Addresses and unclosed elements of a page."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.open: list[str] = []
+        self.text = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
+    """A report without a diagnosis; tests change copies only."""
+    return write_report(small(provenance={"command": "taccorl compare sweeps"}), tmp_path_factory.mktemp("report"))
+
+
+def test_page_needs_no_other_file_and_says_where_its_data_is_from(written: Written):
+    page = written.page.read_text()
+    tags = Tags(page)
+    assert tags.open == [], "every element is closed"
+    assert tags.addresses and all(a.startswith("data:image/png;base64,") for a in tags.addresses)
+    assert not re.search(r"https?://|<script|@import|url\(", page)
+    assert f"data: {ORIGIN}" in tags.text
+    assert "where the twin is off, not why" in tags.text and "taccorl compare sweeps" in tags.text
+    assert written.replaced == ""
+
+
+def test_numbers_are_those_of_the_comparison(tmp_path: Path):
+    report = small(after=comparison(trace(2e-4 * np.sign(POSITION), POSITION), twin="mended twin"))
+    written = write_report(report, tmp_path)
+    found = json.loads(written.numbers.read_text())
+    score = report.comparison.scores()[0]
+    assert found["scores"][0]["rmse"] == score.rmse and found["scores"][0]["ratio"] == score.ratio
+    assert found["scores_after"][0]["ratio"] == pytest.approx(1.0, rel=1e-3)
+    assert found["data"] == [ORIGIN]
+    assert {c["regime"] for c in found["where"]["cells"]} >= {"after a reversal", "high speed"}
+    text = Tags(written.page.read_text()).text
+    assert "5 mrad" in text and "-96%" in text and "mended twin" in text
+
+
+def test_errors_hold_up_the_joints_of_their_own_recordings_only():
+    both = comparison(
+        trace(0 * POSITION, POSITION, recording="a.csv", signal="left_joint5"),
+        trace(0 * POSITION, POSITION, recording="b.csv", signal="left_joint4"),
+        clock={"b.csv": (Finding("shifted_from_twin", "error", "left_joint4", "leads"),)},
+    )
+    report = small(
+        comparison=both, findings={"a.csv": [], "b.csv": [Finding("unit", "error", "left_joint4", "degrees")]}
+    )
+    assert report.unsettled("left_joint5") == []
+    assert report.unsettled("left_joint4") == ["b.csv: degrees", "b.csv: leads"]
+    assert report.unsettled("left pads") == report.unsettled("left_joint4"), "a part without traces sees all"
+
+
+def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(written: Written, tmp_path: Path):
+    shutil.copytree(written.page.parent, tmp_path, dirs_exist_ok=True)
+    again = write_report(small(title="the second"), tmp_path)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d", again.replaced)
+    assert "the second" in again.page.read_text()
+    assert sorted(p.name for p in tmp_path.iterdir()) == [PAGE, NUMBERS]
+    (tmp_path / NUMBERS).write_text('{"mine": 1}')
+    with pytest.raises(TaccorlError, match="not a report of ours"):
+        write_report(small(title="the third"), tmp_path)
+    assert "the second" in again.page.read_text()
+    with pytest.raises(TaccorlError, match="is a file"):
+        check_folder(again.page)
+
+
+def test_names_from_files_are_text_and_no_html(tmp_path: Path):
+    name = "<script>alert(1)</script>&.csv"
+    bad = comparison(
+        trace(1e-3 * POSITION, POSITION, recording=name, origin="<b>robot</b>"), left_out=(f"touch of {name}",)
+    )
+    report = small(comparison=bad, findings={name: [Finding("jitter", "warning", "time", "steps < 5 ms & more")]})
+    tags = Tags(write_report(report, tmp_path).page.read_text())
+    assert "script" not in tags.open
+    assert name in tags.text and "<b>robot</b>" in tags.text and "steps < 5 ms & more" in tags.text
+
+
+# with a diagnosis --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointFinding, Path]:
+    """The report on dry friction hidden in simulated sweeps."""
+    measured = sweeps(friction(), seconds=4.0)
+    finding = diagnose_joint(TwinConfig(), SIGNAL, measured, search=SearchConfig(num_refitted=3))
+    report = Report(
+        title="what is missing",
+        comparison=compare(TwinConfig(), measured, name="nominal twin"),
+        refitted=PiperTwin.nominal().refitted([finding]).compare(measured, name="refitted twin"),
+        after=PiperTwin.nominal().mended([finding])[0].compare(measured, name="mended twin"),
+        diagnoses={SIGNAL: finding.diagnosis},
+        can_tell={SIGNAL: finding.can_tell},
+        known={SIGNAL: finding.known},
+    )
+    return finding, write_report(report, tmp_path_factory.mktemp("diagnosed")).page
+
+
+def test_evidence_says_what_effects_are_and_what_cannot_be_told_apart(diagnosed: tuple[JointFinding, Path]):
+    finding, path = diagnosed
+    d, text = finding.diagnosis, Tags(path.read_text()).text
+    assert d.names == ("coulomb_friction",)
+    cls = effects.get("coulomb_friction")
+    for words in (cls.equation, cls.in_words, cls.at_a_policy, cls.to_record, d.words):
+        assert words in text
+    for name, why in cls.near_twins.items():
+        assert f"near-twin {name}" in text and why in text
+    for row in d.rounds[0].evidence:
+        assert effects.get(row.name).equation in text and row.verdict in text
+    for rival in d.rivals.get("coulomb_friction", ()):
+        assert rival in text and "do not tell which it is" in text
+        assert f"taccorl excite {SIGNAL} --effects=coulomb_friction,{','.join(d.rivals['coulomb_friction'])}" in text
+    assert "taccorl add-effect coulomb_friction" in text
+    before, fitted, after = (d.errors[stage]["validation"] for stage in ("before", "fitted", "after"))
+    assert f"{before:.3g}, numbers refitted {fitted:.3g}, now {after:.3g} × floor" in text
+    assert f"by the effects {after / fitted - 1:+.0%}" in text, "what the gains alone did is not the effect's merit"
+
+
+def test_numbers_hold_the_diagnosis_and_no_residuals(diagnosed: tuple[JointFinding, Path]):
+    finding, path = diagnosed
+    content = (path.parent / NUMBERS).read_text()
+    found = json.loads(content)["diagnoses"][SIGNAL]
+    assert found["effects"][0]["effect"] == "coulomb_friction"
+    assert found["effects"][0]["torque_nm"] == finding.diagnosis.effects[0].torque_nm  # pyright: ignore[reportAttributeAccessIssue]
+    assert found["status"] == finding.diagnosis.status and found["errors"] == finding.diagnosis.errors
+    assert len(content) < 200_000
+
+
+def test_verdict_confidence_and_next_recording_come_before_every_table(diagnosed: tuple[JointFinding, Path]):
+    _, path = diagnosed
+    text, found = path.read_text(), json.loads((path.parent / NUMBERS).read_text())["verdicts"][SIGNAL]
+    body = Tags(text).text
+    places = [body.index(found[key]) for key in ("finding", "confidence", "record_next")]
+    assert places == sorted(places) and found["level"] in ("high", "moderate")
+    assert text.index('class="verdict') < text.index("<table") < text.index("<h2>")
+    assert "coulomb_friction" in found["finding"]
+
+
+def test_heat_maps_are_of_the_twin_whose_gains_are_refitted(diagnosed: tuple[JointFinding, Path]):
+    """The first row of a score is the twin as given; the map must not credit an effect with what gains removed."""
+    finding, path = diagnosed
+    found = json.loads((path.parent / NUMBERS).read_text())
+    assert found["where"]["twin"] == "refitted twin"
+    given, refitted_, after = (
+        next(s["ratio"] for s in found[k] if s["kind"] == "position" and s["use"] == "fit")
+        for k in ("scores", "scores_refitted", "scores_after")
+    )
+    cells = [c for c in found["where"]["cells"] if c["kind"] == "position"]
+    thirds = [c for c in cells if c["regime"] in ("first third", "second third", "last third")]
+    over_all = np.sqrt(sum(c["ratio"] ** 2 * c["n"] for c in thirds) / sum(c["n"] for c in thirds))
+    assert over_all == pytest.approx(refitted_, rel=0.3)
+    assert given > refitted_ > 2 * after, "gains took some of it, the effect the rest"
+    assert finding.diagnosis.steps[0][0] == "" and len(finding.diagnosis.steps) == 2
+    page = Tags(path.read_text()).text
+    assert "Error after the fit, by recording and regime" in page and "range covered" in page
+
+
+def test_primary_numbers_are_those_that_are_identified(diagnosed: tuple[JointFinding, Path]):
+    """Efforts were recorded here: they fix the scale of the torques, and the absolute friction of 1 N·m is identified."""
+    finding, path = diagnosed
+    found = json.loads((path.parent / NUMBERS).read_text())["identified"][SIGNAL]
+    assert found["pinned_by"] == list(finding.known.pinned_by) == ["recorded effort"]
+    numbers = {n["name"]: n for n in found["identifiable"]}
+    assert numbers["kd/kp"]["unit"] == "s" and numbers["coulomb_friction.torque_nm/kp"]["unit"] == "rad"
+    assert numbers["coulomb_friction.torque_nm"]["value"] == pytest.approx(1.0, rel=0.03)
+    page = Tags(path.read_text()).text
+    assert page.index("coulomb_friction.torque_nm/kp") < page.index("number of the twin")
+    assert "identified: coulomb_friction.torque_nm/kp" in finding.diagnosis.effects[0].evidence
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+@pytest.mark.skipif(
+    not (shutil.which("chromium") and find_spec("playwright")),
+    reason="no browser to look with: apt-get install chromium, pip install playwright",
+)
+def test_a_browser_shows_every_picture_and_asks_nobody(diagnosed: tuple[JointFinding, Path], tmp_path: Path):
+    from playwright.sync_api import sync_playwright
+
+    asked: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(diagnosed[1].as_uri())
+        sizes = page.evaluate("[...document.images].map(i => [i.naturalWidth, i.complete])")
+        wide = page.evaluate("document.documentElement.scrollWidth")
+        browser.close()
+    assert len(sizes) >= 6 and all(width > 300 and complete for width, complete in sizes)
+    assert [a for a in asked if not a.startswith("data:")] == [diagnosed[1].as_uri()]
+    assert wide <= 1280, "nothing sticks out of the window"

@@ -1,0 +1,143 @@
+"""The first three sentences of a report, by their facts: kind, level, names, numbers, command."""
+
+import dataclasses
+from typing import Any
+
+import pytest
+from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
+
+from taccorl.diagnosis.report.verdict import Verdict, verdict
+from taccorl.diagnosis.search.identifiability import Identifiability
+from taccorl.diagnosis.search.identifiable import Identified, Known
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.search import diagnose
+
+PART = "left_joint5"
+
+
+@pytest.fixture(scope="module")
+def one() -> Diagnosis:
+    """A ripple, and nothing like it."""
+    kinds, hidden = (Ripple, Bump), Ripple(strength=1.0)
+    recordings = [record(k, hidden) for k in range(3)]
+    return diagnose(MadeProblem(*kinds), recordings[:1], recordings[1:2], recordings[2:])
+
+
+@pytest.fixture(scope="module")
+def nothing() -> Diagnosis:
+    return diagnose(MadeProblem(Ripple), [record(0)], [record(1)], [record(2)])
+
+
+def changed(d: Diagnosis, **fields: Any) -> Diagnosis:
+    return dataclasses.replace(d, **fields)
+
+
+def sentences(v: Verdict) -> list[str]:
+    return [v.finding, v.confidence, v.record_next]
+
+
+def test_a_named_effect_is_said_with_its_errors_and_its_identified_size(one: Diagnosis):
+    number = Identified(name="ripple.strength/kp", value=0.002, low=0.0019, high=0.0021, unit="rad")
+    known = Known(
+        identifiable=(number,),
+        absolute=(Identified(name="kp", value=151.0, low=110.0, high=152.0, unit="N·m/rad"),),
+        pinned_by=(),
+    )
+    v = verdict(PART, one, known=known)
+    assert (v.kind, v.level) == ("effects", "high")
+    assert (
+        f"{one.errors['fitted']['validation']:.2f}" in v.finding
+        and f"{one.errors['after']['validation']:.2f}" in v.finding
+    )
+    assert PART in v.finding and "ripple" in v.finding and "0.002 rad (0.0019 … 0.0021)" in v.finding
+    assert f"{one.errors['after']['test']:.2f}" in v.confidence
+    assert "110" in v.record_next and "152" in v.record_next, "what the recordings leave of K_p"
+    pinned = verdict(PART, one, known=dataclasses.replace(known, pinned_by=("recorded effort",)))
+    assert "K_p" not in pinned.record_next
+    assert all(s.endswith(".") and "\n" not in s for s in sentences(v))
+
+
+def test_nothing_missing_is_said_with_what_the_recordings_would_not_show(nothing: Diagnosis):
+    seen = Identifiability(visible={"backlash": 0.1, "cogging": 0.2, "armature": 9.0}, pairs=(), ridges=())
+    v = verdict(PART, nothing, can_tell=seen, options=("--twin=a.yaml",))
+    assert (v.kind, v.level) == ("nothing_missing", "high")
+    assert "backlash" in v.record_next and "cogging" in v.record_next and "armature" not in v.record_next
+    assert v.command == f"taccorl excite {PART} --effects=backlash,cogging --twin=a.yaml"
+    assert verdict(PART, nothing).command == ""
+
+
+def test_effects_that_do_as_well_are_named_with_the_recording_that_decides():
+    hidden = Square(strength=1.0)
+    recordings = [record(k, hidden) for k in range(3)]
+    d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:2], recordings[2:])
+    v = verdict(PART, d)
+    assert (v.kind, v.level) == ("ties", "moderate")
+    assert "square" in v.finding and "squire" in v.finding
+    assert v.command == f"taccorl excite {PART} --effects=square,squire"
+
+
+def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest():
+    recordings = [record(k, Bump(strength=3.0), Ripple(strength=1.0)) for k in range(3)]
+    d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:2], recordings[2:])
+    assert d.status == "something_else"
+    v = verdict(PART, d)
+    assert (v.kind, v.level) == ("something_else", "low")
+    assert f"{d.errors['after']['validation']:.2f}" in v.finding
+    nearest = [e.name for e in d.rounds[-1].evidence[:2]]
+    assert v.command == f"taccorl excite {PART} --effects={','.join(nearest)}"
+
+
+def test_one_effect_where_more_is_missing_is_not_called_the_answer():
+    recordings = [record(k, Bump(strength=5.0), Ripple(strength=1.0)) for k in range(2)]
+    d = diagnose(MadeProblem(Bump, Ripple), recordings[:1], recordings[1:], config=SearchConfig(max_effects=1))
+    assert d.status == "too_many"
+    v = verdict(PART, d)
+    assert (v.kind, v.level) == ("more", "low")
+    assert d.names[0] in v.finding and "--until=noise_floor" in v.record_next
+
+
+def test_gains_that_moved_and_fits_that_did_not_converge_name_no_effect(nothing: Diagnosis):
+    base, start = {"kp": 41.0, "kd": 10.0}, {"kp": 151.0, "kd": 12.0}
+    v = verdict(PART, changed(nothing, status="gains_moved", base=base, start=start))
+    assert (v.kind, v.level, v.command) == ("gains_moved", "low", "")
+    assert "151" in v.finding and "41" in v.finding and "0.27" in v.finding
+    v = verdict(PART, changed(nothing, status="not_converged", trouble="not converged: still improving after 9 steps"))
+    assert (v.kind, v.level) == ("not_converged", "low")
+    assert "still improving after 9 steps" in v.confidence
+
+
+def test_remarks_of_the_search_are_repeated_and_lower_the_confidence(one: Diagnosis):
+    d = dataclasses.replace(one)
+    remark = "kp had to move from 151 to 41 N·m/rad (× 0.27)."
+    object.__setattr__(d, "remarks", (remark,))
+    v = verdict(PART, d)
+    assert (v.level, v.remarks) == ("moderate", (remark,))
+
+
+def test_data_comes_before_any_effect(one: Diagnosis):
+    v = verdict(PART, one, data=["a.csv: positions are 5 ms late", "b.csv: the same"])
+    assert (v.kind, v.level, v.command) == ("data_first", "low", "")
+    assert "5 ms late" in v.finding and "1 more" in v.finding and "ripple" not in v.finding
+
+
+@pytest.mark.parametrize("reason", ["test", "no test", "bound", "doubt", "disagree"])
+def test_every_reason_to_doubt_lowers_the_confidence_and_is_said(one: Diagnosis, reason: str):
+    after = one.errors["after"]
+    errors = {
+        "test": after | {"test": 2.34},
+        "no test": {k: v for k, v in after.items() if k != "test"},
+        "disagree": after | {"fit": 1.47, "validation": 0.92},
+    }
+    d = changed(one, errors=one.errors | {"after": errors.get(reason, after)})
+    d = changed(d, at_bound=("ripple.strength",)) if reason == "bound" else d
+    v = verdict(PART, d, doubts=["velocity: not validated"] if reason == "doubt" else [])
+    said = {
+        "test": "2.34",
+        "no test": "no test recording",
+        "bound": "ripple.strength",
+        "doubt": "velocity",
+        "disagree": "1.47",
+    }
+    assert v.level == "moderate"
+    assert said[reason] in " ".join((v.confidence, *v.remarks))
+    assert reason != "doubt" or "1 remark below" in v.confidence

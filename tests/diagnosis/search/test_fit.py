@@ -1,0 +1,115 @@
+"""Least squares in noise floors, its intervals, and the statistics that judge it."""
+
+import numpy as np
+import pytest
+from made_problem import MadeProblem, Ripple, Square, record
+
+from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
+from taccorl.diagnosis.search.fit import FAR, fit, residuals, rms
+from taccorl.diagnosis.search.problem import Free, free
+from taccorl.diagnosis.search.screen import alike, probe
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    inside = 0
+    for seed in range(100):
+        model = fit(MadeProblem(), [record(seed, seconds=3.0)], (), {})
+        low, high = model.intervals()["gain"]
+        inside += low <= 3.0 <= high
+    assert 88 <= inside <= 100  # 95 of 100; fewer than 88 happens once in 1000
+
+
+def test_a_number_at_its_bound_is_said_to_be_there():
+    problem = MadeProblem()
+    problem.base = (Free(name="gain", unit="1", start=1.0, low=0.1, high=2.0, log=True), problem.base[1])
+    assert fit(problem, [record(0)], (), {}).at_bound == ("gain",)
+    assert fit(MadeProblem(), [record(0)], (), {}).at_bound == ()
+
+
+def test_a_fit_that_runs_out_of_steps_says_so():
+    short = fit(MadeProblem(Square), [record(0, Square(strength=3.0))], ("square",), {}, most=1)
+    assert "not converged" in short.trouble
+    assert fit(MadeProblem(Square), [record(0, Square(strength=3.0))], ("square",), {}).trouble == ""
+
+
+def test_a_simulation_that_ends_in_nan_counts_as_far_off_and_unmeasured_rows_count_nothing():
+    recording = record(0)
+    recording.measured[:10] = np.nan
+
+    class Broken(MadeProblem):
+        def simulate(self, base, effects, recording):
+            values = super().simulate(base, effects, recording)
+            values[20:30] = np.nan
+            return values
+
+    left = residuals(Broken(), {"gain": 3.0, "offset": 0.4}, [], recording)
+    assert np.isnan(left[:10]).all()
+    assert (left[20:30] == FAR).all()
+    assert np.isfinite(left[10:]).all()
+
+
+def test_blocks_are_means_of_half_a_second():
+    recording = record(0, seconds=2.0)
+    model = fit(MadeProblem(), [recording], (), {})
+    blocks = block_squares(MadeProblem(), model, [recording])
+    assert len(blocks.squares) == 4  # 400 rows at 200 Hz
+    assert blocks.mean == pytest.approx(rms(model.residuals) ** 2)
+
+
+def test_standard_score_is_mean_over_its_error():
+    # mean 2, deviation √(((1−2)² + 0 + (3−2)²) / 2) = 1, error 1/√3
+    even = np.full(3, 1 / 3)
+    assert standard_score(Blocks(np.array([1.0, 2.0, 3.0]), even)) == pytest.approx(2 * np.sqrt(3))
+    assert standard_score(Blocks(np.array([5.0]), np.ones(1))) == 0.0
+    assert standard_score(Blocks(np.zeros(4), np.full(4, 0.25))) == 0.0
+
+
+def test_a_block_with_little_weight_decides_little():
+    # 24 blocks of 100 rows gain 1 ± 0.2, and one of a single row loses 100. With equal weights it would outweigh them all.
+    gains = np.append(1.0 + 0.2 * (-1.0) ** np.arange(24), -100.0)
+    weights = np.append(np.full(24, 100.0), 1.0) / 2401.0
+    equal = Blocks(gains, np.full(25, 1 / 25))
+    assert equal.mean == pytest.approx((24 - 100) / 25)
+    weighed = Blocks(gains, weights)
+    assert weighed.mean == pytest.approx((2400 - 100) / 2401)
+    assert standard_score(weighed) > 10 > 0 > standard_score(equal)
+
+
+def test_bic_of_a_needless_parameter_falls_below_zero():
+    recordings = [record(0)]
+    problem = MadeProblem(Ripple)
+    parent, child = fit(problem, recordings, (), {}), fit(problem, recordings, ("ripple",), {})
+    # one number of ln n less a trifle: on its logarithmic scale it cannot quite reach 0
+    assert -np.log(3000) - 2 < bic_gain(parent, child, 1) < -np.log(1000)
+    there = [record(0, Ripple(strength=0.5))]
+    parent, child = fit(problem, there, (), {}), fit(problem, there, ("ripple",), {})
+    assert bic_gain(parent, child, 1) > 50
+
+
+def test_the_probe_of_the_true_effect_explains_what_it_is_and_says_how_strong():
+    problem = MadeProblem(Ripple, Square)
+    recordings = [record(0, Ripple(strength=0.3))]
+    parent = fit(problem, recordings, (), {})
+    found = probe(problem, recordings, parent, list(problem.candidates.values()))
+    ripple, other = [p for p in found if p.name == "ripple"][:2]
+    square = next(p for p in found if p.name == "square")
+    strength = ripple.start["ripple.strength"]
+    # power 0.3²/2 of the signal against 0.1² of noise: 0.045 / 0.055
+    assert ripple.explained == pytest.approx(0.818, abs=0.02)
+    assert ripple.multiple * strength == pytest.approx(0.3, abs=0.01)
+    assert ripple.visible == pytest.approx(10 * strength / np.sqrt(2), rel=0.01)
+    # what is left to be explained is √(0.045 + 0.01) / 0.1 = 2.35 floors: a start of thrice that has been weakened
+    assert ripple.visible <= 3 * 2.35
+    assert square.explained < 0.02
+    assert alike(ripple, other) == pytest.approx(1.0)
+    assert alike(ripple, square) < 0.05
+
+
+def test_strengths_that_cannot_change_sign_are_searched_on_a_logarithmic_scale():
+    one, both = (free(cls.parameters()[0], "x") for cls in (Ripple, Square))
+    assert one.log
+    assert not both.log
+    assert one.value(one.coordinate(2.5)) == pytest.approx(2.5)
+    assert both.value(both.coordinate(-2.5)) == pytest.approx(-2.5)
+    assert one.value(one.coordinate(1e9)) == pytest.approx(one.high)
+    assert one.value(9e9) == one.high

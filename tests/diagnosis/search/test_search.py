@@ -1,0 +1,279 @@
+"""The search on problems whose answers can be written down (made_problem)."""
+
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, drive, record
+
+from taccorl.diagnosis.search import search
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.search.search import diagnose
+from taccorl.errors import TaccorlError
+
+
+def made(*effects, extra=0.0, seeds=(0, 1, 2), noise=0.1):
+    return [[record(seed + k, *effects, extra=extra, noise=noise) for k in range(1)] for seed in seeds]
+
+
+def test_the_hidden_effect_is_found_with_its_strength_and_the_error_falls_to_the_floor():
+    fit, validation, test = made(Ripple(strength=1.7))
+    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation, test)
+    assert found.names == ("ripple",)
+    assert found.status == "at_floor"
+    low, high = found.effects[0].interval["strength"]
+    assert low < 1.7 < high
+    # 2000 rows of noise 0.1 and a sine of power 1/2: standard error 0.1 / √1000 = 0.0032
+    assert high - low == pytest.approx(2 * 1.96 * 0.0032, rel=0.3)
+    assert found.base["gain"] == pytest.approx(3.0, abs=0.02)
+    # a ripple of 1.7 / √2 on noise of 0.1: √(1 + 12.02²) floors before, 1 after
+    assert found.errors["fitted"]["test"] == pytest.approx(12.06, rel=0.02)
+    assert found.errors["after"]["test"] == pytest.approx(1.0, abs=0.05)
+    assert [name for name, _ in found.steps] == ["", "ripple"]
+
+
+def test_nothing_is_added_where_nothing_is_missing():
+    problem = MadeProblem(Ripple, Bump, Square, Squire, Hidden)
+    for seed in range(40):
+        found = diagnose(problem, [record(3 * seed)], [record(3 * seed + 1)])
+        assert found.names == ()
+        assert found.status == "nothing_missing"
+
+
+def test_two_effects_are_found_one_after_the_other():
+    fit, validation, test = made(Ripple(strength=1.0), Square(strength=-0.6))
+    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation, test)
+    assert set(found.names) == {"ripple", "square"}
+    assert found.status == "at_floor"
+    errors = [error for _, error in found.steps]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_a_rare_event_counts_although_few_blocks_know_of_it():
+    fit, validation, _ = made(Bump(strength=3.0))
+    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation)
+    assert found.names == ("bump",)
+
+
+def test_what_cannot_be_told_apart_is_a_tie_and_the_simpler_one_is_taken():
+    fit, validation, _ = made(Squire(strength=2.0))
+    found = diagnose(MadeProblem(Ripple, Square, Squire), fit, validation)
+    assert found.names == ("square",)
+    assert found.rivals == {"square": ("squire",)}
+    verdicts = {row.name: row.verdict for row in found.rounds[0].evidence}
+    assert verdicts["square"] == "added"
+    assert verdicts["squire"] == "tied with square"
+
+
+def test_an_effect_that_the_fitted_numbers_take_up_stays_unseen_and_explains_nothing():
+    fit, validation, _ = made(Hidden(strength=1.0), Ripple(strength=1.0))
+    found = diagnose(MadeProblem(Hidden, Ripple), fit, validation)
+    assert found.names == ("ripple",)
+    assert found.base["gain"] == pytest.approx(4.0, abs=0.02)
+    row = next(row for row in found.rounds[0].evidence if row.name == "hidden")
+    assert row.explained == 0.0
+
+
+def test_structure_that_no_effect_explains_is_called_something_else():
+    t = np.arange(0.0, 10.0, 0.005)
+    fit, validation, _ = made(extra=np.sign(np.sin(3.0 * t)))
+    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation)
+    assert found.status == "something_else"
+    assert found.names == ()
+    assert all(row.verdict for row in found.rounds[0].evidence)
+
+
+def test_an_effect_that_fits_one_recording_only_is_not_believed():
+    """Validation recordings decide: a ripple in the fit recording alone is an accident of it."""
+    found = diagnose(MadeProblem(Ripple, Square), [record(0, Ripple(strength=1.0))], [record(1, extra=1.0)])
+    assert found.names == ()
+    assert found.status == "something_else"
+
+
+def test_effects_that_the_twin_has_are_refitted_and_stay():
+    fit, validation, _ = made(Ripple(strength=2.0), Square(strength=1.0))
+    found = diagnose(MadeProblem(Ripple, Square), fit, validation, present=["ripple"], start={"ripple.strength": 0.5})
+    assert found.present == ("ripple",)
+    assert found.names == ("ripple", "square")
+    assert found.after.values["ripple.strength"] == pytest.approx(2.0, abs=0.02)
+    assert (
+        found.errors["before"]["validation"]
+        > found.errors["fitted"]["validation"]
+        > found.errors["after"]["validation"]
+    )
+
+
+def test_the_true_effect_can_be_left_out_and_is_then_missed():
+    fit, validation, _ = made(Ripple(strength=1.0))
+    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation, without=["ripple"])
+    assert found.status == "something_else"
+    assert "ripple" not in found.names
+
+
+def test_an_unknown_effect_is_refused_with_the_nearest_name():
+    fit, validation, _ = made()
+    with pytest.raises(TaccorlError, match=r"no effect 'riple' for this part.*ripple"):
+        diagnose(MadeProblem(Ripple), fit, validation, present=["riple"])
+
+
+class Valley(MadeProblem):
+    """measured = gain × drive + steep × (offset − gain²): a curved valley, along which a solver crawls."""
+
+    def simulate(self, base, effects, recording):
+        wall = 500.0 * (base["offset"] - base["gain"] ** 2)
+        return (base["gain"] * drive(recording.time_s, recording.data) + wall)[:, None]
+
+
+def test_a_fit_that_has_not_converged_is_no_proof_that_nothing_is_missing():
+    """Gain 1 to gain 3 is further along the valley than 60 and 200 steps go; wide floors make every place of it look right."""
+    fit, validation = ([dataclasses.replace(record(k, offset=0.0, noise=0.5), floor=np.array([2.0]))] for k in (0, 1))
+    cut = diagnose(Valley(), fit, validation)
+    assert cut.errors["after"]["validation"] < 1.25
+    assert cut.trouble
+    assert cut.status == "not_converged"
+    whole = diagnose(Valley(), fit, validation, config=SearchConfig(last_steps=1000))
+    assert whole.status == "nothing_missing"
+    assert whole.base["gain"] == pytest.approx(3.0, abs=0.05)
+
+
+def test_a_direction_that_the_recordings_leave_open_is_wide_and_no_trouble(monkeypatch):
+    """With the solver stopped each time after two steps, at the best place there is, χ² has no more to give."""
+    plain = search.fit
+    monkeypatch.setattr(search, "fit", lambda p, r, n, s, most, step: plain(p, r, n, s, 2, step))
+    fit, validation, _ = made(Squire(strength=1.7))
+    found = diagnose(MadeProblem(Squire), fit, validation)
+    assert found.names == ("squire",)
+    assert found.trouble == ""
+    low, high = found.effects[0].interval["idle"]  # nothing hangs on it: the whole of its range
+    assert (low, high) == (0.5, 2.0)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Overtone(Ripple):
+    """Most of a ripple, and something that is not there."""
+
+    name: ClassVar = "overtone"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Ripple.signal(t, seed) + 0.3 * np.sin(90.0 * t)
+
+
+def test_a_round_goes_on_to_the_next_effect_when_the_best_one_is_refused():
+    """The map has the least error, but a million numbers; the overtone is acceptable."""
+    fit, validation, _ = made(Ripple(strength=1.0))
+    problem = MadeProblem(Ripple, Overtone)
+    problem.candidates["ripple"] = dataclasses.replace(problem.candidates["ripple"], num_maps=10**6)
+    found = diagnose(problem, fit, validation, config=SearchConfig(max_effects=1))
+    first, second = found.rounds[0].evidence[:2]
+    assert (first.name, second.name) == ("ripple", "overtone")
+    assert "does not pay" in first.verdict
+    assert second.verdict == "added"
+    assert found.names == ("overtone",)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Richer(Squire):
+    """A square and a sine: explains a little more of what lies below the floor."""
+
+    name: ClassVar = "richer"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Square.signal(t, seed) + 0.0775 / 2.0 * np.sin(7.0 * t)
+
+
+def test_below_one_floor_the_simplest_effect_is_taken_and_not_the_one_with_less_error():
+    """Noise 0.1, floor 0.12: squared error 0.69 with the sine and 0.69 + 0.0775² / 2 / 0.12² = 0.90 without, both below 1."""
+    sine = 0.0775 * np.sin(7.0 * np.arange(0.0, 10.0, 0.005))
+    fit, validation = (
+        [dataclasses.replace(record(k, Square(strength=2.0), extra=sine), floor=np.array([0.12]))] for k in (0, 1)
+    )
+    found = diagnose(MadeProblem(Square, Richer), fit, validation)
+    errors = {row.name: row.validation_error for row in found.rounds[0].evidence}
+    assert errors["richer"] ** 2 == pytest.approx(0.69, abs=0.06)
+    assert errors["square"] ** 2 == pytest.approx(0.90, abs=0.06)
+    assert found.names == ("square",)
+    assert found.rivals == {"square": ("richer",)}
+
+
+def test_an_effect_that_was_fitted_to_nothing_is_not_added():
+    class ShapeOnly(MadeProblem):
+        """Ripple's own strength is not in the data; its base numbers can do more as soon as the effect is there."""
+
+        def simulate(self, base, effects, recording):
+            total = super().simulate(base, effects, recording)
+            return total + len(effects) * np.sin(5.0 * recording.time_s)[:, None]
+
+    t = np.arange(0.0, 10.0, 0.005)
+    fit, validation, _ = made(extra=np.sin(5.0 * t))
+    found = diagnose(ShapeOnly(Ripple), fit, validation)
+    assert found.names == ()
+    row = found.rounds[0].evidence[0]
+    assert row.gain > 0.9  # it would explain nearly all …
+    assert row.at_bound == ("ripple.strength",)  # … with a strength of nothing
+    assert "strength is at 0.001 1" in row.verdict
+
+
+@dataclasses.dataclass(kw_only=True)
+class Both(Squire):
+    """A ripple and a bump in one effect, with two numbers more; without the bump it is a ripple."""
+
+    name: ClassVar = "both"
+    reduces_to: ClassVar = {"ripple": "idle"}
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Ripple.signal(t, seed) + 3.0 * np.exp(-(((t % 2.0 - 0.6) / 0.1) ** 2))
+
+
+@dataclasses.dataclass(kw_only=True)
+class Bumps(Ripple):
+    name: ClassVar = "bumps"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return np.exp(-(((t % 2.0 - 0.6) / 0.1) ** 2))
+
+
+def test_two_simple_effects_are_preferred_to_one_with_as_many_numbers_that_contains_one_of_them():
+    fit, validation, test = made(Ripple(strength=1.0), Bumps(strength=3.0))
+    found = diagnose(MadeProblem(Ripple, Bumps, Both), fit, validation, test)
+    assert set(found.names) == {"ripple", "bumps"}
+    assert found.status == "at_floor"
+    assert any("both" in others for others in found.rivals.values())
+    assert [name for name, _ in found.steps] == ["", *[r.added for r in found.rounds]]
+
+
+class Driven(MadeProblem):
+    """The first number is a gain that the twin states."""
+
+    base = (dataclasses.replace(MadeProblem.base[0], name="kp", unit="N·m/rad"), MadeProblem.base[1])
+
+    def simulate(self, base, effects, recording):
+        return super().simulate({"gain": base["kp"], **base}, effects, recording)
+
+
+@pytest.mark.parametrize(("stated", "moved"), [(7.0, True), (1.0, True), (5.0, False), (2.0, False)])
+def test_gains_that_move_by_more_than_twice_are_a_finding_of_their_own(stated: float, moved: bool):
+    """They are 3 in the data."""
+    found = diagnose(Driven(Ripple), [record(0)], [record(1)], start={"kp": stated, "offset": 0.0})
+    assert found.names == ()
+    assert found.status == ("gains_moved" if moved else "nothing_missing")
+    assert len(found.remarks) == moved
+    if moved:
+        remark = found.remarks[0]
+        assert remark.startswith("kp ")
+        assert f"{stated:.4g}" in remark
+        assert f"{3 / stated:.2g}" in remark
+        assert "measurements.yaml" in remark
+
+
+def test_an_error_that_only_the_fit_recordings_show_is_searched_too():
+    """A ripple of 0.25: √(1 + 0.03 / 0.01) = 2 floors where noise is 0.1, √(1 + 0.03 / 0.09) = 1.16 where it is 0.3."""
+    fit, validation = [record(0, Ripple(strength=0.25))], [record(1, Ripple(strength=0.25), noise=0.3)]
+    found = diagnose(MadeProblem(Ripple, Square), fit, validation)
+    assert found.errors["fitted"]["fit"] == pytest.approx(2.0, abs=0.1)
+    assert found.errors["fitted"]["validation"] < 1.25
+    assert found.names == ("ripple",)

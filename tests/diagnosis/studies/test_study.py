@@ -1,0 +1,188 @@
+"""Arithmetic of the study on rows written by hand, and one real job."""
+
+from typing import Any
+
+import pytest
+
+from taccorl.diagnosis.studies.joints_and_pads import (
+    IDENTICAL,
+    MATERIAL,
+    Conditions,
+    Job,
+    conditions,
+    drop_said,
+    dropped,
+    exact,
+    exact_but_for_algebra,
+    failed,
+    inside,
+    loop,
+    material,
+    named,
+    nothing,
+    pairs,
+    removed,
+    run,
+    silently_wrong,
+    single,
+)
+from taccorl.sim.effects import effects
+from taccorl.surrogate.hidden import KINDS
+
+
+def row(hidden: tuple[str, ...], found: tuple[str, ...], **fields: Any) -> dict[str, Any]:
+    plain = {"status": "at_floor", "ties": {}, "swapped": [], "rivals": {}, "errors": {"fitted": {"validation": 5.0}}}
+    plain |= {"findings": [], "numbers": {}}
+    return {"hidden": list(hidden), "found": list(found)} | plain | fields
+
+
+def test_of_one_hidden_effect_the_first_one_found_must_be_it():
+    assert exact(row(("backlash",), ("backlash",)))
+    assert exact(row(("backlash",), ("backlash", "cogging")))
+    assert not exact(row(("backlash",), ("cogging", "backlash")))
+    assert not exact(row(("backlash",), ()))
+
+
+def test_of_two_both_must_be_found_in_any_order():
+    assert exact(row(("backlash", "cogging"), ("cogging", "slew_limit", "backlash")))
+    assert not exact(row(("backlash", "cogging"), ("backlash",)))
+
+
+def test_what_algebra_makes_one_counts_either_way():
+    assert not exact(row(("coulomb_friction",), ("asymmetric_friction",)))
+    assert exact_but_for_algebra(row(("coulomb_friction",), ("asymmetric_friction",)))
+    assert exact_but_for_algebra(row(("sensor_delay",), ("command_delay",)))
+    assert not exact_but_for_algebra(row(("coulomb_friction",), ("stribeck_friction",)))
+    assert not exact_but_for_algebra(row(("coulomb_friction",), ("backlash", "asymmetric_friction")))
+    assert not exact_but_for_algebra(row(("coulomb_friction",), ()))
+    both = ("coulomb_friction", "command_delay")
+    assert exact_but_for_algebra(row(both, ("sensor_delay", "coulomb_friction")))
+    assert not exact_but_for_algebra(row(both, ("coulomb_friction", "asymmetric_friction")))  # one of them twice
+
+
+def test_effects_that_are_one_by_algebra_call_each_other_near_twins():
+    for group in IDENTICAL:
+        for name in group:
+            assert group - {name} <= set(effects.get(name).near_twins), f"{name} does not name {group - {name}}"
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (("backlash",), {}),
+        (("cogging",), {"ties": {"cogging": ["backlash"]}}),
+        (("cogging",), {"rivals": {"cogging": ["backlash"]}}),
+        (("cogging",), {"swapped": [["backlash", "cogging"]]}),
+        (("cogging",), {"swapped": [["slew_limit", "cogging"]], "ties": {"slew_limit": ["backlash"]}}),
+    ],
+)
+def test_a_hidden_effect_is_named_in_any_of_these_ways(found: tuple[str, ...], said: dict[str, Any]):
+    assert named(row(("backlash",), found, **said))
+    assert not silently_wrong(row(("backlash",), found, **said))
+
+
+def test_a_near_twin_of_what_was_found_is_named():
+    twin = next(t for t in effects.get("coulomb_friction").near_twins if t in effects)
+    assert named(row((twin,), ("coulomb_friction",)))
+
+
+def test_a_tie_of_an_effect_that_is_not_there_any_more_says_nothing():
+    assert "backlash" not in effects.get("cogging").near_twins
+    assert not named(row(("backlash",), ("cogging",), ties={"slew_limit": ["backlash"]}))
+
+
+def test_silently_wrong_is_at_the_floor_with_another_effect_and_no_word_of_the_true_one():
+    assert silently_wrong(row(("backlash",), ("cogging",)))
+    assert not silently_wrong(row(("backlash",), ("cogging",), status="something_else"))
+    assert silently_wrong(
+        row(("backlash",), ("cogging",), status="gains_moved")
+    )  # which says nothing of what is hidden
+    assert not silently_wrong(row(("backlash", "slew_limit"), ("slew_limit", "cogging")))
+    assert not silently_wrong(row(("backlash",), (), status="nothing_missing"))
+
+
+def test_material_is_what_refitted_gains_leave():
+    at = {"errors": {"fitted": {"validation": MATERIAL}, "before": {"validation": 99.0}}}
+    below = {"errors": {"fitted": {"validation": MATERIAL - 0.01}, "before": {"validation": 99.0}}}
+    assert material(row((), (), **at)) and not material(row((), (), **below))
+
+
+def test_a_near_twin_of_a_kind_outside_the_registry_is_named_and_another_effect_is_not():
+    assert KINDS["magnetic_hysteresis"].near == ("coulomb_friction", "stribeck_friction")
+    assert named(row(("magnetic_hysteresis",), ("stribeck_friction",)))
+    assert not named(row(("magnetic_hysteresis",), ("cogging",)))
+    assert silently_wrong(row(("magnetic_hysteresis",), ("cogging",)))
+
+
+def test_near_twins_of_kinds_outside_are_joint_effects_or_will_be():
+    for name, k in KINDS.items():
+        if not k.registered:
+            assert set(k.near) <= set(KINDS) - {name}, name
+
+
+def test_lost_commands_are_said_by_a_finding_or_an_effect():
+    assert drop_said(row(("dropped_commands",), (), findings=["does_not_repeat", "dropped_commands"]))
+    assert not drop_said(row(("dropped_commands",), ("backlash",), findings=["does_not_repeat"]))
+
+
+def test_intervals_hold_the_truth_or_do_not():
+    numbers = {"kd/kp": [0.1, 0.09, 0.11, 0.105], "backlash.play_rad": [0.01, 0.009, 0.011, 0.012]}
+    r = row(("backlash",), ("backlash",), numbers=numbers)
+    assert inside(r) == [True, False]
+    assert inside(r, hidden_only=True) == [False]
+
+
+def test_a_failed_case_is_material_so_that_it_counts():
+    r = failed(Job(study="single", hidden=("cogging",), seed=1, design="pack"), "ValueError: no")
+    assert material(r) and r["failed"] == "ValueError: no" and r["key"] == "single pack cogging seed 1"
+
+
+def test_every_condition_is_as_frequent_as_it_is_said_to_be():
+    def share(jobs: list[Job], name: str) -> float:
+        return sum(getattr(conditions(job), name) for job in jobs) / len(jobs)
+
+    clean = nothing("chirp", range(20000, 20162))
+    shares = [share(clean, n) for n in ("loaded", "sampled", "coloured", "effort")]
+    assert shares == pytest.approx([1 / 3] * 4, abs=0.01)  # efforts: half of the two thirds without a sampled loop
+    assert not any(conditions(j).sampled and conditions(j).effort for j in clean)
+    assert all(conditions(j).sampled and conditions(j).effort for j in loop("chirp", [1, 2]))
+    hidden = single("pack", ["cogging", "backlash", "payload"], range(20000, 20016))
+    assert [share(hidden, n) for n in ("effort", "sampled", "coloured", "loaded")] == [0.5, 0.5, 0.25, 0.0]
+    both = {(conditions(j).effort, conditions(j).sampled) for j in single("chirp", ["cogging"], range(4))}
+    assert len(both) == 4  # every combination within four seeds
+    assert conditions(clean[5]) == conditions(nothing("pack", [20005])[0])
+    assert isinstance(conditions(clean[0]), Conditions)
+
+
+def test_keys_tell_jobs_apart_and_are_the_same_for_the_same_job():
+    assert Job(study="single", hidden=("cogging",), seed=3, design="pack").key == "single pack cogging seed 3"
+    strong = Job(study="single", hidden=("cogging",), seed=3, design="pack", strength=2.0)
+    assert strong.key == "single pack cogging at 2 seed 3"
+    couples = [("backlash", "cogging"), ("cogging", "backlash")]
+    jobs = [
+        *single("chirp", ["cogging", "backlash"], [0, 1]),
+        *single("pack", ["cogging", "backlash"], [0, 1]),
+        *nothing("chirp", [0, 1]),
+        *removed("chirp", ["cogging"], [0, 1]),
+        *pairs("chirp", couples, [0, 1]),
+        *dropped("chirp", [0, 1]),
+    ]
+    assert len({job.key for job in jobs}) == len(jobs) == 18
+    assert {job.key for job in nothing("chirp", [0])} == {"none chirp none seed 0"}
+
+
+def test_a_removed_effect_is_hidden_and_unknown_to_the_search():
+    known, outside = removed("chirp", ["cogging", "nothing_in_the_registry"], [4])
+    assert (known.hidden, known.without) == (("cogging",), ("cogging",))
+    assert (outside.hidden, outside.without) == (("nothing_in_the_registry",), ())
+
+
+@pytest.mark.slow
+def test_the_same_job_gives_the_same_row_but_for_the_time_it_took():
+    job = Job(study="single", hidden=("coulomb_friction",), seed=3, design="chirp", strength=12.0)
+    rows = [run(job), run(job)]
+    for one in rows:
+        assert one.pop("cpu_s") > 0 and one.pop("recording_cpu_s") > 0
+    assert rows[0] == rows[1]
+    assert rows[0]["key"] == job.key and rows[0]["left_floors"] == pytest.approx(12.0, rel=0.2)
+    assert material(rows[0]) and exact_but_for_algebra(rows[0]) and named(rows[0]) and not silently_wrong(rows[0])

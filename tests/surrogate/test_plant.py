@@ -1,0 +1,237 @@
+"""The surrogate's joint under test: what can be said of it beforehand."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+from taccorl.alignment.measurements.motions import CHIRP, LOADED_CHIRP, POSES, RATE_HZ, Motion, Room
+from taccorl.sim.robot import RobotConfig, link_poses
+from taccorl.surrogate.arm import GRAVITY, bodies, mass_matrix, torques
+from taccorl.surrogate.hidden import KINDS, Change, Scale
+from taccorl.surrogate.plant import Arm, Drive, Run, simulate
+from taccorl.surrogate.robot import Robot, inertia_and_weight
+
+NONE = np.zeros(6)
+JOINT = 5
+POSE = POSES[JOINT - 1]
+INERTIA, WEIGHT = inertia_and_weight(np.array(POSE), JOINT)
+OMEGA, ZETA = 15.0, 1.0
+KP, KD = INERTIA * OMEGA**2, 2 * ZETA * OMEGA * INERTIA
+ROOM = Room.of(JOINT, POSE[JOINT - 1], INERTIA, WEIGHT)
+
+
+def robot(torque_ff: float = 0.0, **drive: float) -> Robot:
+    return Robot(f"left_joint{JOINT}", (KP, KD, torque_ff), [Change(drive=drive)] if drive else [], POSE)
+
+
+def of_targets(target: np.ndarray) -> Motion:
+    return Motion(name="made", target=lambda room: POSE[JOINT - 1] + target)
+
+
+def joint(run: Run) -> np.ndarray:
+    """(T,) rad from the middle, at the rows."""
+    return run.angle[::5, JOINT - 1] - POSE[JOINT - 1]
+
+
+REST = of_targets(np.zeros(400))
+SLOW = of_targets(0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 0]))
+"""0.1 rad/s."""
+
+
+def test_without_effects_a_joint_is_the_linear_one_of_its_inertia_and_gains():
+    discrete = cont2discrete(([KP / INERTIA], [1.0, KD / INERTIA, KP / INERTIA]), 1 / RATE_HZ)
+    target = CHIRP.target(ROOM) - POSE[JOINT - 1]
+    linear = lfilter(np.ravel(discrete[0]), discrete[1], target)
+    swing = np.sqrt(np.mean(linear**2))
+    # Half a step of the twin (0.42 ms) more of damping than the continuous joint, see LATE_S: 3e-3 of the swing.
+    assert np.sqrt(np.mean((joint(robot().run(CHIRP, ROOM)) - linear) ** 2)) < 5e-3 * swing
+
+
+def test_it_rests_where_its_constant_torque_turns_it():
+    run = robot(torque_ff=0.01 * KP).run(REST, ROOM)
+    np.testing.assert_allclose(joint(run), 0.01, atol=1e-6)
+    np.testing.assert_allclose(run.effort[:, JOINT - 1], 0.0, atol=1e-6)  # the weight is carried
+
+
+def test_energy_stays_when_nothing_drives_or_brakes():
+    arm = bodies(RobotConfig(), 0.02)
+    free = Arm(arm, arm, 0.0, np.full(6, 0.01), NONE, NONE, NONE)
+    start = np.array([0.0, 1.0, -1.0, 0.3, 0.2, 0.1])
+    target = np.tile(start, (100, 1))
+    drive = Drive(kp=0.0, kd=0.0, torque_ff=0.0)
+    run = simulate(free, 4, drive, target, start, np.zeros((500, 6)), np.zeros(500, np.int64), 0)
+
+    def energy(q: np.ndarray, v: np.ndarray) -> float:
+        moving = 0.5 * v @ (mass_matrix(arm, q) + 0.01 * np.eye(6)) @ v
+        poses = link_poses(q)
+        return moving + GRAVITY * sum(
+            float(p[2, :3] @ h + m * p[2, 3]) for p, h, m in zip(poses, arm.moment, arm.mass, strict=True)
+        )
+
+    total = np.array([energy(q, v) for q, v in zip(run.angle[::10], run.velocity[::10], strict=True)])
+    fallen = 0.5 * run.velocity[-1] @ run.velocity[-1]
+    assert fallen > 1.0  # it did move
+    assert np.ptp(total) < 2e-3 * (energy(run.angle[-1], run.velocity[-1]) - energy(run.angle[-1], NONE))
+
+
+def test_in_slow_motion_dry_friction_costs_its_torque_in_either_direction():
+    friction = 0.05
+    run = robot(coulomb=friction).run(SLOW, ROOM)
+    effort = run.effort[::5, JOINT - 1]
+    assert effort[400] == pytest.approx(friction, rel=0.02)  # going up
+    assert effort[1200] == pytest.approx(-friction, rel=0.02)  # coming down
+
+
+def test_friction_that_grows_one_way_does_so():
+    effort = robot(coulomb=0.05, asymmetry=0.4).run(SLOW, ROOM).effort[::5, JOINT - 1]
+    assert effort[400] == pytest.approx(0.07, rel=0.02)
+    assert effort[1200] == pytest.approx(-0.03, rel=0.04)
+
+
+def test_a_command_within_the_friction_moves_nothing():
+    # K_p · 0.002 rad is less than the friction.
+    run = robot(coulomb=0.003 * KP).run(of_targets(np.repeat([0.0, 0.002], 400)), ROOM)
+    assert np.ptp(joint(run)) < 1e-4
+
+
+def test_stiction_is_greater_in_slow_motion_than_in_fast():
+    sticky = robot(coulomb=0.02, stribeck=0.06, stribeck_speed=0.05)
+    for speed in (0.007, 0.3):
+        run = sticky.run(of_targets(speed * np.arange(800) / 200), ROOM)
+        friction = 0.02 + 0.06 * math.exp(-((speed / 0.05) ** 2))
+        assert run.effort[-200:, JOINT - 1].mean() == pytest.approx(friction, rel=0.02)
+
+
+def test_viscous_and_quadratic_friction_cost_what_the_speed_says():
+    for drive, torque in (({"viscous": 0.3}, 0.3 * 0.1), ({"quadratic": 2.0}, 2.0 * 0.1**2)):
+        effort = robot(**drive).run(SLOW, ROOM).effort[:, JOINT - 1]
+        assert effort[1500:2500].mean() == pytest.approx(torque, rel=0.02)
+
+
+def test_a_delayed_command_gives_the_same_motion_later():
+    plain, late = joint(robot().run(CHIRP, ROOM)), joint(robot(delay=0.02).run(CHIRP, ROOM))
+    np.testing.assert_allclose(late[4:], plain[:-4], rtol=0, atol=1e-5)
+
+
+def test_a_delayed_report_is_the_same_motion_later():
+    plain = robot()
+    late = Robot(f"left_joint{JOINT}", (KP, KD, 0.0), [Change(report_delay_s=0.02)], POSE)
+    run = plain.run(CHIRP, ROOM)
+    np.testing.assert_array_equal(late.run(CHIRP, ROOM).angle, run.angle)
+    np.testing.assert_allclose(late.reported(run)[4:, 4], plain.reported(run)[:-4, 4], rtol=0, atol=1e-12)
+
+
+def test_the_torque_limit_holds_and_counts_the_weight():
+    plain = robot()
+    run = plain.run(CHIRP, ROOM)
+    most = 0.7 * np.abs(run.effort[:, JOINT - 1] + plain.carried_nm(run)).max()
+    limited = robot(torque_max=float(most))
+    run = limited.run(CHIRP, ROOM)
+    drawn = np.abs(run.effort[:, JOINT - 1] + limited.carried_nm(run))
+    assert 0.99 * most < drawn.max() < 1.01 * most
+
+
+def test_a_weak_motor_lets_the_arm_sag_by_what_it_does_not_carry():
+    run = robot(torque_scale=0.8).run(REST, ROOM)
+    angle = np.array(POSE)
+    angle[JOINT - 1] += joint(run)[-1]
+    weight = torques(bodies(RobotConfig(), 0.02), angle, NONE, NONE, GRAVITY)[JOINT - 1]
+    # 0.8 (K_p e + weight) = weight
+    assert joint(run)[-1] == pytest.approx(-(weight / 0.8 - weight) / KP, rel=0.01)
+
+
+def test_an_encoders_bias_is_taken_for_the_angle():
+    biased = robot(encoder_bias=0.05)
+    run = biased.run(REST, ROOM)
+    np.testing.assert_allclose(joint(run), -0.05, atol=1e-5)
+    np.testing.assert_allclose(biased.reported(run)[:, JOINT - 1], POSE[JOINT - 1], atol=1e-5)
+
+
+def test_integral_action_takes_a_constant_error_away():
+    target = np.repeat([0.0, 0.3], [200, 1400])
+    plain = joint(robot(coulomb=0.01 * KP).run(of_targets(target), ROOM))[-1]
+    mended = joint(robot(coulomb=0.01 * KP, integral=2.0).run(of_targets(target), ROOM))[-1]
+    assert 0.3 - plain > 0.005
+    assert abs(0.3 - mended) < 0.002
+
+
+def test_a_dead_band_leaves_its_width():
+    target = np.repeat([0.0, 0.3], [200, 800])
+    assert joint(robot(deadband=0.01).run(of_targets(target), ROOM))[-1] == pytest.approx(0.29, abs=1e-4)
+
+
+# Joint 1 turns about a vertical axis: no weight, so that in its play the motor is alone.
+INERTIA_1, _ = inertia_and_weight(np.array(POSES[0]), 1)
+KP_1, KD_1 = INERTIA_1 * OMEGA**2, 2 * ZETA * OMEGA * INERTIA_1
+ROTOR = 0.01
+
+
+def geared(target: np.ndarray, **drive: float) -> np.ndarray:
+    """(T,) rad of joint 1's motor."""
+    made = Robot("right_joint1", (KP_1, KD_1, 0.0), [Change(drive=drive)], POSES[0])
+    room = Room.of(1, 0.0, INERTIA_1, 0.0)
+    return made.run(Motion(name="made", target=lambda room: target), room).angle[::5, 0]
+
+
+def test_within_the_play_a_motor_moves_itself_alone():
+    step = np.repeat([0.0, 0.002], [100, 100])
+    discrete = cont2discrete(([KP_1 / ROTOR], [1.0, KD_1 / ROTOR, KP_1 / ROTOR]), 1 / RATE_HZ)
+    alone = lfilter(np.ravel(discrete[0]), discrete[1], step)
+    np.testing.assert_allclose(geared(step, play=0.02), alone, atol=2e-5)
+    assert np.abs(geared(step) - alone).max() > 1e-4  # a rigid one does not
+
+
+def test_with_a_spring_in_the_gear_motor_and_link_are_two_masses():
+    compliance, damping_s = 0.05, 0.002
+    k, link = 1 / compliance, INERTIA_1 - ROTOR
+    c = damping_s * k
+    a = np.array(
+        [
+            [0, 1, 0, 0],
+            [-(KP_1 + k) / ROTOR, -(KD_1 + c) / ROTOR, k / ROTOR, c / ROTOR],
+            [0, 0, 0, 1],
+            [k / link, c / link, -k / link, -c / link],
+        ]
+    )
+    b = np.array([[0], [KP_1 / ROTOR], [0], [0]])
+    step = np.repeat([0.0, 0.05], [100, 300])
+    ad, bd, *_ = cont2discrete((a, b, np.eye(4), np.zeros((4, 1))), 1 / RATE_HZ)
+    state, motor = np.zeros(4), []
+    for u in step:
+        motor.append(state[0])
+        state = ad @ state + bd[:, 0] * u
+    np.testing.assert_allclose(geared(step, compliance=compliance, compliance_damping=damping_s), motor, atol=2.5e-4)
+    assert np.abs(geared(step) - motor).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (k % 4 > 0)) for k, n in enumerate(KINDS)])
+def test_every_hidden_effect_changes_what_is_reported(name):
+    k = KINDS[name]
+    number = 5 if 5 in k.joints else k.joints[-1]  # a joint with weight
+    pose = np.array(POSES[number - 1])
+    inertia, weight = inertia_and_weight(pose, number)
+    kp, kd = inertia * OMEGA**2, 2 * OMEGA * inertia
+    room = Room.of(number, pose[number - 1], inertia, weight)
+    plain = Robot(f"left_joint{number}", (kp, kd, 0.01 * kp), [], tuple(pose))
+    run = plain.run(LOADED_CHIRP, room)
+    scale = Scale(
+        kp=kp,
+        kd=kd,
+        inertia=inertia,
+        torque=float(np.abs(run.effort[:, number - 1] + plain.carried_nm(run)).max()),
+        speed=3.0,
+        centre=pose[number - 1],
+    )
+    low, high = k.severity(scale)
+    shape = k.shape(np.random.default_rng(0), scale)
+    moved = []
+    for severity in (math.sqrt(low * high), high):
+        change = k.plant(k.values(severity, scale, shape))
+        changed = Robot(f"left_joint{number}", (kp, kd, 0.01 * kp), [change], tuple(pose))
+        other = changed.reported(changed.run(LOADED_CHIRP, room))
+        assert np.isfinite(other).all()
+        moved.append(np.abs(other - plain.reported(run)).max())
+    assert moved[0] > 1e-5
+    assert moved[1] > moved[0]
