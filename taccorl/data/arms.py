@@ -17,15 +17,16 @@ class Arm:
     """Indices of the elements of ``observation.state`` and ``action`` that belong to one arm."""
 
     name: str
-    """Prefix of its names without the underscore; empty for a robot with one arm."""
+    """Prefix of the elements' names (``left``, ``right``), without the underscore; empty for a robot with one arm."""
     joints: np.ndarray
-    """(n,) element numbers in rad, base to wrist."""
+    """(n,) indices of the elements that are joint angles [rad], from base to wrist."""
     gripper: int | None
-    """Element number of the opening in m."""
+    """Index of the element that is the gripper's opening [m]; None without a gripper."""
 
 
 def find_arms(names: tuple[str, ...], units: tuple[str, ...]) -> list[Arm]:
-    """Arms by the names' prefixes ``left_`` and ``right_``; elements with neither belong to the arm without a name."""
+    """Find the arms by the prefixes ``left_`` and ``right_`` of the elements' names; elements without a prefix belong to the arm
+    without a name."""
     arms = []
     prefixes = [next((p for p in ("left", "right") if n.startswith(f"{p}_")), "") for n in names]
     for prefix in sorted(set(prefixes)):
@@ -49,7 +50,7 @@ def element_names(episode: Episode, key: str) -> tuple[str, ...]:
 
 
 def episode_arms(episode: Episode) -> list[Arm]:
-    """The arms of an episode that holds both state and command under the same names; else none."""
+    """The arms of an episode whose state and command have the same names; an empty result if they differ or one is missing."""
     if STATE not in episode.arrays or ACTION not in episode.arrays:
         return []
     if element_names(episode, STATE) != episode.spec.features[ACTION].names:

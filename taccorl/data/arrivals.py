@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from taccorl.data.ingest import Job
 
 SETTLED_S = 5.0
-"""Longer than the pauses between writes of common recorders (rosbag2 writes its cache when full, or every second). A choice."""
+"""Longer than the pauses between writes of common recorders (rosbag2 writes when its cache is full, or every second). A choice.
+"""
 
 _Key = tuple[str, str | None]
 _Signature = tuple[tuple[int, int], ...] | None
@@ -28,15 +29,15 @@ class Arrivals:
         self._since: dict[_Key, tuple[_Signature, float]] = {}
         self._told: dict[_Key, _Signature] = {}
         self.complete: list[Job] = []
-        """All that are complete, as of the last ``look``."""
+        """All complete recordings, as of the last call of ``look``."""
         self.growing: list[Job] = []
-        """All that are not complete yet, as of the last ``look``."""
+        """All recordings that are not complete yet, as of the last call of ``look``."""
 
     def look(self, now_s: float) -> list[Job]:
         """Complete recordings that no earlier call has returned in their present state.
 
         Args:
-            now_s: a clock that does not jump [s].
+            now_s: time of a monotonic clock [s].
         """
         self.complete, self.growing, new = [], [], []
         for job in self._find():

@@ -39,21 +39,25 @@ from taccorl.data.touch_checks import Pad, check_pads, read_pads, tactile_keys
 __all__ = ["Finding", "Severity", "check_episode", "check_recording_episodes"]
 
 RATE_SHARE = 0.8
-"""Of the rate that the spec states: a channel below it loses every fifth sample or was set up wrongly."""
+"""Lowest accepted rate of a channel, as a share of the rate that the spec states: below it every fifth sample is lost, or the
+driver is set up wrongly."""
 GAP_S = 0.1
-"""Three rows at 30 fps: so long a policy would look at the past."""
+"""Shortest interval between two samples that is reported as a gap [s]: three rows at 30 fps, during which a policy would see an
+old sample."""
 GAPS_SHARE = 0.05
-"""Of a channel's samples: more dropped ones than leggedrobotics' recordings tolerate (5 %)."""
+"""Highest accepted share of dropped samples of a channel. Recordings of leggedrobotics tolerate 5 %."""
 GAPS_MIN = 3
-"""Fewer gaps are single dropped samples, whatever share of a short episode they are."""
+"""Least number of gaps that is reported: fewer are single dropped samples, even if they are a large share of a short episode."""
 OLD_SAMPLES_PERIODS = 1.5
-"""Median age of the sample in a row, in periods of the channel: half a period is usual, one the worst."""
+"""Highest accepted median age of the samples in the rows, in periods of the channel: half a period is usual, one period the
+worst case."""
 REPEAT_SHARE = 0.5
-"""Of the episode's samples: PiPER's driver republishes a few per cent with an old stamp at all times."""
+"""Highest accepted share of samples that repeat the stamp of an earlier one: PiPER's driver always republishes a few per cent."""
 EPISODE_LAG_S = 0.05
-"""Lag of one episode against the median of its recording: more than a row and a half at 30 fps."""
+"""Largest accepted difference [s] between the lag of one episode and the median lag of its recording: a row and a half at 30
+fps."""
 COMPARED_EPISODES = 3
-"""It takes so many to say which one is odd."""
+"""Least number of episodes in a recording for deciding which one differs."""
 
 
 def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
@@ -202,7 +206,8 @@ def _pads_and_grippers(episodes: list[Episode]) -> Iterator[tuple[Episode, str, 
 
 
 def _touch_lags(episodes: list[Episode]) -> list[Finding]:
-    """All holds together: one row's resolution no longer matters, so the window is the plain one."""
+    """Touch lags of all holds together. Many holds average out the resolution of one row, so the accepted interval is not
+    widened by it."""
     lags: dict[tuple[str, str], list[float]] = {}
     for episode, key, pads, grippers in _pads_and_grippers(episodes):
         for pad in pads:

@@ -22,13 +22,15 @@ from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
 START_UP_S = 1.0
-"""Channels need not start and stop together: this much at either end is no loss worth a word."""
+"""Time at either end of a recording for which channels may be missing without a reported loss [s]: they need not start and stop
+together."""
 END_SLACK_S = 0.25
-"""So much may be missing at an end that was marked."""
+"""Time for which a channel may be missing at a marked end without a reported loss [s]."""
 LONGEST_S = 24 * 3600.0
 """Longest recording that is read. At 200 Hz a channel has 17 million messages by then."""
 MAX_WAITING_PICTURES = 1000
-"""Cameras of one recording come interleaved; more waiting than this means that they do not."""
+"""Most pictures that wait for those of the other cameras. A recording interleaves its cameras; more waiting pictures mean that
+this one does not."""
 
 
 class Unfit(RecordingError):
@@ -43,7 +45,7 @@ class Loss:
     end_s: float
     reason: str
     wanted: bool = True
-    """False: left out on purpose (the operator discarded it)."""
+    """False: the operator discarded the stretch on purpose."""
 
 
 @dataclass
@@ -51,7 +53,7 @@ class Cut:
     """Result of cutting one recording: its episodes, and the losses between them."""
 
     origin_ns: int = 0
-    """The recording's first sample, on its channels' clock: where the losses' seconds count from."""
+    """Time of the recording's first sample on its channels' clock [ns]; ``Loss`` counts its seconds from here."""
     episodes: list[Episode] = field(default_factory=list)
     losses: list[Loss] = field(default_factory=list)
 
@@ -63,11 +65,11 @@ class _Interval:
     instruction: str
     success: bool | None
     marked: bool
-    """Its ends were marked, rather than being those of the file."""
+    """True if markers give the ends of the interval; False if they are the ends of the file."""
 
     @property
     def slack_ns(self) -> int:
-        """Missing at an end without being a loss."""
+        """Time that may be missing at an end of the interval without being a loss [ns]."""
         return round(((0.0 if self.marked else START_UP_S) + END_SLACK_S) * NS_PER_S)
 
 
@@ -120,7 +122,8 @@ class Cutter:
         return readings
 
     def _check_span(self, name: str, clock: timing.ClockReading) -> None:
-        """One wrong stamp, changed by a single bit, would make a recording of years."""
+        """Refuse a recording that lasts longer than ``LONGEST_S``: a single changed bit in a stamp would make it last
+        for years."""
         if clock.time_ns[-1] - clock.time_ns[0] <= LONGEST_S * NS_PER_S:
             return
         k, span_h = int(np.argmax(np.diff(clock.time_ns))), (clock.time_ns[-1] - clock.time_ns[0]) / NS_PER_S / 3600
@@ -308,7 +311,7 @@ class Cutter:
             result.episodes.append(self._episode(name, shown, grid_ns[a:b], matches, slice(a, b)))
 
     def _last_ns(self) -> dict[str, int]:
-        """Channel → time of the last row that it can fill; a held one goes on for ever."""
+        """Channel → time of the last row that it can fill [ns]; a held channel has no end."""
         found: dict[str, int] = {}
         for key in self.spec.mapped:
             if self.spec.features[key].align == "hold":
@@ -396,7 +399,8 @@ class Cutter:
         )
 
     def _sample_jumps(self, grid_ns: np.ndarray) -> Iterator[Finding]:
-        """In the channels of state and action, between the first and the last row. Slow ones are in the rows whole."""
+        """Findings of ``check_sample_jumps`` for the channels of state and action between the first and the last row. Channels
+        slower than the rows are skipped: the rows hold all of their samples."""
         fps = self.spec.target.fps
         for key in (STATE, ACTION):
             feature, start = self.spec.target.features.get(key), 0

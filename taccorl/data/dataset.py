@@ -29,7 +29,7 @@ from taccorl.errors import DatasetError, nearest
 
 PROVENANCE = Path("meta/taccorl")
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""LeRobot's own columns: no features."""
+"""LeRobot's own columns, which are not features."""
 NUMBERS = ("float32", "float64", "int16", "int64")
 """Kinds of numbers that are read from flat features."""
 MOST_FPS = 100_000
@@ -57,7 +57,8 @@ class Dataset:
         self.spec, self.skipped = _read_spec(self.root, self.info)
         """``skipped``: feature key → why episodes do not have it."""
         self.unstored = _without_videos(self.info, self._table)
-        """Cameras without videos: their frames are in the cache of training alone (taccorl execute --pictures=cache)."""
+        """Cameras without videos: ``taccorl execute --pictures=cache`` stored their frames only in the frame cache of training.
+        """
         if self.unstored:
             kept = {key: f for key, f in self.spec.features.items() if key not in self.unstored}
             self.spec = dataclasses.replace(self.spec, features=kept)
@@ -78,11 +79,11 @@ class Dataset:
 
     @property
     def instructions(self) -> tuple[str, ...]:
-        """All sentences of ``meta/tasks.parquet``."""
+        """The different instructions of the dataset, from ``meta/tasks.parquet``."""
         return tuple(self._tasks.values())
 
     def num_rows(self, index: int) -> int:
-        """Rows of one episode, as ``meta/episodes`` counts them."""
+        """Number of rows of one episode, from ``meta/episodes``."""
         return int(self._entry(index)["length"])
 
     def first_row(self, index: int) -> int:
@@ -97,7 +98,7 @@ class Dataset:
         """Path and time range of the episode within a video file.
 
         Raises:
-            DatasetError: its frames are in the cache of training alone.
+            DatasetError: the frames of this camera are only in the frame cache of training.
         """
         if key in self.unstored:
             raise DatasetError(f"{self.root}: {key}: {self.skipped[key]}")
@@ -140,7 +141,8 @@ class Dataset:
         return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
 
     def told(self, index: int) -> dict[str, Any]:
-        """Fields of ``Episode`` that ingest wrote down (success, origin, baselines, …); none for other people's datasets."""
+        """Fields of ``Episode`` from ``meta/taccorl/`` (success, origin, baselines, …), where ingest wrote them; empty for other
+        people's datasets."""
         return {} if self._records is None else dict(self._records[index])
 
     def episode(self, index: int) -> Episode:
@@ -263,7 +265,7 @@ def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
 
 
 def dataset_spec_from_json(path: Path) -> DatasetSpec:
-    """The spec that ``dataset_spec_to_json`` gave, exactly; as strict as with the YAML files of ``data_specs/``.
+    """Inverse of ``dataset_spec_to_json``: the same spec, read as strictly as the YAML files of ``data_specs/``.
 
     Raises:
         SpecError: with file, line, key and the way out.
@@ -362,7 +364,7 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
 
 
 def _without_videos(info: dict[str, Any], table: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Cameras of whose videos no episode says anything."""
+    """Cameras whose videos no episode mentions."""
     cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
     return tuple(key for key in cameras if table and not any(n.startswith(f"videos/{key}/") for n in table[0]))
 
@@ -562,7 +564,7 @@ def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, av.VideoFra
 
 @contextlib.contextmanager
 def _plainly(path: Path, what: str) -> Iterator[None]:
-    """Libraries' errors about ``path`` as a DatasetError in plain words."""
+    """Raise errors of libraries about ``path`` as a DatasetError in plain words."""
     try:
         yield
     except FileNotFoundError as error:

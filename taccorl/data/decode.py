@@ -45,7 +45,8 @@ def _part(value: Any, part: str) -> Any:
 
 
 def maybe(value: Any, field: str) -> Any:
-    """``get``, or None; quick, because most messages lack most fields that are asked for."""
+    """Like ``get``, but None if there is no such field. It is faster than catching the error: most messages lack most of the
+    optional fields."""
     for part in field.split("."):
         value = _part(value, part)
         if value is MISSING:
@@ -85,7 +86,8 @@ def text(value: Any, topic: str) -> str:
 
 
 def vector_paths(value: Any) -> dict[str, str]:
-    """Name → dotted path of the numbers in a ROS vector, pose, twist, wrench, IMU or odometry message; empty for others."""
+    """Names of the numbers in a ROS vector, pose, twist, wrench, IMU or odometry message → their dotted paths; empty for other
+    messages."""
     fields = next((s for s in STRUCTURES if all(_part(value, f) is not MISSING for f in s)), ())
     found: dict[str, str] = {}
     for field in fields:
@@ -182,7 +184,7 @@ def pad_counts(found: Any, dtype: str) -> np.ndarray:
     """Counts in little-endian bytes, base64 text, or a list or array of whole numbers, in its own shape.
 
     Raises:
-        RecordingError: not that, or counts that do not fit ``dtype``.
+        RecordingError: ``value`` has none of these forms, or a count does not fit ``dtype``.
     """
     wire = np.dtype(dtype).newbyteorder("<")
     if isinstance(found, str):

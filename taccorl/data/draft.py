@@ -1,4 +1,4 @@
-"""Draft specs from a recording: how recordings are read, what their dataset holds, and of which kind unknown pads are.
+"""Draft the specs for a recording: a recording spec, the dataset spec, and a sensor spec if its pads are of an unknown kind.
 
 Filled in is what the recording states: topics, types, names of joints, rates, shapes. What it does not state (units, valid
 ranges, the instruction) is ``TODO`` with a comment that says what to write there.
@@ -23,15 +23,15 @@ TOUCH_WORDS = ("tact", "touch", "taxel", "skin", "finger", "pad")
 STATE_WORDS = ("qpos", "state", "position", "joint")
 YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 PICTURE_SHAPE = (224, 224, 3)
-"""What π0.5 looks at; pictures are letterboxed to it."""
+"""Rows, columns and colours of pictures in a drafted dataset: the input size of π0.5. Pictures are letterboxed to it."""
 FPS = 30
-"""Rows a second where no camera says what would be natural."""
+"""Row rate of the drafted dataset [Hz] if no camera suggests another."""
 ROW_CLOCK_READERS = ("hdf5", "lerobot")
-"""Their files hold rows without times: ``lead_frames`` says which row a command is valid at."""
+"""Readers of files that hold rows without times. Their drafts state ``lead_frames``: the row for which a command is valid."""
 ACTION_TIME = "action_time: next_row   # action of row t: the last command sent before row t + 1"
 COUNT_UNIT = "adc_count"
 STALE_PERIODS = 2.4
-"""A sample may be late by this many periods before a row counts as stale."""
+"""``max_age_s`` of a drafted channel, in periods of the channel."""
 
 
 class Drafts(NamedTuple):
@@ -40,10 +40,10 @@ class Drafts(NamedTuple):
     recording: str
     dataset: str
     sensor: str = ""
-    """Of pads that no shipped sensor fits; empty where there are none."""
+    """Text of the sensor spec for pads that no shipped sensor fits; empty if there are none."""
 
     def files(self, path: Path) -> dict[Path, str]:
-        """File → text, for a recording spec at ``path``: the others lie beside it."""
+        """File → text. The recording spec is at ``path``, the other specs are beside it."""
         texts = {path: self.recording, dataset_path(path): self.dataset, sensor_path(path): self.sensor}
         return {place: text for place, text in texts.items() if text}
 
@@ -72,14 +72,14 @@ def draft_specs(inventory: Inventory, path: Path = Path("draft.yaml")) -> Drafts
 class _Roles:
     states: list[TopicSummary]
     commands: list[TopicSummary]
-    """Empty: no topic is named as a command."""
+    """Topics of commands; empty if no topic is named as a command."""
     pictures: list[TopicSummary]
     pads: list[TopicSummary]
-    """Of one sensor: a shipped one, or one that is unknown."""
+    """Topics of pads of one kind: a shipped sensor, or an unknown one."""
     vectors: list[TopicSummary]
-    """Poses, wrenches, IMU readings …: a feature each."""
+    """Topics of poses, wrenches, IMU readings and the like; each becomes one feature."""
     spare: list[TopicSummary]
-    """Other topics with numbers: any of them may be what the user wants."""
+    """Other topics with numbers, which the draft lists for the user to choose from."""
     names: dict[str, str]
     """Topic → channel."""
 
@@ -131,7 +131,7 @@ def _side(t: TopicSummary) -> str:
 
 
 def _says(t: TopicSummary, hints: tuple[str, ...]) -> bool:
-    """One of the words of its topic is, or begins with, one of ``hints``."""
+    """Whether a word of the topic is, or begins with, one of ``hints``."""
     return any(word.startswith(hints) for word in re.split(r"[^a-z]+", t.topic.lower()))
 
 
@@ -389,7 +389,7 @@ def _counts(pad: TopicSummary) -> tuple[str, tuple[int, ...]]:
 
 
 def _rate_hz(topics: list[TopicSummary]) -> float:
-    """The slowest one's, to three digits; a whole number if it is that within 1 %."""
+    """The rate of the slowest topic, rounded to three digits, or to a whole number if it is within 1 % of one."""
     rate_hz = min(t.rate_hz or 1.0 for t in topics)
     return float(f"{rate_hz:.3g}") if abs(round(rate_hz) - rate_hz) > 0.01 * rate_hz else float(round(rate_hz))
 

@@ -14,7 +14,7 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
 EXECUTED = "sim.executed"
-"""What was sent to the twin, where ``action`` is what was intended."""
+"""Feature with the targets that were sent to the twin, if they differ from the intended ones in ``action``."""
 
 Pictures = dict[str, np.ndarray]
 """Feature key → (rows, columns, 3) uint8 RGB."""
@@ -44,13 +44,13 @@ class ChannelTiming:
     longest_gap_s: float
     age_median_s: float
     age_max_s: float
-    """Age of the sample that a row shows: row time − sample time, for ``action`` the next row's time − sample time; negative
-    only for interpolate's look-ahead."""
+    """Largest age of a sample that a row shows [s]: row time − sample time; for ``action`` the time of the next row − sample
+    time. Negative only if ``align: interpolate`` looks ahead."""
     duplicates: int = 0
     out_of_order: int = 0
     zero_stamps: int = 0
     nominal_hz: float = 0.0
-    """Rate that the recording spec states for the channel; 0 if nobody says."""
+    """Rate that the recording spec states for the channel [Hz]; 0 if it states none."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ class Episode:
     """One episode, cut and aligned. T rows at ``spec.fps``."""
 
     name: str
-    """For people: recording and episode."""
+    """Name for messages and titles: recording and episode."""
     spec: DatasetSpec
     start_ns: int
-    """Recording's clock at row 0."""
+    """Time of row 0 on the recording's clock [ns]."""
     arrays: dict[str, np.ndarray]
     """Feature key → (T, size): every feature of the episode that is not a video."""
     pictures: Callable[[], Iterator[Pictures]]
@@ -69,12 +69,13 @@ class Episode:
     picture_keys: tuple[str, ...]
     instruction: str
     success: bool | None = None
-    """What the operator's marker said; None if nobody said."""
+    """True or False as the operator's marker states; None without a marker."""
     origin: str = ""
-    """Where it is from, e.g. "surrogate stand-in, not a robot"; empty for a recording that does not say."""
+    """Origin of the episode, such as "surrogate stand-in, not a robot"; empty for a recording that states none."""
     timing: tuple[ChannelTiming, ...] = ()
     picture_rows: dict[str, np.ndarray] = field(default_factory=dict)
-    """Video key → (T,) number of the source picture a row shows, for freezes and repeats; empty in a dataset."""
+    """Video key → (T,) index of the source picture that each row shows, for finding frozen cameras; empty for an episode of a
+    dataset."""
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
     """Tactile key → (K,) counts that were subtracted."""
     videos: dict[str, Video] = field(default_factory=dict)
@@ -98,7 +99,7 @@ class Episode:
         """(T, A) targets that were sent: the actions, or in a disturbed episode the disturbed targets.
 
         Raises:
-            DatasetError: it was disturbed, and what was sent is not there any more.
+            DatasetError: the episode was disturbed, and the targets that were sent are not stored.
         """
         told = self.provenance.get("simulation")
         made = told.get("mimicgen") if isinstance(told, dict) else None
@@ -112,13 +113,13 @@ class Episode:
         return self.arrays["action"]
 
     def joints(self, key: str, unit: str) -> np.ndarray:
-        """(size,) bool: which elements of ``key`` have that unit."""
+        """(size,) bool: True for the elements of feature ``key`` that have this unit."""
         units = self.spec.features[key].unit
         names = (units,) * self.spec.features[key].size if isinstance(units, str) else units
         return np.array([u == unit for u in names])
 
     def pads(self, key: str) -> dict[str, np.ndarray]:
-        """Pad name → (T, rows, columns): newest counts above baseline of tactile feature ``key``."""
+        """Pad name → (T, rows, columns) counts above baseline, the newest reading in each row of tactile feature ``key``."""
         feature, sensor = self.spec.features[key], self.spec.sensors[key]
         counts = self.arrays[key].reshape(-1, feature.history, len(feature.pads), sensor.rows, sensor.columns)
         return {pad: counts[:, -1, p] for p, pad in enumerate(feature.pads)}

@@ -9,12 +9,12 @@ class FileKind(NamedTuple):
     """A kind of file."""
 
     name: str
-    """Name with its article, such as ``an MCAP file``."""
+    """Name with its article, such as ``an MCAP file``, for messages."""
     magic: bytes
     """Bytes that such a file holds at ``offset``."""
     offset: int = 0
     reader: str | None = None
-    """Name of the reader that opens it; None: it is no recording."""
+    """Name of the reader that opens such a file; None if it is not a recording."""
     command: str = ""
     """Shell command that produces the wanted file; {path} and {folder} stand for this file and its folder."""
 
@@ -58,7 +58,7 @@ def no_recording(path: Path) -> str | None:
 
 
 def no_dataset(path: Path) -> str:
-    """Why ``path``, which is no dataset, is refused where a recording would need its spec, and what helps."""
+    """Reason why ``path``, which is no dataset, is refused where only a dataset is accepted, and the command that helps."""
     if what := no_recording(path):
         return f"{path}: {what}"
     return f"{path} is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"

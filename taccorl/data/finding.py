@@ -15,11 +15,11 @@ class Finding:
     severity: Severity
     """error: the episode's data is wrong, ingest quarantines it; warning: look at it; note: worth knowing."""
     feature: str
-    """Feature, or channel for timing."""
+    """Name of the feature, or of the channel if the finding is about timing."""
     text: str
-    """Thing, value, place and way out."""
+    """Message: the thing, the value, the place and the remedy."""
     rows: tuple[int, int] | None = None
-    """[first, last + 1)"""
+    """First row and last row + 1 of the finding; None if it is about the whole episode."""
 
 
 def not_judged(feature: str, what: str, why: str) -> Finding:
@@ -28,11 +28,11 @@ def not_judged(feature: str, what: str, why: str) -> Finding:
 
 
 def place(rows: tuple[int, int], fps: int) -> str:
-    """``rows 30 to 44 (1.00 to 1.50 s)``"""
+    """Text of a row range, such as ``rows 30 to 44 (1.00 to 1.50 s)``."""
     return f"rows {rows[0]} to {rows[1] - 1} ({rows[0] / fps:.2f} to {rows[1] / fps:.2f} s)"
 
 
 def listed(names: list[str], most: int = 4) -> str:
-    """The first few names, and how many more."""
+    """Text of the first few names, and the number of further ones."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,4 +1,4 @@
-"""Touch against the grippers: does each pad read contact while its own gripper holds a part, and only then?
+"""Compare touch with the grippers: each pad should read contact while its own gripper holds a part, and only then.
 
     hold     the gripper's command goes on closing, its state does not: a part is between the fingers
     lag      first contact of the pad − moment at which the gripper came to its held opening
@@ -20,36 +20,42 @@ from taccorl.data.timing import runs
 from taccorl.data.touch_checks import JUDGE_S, Pad
 
 HOLD_GAP_M = 0.003
-"""The command is this far past the state: more than calibration offset, less than any firm grip (8 mm is usual)."""
+"""Least distance of the commanded from the measured opening in a hold [m]: more than the calibration offset, less than in any
+firm grip (8 mm is usual)."""
 HOLD_SPEED_M_PER_S = 0.010
-"""A closing gripper moves at 50 to 200 mm/s, a stalled one creeps as the pads give."""
+"""Highest closing speed of a gripper that is stopped by a part [m/s]: it closes freely at 50 to 200 mm/s, and creeps while the
+pads yield."""
 HOLD_MIN_S = 0.3
 HOLD_MERGE_S = 0.2
 STOP_BAND_M = 0.001
-"""Within this of its held opening the gripper has reached the part: a pad's rubber gives about so much."""
+"""A gripper within this distance of its held opening has reached the part [m]: the pad's rubber yields about as much."""
 HOLD_EDGE_S = 0.2
-"""Cut off both ends of a hold before asking a pad whether it feels it: clocks and creep blur them."""
+"""Time that is removed from both ends of a hold before its contact is judged [s]: clock errors and creep blur the ends."""
 HOLD_SUM_S = 0.3
-"""It takes so much holding to judge a pad."""
+"""Least total time of holds for judging a pad [s]."""
 FEELS, SILENT = 0.8, 0.2
-"""A pad feels a hold if it is in contact in this share of its rows, and is silent below the other."""
+"""A pad reads a hold if it is in contact in more than the first share of the hold's rows; it is silent if in less than the
+second share."""
 TOUCH_LAG_S = (-0.13, 0.15)
-"""Plausible first contact after the gripper's stop: what is soft is felt before it (the twin's pads, which yield 1.5 mm at
-30 N, 0.06 s before by the right hand of assembly_2 and 0.11 s by the left, 0.12 s at most in 95 % of 20 demonstrations), 100 Hz
-scans and drivers come after."""
+"""Plausible times from the gripper's stop to the first contact [s]. Contact can come first, since pads are soft (the twin's
+pads, which yield 1.5 mm at 30 N: 0.06 s earlier for the right hand of assembly_2 and 0.11 s for the left, 0.12 s at most in 95 %
+of 20 demonstrations); scans at 100 Hz and drivers make it later."""
 TOUCH_LAG_SEARCH_S = 1.5
 PAD_LAG_S = 0.1
-"""Between the two pads of one gripper: a part may lean on one finger first, but not for three rows of force."""
+"""Largest accepted time between the first contacts of the two pads of a gripper [s]: a part may touch one finger first, but not
+for three rows of force."""
 OPEN_SHARE = 0.8
-"""Of the episode's widest opening: the gripper is open, nothing ought to touch the pads."""
+"""Share of the episode's widest opening above which a gripper is open, so that nothing should touch its pads."""
 RELEASE_S = 0.3
-"""After a release the film creeps back: these rows do not count as rest."""
+"""Time after a release that is not used as rest [s]: the sensor's film creeps back."""
 REST_MIN_S = 0.3
-"""Rest needed at each end of an episode to speak of drift."""
+"""Least time of rest at each end of an episode for judging drift [s]."""
 DRIFT_SHARE = 1 / 3
-"""Of the sensor's noise_count (15 counts): a drift of 5 counts in an episode eats a third of the contact threshold."""
+"""Largest accepted drift in an episode, as a share of the sensor's noise_count (15 counts): a drift of 5 counts is a third of
+the contact threshold."""
 OFFSET_SHARE = 0.05
-"""Share of a pad's taxels (19 of 384) that may rest beyond the noise_count: residual touch, single bad taxels."""
+"""Largest accepted share of a pad's taxels (19 of 384) that rest above noise_count: residual touch, or single defective taxels.
+"""
 
 
 @dataclass(frozen=True)
@@ -57,11 +63,11 @@ class Hold:
     """A period in which a gripper holds a part."""
 
     first: int
-    """Row at which the gripper stands still."""
+    """First row in which the gripper stands still."""
     end: int
     """Last row + 1."""
     stop_s: float | None
-    """Episode time at which it came within STOP_BAND_M of its held opening; None if it held from row 0."""
+    """Episode time [s] at which the gripper came within STOP_BAND_M of its held opening; None if the hold began before row 0."""
 
 
 def find_holds(opening: np.ndarray, command: np.ndarray, fps: int) -> list[Hold]:
@@ -94,19 +100,19 @@ class Grippers:
     """Openings, commands and holds of the grippers in an episode."""
 
     opening: dict[str, np.ndarray]
-    """Arm → (T,) m."""
+    """Arm → (T,) measured opening [m]."""
     holds: dict[str, list[Hold]]
     """Arm → its holds."""
 
     def held(self, arm: str, *, cut: int = 0, grow: int = 0) -> np.ndarray:
-        """(T,) bool: the arm holds; holds cut by ``cut`` rows, or grown by ``grow`` rows, at both ends."""
+        """(T,) bool: the arm holds a part. Holds are shortened by ``cut`` rows, or lengthened by ``grow`` rows, at both ends."""
         rows = np.zeros(len(self.opening[arm]), dtype=bool)
         for hold in self.holds[arm]:
             rows[max(hold.first + cut - grow, 0) : max(hold.end - cut + grow, 0)] = True
         return rows
 
     def rest(self, arm: str, fps: int) -> np.ndarray:
-        """(T,) bool: gripper open, and not just after a release."""
+        """(T,) bool: the gripper is open and the last release is longer ago than ``RELEASE_S``."""
         opening = self.opening[arm]
         closed = self.held(arm) | (opening < OPEN_SHARE * opening.max())
         return ~binary_dilation(closed, np.ones(2 * round(RELEASE_S * fps) + 1, dtype=bool))
@@ -232,7 +238,7 @@ def _check_silence(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> l
 
 
 def touch_lags(pad: Pad, grippers: Grippers, fps: int) -> list[float]:
-    """First contact after its gripper's stop (s), one per hold that shows both."""
+    """Time [s] from the gripper's stop to the pad's first contact, one per hold in which both are found."""
     lags, reach, before = [], round(TOUCH_LAG_SEARCH_S * fps), 0
     for hold in grippers.holds[pad.arm]:
         if hold.stop_s is not None:
@@ -255,7 +261,7 @@ def _onset(pad: Pad, first: int, end: int) -> float | None:
 
 
 def lag_text(lag_s: float) -> str:
-    """``0.120 s before``, ``0.300 s after``"""
+    """Text of a lag, such as ``0.120 s before`` or ``0.300 s after``."""
     return f"{abs(lag_s):.3f} s {'before' if lag_s < 0 else 'after'}"
 
 

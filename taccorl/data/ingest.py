@@ -1,4 +1,5 @@
-"""Recordings into one LeRobot dataset: each recording a stage of its own in the store, then merged and published whole.
+"""Turn recordings into one LeRobot dataset: each recording is a stage of its own in the store; the results are then merged and
+published together.
 
 Every input ends as exactly one of: ``written``; ``split`` (written in part: something was silent, damaged, cut off, or some
 of its episodes were quarantined, and what is missing is listed); ``quarantined`` (readable, but its data is wrong: none of it
@@ -36,7 +37,7 @@ from taccorl.lineage.store import Store
 
 Outcome = Literal["written", "split", "quarantined", "refused"]
 Progress = Callable[[str, int, int], None]
-"""(recording, rows done, rows in all)"""
+"""Function that is called with (recording, number of rows done, number of rows in all)."""
 
 PROVENANCE = "meta/taccorl"
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
@@ -46,7 +47,7 @@ MACHINE_FAULTS = {
     errno.EFBIG: "a file larger than this user may write (ulimit -f)",
     errno.EROFS: "the disk is read-only",
 }
-"""Faults that no other recording would escape: the whole run stops."""
+"""Errors of the machine, such as a full disk, that every further recording would meet: the whole run stops."""
 RECORDING_STAGE_VERSION = 4
 DATASET_STAGE_VERSION = 3
 
@@ -63,7 +64,7 @@ class Job:
 
 
 class NothingToWrite(RecordingError):
-    """Error: no episode of the recording may go into a dataset. Has the recording's report entry."""
+    """Error: no episode of the recording may go into a dataset. Holds the recording's report entry."""
 
     def __init__(self, entry: dict[str, Any]) -> None:
         super().__init__(entry["reason"])
@@ -78,10 +79,11 @@ def find_jobs(
     dry_run: bool,
     skipped: list[str] | None = None,
 ) -> list[Job]:
-    """One job per recording under ``paths``, in the order given, folders in natural order; a file twice is one input.
+    """One job per recording under ``paths``, in the order given, folders in natural order; a file that is named twice is one
+    input.
 
     Args:
-        skipped: is told what else lies there and why it is not read.
+        skipped: if given, other entries of the folders and the reasons why they are not read are added to it.
 
     Raises:
         RecordingError: a path holds no recording.
@@ -105,11 +107,11 @@ def ingest(
     """Ingest all jobs and publish the dataset at ``out``; returns the report. A dry run needs no store.
 
     Args:
-        replace: if given, whatever else is at ``out`` is moved aside, and this is told to where.
+        replace: if given, whatever else is at ``out`` is moved aside; called with the path it is moved to.
 
     Raises:
         InTheWayError: ``out`` holds something else.
-        TaccorlError: the machine failed (disk full); what was finished is kept and not done again.
+        TaccorlError: the machine failed (disk full); finished recordings are kept, and a later run does not repeat them.
     """
     entries = ingest_each(jobs, engine, progress)
     _leave_out_twins(jobs, entries)
@@ -155,7 +157,7 @@ def ingest(
 def ingest_each(
     jobs: Sequence[Job], engine: Engine | None = None, progress: Progress | None = None
 ) -> list[dict[str, Any]]:
-    """Report entries of ``ingest_one`` for each job, in order."""
+    """Report entries of ``ingest_one`` for each job, in the order of the jobs."""
     if engine is None or (isinstance(engine, LocalEngine) and engine.workers <= 1):
         return [ingest_one(job, progress) for job in jobs]
     done = iter(range(1, len(jobs) + 1))
@@ -204,7 +206,7 @@ def _moved_aside(out: Path) -> Iterator[Path]:
 
 
 def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
-    """Ingest one recording into a shard in the store. Never raises for a fault of the recording: the entry states the outcome."""
+    """Ingest one recording into a shard in the store. A fault of the recording is never raised: the entry states the outcome."""
     digests: list[str] = []
     try:
         entry = _dry(job, progress) if job.dry_run else _stored(job, progress, digests)
@@ -228,7 +230,8 @@ def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
 
 
 def _machine_fault(error: Exception) -> str | None:
-    """What of the machine failed, if it did. LeRobot's encoder threads and shutil hand an OSError on as text only."""
+    """The fault of the machine behind an error; None if it was none. LeRobot's encoder threads and shutil pass an OSError on as
+    text only."""
     told = (text for number, text in MACHINE_FAULTS.items() if f"[Errno {number}]" in str(error))
     return MACHINE_FAULTS.get(getattr(error, "errno", None) or 0) or next(told, None)
 
@@ -267,7 +270,8 @@ def _build(job: Job, folder: Path, progress: Progress | None) -> None:
 
 
 def _dry(job: Job, progress: Progress | None) -> dict[str, Any]:
-    """What ``_build`` would say: everything is read, pictures too; two rows are written by LeRobot into a scratch folder."""
+    """Same result as ``_build`` without writing a dataset: everything is read, pictures too, and LeRobot writes two rows into a
+    scratch folder."""
     from taccorl.data.lerobot_format import write_episodes
 
     def look(episodes: list[Episode]) -> None:
@@ -378,7 +382,7 @@ def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tu
 
 
 def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damage]) -> tuple[Outcome, str]:
-    """A recording's outcome and the reason, most telling part first."""
+    """Outcome of a recording and its reasons, the most important one first."""
     errors = [next((f for f in found if f.severity == "error"), None) for found in findings]
     wrong = [f"{f.feature}: {f.text}" for f in errors if f is not None]
     gone = [str(d) for d in damage if d.lost]

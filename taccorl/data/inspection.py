@@ -1,4 +1,4 @@
-"""Inspect a recording: channels, rates, gaps, clock skew, names of joints, damage, and which shipped spec fits it."""
+"""Inspect a recording: channels, rates, gaps, clock skew, names of joints, damage, and the shipped specs that fit it."""
 
 import contextlib
 import math
@@ -39,7 +39,7 @@ class TopicSummary:
     first_ns: int
     last_ns: int
     rate_hz: float
-    """1 / median interval of its own stamps (log times where it has none); 0 with fewer than two messages."""
+    """1 / median interval of the topic's own stamps, or of log times if it has none [Hz]; 0 with fewer than two messages."""
     longest_gap_s: float
     num_gaps: int
     """Intervals longer than 1.5 median intervals."""
@@ -48,9 +48,9 @@ class TopicSummary:
     """Median of log time − header stamp; 0 without a header."""
     skew_p99_s: float
     repeated: int
-    """Messages with the stamp of an earlier one."""
+    """Number of messages with the stamp of an earlier one."""
     zero_stamps: int
-    """Messages stamped 0, where others have a time."""
+    """Number of messages whose stamp is 0, on a topic where other stamps are times."""
     names: tuple[str, ...] = ()
     """Names of the values: the ``name`` list of the first message, the type's, or paths such as ``force.x`` in a wrench."""
     units: tuple[str, ...] = ()
@@ -58,17 +58,19 @@ class TopicSummary:
     frame: str = ""
     """``header.frame_id`` of a vector, pose and the like; empty for odometry, whose twist is in another frame than its pose."""
     num_values: int | None = None
-    """Numbers in a message of joints or of an array; None where it holds no list of numbers."""
+    """Number of numbers in a message of joints or of an array; None if it holds no list of numbers."""
     sensor: str | None = None
-    """Shipped sensor whose pad frames fit it."""
+    """Name of the shipped sensor whose pad frames have the same type and size; None if there is none."""
     counts: tuple[str, tuple[int, ...]] | None = None
-    """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits: a pad of another kind, perhaps."""
+    """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits, possibly a pad of another kind; None for
+    other messages."""
     misfit: str = ""
-    """Why its first message cannot be used: a picture in an encoding that is not read, names without values."""
+    """Reason why its first message cannot be used, such as a picture in an unknown encoding or names without values; empty if it
+    can."""
 
     @property
     def problem(self) -> str:
-        """Why its values cannot be decoded, with its name; empty where they can."""
+        """Name of the topic and the reason why its values cannot be decoded; empty if they can."""
         why = self.type.undecodable or self.misfit
         return why if not why or why.startswith(self.topic) else f"{self.topic}: {why}"
 
@@ -78,7 +80,7 @@ class TopicSummary:
         return self.stamped and abs(self.skew_s) > SIM_TIME_S
 
     def holds(self, kinds: tuple[str, ...]) -> bool:
-        """Its type's name ends as one of ``kinds`` does, whatever the package is called."""
+        """Whether the name of its message type ends in one of ``kinds``, in any package."""
         return any(kind in decode.type_key(self.type.name).rsplit("/", 1)[-1] for kind in kinds)
 
 
@@ -92,11 +94,11 @@ class Inventory:
     metadata: dict[str, dict[str, str]]
     damage: tuple[Damage, ...]
     fits: tuple[str, ...] = field(default=())
-    """Shipped recording specs whose topics are all here."""
+    """Shipped recording specs whose topics are all in the recording."""
 
     @property
     def times_known(self) -> bool:
-        """False: the file names neither times nor a rate, and the reader had to make times up."""
+        """False: the file states neither times nor a rate, so that the reader assumed a rate."""
         return "rate" not in self.metadata.get("time", {})
 
     @property
@@ -170,7 +172,7 @@ def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | Non
 
 
 def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
-    """What only a decoded message tells: names, number of values, pad or not."""
+    """Facts that only a decoded message gives: names, number of values, whether it is a pad frame."""
     shape = t.type.shape
     if t.type.undecodable or not t.num_messages:
         return {}

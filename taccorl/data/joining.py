@@ -39,7 +39,7 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
         destination: does not exist, or is empty.
 
     Raises:
-        ValueError: they differ in features, rate or robot.
+        ValueError: the datasets differ in features, rate or robot.
     """
     infos = [_info(root) for root in roots]
     for info, root in zip(infos, roots, strict=True):
@@ -76,7 +76,7 @@ def _without_lost_features(table: pa.Table, features: dict[str, Any]) -> pa.Tabl
 
 @dataclass(eq=False)
 class _Part:
-    """A dataset that goes in: from which row and episode on, and into which chunk and file each of its files goes."""
+    """One input dataset of the merge: its first row and episode in the result, and the chunk and file for each of its files."""
 
     root: Path
     first_row: int
@@ -191,7 +191,7 @@ class _Tasks:
 def _with_own_statistics(
     table: pa.Table, first_rows: np.ndarray, first_episodes: np.ndarray, tasks: _Tasks
 ) -> pa.Table:
-    """Of rows' and episodes' numbers, which are others here, and of tasks, as LeRobot tells them of an episode's instructions."""
+    """Table of episodes with new statistics of the row, episode and task indices, which differ after the merge."""
     for key, more in (("index", first_rows), ("episode_index", first_episodes)):
         for name in set(_STATISTICS) - {"std"}:
             column = f"stats/{key}/{name}"
@@ -237,12 +237,12 @@ def _files(root: Path, kind: str) -> Iterator[Path]:
 
 
 def _numbers(path: Path) -> tuple[int, int]:
-    """Chunk and file."""
+    """Chunk index and file index."""
     return int(path.parent.name.removeprefix("chunk-")), int(path.stem.removeprefix("file-"))
 
 
 def _plus(table: pa.Table, key: str, more: int | np.ndarray) -> pa.Table:
-    """Args: more: one number, or one for each row."""
+    """Args: more: increment, one number or one for each row."""
     plus = pa.array(more) if isinstance(more, np.ndarray) else more
     return _set(table, key, pc.add(table[key], plus))  # pyright: ignore[reportAttributeAccessIssue]
 

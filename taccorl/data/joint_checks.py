@@ -17,24 +17,25 @@ from taccorl.data.timing import runs
 LIMIT_TOLERANCE = 0.02
 """Share of the valid span by which a value may lie outside: calibration offsets and the leader's own stops."""
 JOINT_SPEED_RAD_PER_S = 3.93
-"""225 °/s, PiPER's fastest joints (J4 to J6; J1 to J3: 180 to 195 °/s)."""
+"""Highest plausible joint speed: 225 °/s, of PiPER's fastest joints (J4 to J6; J1 to J3: 180 to 195 °/s)."""
 GRIPPER_SPEED_M_PER_S = 1.5
-"""The whole 70 mm stroke in 47 ms: faster than a hand can press the leader's trigger."""
+"""Highest plausible gripper speed: the whole stroke of 70 mm in 47 ms, faster than a hand can press the leader's trigger."""
 SPEEDS = {"rad": JOINT_SPEED_RAD_PER_S, "m": GRIPPER_SPEED_M_PER_S}
 """Unit of a position → highest speed that is plausible for it [that unit per second]."""
 JUMP_MARGIN = 2.0
-"""A row may show a sample one row older than its neighbour's, so that a step can hold the way of two rows."""
+"""Factor on the largest plausible step between rows: two neighbouring rows may show samples that are two rows apart."""
 STILL_RAD = 0.02
-"""A joint that stays within this for a second is at rest: a trembling hand on the leader moves about half of it."""
+"""A joint whose angle stays within this range for a second is at rest [rad]: a trembling hand on the leader moves it about half
+as much."""
 STILL_M = 0.002
 STILL_WINDOW_S = 1.0
 IDLE_END_S = 3.0
-"""Longer rests at the start or end should be trimmed: a policy would learn to wait."""
+"""Longest accepted rest at the start or end of an episode [s]; a policy would learn to wait, so longer ones should be trimmed."""
 IDLE_MIDDLE_S = 5.0
 FROZEN_S = 0.5
-"""15 rows at 30 fps: bit-identical for so long while it should change is not chance."""
+"""Time of bit-identical states, while the command moves, that is reported [s]: 15 rows at 30 fps are no coincidence."""
 MOVING_RAD = 0.05
-"""A joint has moved: 2.9°, well above tremor."""
+"""Least range of a moving joint [rad]: 2.9°, well above tremor."""
 
 
 # ---- values ----
@@ -71,7 +72,7 @@ def outside(values: np.ndarray, limits: np.ndarray, tolerance: float = LIMIT_TOL
 
 
 def unit_hint(values: np.ndarray, limit: np.ndarray, unit: str) -> str | None:
-    """Name of the unit that would bring all of an element's values (T,) into its limits; None if there is none."""
+    """Name of the unit in which all values (T,) of an element would lie within its limits; None if there is none."""
     if unit == "m" and values.min() >= -0.05 and values.max() <= 1.05:
         return "a normalised opening 0 to 1"
     candidates = {
@@ -154,11 +155,11 @@ def check_sample_jumps(
 ) -> list[Finding]:
     """Find steps between samples of a channel that are larger than a joint can move in that time.
 
-    Rows hold a part of a fast channel's samples, and less can happen between two samples than between two rows. A driver may
-    repeat a reading: the time counts from the last change, but not from further back than a row.
+    Rows hold a part of a fast channel's samples, and a possible step between two samples is smaller than one between two rows. A
+    driver may repeat a reading: so the time of a step is taken from the last change, but at most one row.
 
     Args:
-        channel: for the message.
+        channel: name for the message.
         values: (N, J) samples of an episode, in rad and m where ``units`` say so; others are not judged.
         time_s: (N,) since row 0, increasing.
         names: of the J elements.

@@ -20,16 +20,16 @@ LITTLE_ENDIAN = b"\0\1\0\0"
 
 @dataclass(frozen=True)
 class _Places:
-    """Where the values of one message are, and what its other bytes must be."""
+    """Byte positions of the values in one message, and the required content of its other bytes."""
 
     values: struct.Struct
     """sec, nanosec, and all doubles in order, from byte 4 on; the bytes between them are skipped."""
     fixed: tuple[tuple[int, int, bytes], ...]
-    """(first byte, last byte + 1, content) of all others."""
+    """(first byte, last byte + 1, required content) of all other byte ranges."""
     size: int
     counts: tuple[int, int, int]
     kinds: tuple[type, type, type]
-    """Classes of message, header and stamp."""
+    """Python classes of message, header and stamp."""
     frame_id: str
     names: tuple[str, ...]
 

@@ -1,4 +1,4 @@
-"""Does each arm follow its own command, and how late?
+"""Check that each arm follows its own command, and how late.
 
     lag      argmax over k of Σ_t v_action[t] · v_state[t + k], the velocities of all moving joints of one arm,
              less the one row after which an action is reached (``DatasetSpec.action_time``)
@@ -20,17 +20,18 @@ from taccorl.data.joint_checks import MOVING_RAD
 
 LAG_SEARCH_S = (-0.5, 1.0)
 LAG_PLAUSIBLE_S = (0.0, 0.3)
-"""PiPER follows its command in about 0.1 s (CAN, controller, gear); 0.3 s would be slow."""
+"""Plausible lag of the state behind the command [s]: PiPER's is about 0.1 s (CAN, controller, gear); 0.3 s would be slow."""
 LAG_TOLERANCE_ROWS = 1.0
-"""A sample is up to one row old, so that true lags near 0 measure as slightly negative."""
+"""Tolerance on the lag [rows]: a sample is up to one row old, so that lags near 0 are measured slightly negative."""
 LAG_SURE = 0.6
-"""Correlation below this says nothing about time."""
+"""Least correlation at which a lag is used."""
 ARM_LAG_SPREAD_S = 0.1
-"""Two arms of one make differ less."""
+"""Largest accepted difference between the lags of two arms [s]; arms of one make differ less."""
 LAG_MIN_S = 3.0
-"""Shorter episodes hold too little motion to correlate."""
+"""Shortest episode whose lag is measured [s]; shorter ones hold too little motion."""
 SWAP_RATIO = 3.0
-"""Own command must be this many times farther than the other arm's: symmetric motion never is."""
+"""Arms count as swapped if the distance to the own command is this many times the distance to the other arm's; symmetric motion
+never reaches it."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Lag:
 
     lag_s: float
     correlation: float
-    """Of the velocities at that lag; below LAG_SURE the lag means nothing."""
+    """Correlation of the velocities at that lag; below LAG_SURE the lag is not used."""
 
 
 def find_lag(action: np.ndarray, state: np.ndarray, fps: int, search_s: tuple[float, float] = LAG_SEARCH_S) -> Lag:
@@ -89,7 +90,7 @@ def arm_lags(episode: Episode) -> dict[str, Lag]:
 
 
 def check_lag(episode: Episode) -> list[Finding]:
-    """Does the state follow the command, and within a plausible time?"""
+    """Check that the state follows the command within a plausible time."""
     fps = episode.spec.fps
     if episode.num_rows < LAG_MIN_S * fps:
         return [not_judged(ACTION, "action lag", f"{episode.num_rows / fps:.1f} s, it takes {LAG_MIN_S:g} s of motion")]
@@ -157,7 +158,7 @@ def arms_swapped(state: np.ndarray, action: np.ndarray, left: Arm, right: Arm, f
 
 
 def check_swapped_arms(episode: Episode) -> list[Finding]:
-    """Find exchanged arms: the state of the left arm with the command of the right one, and vice versa."""
+    """Find exchanged arms: the left arm's state belongs to the right arm's command, and vice versa."""
     arms = {arm.name: arm for arm in episode_arms(episode)}
     if not {"left", "right"} <= set(arms):
         return []

@@ -37,9 +37,9 @@ LARGE_FEATURE = 256
 element: 80 kB an element, 123 MB for the taxels of a row and 1.2 GB for their window."""
 PRIORITY_ROWS = 16
 MERGED_AT_ONCE = 16
-"""Datasets that LeRobot merges in one go."""
+"""Most datasets that one call of LeRobot's ``aggregate_datasets`` merges."""
 UNSAFE_IN_PATHS = "'*?[]"
-"""LeRobot 0.6.1 reads these as patterns (of parquet files) or quotes (in the list of videos to join)."""
+"""Characters that LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos to join)."""
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 ENCODERS: dict[str, dict[str, Any]] = {
     # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
@@ -82,8 +82,8 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
 
 
 def declare_pictures(root: Path, spec: DatasetSpec) -> None:
-    """Add the picture features of ``spec`` to ``info.json`` of a dataset without videos: its frames are in the cache of training
-    alone (``taccorl.training.rendered_frames``)."""
+    """Add the picture features of ``spec`` to ``info.json`` of a dataset without videos, whose frames are only in the frame
+    cache of training (``taccorl.training.rendered_frames``)."""
     path = root / "meta" / "info.json"
     info = json.loads(path.read_text(encoding="utf-8"))
     features = lerobot_features(spec, spec.keys("video"))
@@ -99,7 +99,7 @@ def check_path(path: Path) -> None:
     """Check that LeRobot can use this path for a dataset.
 
     Raises:
-        DatasetError: LeRobot would misread this place, or worse, read another.
+        DatasetError: LeRobot would misread this path, or read another one.
     """
     odd = sorted(set(str(path.resolve())) & set(UNSAFE_IN_PATHS))
     if odd:
@@ -115,10 +115,10 @@ def write_episodes(
 
     Args:
         progress: called with the number of rows written so far.
-        streaming: False goes the slow way at once.
+        streaming: False: write through PNG files from the start.
 
     Raises:
-        DatasetError: even the slow way's videos do not hold one frame a row.
+        DatasetError: also the videos made from PNG files do not hold exactly one frame per row.
         RecordingError: a picture is broken; nothing is left at ``root``.
     """
     check_path(root)
@@ -248,7 +248,8 @@ def _pixels_counted() -> Iterator[None]:
     theirs: type = compute_stats.RunningQuantileStats
 
     class PixelStatistics(theirs):
-        """LeRobot's, but for bytes. Of a picture: (pixels, channels)."""
+        """LeRobot's running statistics for 8-bit values: counts of the 256 values per channel. Pictures are given as (pixels,
+        channels)."""
 
         counts: np.ndarray | None = None
 
@@ -306,7 +307,8 @@ def _statistics_in_order(module: Any) -> Iterator[None]:
 
 
 def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
-    """(T, size) numbers as T fixed-size lists, ``rows`` a piece, so that nothing downstream holds all of them twice."""
+    """(T, size) numbers as an Arrow array of T fixed-size lists, in pieces of ``rows``, so that no later step holds all of them
+    twice."""
     pieces = [values[k : k + rows] for k in range(0, len(values), rows)]
     return pa.chunked_array([pa.FixedSizeListArray.from_arrays(pa.array(p.reshape(-1)), p.shape[1]) for p in pieces])
 
@@ -345,11 +347,11 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
     """Merge datasets into one; a single one is copied. With videos by LeRobot's ``aggregate_datasets``, else by ``joining``. The
     result is verified like a written one.
 
-    Statistics of joints and actions are those of all rows: LeRobot 0.6.1 takes the mean of the datasets' quantiles, which is no
-    quantile of theirs together.
+    Statistics of joints and actions are those of all rows: LeRobot 0.6.1 averages the datasets' quantiles, which is not the
+    quantile of all rows.
 
     Raises:
-        DatasetError: they differ in features, fps or robot, or the merged videos do not hold one frame a row.
+        DatasetError: the datasets differ in features, fps or robot, or the merged videos do not hold exactly one frame per row.
     """
     for path in (*roots, destination):
         check_path(path)
@@ -372,7 +374,7 @@ def require_videos(root: Path) -> None:
     """Check that the dataset contains its videos.
 
     Raises:
-        DatasetError: pictures of the dataset are in the cache of training frames alone.
+        DatasetError: pictures of the dataset are only in the frame cache of training.
     """
     if has_videos(root) and (unstored := Dataset(root).unstored):
         raise DatasetError(
@@ -456,7 +458,8 @@ def _aggregate(roots: Sequence[Path], destination: Path) -> None:
 
 @contextlib.contextmanager
 def quiet_lerobot() -> Iterator[None]:
-    """LeRobot offline and without its progress bars, encoder banners and download attempts; errors still show."""
+    """While open, LeRobot works offline and prints no progress bars, encoder messages or download attempts; errors are still
+    printed."""
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     os.environ.setdefault("SVT_LOG", "1")
     os.environ.setdefault("TQDM_DISABLE", "1")

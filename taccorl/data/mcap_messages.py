@@ -59,7 +59,7 @@ def message_decoder(channel: Channel, schema: Schema | None) -> Decoder:
 
 
 def message_stamper(channel: Channel, schema: Schema | None) -> Stamper:
-    """Function from bytes to the stamp. If a ROS 2 header comes first, the message is not decoded."""
+    """Return a function from a message's bytes to its stamp [ns]. If a ROS 2 header comes first, the rest is not decoded."""
     if channel.message_encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
         fields = _top_fields(schema.data.decode(errors="replace"))
         if fields and fields[0][0] in HEADERS and fields[0][1] == "header":

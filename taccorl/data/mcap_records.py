@@ -93,16 +93,16 @@ class Summary:
     """Summary section at the end of a file: index and statistics."""
 
     problem: str | None = None
-    """Why nothing in it is believed."""
+    """Reason why the summary section is not used; empty if it is."""
     proven: bool = False
-    """Its CRC is there and right."""
+    """True if the section has a CRC and agrees with it."""
     schemas: list[Schema] = field(default_factory=list)
     channels: list[Channel] = field(default_factory=list)
     has_chunks: bool = False
     starts: list[int] = field(default_factory=list)
-    """Offsets of its chunks, attachments and metadata records, ascending."""
+    """Offsets of the file's chunks, attachments and metadata records, ascending."""
     end: int | None = None
-    """Where the data section ends; None where there is no sound footer: the file may have been cut."""
+    """Offset at which the data section ends; None without a sound footer: the file may have been cut."""
 
     def next_start(self, offset: int) -> int | None:
         """The first indexed record at or after ``offset``."""
@@ -116,9 +116,9 @@ class McapFile:
     def __init__(self, file: BinaryIO, size: int) -> None:
         self.file, self.size = file, size
         self.end = size
-        """Where the data section ends, as far as is known."""
+        """Offset at which the data section ends, as far as known."""
         self.chunked = False
-        """Messages are known to lie in chunks: one outside is more likely a message index gone wrong."""
+        """True if messages are known to lie in chunks; one outside is then probably a damaged message index."""
         self.summary = self._read_summary()
         self.end = self.summary.end or size
         self.chunked = self.summary.has_chunks
@@ -160,7 +160,7 @@ class McapFile:
         return self.file.read(record.length)
 
     def has_data_crc(self, data_end: Record | None) -> bool:
-        """True if the writer stored a CRC of the data section."""
+        """True if the file has a CRC of the data section."""
         return data_end is not None and any(self.body(data_end))
 
     def data_crc_matches(self, data_end: Record) -> bool:

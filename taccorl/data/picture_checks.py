@@ -1,7 +1,7 @@
 """Find frozen cameras: a camera that repeats one picture while joints move.
 
-Two ways to see it: the same source picture on many rows (``Episode.picture_rows``), and decoded pictures that do not
-change. Each picture is compared as block means in grey levels, so that neither noise nor a video codec decides.
+Two signs are used: the same source picture on many rows (``Episode.picture_rows``), and decoded pictures that do not
+change. Each picture is compared as block means in grey levels, so that neither noise nor the video codec affects the result.
 """
 
 import cv2
@@ -14,13 +14,13 @@ from taccorl.data.joint_checks import FROZEN_S
 from taccorl.data.timing import runs
 
 THUMB_PX = 28
-"""Block means on a side: 8 × 8 pixels each at 224 × 224. Sensor noise of 3 levels leaves about 0.4 there."""
+"""Block means per side of a picture: 8 × 8 pixels each at 224 × 224. Sensor noise of 3 levels changes a mean by about 0.4."""
 SAME_LEVELS = 2.0
-"""Grey levels (of 255): pictures whose block means all differ less are the same picture."""
+"""Pictures are the same if all their block means differ by less than this [grey levels of 255]."""
 SIGHT_RAD = 0.3
-"""An arm that turns a joint this far (12 cm at 0.4 m) is seen to move."""
+"""Joint rotation that must be visible in a picture [rad]: it moves the hand by 12 cm at 0.4 m."""
 FROZEN_SHARE = 0.5
-"""Of the episode's rows: from here on the pictures are wrong rather than poor."""
+"""Share of an episode's rows with a frozen picture from which on the finding is an error; below it is a warning."""
 DARK_LEVEL = 4.0
 
 
@@ -55,12 +55,12 @@ class PictureWatch:
         self._thumbs: dict[str, list[np.ndarray]] = {key: [] for key in self.episode.picture_keys}
 
     def see(self, pictures: Pictures) -> None:
-        """Take the pictures of the next row."""
+        """Add the pictures of the next row."""
         for key, thumbs in self._thumbs.items():
             thumbs.append(thumbnail(pictures[key]).astype(np.float16))  # exact to 1/16 of a level
 
     def findings(self) -> list[Finding]:
-        """Frozen cameras, once all rows were seen."""
+        """Findings about frozen cameras, after all rows were added."""
         return [f for key, thumbs in self._thumbs.items() for f in _check_thumbs(self.episode, key, np.array(thumbs))]
 
 

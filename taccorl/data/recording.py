@@ -29,11 +29,11 @@ class Message(NamedTuple):
 
     topic: str
     log_ns: int
-    """When the recorder received it (ns)."""
+    """Time at which the recorder received the message [ns]."""
     stamp_ns: int | None
-    """Its header stamp (ns); None where messages of that type have none."""
+    """Header stamp of the message [ns]; None if messages of its type have none."""
     value: Any
-    """Decoded; None where only stamps were asked for."""
+    """Decoded message; None if only stamps were requested."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class TopicType:
     name: str
     """Schema name, e.g. ``sensor_msgs/msg/JointState``."""
     encoding: str
-    """How it is encoded: cdr, json, protobuf, array …"""
+    """Encoding of the messages: cdr, json, protobuf, array …"""
     undecodable: str | None = None
-    """Why its values cannot be decoded; None where they can."""
+    """Reason why the values cannot be decoded; None if they can."""
     shape: tuple[int, ...] | None = None
     """Shape of one value, where the format says so (HDF5, LeRobot)."""
     names: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ class Damage:
     start_ns: int | None = None
     end_ns: int | None = None
     lost: bool = True
-    """False: no message can have been there (an index that only says again what the data holds)."""
+    """True if messages may be lost; False if not, as for a damaged index that only repeats what the data section holds."""
 
     def __str__(self) -> str:
         return f"{Path(self.file).name} bytes {self.byte_start:,} to {self.byte_end:,}: {self.reason}"
@@ -99,14 +99,15 @@ class Reader(ABC):
                 raise RecordingError(f"{path}: {what}")
         self.source = source
         self.spec = spec
-        """None while somebody only looks into a file."""
+        """Recording spec for which the file is read; None while it is only inspected."""
         self.damage: list[Damage] = []
-        """Known once ``messages`` has run to its end without bounds; a partial or abandoned read leaves it as it was."""
+        """Damaged parts of the recording. Complete only after ``messages`` has run to its end without time bounds; a partial
+        read does not change it."""
         self.metadata: dict[str, dict[str, str]] = {}
-        """Named records beside the messages; filled while reading."""
+        """Named metadata records of the file, beside the messages; filled while reading."""
         self.unprotected = ""
-        """What no checksum protects, for the report: a changed byte there may be read as data. Empty: everything has one.
-        Known when ``damage`` is."""
+        """Sentence for the report about the parts that no checksum protects: a changed byte there may be read as data. Empty if
+        everything has a checksum. Complete when ``damage`` is."""
 
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
@@ -130,10 +131,10 @@ class Reader(ABC):
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[Message]:
-        """Messages of ``topics`` (None: of all, stamps only) in file order; may skip those logged outside [start, end].
+        """Messages of ``topics`` (None: all topics, stamps only) in file order; may skip those logged outside [start, end].
 
         Raises:
-            RecordingError: the file is not of this format, or an asked-for topic cannot be decoded.
+            RecordingError: the file is not of this format, or a requested topic cannot be decoded.
         """
 
 
@@ -141,9 +142,9 @@ readers: Registry[type[Reader]] = Registry("reader", "taccorl.data.readers")
 
 
 MOST_NAMED = 5
-"""Entries of a folder to name in an error."""
+"""Most entries of a folder that an error message names."""
 DEEPEST = 4
-"""Levels of folders to look through for recordings that lie deeper than they are read."""
+"""Levels of folders that are searched for a hint, below the level at which recordings are read."""
 
 
 def find_sources(
@@ -152,8 +153,8 @@ def find_sources(
     """Find all recordings at ``path`` (a file, bag folder, dataset, or folder of those) as (reader name, source).
 
     Args:
-        skipped: if given, what a folder holds besides and why it is not read is added here, and no entry of a folder
-            keeps the others from being read.
+        skipped: if given, other entries of a folder and the reasons why they are not read are added to it, and an unreadable
+            entry raises no error.
 
     Raises:
         RecordingError: nothing there, or nothing that a reader opens.
@@ -251,7 +252,7 @@ def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
 
 
 def without_place(text: str, path: Path | str) -> str:
-    """Text of an error without the path, for messages that name the file already."""
+    """Text of an error without the path, for messages that already name the file."""
     return text.removeprefix(f"{path}: ")
 
 
@@ -305,23 +306,23 @@ class Channel:
     name: str
     spec: ChannelSpec
     log_ns: np.ndarray
-    """(N,) int64."""
+    """(N,) int64 log times [ns]."""
     stamp_ns: np.ndarray | None
-    """(N,) int64; None where the messages have no header."""
+    """(N,) int64 header stamps [ns]; None if the messages have no header."""
     values: np.ndarray | None
     """(N, size) numbers; None for pictures."""
 
 
 @dataclass
 class Recording:
-    """One recording, read once. Pictures are read again when ``pictures`` is asked for them."""
+    """One recording, read once. ``pictures`` reads the file again."""
 
     source: Source
     spec: RecordingSpec
     reader: Reader
     channels: dict[str, Channel]
     texts: dict[str, list[tuple[int, str]]]
-    """(log_ns, text) of marker and instruction topics."""
+    """Topic → (log time [ns], text) of its messages, for topics of markers and instructions."""
     counts: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -331,7 +332,7 @@ class Recording:
     def pictures(
         self, wanted: dict[str, list[tuple[int, int | None]]]
     ) -> Iterator[tuple[str, tuple[int, int | None], Any]]:
-        """Encoded pictures by (log_ns, stamp_ns), as they come in the file: (channel, identity, payload)."""
+        """Iterate over encoded pictures in the order of the file: (channel, (log_ns, stamp_ns), payload)."""
         by_topic: dict[str, list[str]] = {}
         for name in wanted:
             by_topic.setdefault(self.spec.channels[name].topic, []).append(name)
@@ -347,7 +348,8 @@ class Recording:
 
 
 class Spool:
-    """Rows appended to a file on disk and read back as one memory-mapped array: memory stays flat however long it gets."""
+    """Rows that are appended to a file on disk and read back as one memory-mapped array, so that memory use does not grow with
+    their number."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self._path = folder / f"{name}.spool"
@@ -390,7 +392,7 @@ def load_recording(
         progress: called with the number of messages read so far, now and then.
 
     Raises:
-        RecordingError: not readable, topics missing, of another type, or a message that does not fit the spec.
+        RecordingError: not readable, a topic is missing or of another type, or a message does not fit the spec.
     """
     reader = readers.get(spec.reader)(source, spec)
     loader = _Loader(reader, spec, scratch)

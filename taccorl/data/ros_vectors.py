@@ -1,4 +1,4 @@
-"""ROS messages of vectors, poses, velocities, forces and IMU readings: which of their fields are numbers, and in which unit.
+"""Numeric fields, and their units, of ROS messages with vectors, poses, velocities, forces and IMU readings.
 
 A value's name is its path in the message without the fields that only wrap: ``position.x`` is at ``pose.pose.position.x`` of an
 Odometry. Quaternions are read in the order w, x, y, z of the unit ``wxyz``; ROS writes w last. Headers, covariances and names
@@ -6,7 +6,7 @@ of frames are left out.
 """
 
 WRAPPERS = ("vector", "point", "quaternion", "pose", "twist", "wrench", "accel", "transform")
-"""Fields of the Stamped and WithCovariance forms that hold the message itself."""
+"""Fields of Stamped and WithCovariance types that contain the message itself."""
 STRUCTURES = (
     ("w", "x", "y", "z"),
     ("x", "y", "z"),
@@ -18,7 +18,7 @@ STRUCTURES = (
     ("pose", "twist"),
     *((wrapper,) for wrapper in WRAPPERS),
 )
-"""Fields of a message that hold numbers, in the order in which they are read: the first line whose fields are all there."""
+"""Fields that hold numbers, in the order in which they are read. The first line whose fields all exist in a message applies."""
 TYPES = ("Vector3", "Point", "Quaternion", "Pose", "Transform", "Twist", "Accel", "Wrench", "Imu", "Odometry")
 UNITS = {
     "position": "m",
@@ -35,7 +35,7 @@ UNITS = {
 """Name of the field that holds x, y and z → their unit. ROS messages are in SI units (REP 103)."""
 UNITS_OF_ACCEL = {"linear": "m/s2", "angular": "rad/s2"}
 UNITS_OF_TYPE = {"Point": "m", "Quaternion": "wxyz"}
-"""Type of a message that is x, y, z (and w) itself → their unit. A bare Vector3 has none: its type does not say what it is."""
+"""Type of a message that consists of x, y, z (and w) only → their unit. Vector3 has none: its type does not state a quantity."""
 
 
 def vector_type(kind: str) -> str | None:

@@ -45,7 +45,7 @@ OTHER_UNITS = {
     "kPa": ("Pa", "1000"),
     "%": ("1", "0.01"),
 }
-"""What drivers send instead: the unit to have and the factor to it."""
+"""Unit that drivers send → the unit of the dataset and the factor to it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,8 @@ class BaselineSpec:
     rule: Literal["median_of_first"]
     frames: int
     max_spread_count: float
-    """A pad whose frames spread more than this about their median (0.99 quantile) is not at rest: no baseline."""
+    """Largest accepted spread of the frames about their median [counts, 0.99 quantile]. A pad with more spread is not at rest
+    and gets no baseline."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,14 +88,14 @@ class SensorSpec:
     unit: str
     baseline: BaselineSpec
     noise_count: float
-    """Counts above baseline that an untouched taxel may show."""
+    """Largest value of an untouched taxel [counts above baseline]."""
     scheme: Literal["fixed_scale"]
     gain_per_count: float
     """Normalised reading = counts above baseline × gain; the policy's processor applies it, never the dataset."""
 
     @property
     def max_count(self) -> int:
-        """Largest count on the wire: (2^bits − 1) >> shift."""
+        """Largest count that the sensor sends: (2^bits − 1) >> shift."""
         return (2**self.adc_bits - 1) >> self.wire_shift_bits
 
 
@@ -107,17 +108,17 @@ class FeatureSpec:
     unit: str | tuple[str, ...]
     frame: str
     rate_hz: float
-    """Rate at which the robot measures it; the dataset holds it at the dataset's fps."""
+    """Rate at which the robot measures the feature [Hz]; rows of the dataset come at the dataset's fps."""
     range: tuple[float, float] | dict[str, tuple[float, float]]
     names: tuple[str, ...] = ()
     sensor: str | None = None
-    """Tactile: sensor file, relative to this one."""
+    """Tactile features only: sensor file, relative to this file."""
     pads: tuple[str, ...] = ()
-    """Tactile: pad order; the feature is these pads' taxels, row after row, pad after pad."""
+    """Tactile features only: order of the pads. The feature holds the taxels of these pads, row after row, pad after pad."""
     history: int = 1
-    """L: readings per row, oldest first (align: window)."""
+    """L: number of readings per row, oldest first (with ``align: window``)."""
     optional: bool = False
-    """A recording spec may leave it out."""
+    """True if a recording spec need not fill the feature."""
 
     @property
     def size(self) -> int:
@@ -153,7 +154,7 @@ class DatasetSpec:
         """Check that the spec states when an action is reached.
 
         Args:
-            name: of the dataset or episode, for the message.
+            name: name of the dataset or episode for the message.
 
         Raises:
             DatasetError: nobody stated at which row its actions are reached.
@@ -180,38 +181,41 @@ class DatasetSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSpec:
-    """One recorded stream: its topic, the part that is used, its clock, and the age at which a sample is too old."""
+    """One recorded stream: its topic, the part of the message that is used, its clock, and the age at which a sample is
+    too old."""
 
     topic: str
     """Topic (MCAP, bag), path inside the file (HDF5) or feature key (LeRobot)."""
     rate_hz: float
     max_age_s: float | None = None
-    """A row whose newest sample is older than this is stale: the episode splits there. Needed unless align is hold."""
+    """Largest accepted age of a row's newest sample [s]; the episode is split at older ones. Required unless ``align`` is hold.
+    """
     type: str | None = None
-    """Schema name; another one in the file is refused."""
+    """Required schema name; a recording with another type is refused. None: not checked."""
     field: str | None = None
-    """Field of the message (dotted)."""
+    """Dotted name of the message's field to read."""
     pick: tuple[str, ...] = ()
-    """Elements by the message's own ``name`` list, or by their paths in a pose, a wrench … (``ros_vectors``), never by place."""
+    """Names of the elements to take: from the message's own ``name`` list, or paths in a pose, a wrench … (``ros_vectors``).
+    Elements are never taken by position."""
     scale: tuple[float, ...] = ()
-    """Multiplied in after picking, per element: unit conversion or a driver's known factor."""
+    """Factor for each element, applied after ``pick``: unit conversion or a driver's known error."""
     clock: Literal["header", "log"] | None = None
-    """Default: the recording spec's clock."""
+    """Clock of the channel; None: that of the recording spec."""
     latency_s: float = 0.0
-    """Time from the event to its stamp; subtracted."""
+    """Time from the event to its stamp [s]; it is subtracted from the stamp."""
     drop_zero_stamp: bool = False
     """Messages stamped 0 (PiPER's joint_ctrl before a first command) are dropped and counted."""
     lead_frames: int | None = None
-    """Files without clocks (HDF5, LeRobot) only: sample k was valid at row k + lead_frames; 0 if not given. The channels of
+    """Files without clocks (HDF5, LeRobot) only: sample k is valid at row k + lead_frames; 0 if not given. The channels of
     ``action`` must state it: 1 if row k holds the command that is reached at row k + 1 (cobot_magic, ALOHA, LeRobot),
     0 if it holds the command in force at row k."""
     channel_order: Literal["rgb", "bgr"] = "rgb"
-    """Raw HDF5 pictures only."""
+    """Order of the colours; for raw pictures in HDF5 only."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MappingSpec:
-    """Source of one feature: these channels, one after the other, aligned to the rows by ``align``."""
+    """Source of one feature: channels whose values are joined in this order and aligned to the rows by ``align``."""
 
     channels: tuple[str, ...]
     align: Align
@@ -223,9 +227,10 @@ class EpisodesSpec:
 
     by: Literal["whole_file", "markers", "metadata"]
     topic: str | None = None
-    """markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard"."""
+    """Topic of the markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard". Required for
+    ``markers``."""
     min_s: float = 1.0
-    """Shorter pieces are not worth an episode: reported, not written."""
+    """Shortest episode that is written [s]; shorter pieces are only reported."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,11 +239,11 @@ class InstructionSpec:
 
     from_: Literal["spec", "metadata", "markers", "topic"]
     text: str | None = None
-    """from: spec."""
+    """The instruction, for ``from: spec``."""
     key: str | None = None
-    """from: metadata: key of the MCAP metadata record."""
+    """Key of the MCAP metadata record that holds the instruction, for ``from: metadata``."""
     topic: str | None = None
-    """from: topic."""
+    """Topic that holds the instruction, for ``from: topic``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,7 +252,7 @@ class RecordingSpec:
 
     spec_version: int
     dataset: str
-    """Dataset spec, relative to this file."""
+    """Path of the dataset spec, relative to this file."""
     reader: str
     clock: Literal["header", "log"]
     episodes: EpisodesSpec
@@ -257,7 +262,8 @@ class RecordingSpec:
     split_bag: bool = False
     """Files x_0, x_1, … of a folder without metadata.yaml are one recording."""
     max_clock_spread_s: float = 0.25
-    """Channels whose clocks (log time − stamp) differ by more are on different clocks: refused."""
+    """Largest accepted difference of (log time − stamp) between channels [s]; above it they are on different clocks, and the
+    recording is refused."""
     contract: DatasetSpec | None = None
     """Filled on loading from ``dataset``. Not a key of the file."""
 
@@ -276,22 +282,22 @@ class RecordingSpec:
 
     @functools.cached_property
     def digest(self) -> str:
-        """SHA-256 of everything that decides the output; comments and layout of the files do not."""
+        """SHA-256 of everything in the spec that affects the output; comments and layout of the files do not."""
         return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
 
 
 def data_specs_folder() -> Path:
-    """The shipped specs: the clone's ``data_specs``, or the copy inside an installed package."""
+    """Folder of the shipped specs: ``data_specs`` of the clone, or the copy in an installed package."""
     package = Path(__file__).resolve().parents[1]
     clone = package.parent / "data_specs"
     return clone if clone.is_dir() else package / "_data_specs"
 
 
 def find_spec(name: str | Path) -> Path:
-    """A spec's path: as given, else by its bare name among the shipped ones.
+    """Path of a spec: ``name`` itself if it is a file, else the shipped spec of that name.
 
     Raises:
-        SpecError: neither exists; names the nearest shipped spec.
+        SpecError: neither exists; the message names the nearest shipped spec.
     """
     path = Path(name)
     if path.is_file():
@@ -303,7 +309,7 @@ def find_spec(name: str | Path) -> Path:
 
 
 def shipped_recording_specs() -> dict[str, RecordingSpec]:
-    """Name → recording spec of every shipped one that loads."""
+    """Name → shipped recording spec, for those that load without an error."""
     return _recording_specs(data_specs_folder() / "recordings")
 
 
@@ -447,7 +453,7 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
 
 
 def load_recording_spec(name: str | Path) -> RecordingSpec:
-    """A recording spec by path or by the bare name of a shipped one, checked against its dataset spec.
+    """A recording spec by its path or the name of a shipped one, checked against its dataset spec.
 
     Raises:
         SpecError: with file, line, key, value and the way out.

@@ -1,7 +1,7 @@
-"""YAML into frozen dataclasses, strictly: a wrong key or value is an error with file, line and the nearest name.
+"""Read YAML into frozen dataclasses, strictly: a wrong key or value is an error with file, line and the nearest name.
 
-Keys that start with ``x-`` are shared anchors and ignored. Nothing is guessed: ``no`` is not the text "no", ``"3"`` is not
-the number 3, and 010, 0x1F, 1:30 and .inf, which YAML 1.1 reads in ways of its own, are not numbers at all.
+Keys that start with ``x-`` hold shared anchors and are ignored. Nothing is guessed: ``no`` is not the text "no", ``"3"`` is not
+the number 3, and 010, 0x1F, 1:30 and .inf, which YAML 1.1 reads unexpectedly, are not numbers at all.
 
 PyYAML takes half a minute for a megabyte of short list items and ends deep nesting in a RecursionError, so files have a limit.
 """
@@ -21,7 +21,7 @@ from taccorl.errors import SpecError, nearest
 MOST_BYTES = 1 << 18
 """Largest YAML file that is read [bytes]; the largest shipped one has 9 kB."""
 MOST_DIGITS = 100
-"""Most digits of a whole number. Python refuses more than 4300 with an error that does not name the file."""
+"""Most digits of a whole number. Python refuses more than 4300, with an error that does not name the file."""
 MOST_SHOWN = 60
 """Most characters of a value that an error message repeats."""
 PLAIN_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
@@ -82,7 +82,7 @@ class Document[T]:
         self.value: T = self._build(cls, root, "")
 
     def error(self, key: str, text: str) -> SpecError:
-        """A SpecError that points at ``key`` (dotted path), or at its closest parent that stands in the file."""
+        """A SpecError that points at ``key`` (dotted path), or at its closest parent that is in the file."""
         parts = key.split("/")
         while parts and "/".join(parts) not in self._lines:
             parts.pop()

@@ -1,9 +1,9 @@
-"""Bring channels with different clocks to one grid: clock of each channel, and the sample of it that each row shows.
+"""Align channels with different clocks to one grid of rows: the clock of each channel, and the sample that each row shows.
 
-Pure functions on int64 nanoseconds. No observation shows the future: ``hold``, ``asof`` and ``window`` use nothing after the
-row's time, and ``interpolate`` (for offline study) looks ahead to one next sample, within the channel's max_age_s, and says so.
-``action`` is no observation: its samples are matched with the times of the following rows (``next_rows``).
-A row without a fresh sample is stale; stale rows are never filled or deleted: the episode is split there.
+Pure functions on int64 nanoseconds. No observation uses a later sample: ``hold``, ``asof`` and ``window`` use nothing after the
+row's time, and ``interpolate`` (for offline study) looks ahead to one next sample, within the channel's max_age_s, and reports a
+negative age. ``action`` is no observation: its samples are matched with the times of the following rows (``next_rows``). A row
+without a fresh sample is stale; stale rows are never filled or deleted: the episode is split there.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from taccorl.errors import RecordingError
 
 NS_PER_S = 1_000_000_000
 SIM_TIME_S = 1e6
-"""Clocks further apart than this are not two clocks set differently: one counts from a simulation's start."""
+"""Least difference of two clocks [s] that cannot be a wrong setting: one of them counts from the start of a simulation."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,8 @@ def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
 
 
 def next_rows(grid_ns: np.ndarray, fps: int) -> np.ndarray:
-    """(T,) time of the row after each row of ``make_grid``; the last one is where one more row would be."""
+    """(T,) times of the following rows: entry t is the time of row t + 1 of ``make_grid``; the last one is where another row
+    would be."""
     if len(grid_ns) == 0:
         return grid_ns
     return np.append(grid_ns[1:], grid_ns[0] + (len(grid_ns) * NS_PER_S + fps // 2) // fps)
@@ -130,9 +131,9 @@ class Matched:
     weight: np.ndarray | None
     """(T,) share of the following sample (interpolate), else None."""
     age_s: np.ndarray
-    """(T,) row time − time of the newest sample used; negative for a look-ahead; inf where there is none."""
+    """(T,) row time − time of the newest sample that is used [s]; negative with look-ahead, inf if there is no sample."""
     fresh: np.ndarray
-    """(T,) bool: the row has what it needs."""
+    """(T,) bool: False for a stale row, which has no sample within the accepted age."""
 
 
 def match(
@@ -185,6 +186,6 @@ def match(
 
 
 def runs(fresh: np.ndarray) -> list[tuple[int, int]]:
-    """[first, last + 1) of every run of True."""
+    """First index and last index + 1 of every run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], fresh, [False])).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,6 +1,6 @@
 """Checks of single pads: dead, stuck, saturated, noisy or frozen taxels, and the share of an episode with contact.
 
-Judged from one pad alone; ``grip_checks`` holds touch against the grippers. What one episode cannot show: a taxel that
+Each pad is judged alone; ``grip_checks`` compares touch with the grippers. One episode cannot show: a taxel that
 nothing touched (it is not called dead), the pads a and b of one gripper exchanged (both touch the same part at the
 same time), and a gain that is wrong for a whole pad.
 
@@ -19,34 +19,38 @@ from taccorl.data.joint_checks import FROZEN_S
 from taccorl.data.timing import runs
 
 JUDGE_S = 2.0
-"""Shorter episodes say too little about a taxel."""
+"""Shortest episode in which taxels are judged [s]."""
 CONTACT_MIN_TAXELS = 1
-"""This many 3 × 3 means above the sensor's noise make contact: a mean, so that one stuck taxel is no contact."""
+"""Least number of 3 × 3 means above the sensor's noise that make a contact. Means are used so that one stuck taxel is no
+contact."""
 DEAD_SHARE = 0.1
-"""A dead taxel shows less than this share of what its neighbours on both sides show."""
+"""A taxel is dead if it shows less than this share of what its neighbours on both sides show."""
 DEAD_GAP = 2
-"""Two dead taxels side by side are still seen; wider gaps may be a hollow of the part."""
+"""Most dead taxels side by side that are found; wider gaps may be a hollow in the part."""
 DEAD_MIN_S = 0.3
-"""So long must a taxel lie inside a contact before it is called dead."""
+"""Least time that a taxel must lie inside a contact before it can be called dead [s]."""
 NOISE_VISIBLE_SHARE = 0.9
-"""If so many taxels of a pad ever change, the rest of them should too: then a constant one is dead or stuck."""
+"""Least share of a pad's taxels that change at some time for noise to be visible; a constant taxel is then dead or stuck."""
 RESTING_COUNT = 3
-"""A taxel whose resting count is lower clips at zero, where being constant is no fault, unless all others rest higher."""
+"""Resting count below which a taxel clips at zero, so that constant values are no fault, unless all other taxels rest higher."""
 STUCK_S = 2.0
-"""A taxel with visible noise does not keep one value for 60 rows."""
+"""Shortest time of a constant value at which a taxel with visible noise is stuck [s]: 60 rows."""
 STUCK_ALWAYS = 0.95
 """Share of rows in which a stuck taxel reads touch that none of its neighbours reads."""
 STUCK_BASELINE_FENCE = 1.5
-"""Tukey's fence: a constant taxel that rests so many quartile ranges above the pad's upper quartile is stuck, not dead."""
+"""Tukey's fence: a constant taxel is stuck, not dead, if it rests more than this many interquartile ranges above the pad's upper
+quartile."""
 SATURATED_S = 0.5
 SATURATED_SHARE = 0.05
-"""Of the rows in contact: from here on force magnitude is lost where it matters; below, it is a note."""
+"""Share of the rows in contact with saturated taxels from which on the finding is a warning, since force magnitude is lost;
+below, it is a note."""
 NOISE_SIGMAS = 3.0
-"""The sensor's ``noise_count`` bounds an untouched taxel: noise of a third of it still keeps to that."""
+"""The sensor's ``noise_count`` divided by this is the largest accepted standard deviation of an untouched taxel."""
 LIVELY_SHARE = 0.1
-"""If fewer taxels than this change from row to row at rest, noise is not visible, and a repeated frame says nothing."""
+"""Least share of taxels that change from row to row at rest for noise to be visible; below it a repeated frame is no sign of a
+fault."""
 STRUCTURE = 0.25
-"""Correlation of neighbouring taxels: 0 for white noise, above 0.5 for any contact wider than one taxel."""
+"""Least correlation of neighbouring taxels in a contact: 0 for white noise, above 0.5 for any contact wider than one taxel."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Pad:
 
     name: str
     counts: np.ndarray
-    """(T, R, C) float32 above baseline, newest reading of each row."""
+    """(T, R, C) float32 counts above baseline, newest reading of each row."""
     baseline: np.ndarray | None
     """(R, C) resting counts; None where the dataset does not hold them."""
     noise_count: float
@@ -64,7 +68,7 @@ class Pad:
 
     @property
     def arm(self) -> str:
-        """Prefix of the name: ``left_a`` is on the arm ``left``."""
+        """Arm of the pad, from the prefix of its name: ``left_a`` is on the arm ``left``."""
         return self.name.rpartition("_")[0]
 
     @functools.cached_property
@@ -74,7 +78,7 @@ class Pad:
 
     @functools.cached_property
     def stuck(self) -> np.ndarray:
-        """(R, C) bool. Repeated frames do not count: a hung driver is another fault."""
+        """(R, C) bool: stuck taxels. Repeated frames are not counted: a driver that stopped is another fault."""
         fresh = self.counts[~self.repeated]
         return find_stuck(fresh, self.baseline, self.noise_count, self.max_count, self.fps)
 
@@ -87,7 +91,7 @@ class Pad:
 
     @functools.cached_property
     def smooth(self) -> np.ndarray:
-        """(T, R, C) means over 3 × 3 taxels, stuck ones taken as 0."""
+        """(T, R, C) means over 3 × 3 taxels; stuck taxels count as 0."""
         living = np.where(self.stuck, np.float32(0), self.counts)
         return uniform_filter1d(uniform_filter1d(living, 3, axis=1, mode="nearest"), 3, axis=2, mode="nearest")
 
@@ -105,12 +109,12 @@ class Pad:
 
     @functools.cached_property
     def noise_std(self) -> float:
-        """Counts from row to row of a typical taxel: most are untouched most of the time."""
+        """Standard deviation between rows of a typical taxel [counts]: most taxels are untouched most of the time."""
         return float(np.median(np.sqrt(np.mean(np.diff(self.counts, axis=0) ** 2, axis=0) / 2)))
 
 
 def read_pads(episode: Episode, key: str) -> list[Pad]:
-    """The pads of one tactile feature."""
+    """Read the pads of one tactile feature."""
     sensor, fps = episode.spec.sensors[key], episode.spec.fps
     counts = episode.pads(key)
     shape = (len(counts), sensor.rows, sensor.columns)
@@ -142,7 +146,7 @@ def constant_runs(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def noise_visible(counts: np.ndarray) -> bool:
-    """Nearly all taxels of (T, R, C) ever change, so that one which does not is odd."""
+    """True if nearly all taxels of (T, R, C) change at some time, so that a constant one is a fault."""
     return bool((np.ptp(counts, axis=0) > 0).mean() >= NOISE_VISIBLE_SHARE)
 
 
@@ -170,9 +174,9 @@ def find_stuck(
 
 
 def inside_contact(counts: np.ndarray) -> np.ndarray:
-    """(T, R, C) counts that a taxel should at least show: the lesser of two neighbours that enclose it.
+    """(T, R, C) lower bound of the counts of a taxel: the smaller count of two neighbours that enclose it.
 
-    Enclosed along a row or a column (not a diagonal: the inner corner of an L-shaped contact is free), with at most
+    It is enclosed along a row or a column (not a diagonal: the inner corner of an L-shaped contact is free), with at most
     ``DEAD_GAP`` taxels between the two.
     """
     expected = np.zeros_like(counts)
@@ -225,7 +229,8 @@ def spatial_structure(counts: np.ndarray) -> float:
 
 
 def taxel_list(mask: np.ndarray) -> str:
-    """``3 taxels: (4, 7), (4, 8), row 11`` for (R, C) bool; whole rows and columns by one name."""
+    """Text that names the taxels of (R, C) bool, such as ``3 taxels: (4, 7), (4, 8), row 11``; whole rows and columns by one
+    name."""
     rows, columns = np.flatnonzero(mask.all(axis=1)), np.flatnonzero(mask.all(axis=0))
     rest = mask.copy()
     rest[rows], rest[:, columns] = False, False

@@ -19,10 +19,11 @@ def beyond_reason(actions: np.ndarray) -> np.ndarray:
 
 
 def check_actions(actions: np.ndarray) -> None:
-    """Targets (N, …, A) are numbers in rad and m; a little beyond the limits is not wrong, it is clipped.
+    """Check that targets (N, …, A) are finite numbers that can be rad and m. Targets slightly beyond the limits are accepted;
+    the simulation clips them.
 
     Raises:
-        TaccorlError: names the joint, the simulation, the value and the limits.
+        TaccorlError: a target is not; the message names the joint, the simulation, the value and the limits.
     """
     if (beyond := beyond_reason(actions)).any():
         at = np.argwhere(beyond)[0]
@@ -30,7 +31,7 @@ def check_actions(actions: np.ndarray) -> None:
 
 
 def why_bad(action: np.ndarray, whose: str = "") -> str:
-    """Names the first joint of a bad action (A,), its value and limits."""
+    """Text that names the first joint of an invalid action (A,), its value and its limits."""
     k = int(beyond_reason(action).argmax())
     return (
         f"action: {ROBOT.action_names[k]}{whose} is {action[k]:g}, limits are {ROBOT.action_low[k]:g} … "

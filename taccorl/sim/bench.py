@@ -8,7 +8,7 @@ from taccorl.sim.task import Reset, Scene, Subtask, Task, Verdict, tasks
 
 @tasks.register("bench")
 class Bench(Task):
-    """Two arms and a table."""
+    """Task without parts and goal: two arms and a table."""
 
     name = "bench"
     instruction = "move the arms"

@@ -41,7 +41,7 @@ def _in_turns(*works: Callable[[], object], repeats: int = REPEATS) -> list[list
 
 
 def holding(num_sims: int = NUM_SIMS) -> tuple[Simulation, np.ndarray]:
-    """Simulations of Assembly #1 in which both hands hold their part on the table, and the targets that keep them there."""
+    """Simulations of Assembly #1 in which both hands hold their part on the table, and the targets that keep them in place."""
     sim = Simulation(tasks.get("assembly_1")(), num_sims=num_sims)
     sim.reset(np.arange(num_sims))
     qpos = sim.arrays["qpos"]
@@ -68,7 +68,7 @@ def holding(num_sims: int = NUM_SIMS) -> tuple[Simulation, np.ndarray]:
 
 @benchmark("twin_speed")
 def twin_speed() -> Iterator[Row]:
-    """Control steps, touch and the share of Python, both hands holding."""
+    """Benchmark of control steps, touch and the share of Python's time, with parts in both hands."""
     sim, goal = holding()
     step_ms = sim.config.physics.timestep_s * 1e3
     steps = sim.config.physics.steps_per_control_step
@@ -131,7 +131,8 @@ def twin_speed() -> Iterator[Row]:
 
 @benchmark("rollout_speed")
 def rollout_speed() -> Iterator[Row]:
-    """Chunks of actions as in rollouts, parts in both hands, on all CPUs, against the same physics steps alone; wall time."""
+    """Benchmark of chunks of actions as in rollouts, with parts in both hands, on all CPUs, relative to the physics steps alone;
+    wall time."""
     sim, goal = holding()
     env = TaccorlVectorEnv("assembly_1", num_envs=NUM_SIMS, num_threads=0)
     env.reset(seed=0)
@@ -171,7 +172,7 @@ def rollout_speed() -> Iterator[Row]:
 
 @benchmark("grip")
 def grip() -> Iterator[Row]:
-    """Creep and slip of a held part, and influence of its mass on the pads' reading."""
+    """Benchmark of a held part: creep, slip, and influence of its mass on the pads' reading."""
     model, data = gripped(0.04, 10.0)
     creeps = []
     for _ in range(3):
@@ -220,7 +221,7 @@ def _peak_reading(mass_kg: float, pads: str) -> float:
 
 @benchmark("pictures")
 def pictures() -> Iterator[Row]:
-    """Rendering of the three cameras."""
+    """Benchmark of rendering the three cameras."""
     sim = Simulation(tasks.get("test_tube")())
     sim.reset([0])
     names = [camera.name for camera in sim.config.cameras]
@@ -234,7 +235,8 @@ def pictures() -> Iterator[Row]:
 
 @benchmark("tiled_pictures")
 def tiled_pictures() -> Iterator[Row]:
-    """Many small views at a time, as reinforcement learning wants them; wall time, because a GPU draws them."""
+    """Benchmark of rendering many small views at a time, as reinforcement learning does; wall time, because a GPU may
+    draw them."""
     sim = Simulation(tasks.get("assembly_1")(), num_sims=NUM_SIMS)
     sim.reset(np.arange(NUM_SIMS))
     names = [camera.name for camera in sim.config.cameras]
@@ -259,7 +261,7 @@ def tiled_pictures() -> Iterator[Row]:
 
 @benchmark("physics_step")
 def physics_step() -> Iterator[Row]:
-    """Cost of the physics step; penetration is measured in ``make bench ONLY=experts``."""
+    """Benchmark of the physics step; penetration is measured in ``make bench ONLY=experts``."""
     for steps in (20, 40):
         config = TwinConfig()
         config.physics = dataclasses.replace(config.physics, steps_per_control_step=steps)

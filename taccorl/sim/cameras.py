@@ -1,4 +1,4 @@
-"""The bench's RealSense cameras: intrinsics, what ingest's letterbox makes of them, and their mounts in the model.
+"""The bench's RealSense cameras: intrinsics before and after ingest's letterbox, and mounts in the model.
 
 Pixels: (0, 0) is the centre of the top left pixel, u to the right, v down, as OpenCV and librealsense count.
 Camera frame: MuJoCo's, x right, y up, looking along −z. (The optical frame of ROS is the same one turned by 180° about x.)
@@ -29,7 +29,7 @@ class Window:
 def letterbox_window(recorded: tuple[int, int], frame: tuple[int, int]) -> Window:
     """The part of ``frame`` (rows, columns) that a picture of ``recorded`` (rows, columns) fills after ingest.
 
-    The same arithmetic as ``taccorl.data.decode.letterbox``; a test holds them together.
+    It uses the arithmetic of ``taccorl.data.decode.letterbox``; a test compares both.
     """
     factor = min(frame[0] / recorded[0], frame[1] / recorded[1])
     rows, columns = max(1, round(recorded[0] * factor)), max(1, round(recorded[1] * factor))
@@ -132,15 +132,15 @@ def sensor_intrinsics(model: str, rows: int, columns: int) -> Intrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOffset:
-    """Small error of a camera mount, in the camera's own frame: found by calibration, or hidden in a surrogate robot.
+    """Small error of a camera mount, found by calibration, or hidden in a surrogate robot.
 
-    In the nominal camera's own frame: R = R₀·exp(ω), p = p₀ + R₀·t. All zero: absent, the pose is the nominal one.
+    In the nominal camera's own frame: R = R₀·exp(ω), p = p₀ + R₀·t. With all zero the pose is the nominal one.
     """
 
     rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """ω, rotation vector about the camera's x (right), y (up), z (back)."""
     translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """t, along the same axes."""
+    """t, translation along the same axes [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,25 +148,26 @@ class CameraConfig:
     """Settings of one colour camera: mount, model, recorded size and intrinsics."""
 
     name: str
-    """Dataset name: ``observation.images.<name>``."""
+    """Name of the camera; its dataset feature is ``observation.images.<name>``."""
     body: str = "world"
-    """MuJoCo body that carries it."""
+    """MuJoCo body to which the camera is fixed."""
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Optical centre of the colour imager in the body's frame."""
+    """Optical centre of the colour imager in the body's frame [m]."""
     look_at_m: tuple[float, float, float] | None = None
-    """A point of the body's frame that shall be in the middle of the picture; or give ``quat_wxyz``."""
+    """Point in the body's frame [m] that the camera's optical axis passes through. Exactly one of ``look_at_m`` and
+    ``quat_wxyz`` is given."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction in the body's frame that points up in the picture (with ``look_at_m``)."""
+    """Direction in the body's frame that points up in the picture; used with ``look_at_m`` only."""
     quat_wxyz: tuple[float, float, float, float] | None = None
-    """Orientation of the camera frame in the body's, instead of ``look_at_m``."""
+    """Orientation of the camera frame in the body's frame, as an alternative to ``look_at_m``."""
     model: str = "d415"
     """RealSense model: "d415" or "d405"."""
     recording_size: tuple[int, int] = (480, 640)
-    """Rows, columns of the stream that the robot records; datasets hold it letterboxed."""
+    """Rows and columns of the stream that the robot records; datasets hold it letterboxed."""
     intrinsics: Intrinsics | None = None
-    """Measured ones of the stream (its camera_info); None: the model's nominal ones."""
+    """Measured intrinsics of the stream (its camera_info); None: the nominal ones of ``model``."""
     offset: CameraOffset = field(default_factory=CameraOffset)
-    """Error of the mount; absent by default."""
+    """Error of the mount; zero by default."""
 
     def __post_init__(self) -> None:
         if (self.look_at_m is None) == (self.quat_wxyz is None):
@@ -231,7 +232,7 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig]) -> None:
     """Put ``cameras`` on their bodies. The model remembers the recorded size, so that a renderer can letterbox.
 
     Raises:
-        TaccorlError: no such body, or a camera of that name is there already.
+        TaccorlError: the body does not exist, or the model already has a camera of that name.
     """
     for config in cameras:
         body = spec.worldbody if config.body == "world" else spec.body(config.body)
@@ -260,7 +261,8 @@ def _draw_measured(camera: mujoco.MjsCamera, measured: Intrinsics) -> None:
 
 
 def place_camera(model: mujoco.MjModel, config: CameraConfig) -> None:
-    """Move a camera of a compiled model to ``config``'s pose, offset included: calibration tries poses without compiling.
+    """Move a camera of a compiled model to ``config``'s pose, offset included: so that calibration can try poses without
+    compiling the model again.
 
     Raises:
         TaccorlError: the model has no camera of that name.
@@ -275,7 +277,7 @@ def place_camera(model: mujoco.MjModel, config: CameraConfig) -> None:
 def project(
     points_world: np.ndarray, position_world: np.ndarray, world_from_camera: np.ndarray, intrinsics: Intrinsics
 ) -> np.ndarray:
-    """Pixels (…, 2) as (u, v) of points (…, 3) [m]; not-a-number for points behind the camera.
+    """Pixels (…, 2) as (u, v) of points (…, 3) [m]; NaN for points behind the camera.
 
     ``position_world`` (3,) and ``world_from_camera`` (3, 3) are ``data.cam_xpos`` and ``data.cam_xmat`` of the camera.
     """

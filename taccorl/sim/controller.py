@@ -40,7 +40,8 @@ class ControllerConfig:
 
 
 def add_actuators(spec: mujoco.MjSpec, arm: str, robot: RobotConfig, controller: ControllerConfig) -> None:
-    """One actuator per joint, ``left_joint1`` …, and ``left_gripper``, whose control is the opening between the pads [m]."""
+    """Add one position actuator per joint, ``left_joint1`` …, and per gripper, ``left_gripper``; a gripper's control is the
+    opening between the pads [m]."""
     gains = zip(ROBOT.joints, controller.kp_nm_per_rad, controller.kd_nms_per_rad, controller.torque_ff_nm, strict=True)
     for joint, kp, kd, torque_ff in gains:
         _affine(spec, f"{arm}_{joint}", mujoco.mjtTrn.mjTRN_JOINT, f"{arm}_{joint}", kp, kd, torque_ff)

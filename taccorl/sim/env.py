@@ -72,7 +72,8 @@ class TaccorlEnv(gymnasium.Env):
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; ``options={"state": snapshot}`` begins it from ``sim.snapshot()``, bit-exactly."""
+        """Begin an episode. ``options={"state": snapshot}`` begins it bit-exactly from the state that ``sim.snapshot()``
+        returned."""
         observation, _ = self._envs.reset(seed=None if seed is None else [seed], options=options)
         super().reset(seed=seed)
         return _only(observation), _only(self._envs.facts())
@@ -81,7 +82,7 @@ class TaccorlEnv(gymnasium.Env):
         """One control step (1/30 s) with targets (14,) [rad, m].
 
         Raises:
-            TaccorlError: wrong shape, a value that is no number or far beyond the limits.
+            TaccorlError: wrong shape, or a target that is NaN or far beyond the limits.
         """
         observation, reward, terminated, truncated, _ = self._envs.step(shaped(action)[None])
         facts = _only(self._envs.facts())

@@ -8,15 +8,16 @@ from taccorl.errors import TaccorlError
 
 
 def episode_seed(root: int, index: int, episode: int) -> int:
-    """Scene seed of environment ``index``'s ``episode``-th episode: a pure function of the three, 32 bits."""
+    """Scene seed of the ``episode``-th episode of environment ``index``: a pure function of ``seed`` and both numbers,
+    32 bits."""
     return int(np.random.SeedSequence(root, spawn_key=(index, episode)).generate_state(1)[0])
 
 
 class EpisodeSeeds:
     """Seed sequences of N environments.
 
-    Begun with one number s, environment i's k-th episode has ``episode_seed(s, i, k)``. Begun with a number sᵢ for each,
-    environment i begins with sᵢ itself and goes on with ``episode_seed(sᵢ, 0, k)``, k = 1, 2, …
+    With one seed s, environment i's k-th episode has ``episode_seed(s, i, k)``. With one seed sᵢ for each environment,
+    environment i begins with scene seed sᵢ and continues with ``episode_seed(sᵢ, 0, k)``, k = 1, 2, …
     """
 
     def __init__(self, num_envs: int, seed: int | None) -> None:
@@ -30,7 +31,7 @@ class EpisodeSeeds:
         """Restart the seed sequences of environments ``ids``.
 
         Raises:
-            TaccorlError: a negative seed, or not one for each of the N environments.
+            TaccorlError: a seed is negative, or the number of seeds is neither 1 nor N.
         """
         alone = not isinstance(seed, int | np.integer)
         seeds: list[int] = list(seed) if alone else [seed] * self.num_envs  # pyright: ignore[reportArgumentType, reportAssignmentType]

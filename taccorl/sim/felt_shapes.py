@@ -30,7 +30,7 @@ def shapes_of(model: mujoco.MjModel, geoms: Sequence[int]) -> list[Shapes]:
     """Shapes of these geoms by kind, with the compiled model's sizes; sizes that differ between simulations are not supported.
 
     Raises:
-        TaccorlError: a geom of a kind that has no exact depth here, or a mesh that is not convex.
+        TaccorlError: a geom is of a kind whose depth is not implemented, or a mesh is not convex.
     """
     kind = mujoco.mjtGeom
     by_kind: dict[int, list[int]] = {}

@@ -15,7 +15,8 @@ _PART_HALF_M = (0.01, 0.01, 0.03)
 def gripped(
     mass_kg: float, force_n: float, config: TwinConfig | None = None, *, friction: float = 0.4
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """A 20 × 20 × 60 mm part held with ``force_n`` by each right pad, after a second of rest."""
+    """Simulation in which each pad of the right hand presses a 20 × 20 × 60 mm part with ``force_n`` [N], after one second of
+    rest."""
     config = config or TwinConfig()
     spec = empty_bench(config)
     peg = spec.worldbody.add_body(name="peg")
@@ -48,13 +49,14 @@ def rest(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float) -> None:
 
 
 def in_hand_m(data: mujoco.MjData) -> np.ndarray:
-    """(3,) the part's place in the TCP's frame."""
+    """(3,) position of the part in the TCP's frame [m]."""
     tcp, peg = data.site("right_tcp"), data.body("peg")
     return tcp.xmat.reshape(3, 3).T @ (peg.xpos - tcp.xpos)
 
 
 def shake(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float = 3.0, swing_rad: float = 0.06) -> float:
-    """Swing the right arm about its joints 1 and 2 (1.5 and 1.2 Hz) and turn joint 6; how far the part slips in the hand [m].
+    """Swing the right arm about its joints 1 and 2 (1.5 and 1.2 Hz) and turn joint 6. Return how far the part slips in the hand
+    [m].
 
     Amplitudes, a choice: ``swing_rad`` (0.06) and two thirds of it (0.04), joint 6 by 0.2 rad at 1 Hz.
     """

@@ -17,8 +17,8 @@ from taccorl.sim.vector_env import TaccorlVectorEnv
 
 
 def raw_names(observation: Observation) -> dict[str, Any]:
-    """An observation, or a batch of them, renamed; ``pixels`` only if it has pictures. Counts become float32, as LeRobot's
-    recorder wants them."""
+    """Rename the entries of an observation, or of a batch of them, to LeRobot's raw names; ``pixels`` is there only if it has
+    pictures. Counts become float32, as LeRobot's recorder requires."""
     pixels = {name: observation[IMAGE_KEYS[name]] for name in ROBOT.cameras if IMAGE_KEYS[name] in observation}
     return {
         **({"pixels": pixels} if pixels else {}),
@@ -39,7 +39,7 @@ def _raw_space(space: gymnasium.Space) -> gymnasium.spaces.Dict:
 
 
 class LeRobotEnv(TaccorlEnv):
-    """``TaccorlEnv`` with LeRobot's raw names; always with pictures."""
+    """``TaccorlEnv`` with LeRobot's raw names; observations always have pictures."""
 
     def __init__(self, task: str, **settings: Any) -> None:
         super().__init__(task, images=True, **settings)
@@ -55,9 +55,10 @@ class LeRobotEnv(TaccorlEnv):
 
 
 class LeRobotVectorEnv(TaccorlVectorEnv):
-    """``TaccorlVectorEnv`` with LeRobot's raw names; always with pictures.
+    """``TaccorlVectorEnv`` with LeRobot's raw names; observations always have pictures.
 
-    A finished episode is frozen: LeRobot's rollout steps until the last one is, and ignores what follows the first end.
+    A finished episode is frozen: LeRobot's rollout steps until all episodes have finished, and ignores the steps of an episode
+    after its end.
     """
 
     def __init__(self, task: str, num_envs: int, **settings: Any) -> None:

@@ -1,4 +1,5 @@
-"""The OpenGL side of rendering: a context without a window, MuJoCo's drawing of one view, a sheet that collects many.
+"""OpenGL part of rendering: a context without a window, MuJoCo's drawing of one view, and a sheet on which many views are
+collected.
 
 No OpenGL library is loaded before the first picture is rendered.
 """
@@ -26,14 +27,14 @@ _left_to_parent: list[Any] = []  # contexts that a forked child inherited: freei
 
 
 class View(NamedTuple):
-    """One camera, and where its picture lies in the frame."""
+    """One camera, and the position of its picture in the frame."""
 
     camera: mujoco.MjvCamera
     window: Window
 
 
 class Canvas:
-    """The OpenGL side: MuJoCo's own buffer, as large as one view, and the sheet on which views are collected."""
+    """OpenGL buffers: MuJoCo's own buffer, as large as one view, and the sheet on which views are collected."""
 
     def __init__(self, model: mujoco.MjModel, cell: tuple[int, int], max_sheet_px: int) -> None:
         self._process = os.getpid()
@@ -66,7 +67,7 @@ class Canvas:
             yield
 
     def draw(self, sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]], views: list[View], out: np.ndarray) -> None:
-        """Fill ``out`` (simulations · cameras, rows, columns, 3), simulation after simulation."""
+        """Render the views and write them to ``out`` (simulations · cameras, rows, columns, 3), simulation after simulation."""
         sheet = self._sheet_for(len(out))
         first = held = 0
         for model, data in sims:
@@ -90,7 +91,7 @@ class Canvas:
         mujoco.mjr_render(mujoco.MjrRect(0, 0, view.window.columns, view.window.rows), self._scene, self._mjr)
 
     def labels(self, model: mujoco.MjModel, data: mujoco.MjData, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Geom shown by each pixel of a view's window (−1 for none), and depth [m] along the optical axis."""
+        """Id of the geom shown by each pixel of a view's window (−1 for none), and depth [m] along the optical axis."""
         flags, rows, columns = self._scene.flags.copy(), view.window.rows, view.window.columns
         self._scene.flags[[int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]] = 1
         try:

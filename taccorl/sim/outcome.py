@@ -1,4 +1,4 @@
-"""Outcome of an episode from predicates at single instants: success that held for half a second, failure, or time limit."""
+"""Outcome of an episode: success if the goal predicate holds for half a second, failure, or time limit."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 BAD_ACTION = "bad_action"
-"""Category of an episode that was given NaN, or a target far beyond the limits."""
+"""Failure category of an episode whose action was NaN, or a target far beyond the limits."""
 
 
 @dataclass(frozen=True)
@@ -23,18 +23,18 @@ class Outcome:
     success: np.ndarray
     """(N,) bool: the goal has held for 0.5 s after release, and nothing had failed before."""
     failure: np.ndarray
-    """(N,) object: '' or the category: the task's own, ``timeout``, ``diverged`` or ``bad_action``."""
+    """(N,) object: '' or the failure category: one of the task's, ``timeout``, ``diverged`` or ``bad_action``."""
     partial: np.ndarray
-    """(N,) int, newest."""
+    """(N,) int: number of the task's goals in place at the newest step (``Verdict.partial``)."""
 
     @property
     def over(self) -> np.ndarray:
-        """(N,) bool."""
+        """(N,) bool: the episode has ended, with success or failure."""
         return self.success | (self.failure != "")
 
 
 class Judge:
-    """Derives outcomes of N episodes from the predicates of each control step; keeps the counters that this needs."""
+    """Derives the outcomes of N episodes from the predicates of each control step, and keeps the counters for it."""
 
     def __init__(self, task: Task, num_sims: int, control_hz: int) -> None:
         self.task, self.control_hz = task, control_hz

@@ -35,7 +35,7 @@ from taccorl.sim.touch_kernel import (
 )
 
 KINEMATIC_FIELDS = ("site_xpos", "site_xmat", "geom_xpos", "geom_xmat", "cvel", "subtree_com")
-"""Fields of ``mujoco.MjData`` that touch is made from."""
+"""Fields of ``mujoco.MjData`` from which touch is computed."""
 
 
 class Kinematics(Protocol):
@@ -77,14 +77,15 @@ class OneSim:
 
 
 class Touch(NamedTuple):
-    """(N, P, K) float32; taxel = row · columns + column. Both are 0 where nothing touches."""
+    """Depth and depth rate, each (N, P, K) float32; taxel = row · columns + column. Both are 0 without contact."""
 
     depth_m: np.ndarray
     depth_rate_mps: np.ndarray
 
 
 def without_sinking(touch: Touch, plate: Touch) -> Touch:
-    """Sprung pads: δ = [D − r]₊ with r = [max (D − c)]₊, and δ̇ = Ḋ − ṙ. D is ``touch``, c how far the ``plate`` is pressed in.
+    """Depth on sprung pads without the part's penetration into the plate: δ = [D − r]₊ with r = [max (D − c)]₊, and δ̇ = Ḋ − ṙ.
+    D is ``touch``, c how far the ``plate`` is pressed in.
 
     The taxel with the greatest D − c gets (c, ċ): on a plate that does not tilt the spring's own compression, N / K in
     balance. Where the taxels miss the summit of a small round part they all read up to that much less (0.1 mm for a sphere of
@@ -105,17 +106,17 @@ class PadArray:
     are not.
 
     Solids of one body that touch or overlap are one part, whose inner faces are no surface; of other shapes that overlap (a
-    cylinder in a box) the deeper one is felt, which near their common line is less than the depth in both together.
+    cylinder in a box) the greater depth is used, which near their common line is less than the depth in both together.
 
     Depth is the distance to the nearest surface (paper App. B.2), with two consequences. In a wall it is never more than half
     its thickness: pressed in further, the taxel is nearer to the wall's back. And near an edge it is the distance to the
-    edge's sides: a sharp one between two rows of taxels is felt little or not at all.
+    edge's sides: a sharp one between two rows of taxels causes little or no depth.
 
     Args:
-        layout: of the taxels on every pad.
+        layout: arrangement of the taxels on every pad.
 
     Raises:
-        TaccorlError: a pad without site or geom; a geom of a kind that pads cannot feel (``shapes_of``).
+        TaccorlError: a pad has no site or no geom, or a geom is of a kind whose depth is not implemented (``shapes_of``).
     """
 
     def __init__(self, model: mujoco.MjModel, pads: Sequence[str], layout: PadLayout = ROBOT.pad) -> None:
@@ -158,7 +159,7 @@ class PadArray:
 
     @property
     def sprung(self) -> tuple[str, ...]:
-        """Names of the pads that are on springs."""
+        """Names of the pads whose plate is on springs."""
         return tuple(self.pads[p] for p in self._sprung)
 
     def _undeformed(self, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
@@ -184,10 +185,11 @@ class PadArray:
         return felt
 
     def touch(self, state: Kinematics, start: int = 0, end: int | None = None) -> Touch:
-        """Input of the sensor's law: depth and rate; on sprung pads without the part's penetration into the plate.
+        """Depth and depth rate, the input of the sensor's law; on sprung pads without the part's penetration into the plate.
 
         Args:
-            start: of the simulations ``start`` … ``end`` (all by default); several threads may work on blocks of them.
+            start: first of the simulations ``start`` … ``end`` to compute (all by default); several threads may compute
+                different blocks.
         """
         return self._past_surface(state, start, end, off_sinking=True)
 
@@ -195,7 +197,7 @@ class PadArray:
         """Depth D and rate relative to the undeformed surface, including the part's penetration into the plate.
 
         Raises:
-            TaccorlError: the fields are all zero: bound after the batch's last call.
+            TaccorlError: the fields are all zero, because they were bound after the batch's last call.
         """
         return self._past_surface(state, 0, None, off_sinking=False)
 

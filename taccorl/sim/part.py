@@ -1,4 +1,4 @@
-"""A part: geometry, mass, grasp and mating poses; and how it is added to a MuJoCo spec.
+"""A part (geometry, mass, grasp and mating poses), and the function that adds it to a MuJoCo spec.
 
 A part is plain numbers (``Part``); ``add_part`` puts it into a spec. Lengths in metres, poses are (4, 4) matrices ``a_from_b``.
 Conventions that experts and predicates rely on:
@@ -73,7 +73,7 @@ LEADING_END = frame_pose(z_axis=(0, 0, -1))  # of a part whose origin is at its 
 def check_clearance(name: str, clearance_m: float) -> None:
     """
     Raises:
-        TaccorlError: the clearance per side of a hole, moved out from its part's outline, is not within 0 and 2 mm.
+        TaccorlError: the clearance per side between a hole and its part is not within 0 and 2 mm.
     """
     if not 0 < clearance_m <= 0.002:
         raise TaccorlError(
@@ -87,19 +87,19 @@ class Mate:
     """The leading end of a part that goes into a hole."""
 
     part_from_mate: np.ndarray
-    """(4, 4) z along the insertion."""
+    """(4, 4) pose of the mate in the part's frame, z along the insertion."""
     num_turns: int | None
-    """How many turns about z look the same: 1, 2, 3 …; None for any angle."""
+    """Number of rotations about z, a whole turn apart in equal steps, that look the same: 1, 2, 3 …; None for any angle."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hole:
-    """A hole in a part, up to which depth it takes a mate."""
+    """A hole in a part, and the depth to which it accepts a mate."""
 
     part_from_hole: np.ndarray
-    """(4, 4) in the middle of the mouth, z into the hole."""
+    """(4, 4) pose of the hole in the part's frame: origin in the middle of the mouth, z into the hole."""
     depth_m: float
-    """From the mouth to the floor."""
+    """Distance from the mouth to the floor [m]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,11 +107,11 @@ class Grasp:
     """One way to grip a part with flat jaws."""
 
     part_from_tcp: np.ndarray
-    """(4, 4) pose of the TCP: z = approach, fingers close along y."""
+    """(4, 4) pose of the TCP in the part's frame: z = approach, fingers close along y."""
     width_m: float
-    """Between the pads when closed."""
+    """Distance between the pads when closed on the part [m]."""
     num_turns: int = 2
-    """How many turns about the approach are as good."""
+    """Number of rotations about the approach direction, in equal steps, that give an equally good grasp."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,14 +121,14 @@ class Part:
     name: str
     solids: list[Solid]
     clamped: bool = False
-    """Clamped to the bench (a mocap body) instead of free."""
+    """True: fixed to the bench (a mocap body); False: free."""
     table_from_part: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """How it rests on a table whose top is z = 0."""
+    """(4, 4) pose of the part when it rests on a table whose top is z = 0."""
     mate: Mate | None = None
     holes: Mapping[str, Hole] = field(default_factory=dict)
     grasps: Mapping[str, Grasp] = field(default_factory=dict)
     seats: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Poses (4, 4), in this part, at which other parts lie ready, by the other part's kind."""
+    """Kind of another part → pose (4, 4) in this part's frame at which it is placed at reset."""
 
     @property
     def mass_kg(self) -> float:
@@ -136,21 +136,21 @@ class Part:
 
     @property
     def com_part_m(self) -> np.ndarray:
-        """(3,) Centre of mass."""
+        """(3,) centre of mass in the part's frame [m]."""
         return sum((s.mass_kg * s.com_part_m for s in self.solids), np.zeros(3)) / self.mass_kg
 
 
 class Fit(NamedTuple):
-    """Pose error of a mate in a hole: arrays with the leading shape of the poses."""
+    """Pose error of a mate relative to a hole; arrays with the leading shape of the poses."""
 
     depth_m: np.ndarray
-    """Positive inside."""
+    """Depth of the mate in the hole [m], positive inside."""
     lateral_m: np.ndarray
-    """Between the two axes, at the leading end."""
+    """Distance of the two axes at the mate's leading end [m]."""
     tilt_rad: np.ndarray
-    """Between the two axes."""
+    """Angle between the two axes [rad]."""
     turn_rad: np.ndarray
-    """About the axis, to the nearest look-alike; 0 for a round part."""
+    """Angle about the axis to the nearest rotation that looks the same [rad]; 0 for a round part."""
 
 
 def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_turns: int | None) -> Fit:
@@ -192,7 +192,8 @@ def add_part(spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION
 
 
 def on_table(part: Part, xy_m: np.ndarray, yaw_rad: float) -> np.ndarray:
-    """World pose (7,) of a part that rests on the table, turned by ``yaw_rad``, its origin above ``xy_m``."""
+    """World pose (7,) of a part that rests on the table, turned by ``yaw_rad`` about the vertical, with its origin above
+    ``xy_m``."""
     rest = part.table_from_part
     turned = Rotation.from_euler("z", yaw_rad)
     pos = np.array([*xy_m, rest[2, 3] + 0.0002])  # a hair above: no contact to begin with

@@ -29,12 +29,12 @@ class _Posed(Protocol):
 
 
 def posed_bodies(task: "Task | type[Task]") -> tuple[str, ...]:
-    """Bodies whose poses are part of the observation, in order."""
+    """Bodies whose poses are in the observation, in order."""
     return (*task.parts, *task.clamped)
 
 
 def part_pose_names(task: "Task | type[Task]") -> tuple[str, ...]:
-    """(9 · bodies) names such as ``plug.x``."""
+    """Names of the (9 · bodies) numbers, such as ``plug.x``."""
     return tuple(f"{body}.{name}" for body in posed_bodies(task) for name in POSE_NAMES)
 
 

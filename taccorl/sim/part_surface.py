@@ -17,7 +17,7 @@ import numpy as np
 from taccorl.sim.signed_distance import FAR_M, FLAT_M, TINY_M, Polyhedron, dot
 
 TOUCH_M = 1e-6
-"""Solids of one part this close share a face: nothing can be between them."""
+"""Largest distance of two solids of one part that are taken to touch [m]: nothing can be between them."""
 _SLIVER_M = 1e-5  # narrower pieces of surface are what cutting left over
 _FLAT_RAD = 1e-4
 NEAR_M = 0.004  # pads rarely go deeper
@@ -28,21 +28,22 @@ _POINTS_AT_ONCE = 1000
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The outer surface of a part that several convex solids make up: convex pieces, and edges that may be hollow.
+    """Outer surface of a part that consists of several convex solids: convex pieces, and the edges at which the part may be
+    concave.
 
-    The surface point nearest to a point within is on a piece straight under it, or on an edge at which the part is hollow.
+    The surface point nearest to an inner point is its projection on a piece, or on an edge at which the part is concave.
     """
 
     corners_m: np.ndarray
-    """(Q, E, 3) of each piece, the last one repeated."""
+    """(Q, E, 3) corners of each piece; the last corner is repeated up to E."""
     normals: np.ndarray
-    """(Q, 3) outward."""
+    """(Q, 3) outward unit normal of each piece."""
     side_normals: np.ndarray
-    """(Q, E, 3) outward, in the piece's plane."""
+    """(Q, E, 3) unit normal of each side of a piece, outward, in the piece's plane."""
     side_offsets_m: np.ndarray
-    """(Q, E)"""
+    """(Q, E) offset of each side: n · p of its points."""
     edges_m: np.ndarray
-    """(M, 2, 3) start and end."""
+    """(M, 2, 3) start and end of each edge."""
 
     def depth(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depth (S,) of (S, 3) points within the part, and the direction (S, 3) in which it grows."""
@@ -65,7 +66,7 @@ class Surface:
 
     @functools.cached_property
     def cells(self) -> "_Cells":
-        """Made when first asked for: most parts are never pressed at a seam."""
+        """Grid of boxes with the pieces and edges near each. Computed on first use: most parts are never pressed at a seam."""
         low, high = self.corners_m.min(axis=(0, 1)), self.corners_m.max(axis=(0, 1))
         size = _CELL_M
         while np.prod(np.ceil((high - low) / size)) > _MAX_CELLS:
@@ -90,7 +91,8 @@ class Surface:
 
     @functools.cached_property
     def piece_table(self) -> np.ndarray:
-        """(8, Q + 1): normal, offset, centre and radius² of a sphere about each piece; a last one that is never near."""
+        """(8, Q + 1) normal, offset, and centre and radius² of a sphere around each piece; the last column is a piece that is
+        never near."""
         centres = self.corners_m.mean(axis=1)
         radius = np.linalg.norm(self.corners_m - centres[:, None], axis=2).max(axis=1) + TOUCH_M
         offsets = dot(self.normals, self.corners_m[:, 0])
@@ -99,7 +101,7 @@ class Surface:
 
     @functools.cached_property
     def edge_table(self) -> np.ndarray:
-        """(6, M + 1): start and vector of each edge; a last one that is never near."""
+        """(6, M + 1) start and vector of each edge; the last column is an edge that is never near."""
         table = np.concatenate([self.edges_m[:, 0], self.edges_m[:, 1] - self.edges_m[:, 0]], axis=1).T
         return np.concatenate([table, np.array([[FAR_M, 0, 0, 1, 0, 0]]).T], axis=1)
 
@@ -142,13 +144,13 @@ def _blocks(points: np.ndarray) -> Iterator[np.ndarray]:
 
 
 class _Cells(NamedTuple):
-    """Boxes of one size over a part, and what of its surface is within ``NEAR_M`` of each."""
+    """Grid of equal boxes over a part, and the part of its surface within ``NEAR_M`` of each box."""
 
     origin_m: np.ndarray
     size_m: float
     shape: tuple[int, int, int]
     pieces: np.ndarray
-    """(cells, L) numbers of pieces, filled up with one that does not exist."""
+    """(cells, L) indices of pieces, padded with the index of the piece that is never near."""
     num_pieces: np.ndarray
     """(cells,)"""
     edges: np.ndarray
@@ -161,9 +163,9 @@ class Covered(NamedTuple):
     """Areas of one solid's faces that other solids cover."""
 
     wholly: np.ndarray
-    """(F,) bool, or in so many places that it may as well be."""
+    """(F,) bool: the whole face is covered, or so many places of it that the whole face is treated as covered."""
     places: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]
-    """Rectangles in the other faces: face, axes (2, 3), lower and upper end along them (2,)."""
+    """Rectangles in the other faces: index of the face, axes (2, 3), lower and upper ends along them (2,)."""
 
     @property
     def faces(self) -> np.ndarray:

@@ -21,12 +21,12 @@ class Row:
 
     @property
     def absent(self) -> np.ndarray:
-        """Value when nothing is drawn: the middle of the range."""
+        """Value of the row in the nominal scene: the middle of the range."""
         return (np.array(self.low) + np.array(self.high)) / 2
 
 
 def symmetric(name: str, half: float | Sequence[float], unit: str) -> Row:
-    """Row with a uniform distribution U(−half, half) for each component."""
+    """Row with the uniform distribution U(−half, half) for each component."""
     halves = tuple(np.atleast_1d(half).tolist())
     return Row(name=name, low=tuple(-h for h in halves), high=halves, unit=unit)
 
@@ -35,7 +35,7 @@ OBJECT_FRICTION = Row(name="friction", low=(0.3,), high=(0.7,), unit="1")
 
 
 def draw(rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0) -> dict[str, np.ndarray]:
-    """One draw of every row; ``scale`` shrinks the ranges about their absent value, 0 gives the nominal scene.
+    """Draw a value for every row. ``scale`` multiplies the ranges about their middle; 0 gives the nominal scene.
 
     The number of random draws does not depend on the probabilities, so that one row does not change another.
     """

@@ -36,7 +36,7 @@ class Renderer:
         columns: int = 224,
         max_sheet_px: int = 4096,
     ) -> None:
-        """``model`` gives meshes, textures and cameras; simulations with models of their own must share the assets.
+        """Meshes, textures and cameras are those of ``model``; simulations with other models must have the same assets.
 
         Args:
             model: compiled, with ``cameras`` in it (``taccorl.sim.cameras.add_cameras``).
@@ -45,7 +45,7 @@ class Renderer:
             max_sheet_px: longest side of the sheet on which views are collected; more views than fit take several sheets.
 
         Raises:
-            TaccorlError: no such camera.
+            TaccorlError: the model has no camera of such a name.
         """
         self._model = model
         self._shape = (rows, columns)
@@ -58,10 +58,10 @@ class Renderer:
         """Pictures (simulations, cameras, rows, columns, 3) uint8, a new array.
 
         Each state is drawn with its own model (``data.model``) and must have been forwarded: mj_forward, or at least
-        mj_kinematics and mj_camlight. Drawn are geoms of groups 0–2, as MuJoCo has it; sites and contacts never.
+        mj_kinematics and mj_camlight. As by MuJoCo's default, geoms of groups 0–2 are drawn; sites and contacts are not.
 
         Raises:
-            TaccorlError: no OpenGL here, or a model with other assets.
+            TaccorlError: OpenGL is not available, or a model has other assets.
         """
         datas = list(datas)
         return self._draw([(data.model, data) for data in datas], len(datas))
@@ -82,8 +82,8 @@ class Renderer:
         return self._draw(self._states(batch, chosen, place), len(chosen))
 
     def labels(self, data: mujoco.MjData) -> list[tuple[np.ndarray, np.ndarray]]:
-        """For each camera: number of the geom that each pixel shows (rows, columns) int32, −1 for none and in the bars, and
-        its depth [m] along the optical axis, infinite there. State and errors: ``render``."""
+        """For each camera: id of the geom that each pixel shows, (rows, columns) int32, −1 for none and in the black bars, and
+        its depth [m] along the optical axis, infinite where the id is −1. Required state and errors: as ``render``."""
         canvas, found = self._canvas(), []
         with canvas.current():
             for view in self._views:

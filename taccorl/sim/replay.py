@@ -23,26 +23,27 @@ class Replay:
     """Result of a replay: the twin's signals, one row per command."""
 
     time_s: np.ndarray
-    """(T,)."""
+    """(T,) times of the commands [s]."""
     reported: np.ndarray
     """(T, 14) joints [rad] and openings [m] as the encoders report them when command k is sent."""
     tactile: np.ndarray
     """(T, 1536) int16 counts above baseline at the same times."""
     effort: np.ndarray
-    """(T, 14) motor torques [N·m] and gripper forces [N] at the end of each command's stretch."""
+    """(T, 14) motor torques [N·m] and gripper forces [N] at the end of the interval in which each command is in force."""
 
 
 def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarray | None = None) -> Replay:
-    """Feed ``targets`` (T, 14) [rad, m] at ``rate_hz`` into simulation 0 from its present scene; reset it first.
+    """Simulate the commands ``targets`` (T, 14) [rad, m] at ``rate_hz`` in simulation 0, from its present scene; the caller
+    resets it before.
 
     Between two of them the command is interpolated linearly, in steps of at most 1/150 s: rows of a dataset are samples of a
-    command that moved on at 200 Hz. From 150 Hz on each is held.
+    command that moved on at 200 Hz. At rates of 150 Hz and above each command is held.
 
     Args:
         start: (14,) joints and openings as measured when the first command was sent; the first targets by default.
 
     Raises:
-        TaccorlError: a rate that is no whole number of physics steps, or a wrong shape.
+        TaccorlError: the period is no whole number of physics steps, or a shape is wrong.
     """
     targets = np.asarray(targets, dtype=float)
     if targets.ndim != 2 or targets.shape[1] != ROBOT.num_actions or not np.isfinite(targets).all():
@@ -74,7 +75,7 @@ def replay_episode(sim: Simulation, episode: Episode) -> Episode:
     """Replay an episode: its commands, with the twin's joint states and touch instead of the measured ones, without pictures.
 
     The action of row t is reached at row t + 1 (``DatasetSpec.action_time``): in force at row t is the action of row t − 1. No
-    row holds the command in force at row 0; the first action is taken for it, which is exact where an episode begins at rest.
+    row holds the command in force at row 0; the first action is used for it, which is exact if the episode begins at rest.
 
     Raises:
         TaccorlError: the episode does not state its action_time, or a wrong rate or shape (``replay``).

@@ -22,17 +22,19 @@ class RobotConfig:
     """Physical parameters of both arms, their grippers and pads."""
 
     inertias: str = "manufacturer"
-    """Mass set: ``manufacturer`` (3.6 kg moving) or ``menagerie`` (2.2 kg moving)."""
+    """Source of the link masses: ``manufacturer`` (3.6 kg moving) or ``menagerie`` (2.2 kg moving)."""
     mount_height_m: float = 0.2
     """Height of the arms' bases above the table. Our choice: with it every task is reached within the joint limits."""
     mount_spacing_m: float = 0.6
     """Distance of the two bases along y. Our choice."""
     armature_kgm2: float = 0.01
-    """Rotor inertia as seen by each joint. Not published; far below what the calibrated gains can tell."""
+    """Rotor inertia reflected to each joint [kg·m²]. Not published; its effect is far below the uncertainty of the calibrated
+    gains."""
     gravity_compensation: float = 1.0
-    """Share of the arm's weight that the controller carries; 1 = all (MuJoCo ``gravcomp``)."""
+    """Share of the arm's weight that the controller compensates; 1: all (MuJoCo ``gravcomp``)."""
     pads: Literal["sprung", "rigid"] = "sprung"
-    """Sprung: each pad is a plate on a spring, so its depth follows the force and not the part's mass."""
+    """Sprung: each pad is a plate on a spring, so that its depth depends on the force and not on the part's mass. Rigid: a fixed
+    box."""
     pad_stiffness_n_per_m: float = 2e4
     """Stiffness of one whole pad; 10 N compress it by 0.5 mm. A choice, to be calibrated on a robot."""
     pad_damping_ns_per_m: float = 30.0
@@ -41,8 +43,8 @@ class RobotConfig:
     the part would leave no trace in the taxels. A plate on a uniform bed would have K L² / 12 = 6.8 and 1.0; a part that covers
     a part of the pad tilts it less. A choice, to be calibrated on a robot."""
     grip_stiffness_n_per_m: float = 2000.0
-    """Closing force of each finger for each metre that the command lies below the opening. A choice: with commands that end
-    at 0 it takes 30 N to hold a part 18 mm wide."""
+    """Closing force of each finger per metre by which the commanded opening is below the actual one. A choice: with commands
+    that end at 0 it takes 30 N to hold a part 18 mm wide."""
     grip_damping_ns_per_m: float = 40.0
     grip_force_max_n: float = ROBOT.grip_force_max_n
     """Greatest closing force of each finger; by default the gripper's rated clamping force."""
@@ -97,13 +99,13 @@ PART_BIT = 1
 
 
 def mount_pos_world_m(arm: str, config: RobotConfig) -> tuple[float, float, float]:
-    """Origin of an arm's base. Bases stand side by side along y, the first arm on the left."""
+    """World position (3,) of an arm's base [m]. Bases stand side by side along y, the first arm on the left."""
     side = (len(ROBOT.arms) - 1) / 2 - ROBOT.arms.index(arm)
     return 0.0, side * config.mount_spacing_m, config.mount_height_m
 
 
 def add_arm(spec: mujoco.MjSpec, arm: str, config: RobotConfig) -> None:
-    """One arm at its mount. Names: ``left_link1`` … ``left_link6``, joints ``left_joint1`` …, ``left_finger_a``, pads
+    """Add one arm at its mount. Names: ``left_link1`` … ``left_link6``, joints ``left_joint1`` …, ``left_finger_a``, pads
     ``left_a``, site ``left_tcp``; each taxel frame is the site named like its pad, at the undeformed pad's surface."""
     base = spec.worldbody.add_body(name=f"{arm}_base_link", pos=mount_pos_world_m(arm, config))
     _geom(base, arm, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.055, 0.035, 0], pos=[0, 0, 0.035], rgba=STEEL)

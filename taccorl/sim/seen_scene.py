@@ -33,7 +33,7 @@ class SeenScene:
     pads: PadArray
     sensor: Sensor
     blocks: Blocks
-    """Threads for what is computed of each simulation by itself."""
+    """Thread pool for computations that are independent between simulations."""
     action_actuators: np.ndarray
     _encoders: np.ndarray
     _bodies: dict[str, int]
@@ -59,8 +59,8 @@ class SeenScene:
         return self.arrays["actuator_force"][:, self.action_actuators]
 
     def reading(self) -> np.ndarray:
-        """(N, 4, 32, 12) float32 readings of the pads before gain, noise and rounding: a pure function of the state, and of
-        the memory of effects."""
+        """(N, 4, 32, 12) float32 readings of the pads before gain, noise and rounding: a function of the state and of the memory
+        of effects only."""
         spec = self.sensor.spec
         reading = np.empty((self.num_sims, len(ROBOT.pads), spec.rows, spec.columns), np.float32)
 
@@ -73,7 +73,8 @@ class SeenScene:
         return reading
 
     def touch(self, noise: Noise = None) -> np.ndarray:
-        """(N, 1536) int16 counts above baseline now; without ``noise`` (one generator, or one a simulation) no noise."""
+        """(N, 1536) int16 counts above baseline at the present state. ``noise``: one random generator, or one per simulation;
+        without it no noise is added."""
         reading = self.reading()
         if not isinstance(noise, ScanNoise):
             return self._above_baseline(self.sensor.digitise(reading, noise))
@@ -145,10 +146,10 @@ class SeenScene:
         return self.effects.picture(pictures, config)
 
     def require_cameras(self, names: Sequence[str]) -> None:
-        """The twin has these cameras.
+        """Check that the twin has these cameras.
 
         Raises:
-            TaccorlError: names those that it lacks.
+            TaccorlError: some are missing; the message names them.
         """
         known = [camera.name for camera in self.config.cameras]
         if missing := [name for name in names if name not in known]:
@@ -186,7 +187,7 @@ class SeenScene:
         return pose
 
     def velocities(self, body: str) -> np.ndarray:
-        """(N, 3) linear velocity of the body's frame origin, world [m/s]."""
+        """(N, 3) linear velocity of the origin of the body's frame, in world coordinates [m/s]."""
         k = self._body(body)
         spatial = self.arrays["cvel"][:, k]
         turn, arm = spatial[:, :3], self.arrays["xpos"][:, k] - self.arrays["subtree_com"][:, self.model.body_rootid[k]]
@@ -195,11 +196,12 @@ class SeenScene:
         return spatial[:, 3:] + across
 
     def pads_touching(self, body: str) -> np.ndarray:
-        """(N, 4) bool in pad order."""
+        """(N, 4) bool: which pads touch the body, in the order of the pads."""
         return self.arrays["sensordata"][:, self._touching[body]] > 0
 
     def contact(self, body: str, other: str) -> Contact:
-        """Contact of a pair in ``task.mating``: touching, deepest penetration and net normal force."""
+        """Contact of a pair of bodies in ``task.mating``: whether they touch, deepest penetration [m] and net normal
+        force [N]."""
         if (body, other) not in self._mating:
             raise TaccorlError(f"contact {body}–{other}: task {self.task.name} declares {list(self._mating)} as mating")
         data, at, force = self.arrays["sensordata"], *self._mating[body, other]

@@ -19,7 +19,7 @@ def check_numbers(
     """Check that the named fields of ``config`` (numbers or lists of them) are finite, ≥ 0 or > 0.
 
     Raises:
-        TaccorlError: names the field in its ``section``, and the value.
+        TaccorlError: one is not; the message names the field, its ``section`` and the value.
     """
     for names, above, wanted in ((finite, -math.inf, ""), (not_negative, 0.0, " ≥ 0"), (positive, 0.0, " > 0")):
         for name in names:

@@ -25,7 +25,7 @@ _CONVEX_TOLERANCE_M = 1e-12  # how far a corner may lie inside the hull and stil
 
 
 def circle_outline(radius_m: float, num_sides: int, *, circumscribed: bool = False) -> np.ndarray:
-    """Regular polygon (N, 2) in place of a circle; ``circumscribed`` (for holes) keeps the whole circle inside it."""
+    """Regular polygon (N, 2) that approximates a circle; with ``circumscribed`` (for holes) the whole circle lies inside it."""
     corner_m = radius_m / math.cos(math.pi / num_sides) if circumscribed else radius_m
     angle = 2 * math.pi * (np.arange(num_sides) + 0.5) / num_sides
     return corner_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -134,12 +134,12 @@ class Solid(ABC):
     """One convex solid of a part, about its own origin, standing along its own z axis."""
 
     part_from_solid: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """(4, 4), m."""
+    """(4, 4) pose of the solid in the part's frame [m]."""
     mass_kg: float = 0.0
     color: str = "grey"
-    """A name; the part says what it looks like."""
+    """Name in ``COLORS``; it has no physical effect."""
     touches: bool = True
-    """False for ballast: it has mass, but nothing touches or sees it."""
+    """False for ballast: it has mass, but no contacts, and is not drawn."""
 
     @property
     @abstractmethod
@@ -174,7 +174,7 @@ class Cylinder(Solid):
 class Capsule(Solid):
     radius_m: float
     half_height_m: float
-    """Of the cylinder between the two half spheres."""
+    """Half the length of the cylinder between the two half spheres [m]."""
 
     @property
     def volume_m3(self) -> float:
@@ -184,7 +184,7 @@ class Capsule(Solid):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prism(Solid):
     outline_m: np.ndarray
-    """(N, 2) convex."""
+    """(N, 2) convex outline, counter-clockwise."""
     half_height_m: float
 
     @property
@@ -222,12 +222,12 @@ def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey
 
 
 def moved[S: Solid](solid: S, part_from_frame: np.ndarray) -> S:
-    """Transform a solid into another frame of the part."""
+    """Move a solid by a pose: return it in another frame of the part."""
     return replace(solid, part_from_solid=part_from_frame @ solid.part_from_solid)
 
 
 def with_mass[S: Solid](solids: Sequence[S], mass_kg: float) -> list[S]:
-    """The solids with ``mass_kg`` shared out by volume."""
+    """The solids with ``mass_kg`` distributed among them by volume."""
     volume = sum(solid.volume_m3 for solid in solids)
     return [replace(solid, mass_kg=mass_kg * solid.volume_m3 / volume) for solid in solids]
 

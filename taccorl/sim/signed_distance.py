@@ -19,9 +19,9 @@ from scipy.spatial import ConvexHull
 FLAT_M = 1e-7
 """Vertices this close to a plane lie in it. MuJoCo stores mesh vertices in single precision: 4e-9 m at 0.1 m."""
 FAR_M = 1e3
-"""Instead of infinity, which times 0 is no number."""
+"""Used in place of infinity, because infinity times 0 is NaN."""
 TINY_M = 1e-12
-"""Least distance to divide by: on a shape's axis and on an edge it is 0."""
+"""Least divisor for distances, which are 0 on a shape's axis and on an edge."""
 _PAIRS_AT_ONCE = 64  # of six faces and 384 taxels they are 0.6 MB: a core's cache holds what is being worked on
 
 
@@ -37,12 +37,12 @@ class Shapes(Protocol):
 
     @property
     def geoms(self) -> np.ndarray:
-        """(G,) Geom ids."""
+        """(G,) ids of the geoms."""
         ...
 
     def feel(self, shape: np.ndarray, position: np.ndarray, velocity: np.ndarray, grid: np.ndarray) -> Felt:
-        """Depth and depth rate of the taxels of n pads, each in one shape: (n,) indices of shapes, (n, 3, 3) matrices, (3, K)
-        rows x, y, 1."""
+        """Depth and depth rate of the taxels of n pads, each relative to one shape. Arguments: (n,) indices of shapes, (n, 3, 3)
+        position and velocity matrices, (3, K) rows x, y, 1."""
         ...
 
 
@@ -80,7 +80,7 @@ class Capsules:
 
 @dataclass(frozen=True, eq=False)
 class Cylinders:
-    """Cylinders along z. Depth = the lesser of the depths under the side and under the nearer end."""
+    """Cylinders along z. Depth is the smaller distance: to the side, or to the nearer end."""
 
     geoms: np.ndarray
     radius_m: np.ndarray
@@ -114,37 +114,37 @@ class Seams:
     """Rectangles in the faces of one solid that hold all that other solids cover of these faces, in the solid's frame."""
 
     faces: np.ndarray
-    """(R,) number of the face that each rectangle is in."""
+    """(R,) index of the face that contains each rectangle."""
     axes: np.ndarray
-    """(2 R, 3) float32: both directions of each."""
+    """(2 R, 3) float32: the two axes of each rectangle."""
     centres_m: np.ndarray
-    """(2 R,) along the axes."""
+    """(2 R,) coordinate of each rectangle's centre along its axes."""
     halves_m: np.ndarray
-    """(2 R,)"""
+    """(2 R,) half the side along each axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Polyhedra:
-    """Convex solids of at most F faces: boxes, convex meshes, planes. Depth = the least of the depths under the faces.
+    """Convex solids of at most F faces: boxes, convex meshes, planes. Depth is the distance to the nearest face.
 
-    Where another solid of the same body touches or cuts a face, the face is no surface. Where the nearest point is such a
-    *seam*, the depth is the distance to the surface of the whole part instead (``PartSurface``), exact as well.
+    Where another solid of the same body touches or cuts a face, the face is not part of the outer surface. Where the nearest
+    point is such a *seam*, the depth is the distance to the surface of the whole part instead (``PartSurface``), exact as well.
     """
 
     geoms: np.ndarray
     normals: np.ndarray
-    """(G, F, 3) outward, float32; filled up with zeros."""
+    """(G, F, 3) outward unit normals of the faces, float32; shapes with fewer than F faces are padded with zeros."""
     offsets_m: np.ndarray
-    """(G, F) n · p of the face's points; filled up with ``FAR_M``. Faces at a seam lie a little further out, so that no point
+    """(G, F) n · p of the face's points; padded with ``FAR_M``. Faces at a seam lie a little further out, so that no point
     falls between two solids."""
     covered: np.ndarray
-    """(G, F) bool: the whole face is taken for a seam."""
+    """(G, F) bool: the whole face is treated as a seam."""
     seams: list[Seams | None]
-    """Per shape: where parts of other faces are seams."""
+    """Per shape: rectangles in its other faces that are seams; None without any."""
     surfaces: list[PartSurface | None]
-    """Per shape: the surface of its part, if it has seams."""
+    """Per shape: the outer surface of its part; None if the shape has no seams."""
     body_from_geom: np.ndarray
-    """(G, 3, 4)"""
+    """(G, 3, 4) pose of each geom in its body's frame."""
 
     def feel(self, shape: np.ndarray, position: np.ndarray, velocity: np.ndarray, grid: np.ndarray) -> Felt:
         at_seam = np.zeros((len(shape), grid.shape[1]), bool)
@@ -218,11 +218,11 @@ class Polyhedron:
     """One convex solid: its faces and vertices."""
 
     normals: np.ndarray
-    """(F, 3) outward."""
+    """(F, 3) outward unit normals of the faces."""
     offsets_m: np.ndarray
-    """(F,) n · p of the face's points."""
+    """(F,) offset of each face: n · p of its points."""
     corners_m: list[np.ndarray]
-    """Per face (N, 3), counter-clockwise seen from outside."""
+    """Corners (N, 3) of each face, counter-clockwise seen from outside."""
 
 
 def polyhedron(vertices_m: np.ndarray) -> Polyhedron:

@@ -27,7 +27,8 @@ from taccorl.sim.task import Reset, Task
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig, build_spec
 
 SUB_COMMANDS = 5
-"""Targets go to their new value in a straight line over a control step, at 150 Hz: a robot's driver does not jump either."""
+"""Number of intermediate targets in one control step: targets change linearly, at 150 Hz, since a robot's driver does not jump
+either."""
 _UNSTABLE = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL)]
 _UNSTABLE += [int(mujoco.mjtWarning.mjWARN_BADQACC)]
 _ENCODER_ROUNDS = 12  # of a scale 10 % off: 1e-12 rad remain
@@ -43,21 +44,22 @@ class Snapshot:
     """(n, nstate) ``mjSTATE_INTEGRATION``: positions, velocities, controls, histories, warm start."""
     judge: dict[str, np.ndarray]
     seeds: np.ndarray
-    """(n,) of the reset draw: friction and masses follow from it."""
+    """(n,) seeds of the reset draws, which determine friction and masses."""
     memory: dict[str, np.ndarray]
-    """Name → (n, …): targets asked for, and what effects remember."""
+    """Name → (n, …): requested targets, and the memory of effects."""
     scene: np.ndarray
-    """(n,) ``scene_digest``: only a simulation of the same task, difficulty, twin and randomisation takes it."""
+    """(n,) ``scene_digest`` of the scenes: only simulations of the same task, difficulty, twin and randomisation accept the
+    snapshot."""
 
 
 @dataclass(frozen=True)
 class Watch:
-    """Callback for given physics steps within a control step."""
+    """Callback that is called after given physics steps of a control step."""
 
     at: Sequence[int]
-    """Physics steps since the control step began, ≥ 1."""
+    """Numbers of the physics steps, ≥ 1, counted from the start of the control step."""
     see: Callable[[int], None]
-    """Called with each of them; positions, velocities and sensors are current."""
+    """Function that is called with the number of each of these steps; positions, velocities and sensors are then current."""
 
 
 class Simulation(SeenScene):
@@ -67,7 +69,7 @@ class Simulation(SeenScene):
         scale: share of the task's reset ranges, 0 … 1; 0 is the nominal scene.
 
     Raises:
-        TaccorlError: wrong sizes, unknown names.
+        TaccorlError: a size is wrong, or a name is unknown.
     """
 
     def __init__(
@@ -92,7 +94,7 @@ class Simulation(SeenScene):
         self.task, self.config, self.num_sims = task, config or TwinConfig(), num_sims
         self.randomization_scale = scale
         self.scene = scene_digest(task, self.config, scale)
-        """What a stored state must have been made in to be taken."""
+        """``scene_digest`` of this scene; a stored state is accepted only if it has the same."""
         self.spec = build_spec(self.config, task)
         self.model = self.spec.compile()
         self.batch = Batch(self.model, num_sims, num_threads)
@@ -108,11 +110,11 @@ class Simulation(SeenScene):
         self.draws: list[dict[str, np.ndarray]] = [{} for _ in range(num_sims)]
         self.diverged = np.zeros(num_sims, dtype=bool)
         self.clipped = np.zeros(num_sims, dtype=bool)
-        """(N,) whether the newest action lay beyond the limits."""
+        """(N,) bool: the newest action was beyond the limits."""
         self.executed = np.zeros((num_sims, ROBOT.num_actions))
-        """(N, A) the newest action as it acted."""
+        """(N, A) the newest action, clipped to the limits."""
         self.targets = np.zeros((num_sims, ROBOT.num_actions))
-        """(N, A) the newest targets asked for; effects may hold them up on their way to the controllers."""
+        """(N, A) the newest requested targets; effects may delay them on the way to the controllers."""
         self._renderers: dict[tuple, Renderer] = {}
         self._index()
 
@@ -146,7 +148,7 @@ class Simulation(SeenScene):
         """Draw new scenes for ``ids`` (all by default), one seed each. The same seed gives the same scene, bit for bit.
 
         Raises:
-            TaccorlError: not one seed for each, or one that is no whole number in 0 … 2⁶³ − 1.
+            TaccorlError: the number of seeds differs from that of ``ids``, or one is no whole number in 0 … 2⁶³ − 1.
         """
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         seeds = checked_seeds(seeds)
@@ -192,7 +194,7 @@ class Simulation(SeenScene):
             qpos[i, self._fingers[arm]] = ROBOT.finger_stroke_m
 
     def place_arms(self, joints: np.ndarray, targets: np.ndarray) -> None:
-        """Put the arms of every simulation at rest at ``joints`` (A,) [rad, m] with ``targets`` (A,) in force."""
+        """Put the arms of every simulation at rest at ``joints`` (A,) [rad, m], with the commands ``targets`` (A,) in force."""
         qpos, qvel = self.arrays["qpos"], self.arrays["qvel"]
         joints = self._true(joints)
         for arm in ROBOT.arms:
@@ -222,7 +224,7 @@ class Simulation(SeenScene):
         """One control step (1/30 s) with targets ``action`` (N, A) [rad, m], linearly interpolated over the step.
 
         Simulations outside ``ids`` (all by default) are frozen, with their targets and outcomes; their rows are not used.
-        ``watch`` is called for the states in between; it must not change them.
+        ``watch`` is called after physics steps within the control step; it must not change the state.
         """
         goal = self._checked(action, ids)
         now = self.targets.copy()
@@ -363,7 +365,8 @@ class Simulation(SeenScene):
         """Put ``ids`` (all by default) into the snapshot's states.
 
         Raises:
-            TaccorlError: not one state for each, or of another task, difficulty, twin or randomisation; nothing is changed.
+            TaccorlError: the number of states differs from that of ``ids``, or they are of another task, difficulty, twin or
+                randomisation. The simulation is then unchanged.
         """
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         self.check_snapshot(snapshot, ids)
@@ -380,13 +383,14 @@ class Simulation(SeenScene):
 
     @property
     def row_size(self) -> int:
-        """Numbers in a row of ``state_rows``."""
+        """Length of a row of ``state_rows``."""
         return self.state_rows(np.array([0])).shape[1]
 
     def state_rows(self, ids: np.ndarray | None = None) -> np.ndarray:
         """(n, row_size) float64 states as stored in a dataset: ``scene_digest``, physics state, memory of effects.
 
-        With the seed, which stands for friction and masses, it restores the simulation bit-exactly but for the judge's counters.
+        Together with the seed, which determines friction and masses, a row restores the simulation bit-exactly except for the
+        judge's counters.
         """
         snapshot = self.snapshot(ids)
         memory = [snapshot.memory[name].reshape(len(snapshot.physics), -1) for name in sorted(snapshot.memory)]
@@ -396,7 +400,7 @@ class Simulation(SeenScene):
         """Put ``ids`` (all by default) into stored states; the outcome counters restart.
 
         Raises:
-            TaccorlError: rows of another task, difficulty, twin or randomisation; nothing is changed.
+            TaccorlError: the rows are of another task, difficulty, twin or randomisation. The simulation is then unchanged.
         """
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         rows = np.asarray(rows, dtype=np.float64)
@@ -412,7 +416,7 @@ class Simulation(SeenScene):
         self.judge.reset(ids, self)
 
     def row_memory(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """``Snapshot.memory`` of stored rows (n, row_size)."""
+        """``Snapshot.memory`` from stored rows (n, row_size)."""
         now, memory, at = self.snapshot(np.array([0])).memory, {}, 1 + self.batch.nstate
         for name in sorted(now):
             one = now[name][0]

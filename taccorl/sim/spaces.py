@@ -17,7 +17,7 @@ def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
     """Observation space of one environment: joints [rad] and openings [m], counts above baseline, rgb8 pictures.
 
     Args:
-        part_numbers: of the parts' poses; None: they are not observed.
+        part_numbers: number of values of the parts' poses; None: they are not observed.
     """
     counts = np.iinfo(np.int16)
     spaces = {

@@ -19,7 +19,7 @@ from taccorl.plugins import Registry
 from taccorl.sim.randomize import Row
 
 CLEARANCES_M = {"easy": 0.0010, "train": 0.0005, "hard": 0.0003}
-"""Gap on each side between mating parts (research: at 0.6 m a D415 pixel is 3.7 mm after scaling to 224)."""
+"""Difficulty → clearance on each side between mating parts [m]. (A D415 pixel is 3.7 mm at 0.6 m after scaling to 224.)"""
 HOLD_S = 0.5  # a goal counts when it has held this long after release
 AT_REST_MPS = 0.02  # a part that moves faster than this against its holder is in flight
 
@@ -30,19 +30,19 @@ class Scene(Protocol):
     num_sims: int
 
     def poses(self, body: str) -> np.ndarray:
-        """World-from-body (N, 4, 4)."""
+        """World-from-body poses (N, 4, 4) of a body."""
         ...
 
     def velocities(self, body: str) -> np.ndarray:
-        """Linear velocity of the body's frame origin, world (N, 3) [m/s]."""
+        """Linear velocity of the origin of the body's frame, in world coordinates (N, 3) [m/s]."""
         ...
 
     def pads_touching(self, body: str) -> np.ndarray:
-        """(N, 4) bool in pad order left_a, left_b, right_a, right_b."""
+        """(N, 4) bool: which pads touch the body, in the order left_a, left_b, right_a, right_b."""
         ...
 
     def contact(self, body: str, other: str) -> "Contact":
-        """Between two bodies that the task declared in ``mating``."""
+        """Contact between two bodies; the task must declare the pair in ``mating``."""
         ...
 
 
@@ -59,12 +59,12 @@ class Contact:
 class Subtask:
     """One segment of one arm's motion; it ends when ``done`` becomes true.
 
-    The body that it refers to, the body that is held and the order between the arms stand in the task's MimicGen spec.
+    The task's MimicGen spec states its reference body, the held body and the order between the arms.
     """
 
     name: str
     done: Callable[[Scene], np.ndarray]
-    """(N,) bool."""
+    """Predicate that ends the subtask: (N,) bool for a ``Scene``."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,13 @@ class Verdict:
     """Values of a task's predicates at one instant. ``Judge`` decides from them when a goal or failure has held long enough."""
 
     goal: np.ndarray
-    """(N,) bool: in place, at rest, no pad touches it."""
+    """(N,) bool: the part is in place and at rest, and no pad touches it."""
     failures: dict[str, np.ndarray]
-    """Category of ``Task.failures`` → (N,) bool: seen now."""
+    """Category of ``Task.failures`` → (N,) bool: its condition is met at this instant."""
     partial: np.ndarray
-    """(N,) int: how many of the task's goals are in place (puzzle: 0–3)."""
+    """(N,) int: number of the task's goals that are in place (puzzle: 0–3)."""
     measures: dict[str, np.ndarray] = field(default_factory=dict)
-    """Name with unit → (N,), for reports and privileged state."""
+    """Name with unit → (N,) value, for reports and privileged state."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,26 +97,27 @@ class Task(ABC):
 
     name: ClassVar[str]
     instruction: ClassVar[str]
-    """The sentence the policy reads."""
+    """The sentence that the policy reads."""
     parts: ClassVar[tuple[str, ...]]
     """Movable bodies, each with a free joint of its own name."""
     clamped: ClassVar[tuple[str, ...]] = ()
     """Bodies clamped to the bench (mocap) whose pose is drawn at reset."""
     mating: ClassVar[tuple[tuple[str, str], ...]] = ()
-    """Pairs of bodies whose contact predicates and reports look at."""
+    """Pairs of bodies whose contact is measured for predicates and reports."""
     max_partial: ClassVar[int] = 1
     time_limit_s: ClassVar[float] = 30.0
     failures: ClassVar[dict[str, float]] = {"dropped": 0.0}
-    """Category that ``look`` can name → seconds for which it must last; ``timeout`` and ``diverged`` come on top."""
+    """Failure category that ``look`` may return → time [s] for which its condition must last. ``timeout`` and ``diverged`` are
+    added to every task."""
     home_rad: ClassVar[dict[str, tuple[float, ...]]]
-    """Arm → six joint angles at reset; grippers open."""
+    """Arm → six joint angles at reset [rad]; grippers are open."""
     rows: ClassVar[tuple[Row, ...]] = ()
     """Randomisation at reset; values of the paper's table "Domain randomization parameter values" (App. E) in its four tasks."""
     expert: ClassVar[str | None] = None
-    """Scripted expert as ``module:Class``, a class of ``taccorl.demos.experts.ScriptedExpert``; imported when it is asked for.
-    None: there is none."""
+    """Scripted expert as ``module:Class``, a class of ``taccorl.demos.experts.ScriptedExpert``; imported on first use. None: the
+    task has no expert."""
     mimicgen: ClassVar[Path | None] = None
-    """YAML file that states how demonstrations become new ones (``taccorl/demos/mimicgen/spec.py``); None: they cannot."""
+    """MimicGen spec, a YAML file (``taccorl/demos/mimicgen/spec.py``); None: ``augment`` does not support the task."""
 
     def __init__(self, difficulty: str = "train") -> None:
         if difficulty not in CLEARANCES_M:
@@ -126,11 +127,11 @@ class Task(ABC):
 
     @abstractmethod
     def add_parts(self, spec: mujoco.MjSpec) -> None:
-        """Put the parts, at their nominal poses, onto the bench."""
+        """Add the parts at their nominal poses to the model of the bench."""
 
     @abstractmethod
     def reset(self, draw: dict[str, np.ndarray]) -> Reset:
-        """Initial scene for a draw of ``rows``."""
+        """Initial scene for one draw of ``rows`` (row name → values)."""
 
     @abstractmethod
     def look(self, scene: Scene) -> Verdict:
@@ -138,19 +139,19 @@ class Task(ABC):
 
     @abstractmethod
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
-        """Arm → its subtasks in order."""
+        """Arm → its subtasks, in order."""
 
 
 tasks: Registry[type[Task]] = Registry("task", "taccorl.tasks")
 
 
 def at_rest(scene: Scene, part: str, holder: str) -> np.ndarray:
-    """(N,) whether a part moves slower than 20 mm/s relative to the body that holds it."""
+    """(N,) bool: the part moves slower than 20 mm/s relative to the body that holds it."""
     off = scene.velocities(part) - scene.velocities(holder)
     return np.einsum("ni,ni->n", off, off) < AT_REST_MPS**2
 
 
 def fell(pose: np.ndarray) -> np.ndarray:
-    """(N,) whether a body is below the table's top or beyond its edge."""
+    """(N,) bool: the body is below the table's top or beyond its edge."""
     x, y, z = pose[:, :3, 3].T
     return (z < -0.02) | (np.abs(y) > 0.7) | (x < -0.15) | (x > 0.85)

@@ -31,19 +31,20 @@ class TouchHistory:
         """(N, L, K) counts above baseline, oldest first."""
 
     def reset(self, first: np.ndarray, mask: np.ndarray | None = None) -> None:
-        """Start new windows with readings ``first`` (N, K) in the environments of ``mask`` (N,) bool (all by default)."""
+        """Fill the windows of the environments in ``mask`` (N,) bool (all by default) with their first readings ``first`` (N,
+        K)."""
         mask = np.ones(len(self.window), dtype=bool) if mask is None else mask
         self.window[mask] = first[mask, None]
 
     def append(self, readings: np.ndarray, num_steps: np.ndarray) -> None:
-        """Add the first ``num_steps`` (N,) of the ``readings`` (N, H, K)."""
+        """Append the first ``num_steps`` (N,) of the ``readings`` (N, H, K) to each window."""
         length = self.window.shape[1]
         both = np.concatenate([self.window, readings], axis=1)
         newest = num_steps[:, None] + np.arange(length)
         self.window = np.take_along_axis(both, newest[:, :, None], axis=1)
 
     def follow(self, chunk: Chunk) -> None:
-        """Add the readings of a chunk. An environment that was reset within it starts a new window with the new episode's
+        """Append the readings of a chunk. An environment that was reset within it starts a new window with the new episode's
         first reading."""
         self.append(chunk.tactile, chunk.num_steps)
         if "_final_obs" in chunk.info:

@@ -26,63 +26,63 @@ class FeltGeoms(NamedTuple):
     """The geoms that pads can detect, in the order of their kinds."""
 
     geom: np.ndarray
-    """(G,) ids."""
+    """(G,) ids of the geoms."""
     body: np.ndarray
-    """(G,)"""
+    """(G,) ids of the geoms' bodies."""
     feels: np.ndarray
-    """(P, G) bool: the pad feels it."""
+    """(P, G) bool: the pad can detect the geom."""
     bound_m: np.ndarray
-    """(G,) radius of the bounding sphere; infinite for a plane."""
+    """(G,) radius of the bounding sphere [m]; infinite for a plane."""
     centre_m: np.ndarray
-    """(G, 3) of the bounding box."""
+    """(G, 3) centre of the bounding box [m]."""
     extent_m: np.ndarray
-    """(G, 3) half the bounding box."""
+    """(G, 3) half the sides of the bounding box [m]."""
     kind: np.ndarray
-    """(G,) capsule, cylinder or convex solid."""
+    """(G,) code of the kind: capsule, cylinder or convex solid."""
     radius_m: np.ndarray
-    """(G,) float32, of capsules and cylinders; as ``half_m``."""
+    """(G,) float32 radius of capsules and cylinders; ``half_m`` is half their length."""
     half_m: np.ndarray
     faces: np.ndarray
-    """(G, 2) first and one past the last face."""
+    """(G, 2) index of the geom's first face, and of its last + 1."""
     normals: np.ndarray
-    """(F, 3) float32"""
+    """(F, 3) float32 outward unit normals of the faces."""
     offsets_m: np.ndarray
-    """(F,) float32"""
+    """(F,) float32 offset of each face: n · p of its points."""
     covered: np.ndarray
-    """(F,) bool"""
+    """(F,) bool: another solid of the part covers the whole face."""
     seams: np.ndarray
-    """(G, 2) first and one past the last seam."""
+    """(G, 2) index of the geom's first seam, and of its last + 1."""
     seam_face: np.ndarray
-    """(R,) number of its face."""
+    """(R,) index of the face that contains the seam."""
     seam_axes: np.ndarray
-    """(R, 2, 3) float32; centres and halves (R, 2)."""
+    """(R, 2, 3) float32 axes of the seam's rectangle; ``seam_centres_m`` and ``seam_halves_m`` (R, 2) lie along them."""
     seam_centres_m: np.ndarray
     seam_halves_m: np.ndarray
     surface: np.ndarray
-    """(G,) number of its part's surface; −1: it has no seam."""
+    """(G,) index of the surface of the geom's part; −1 if it has no seam."""
     body_from_geom: np.ndarray
-    """(G, 3, 4)"""
+    """(G, 3, 4) pose of the geom in its body's frame."""
     own_pieces: np.ndarray
-    """(U, 2) first and one past the last piece of each surface; as ``own_edges``."""
+    """(U, 2) index of the surface's first piece, and of its last + 1; ``own_edges`` likewise."""
     own_edges: np.ndarray
     pieces: np.ndarray
-    """(Q, 8): normal, offset, centre and radius² of a sphere about it."""
+    """(Q, 8): normal, offset, and centre and radius² of a sphere around each piece."""
     side_normals: np.ndarray
-    """(Q, E, 3)"""
+    """(Q, E, 3) outward unit normal of each side of a piece."""
     side_offsets_m: np.ndarray
-    """(Q, E)"""
+    """(Q, E) offset of each side: n · p of its points."""
     edges: np.ndarray
-    """(M, 6): start and vector."""
+    """(M, 6): start and vector of each edge."""
     cell_origin_m: np.ndarray
-    """(U, 3)"""
+    """(U, 3) corner of the surface's grid of cells [m]."""
     cell_size_m: np.ndarray
-    """(U,)"""
+    """(U,) side of a cell [m]."""
     cell_counts: np.ndarray
-    """(U, 3) along x, y, z."""
+    """(U, 3) number of cells along x, y, z."""
     first_cell: np.ndarray
-    """(U,)"""
+    """(U,) index of the surface's first cell."""
     cell_pieces: np.ndarray
-    """(C, 2) first and one past the last entry of ``piece_list``; as ``cell_edges``."""
+    """(C, 2) index of the cell's first entry in ``piece_list``, and of its last + 1; ``cell_edges`` likewise for edges."""
     cell_edges: np.ndarray
     piece_list: np.ndarray
     edge_list: np.ndarray
@@ -92,22 +92,22 @@ class Pads(NamedTuple):
     """The pads of one model."""
 
     site: np.ndarray
-    """(P,) id of the taxel frame."""
+    """(P,) id of the site that is the taxel frame."""
     box: np.ndarray
-    """(P,) id of the geom."""
+    """(P,) id of the pad's geom, a box."""
     finger: np.ndarray
-    """(P,) body of the site."""
+    """(P,) id of the body that holds the site."""
     plate: np.ndarray
-    """(P,) body of the box."""
+    """(P,) id of the body that holds the box."""
     sprung: np.ndarray
-    """(P',) numbers of the sprung pads."""
+    """(P',) indices of the sprung pads."""
     plate_point_m: np.ndarray
-    """(P', 3) a point of the undeformed surface in the box's frame, and its normal (P', 3)."""
+    """(P', 3) a point of the undeformed surface in the box's frame; ``plate_normal`` (P', 3) is its normal."""
     plate_normal: np.ndarray
     root: np.ndarray
-    """(nbody,) root of each body's tree."""
+    """(nbody,) root body of each body's kinematic tree."""
     half_m: np.ndarray
-    """(3,) of the taxels' rectangle."""
+    """(3,) half the sides of the taxels' rectangle [m]."""
     grid: np.ndarray
     """(3, K) float32 rows x, y, 1."""
 

@@ -15,24 +15,25 @@ SAMPLE_HZ = 200  # piper_ros publishes joint states at 200 Hz (data_specs/record
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Samples at exact times; ``targets[k]`` is the command that is in force from ``time_s[k]`` on."""
+    """Samples of one simulation at exact times; ``targets[k]`` is the command in force from ``time_s[k]`` on."""
 
     time_s: np.ndarray
     """(T,) since the episode began."""
     qpos: np.ndarray
-    """(T, nq) true positions, MuJoCo's order."""
+    """(T, nq) true positions, in MuJoCo's order."""
     qvel: np.ndarray
-    """(T, nv)."""
+    """(T, nv) true velocities, in MuJoCo's order."""
     mocap: np.ndarray
     """(nmocap, 7) poses of clamped bodies; they do not move."""
     reported: np.ndarray
     """(T, 14) joint angles [rad] and gripper openings [m] as the encoders report them, at exactly ``time_s``."""
     targets: np.ndarray
-    """(T, 14) rad, m."""
+    """(T, 14) commanded targets [rad, m]."""
     reading: np.ndarray
-    """(T, 4, 32, 12) float32 what the pads read, before gain, noise and rounding."""
+    """(T, 4, 32, 12) float32 readings of the pads before gain, noise and rounding."""
     effort: np.ndarray
-    """(T, 14) motor torque of joints [N·m] and closing force of the gripper's motor [N], of the physics step before."""
+    """(T, 14) motor torque of joints [N·m] and closing force of the gripper's motor [N], in the physics step before the
+    sample."""
 
 
 @dataclass
@@ -49,7 +50,8 @@ class DenseRecorder:
         self._see(0)
 
     def watch(self, num_steps: int | None = None) -> Watch:
-        """``Watch`` for the next control step, or for ``num_steps`` physics steps of ``Simulation.advance``."""
+        """``Watch`` that records the samples of the next control step, or of the next ``num_steps`` physics steps of
+        ``Simulation.advance``."""
         num_steps = num_steps or self.sim.config.physics.steps_per_control_step
         before, self._steps = self._steps, self._steps + num_steps
         first = -before % self._every or self._every

@@ -25,7 +25,8 @@ class PhysicsConfig:
     """Contact and solver settings, chosen by measurement: docs/benchmarks.md, penetration and creep."""
 
     steps_per_control_step: int = 40
-    """Physics steps within 1/30 s; a multiple of 20, so that 200 Hz joints and 100 Hz pads fall on whole steps."""
+    """Number of physics steps within one control step of 1/30 s; a multiple of 20, so that samples at 200 Hz (joints) and 100 Hz
+    (pads) fall on whole steps."""
     impratio: float = 10.0
     """Stiffness of friction relative to the normal force: at 1 a gripped part creeps, at 50 a step costs twice as much."""
 
@@ -49,7 +50,7 @@ class TwinConfig:
     robot: RobotConfig = field(default_factory=RobotConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
     arm_controllers: dict[str, ControllerConfig] = field(default_factory=dict)
-    """``left`` or ``right`` → gains of an arm that are not those of ``controller``."""
+    """``left`` or ``right`` → gains of that arm, where they differ from ``controller``."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     cameras: list[CameraConfig] = field(default_factory=lambda: list(bench_cameras()))
     sensor: SensorConfig = field(default_factory=FlexiTacConfig)
@@ -95,7 +96,7 @@ def empty_bench(config: TwinConfig) -> mujoco.MjSpec:
 
 
 def build_spec(config: TwinConfig, task: Task) -> mujoco.MjSpec:
-    """Complete model specification of a task's scene: arms, parts, cameras, sensors and effects."""
+    """Build the complete model specification of a task's scene: arms, parts, cameras, sensors and effects."""
     spec = empty_bench(config)
     task.add_parts(spec)
     add_cameras(spec, config.cameras)

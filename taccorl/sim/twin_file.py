@@ -76,7 +76,7 @@ def _says_nothing(path: Path) -> bool:
 def kind_of(path: Path) -> tuple[str | None, int]:
     """Value and line of the key ``kind``, which files of machines other than the PiPER begin with.
 
-    None where there is none, and where the file is not YAML or cannot be read: what reads it says so.
+    None if the key is missing, or if the file cannot be read or is not YAML: the function that loads it raises the error.
     """
     try:
         root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
@@ -105,7 +105,7 @@ def twin_text(config: TwinConfig) -> str:
 
 
 def twin_digest(config: TwinConfig) -> str:
-    """Digest of a twin, 16 hexadecimal digits: equal for equal twins."""
+    """Digest of a twin, 16 hexadecimal digits; equal twins have equal digests."""
     return hashlib.sha256(twin_text(config).encode()).hexdigest()[:16]
 
 
@@ -119,7 +119,7 @@ def save_twin(config: TwinConfig, path: Path) -> None:
 
 
 def effect_entry(effect: Effect) -> dict[str, Any]:
-    """An effect as an entry of a file's ``effects``: its name, and what is not as in its class."""
+    """An effect as an entry of a file's ``effects``: its name, and the parameters that differ from its class's defaults."""
     return _plugin_differences("effect", effects, effect)
 
 
@@ -143,7 +143,7 @@ def write_whole(path: Path, text: str) -> None:
 
 
 class EffectsDocument[T](Document[T]):
-    """A strict file with effects: lists, plug-ins and cameras on top of what every strict file knows."""
+    """Strictly read YAML file with effects: ``Document`` extended by lists of effects, plug-ins and cameras."""
 
     def _build(self, kind: Any, node: yaml.Node, key: str) -> Any:
         self._lines.setdefault(key, node.start_mark.line + 1)

@@ -66,17 +66,17 @@ class Chunk:
     """Result of a chunk of actions: observation, rewards, and which environments ended."""
 
     observation: Observation
-    """After the chunk; of an episode that ended, the next one's first."""
+    """Observation after the chunk; of an episode that ended, the first one of the next episode."""
     reward: np.ndarray
-    """(N,) summed over the chunk: 1 where the task succeeded within it."""
+    """(N,) sum of the rewards in the chunk: 1 where the task succeeded within it."""
     terminated: np.ndarray
     """(N,) bool: succeeded or failed within the chunk."""
     truncated: np.ndarray
     """(N,) bool: ran out of time within the chunk."""
     num_steps: np.ndarray
-    """(N,) actions that were carried out; an episode stands still once it is over."""
+    """(N,) number of executed actions; a finished episode executes none."""
     tactile: np.ndarray
-    """(N, H, 1536) int16 counts after every control step, for policies that read a history."""
+    """(N, H, 1536) int16 counts above baseline after every control step, for policies that read a history."""
     info: dict[str, Any]
 
 
@@ -84,11 +84,13 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     """N environments of ``task``. Reward is 1 at the step that completes the task, else 0.
 
     An episode terminates with success or failure (``info["failure"]``) and is truncated when time is up. A simulation that
-    diverges fails as ``diverged``, its seed in ``info["seed"]``, its last observation the one before. An action that is NaN or
-    far beyond the limits is not executed: its episode fails as ``bad_action``, ``info["reason"]`` says why. The others go on.
+    diverges fails as ``diverged``, ``info["seed"]`` holds its scene seed, and its last observation is the one before it
+    diverged. An action that is NaN or far beyond the limits is not executed: its episode fails as ``bad_action``,
+    ``info["reason"]`` says why. The others go on.
 
     Seeds (``EpisodeSeeds``): after ``reset(seed=s)`` environment i's k-th episode has the scene seed ``episode_seed(s, i, k)``.
-    After ``reset(seed=[s0, s1, …])`` environment i begins with scene seed sᵢ itself, so ``info["seed"]`` brings a scene back.
+    After ``reset(seed=[s0, s1, …])`` environment i begins with scene seed sᵢ itself, so that a value of ``info["seed"]``
+    reproduces its scene.
 
     ``info`` has, for each environment: ``is_success``, ``failure`` ('' or the category), ``partial``, ``seed``, ``subtask``
     (left, right), ``steps``, ``clipped`` (an action lay beyond the limits), ``reason`` ('' or which joint of a bad action) and
@@ -114,16 +116,16 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         """The task's scene is compiled here; nothing is placed before ``reset``.
 
         Args:
-            images: ``always`` renders with every observation (a chunk: once), ``on_request`` by ``observe(images=True)``.
+            images: ``always`` renders with every observation (once per chunk), ``on_request`` only in ``observe(images=True)``.
             randomization: share of the task's reset ranges; 0 is the nominal scene.
-            num_threads: of the physics; 0: all CPUs. Results do not depend on it.
-            autoreset: ``SAME_STEP`` or ``DISABLED`` (over means frozen, until ``reset(options={"reset_mask": (N,) bool})``).
+            num_threads: threads of the physics; 0: all CPUs. Results do not depend on it.
+            autoreset: ``SAME_STEP`` or ``DISABLED`` (a finished episode is frozen until ``reset(options={"reset_mask": (N,)
+                bool})``).
             max_episode_steps: None: the task's own time limit.
             part_poses: observations have the parts' poses (``observation.environment_state``), which are privileged.
 
         Raises:
-            TaccorlError: unknown task or difficulty, unreadable twin, one without a camera that is asked for, a setting that
-                does not exist.
+            TaccorlError: unknown task, difficulty or setting; unreadable twin, or one without a requested camera.
         """
         _one_of("images", images, ("never", "always", "on_request"))
         _one_of("autoreset", autoreset, (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED))
@@ -183,7 +185,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         """Start new episodes in all environments, or in those of ``reset_mask``.
 
         Args:
-            seed: root of all seeds, or one scene seed for each environment; None: the next episodes of the stream.
+            seed: one seed for the sequences of all environments, or one scene seed for each environment; None: the next episodes
+                of the present sequences.
             options: ``state``: a ``Snapshot`` to begin from; ``reset_mask``: (N,) bool, which environments to reset.
         """
         self._check_open("reset")
@@ -222,7 +225,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
                 ``info["final_obs"]`` then has the pictures from which the value of a truncated episode is estimated.
 
         Raises:
-            TaccorlError: wrong shape; ``final_images`` where nothing can be rendered.
+            TaccorlError: wrong shape, or ``final_images`` without cameras.
         """
         if final_images and self.images == "never":
             raise TaccorlError(
@@ -312,7 +315,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self._unseen[ids] = False
 
     def facts(self) -> dict[str, Any]:
-        """Privileged information on each episode: a copy of the arrays of ``info``."""
+        """Privileged information on each episode: a copy of the arrays in ``info``."""
         return _each(self._facts, np.copy)
 
     # one episode after another ----------------------------------------------------------------------------------------

@@ -26,12 +26,12 @@ from taccorl.errors import RecordingError, SpecError
 SQLITE_MAGIC = b"SQLite format 3\0"
 FARTHEST_ID = 1 << 62
 MOST_FAULTS = 5
-"""Results of SQLite's integrity check to report; a damaged page gives one for each of its cells."""
+"""Most results of SQLite's integrity check that are reported; a damaged page gives one for each of its cells."""
 EVERY_TIME = (-(1 << 63), (1 << 63) - 1)
 
 Decoder = Callable[[bytes], Any]
 Row = tuple[int, int, int, bytes | None]
-"""Message id, topic id, log time (ns), data."""
+"""Message id, topic id, log time [ns], data."""
 
 
 @readers.register("db3")

@@ -1,4 +1,5 @@
-"""HDF5 files without clocks (ALOHA, AgileX cobot_magic): one file an episode, a topic is a dataset's path, sample k is row k.
+"""HDF5 files without clocks (ALOHA, AgileX cobot_magic): each file is one episode, a topic is the path of an HDF5 dataset, and
+sample k is row k.
 
 Times follow from the rate that the spec's channels state. Pictures may be raw or compressed one by one, padded or not.
 """
@@ -21,7 +22,8 @@ from taccorl.errors import RecordingError
 
 BLOCK_BYTES = 4 << 20
 MOST_ROWS = 10_000_000
-"""Most rows that an HDF5 dataset may have: 92 hours at 30 Hz. A file of some kilobytes can claim any number of unwritten rows."""
+"""Most rows that an HDF5 dataset may have: 92 hours at 30 Hz. A file of a few kilobytes can declare any number of unwritten
+rows."""
 MOST_BLOCK_BYTES = 1 << 30
 """Largest block that is read at once, a chunk or a row [bytes]. 1000 pictures of 480×640 are 0.9 GB."""
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
@@ -44,7 +46,7 @@ class RowClock:
         """Clock for the channels of a spec.
 
         Raises:
-            RecordingError: two channels shift one topic differently, or a channel of ``action`` does not state its shift.
+            RecordingError: two channels of one topic state different ``lead_frames``, or a channel of ``action`` states none.
         """
         leads: dict[str, int] = {}
         firsts = [0]

@@ -1,8 +1,9 @@
-"""A LeRobot v3 dataset as recordings, one per episode: for datasets that others recorded, or to bring one to another spec.
+"""A LeRobot v3 dataset as recordings, one per episode: for datasets that others recorded, or to convert a dataset to another
+spec.
 
 Topics are feature keys and ``task``. A taccorl dataset's touch also comes pad by pad, as ``<feature>/<pad>``: counts as the
-pad sent them (baseline added back, wire order), since a recording spec reads pads from the wire. Pictures are decoded
-videos: written again they are compressed twice.
+pad sent them (baseline added back, wire order), since a recording spec reads pads from the wire. Pictures are decoded from
+videos, so that writing them again compresses them twice.
 """
 
 import contextlib
@@ -24,7 +25,7 @@ from taccorl.errors import DatasetError, RecordingError
 TASK = "task"
 _SPEC_FILE = "meta/taccorl/dataset_spec.json"
 REGULAR_S = 1e-3
-"""Times stamps may be off k / fps by this (they are float32) and still mean row k."""
+"""Largest difference of a time stamp from k / fps at which the row is still row k [s]; stamps are float32."""
 
 
 @readers.register("lerobot")
@@ -121,7 +122,7 @@ class LerobotReader(Reader):
                     yield Message(topic, int(log_ns[topic][k]), None, value)
 
     def _check_action_time(self) -> None:
-        """``lead_frames`` of the command must be what a dataset of ours says of its action."""
+        """Check that ``lead_frames`` of the command agrees with the ``action_time`` that one of our datasets states."""
         if self.spec is None or ACTION not in self.spec.features:
             return
         lead = 1 if self.dataset.spec.action_time == "next_row" else self._lead_without_action_time()

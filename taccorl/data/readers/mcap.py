@@ -34,22 +34,23 @@ from taccorl.data.strict_yaml import load_yaml
 from taccorl.errors import RecordingError, SpecError
 
 MOST_METADATA_BYTES = 1 << 20
-"""Largest metadata.yaml of a bag [bytes]; rosbag2 writes 1 to 2 kB for each topic."""
+"""Largest metadata.yaml of a bag that is read [bytes]; rosbag2 writes 1 to 2 kB for each topic."""
 MAX_TIME_NS = 2**63 - 1
 MAX_MISFITS = 10
-"""Messages of one channel, unprotected by a CRC, that may fail to decode as damage; more mean that its schema is wrong."""
+"""Most messages of a channel without a CRC that may fail to decode as damage; more mean that the channel's schema is wrong."""
 
 
 @dataclass
 class _Definitions:
-    """What the messages of one file mean. Kept between reads: a part that is read later may hold no definitions."""
+    """Definitions (schemas, channels) of one file. They are kept between reads, because a part that is read later may
+    hold none."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     proven: set[tuple[type, int]] = field(default_factory=set)
-    """(kind, id) of definitions that a CRC vouches for."""
+    """(kind, id) of definitions that a CRC protects."""
     decoders: dict[int, Decoder] = field(default_factory=dict)
-    """By channel id, like the next."""
+    """Channel id → decoder."""
     stampers: dict[int, Stamper] = field(default_factory=dict)
 
     def schema(self, channel: Channel) -> Schema | None:
@@ -90,7 +91,7 @@ class McapReader(Reader):
         return super().sources(path, split_bag=split_bag)
 
     def topics(self) -> dict[str, TopicType]:
-        """Topics named by definitions met so far; reads the whole recording if that has not happened yet."""
+        """Topics named by the definitions read so far; reads the whole recording if that has not happened yet."""
         if not self._whole:
             for _ in self.messages(()):
                 pass
@@ -112,7 +113,8 @@ class McapReader(Reader):
 
 
 def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | None:
-    """A rosbag2 folder as one recording: file order from its metadata.yaml, or by number when the spec says split_bag."""
+    """A rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers if the spec sets
+    split_bag."""
     files = sorted((p for p in path.iterdir() if p.suffix == suffix), key=lambda p: decode.natural_key(p.name))
     if not files:
         return None

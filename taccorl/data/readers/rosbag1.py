@@ -82,7 +82,7 @@ class Rosbag1Reader(Reader):
 def _opened(path: Path) -> "Iterator[BagFile]":
     """
     Raises:
-        RecordingError: no ROS 1 bag, not a whole one, or damaged where it was read.
+        RecordingError: not a ROS 1 bag, an incomplete one, or damaged where it was read.
     """
     from rosbags.rosbag1 import Reader as BagFile
     from rosbags.rosbag1 import ReaderError

@@ -12,10 +12,10 @@ effects: Registry[type[Effect]] = Registry("effect", "taccorl.sim.effects")
 
 
 def make_effect(name: str, **values) -> Effect:
-    """The effect of that name with ``values`` for its parameters and selectors; the others are as in its class.
+    """The effect of that name with ``values`` for its parameters and selectors; all others have the class's defaults.
 
     Raises:
-        TaccorlError: unknown effect or parameter (the nearest name is given), value out of bounds.
+        TaccorlError: an effect or parameter is unknown (the message names the nearest), or a value is out of bounds.
     """
     cls = effects.get(name)
     for key in values:

@@ -22,14 +22,14 @@ PAST_POSITIONS, PAST_TIME_S = "pictures/positions", "pictures/time_s"  # of ``Pa
 
 
 class AddedEffects:
-    """Effects of N simulations. Absent ones are left out; what is left acts in the order of ``LAYERS``, then by name.
+    """Effects of N simulations. Absent effects are left out; the others act in the order of ``LAYERS``, then by name.
 
     A sensor takes it as one of its transforms. Reading the pads does not change the memory of touch effects: only ``scan``,
     which ``Simulation.advance`` calls at the boards' rate, advances it.
 
     Args:
-        time_s: (N,) the simulations' clocks, live.
-        batch: the simulations' physics; without it nothing is felt or rewritten.
+        time_s: (N,) the simulations' clocks [s]; the array is read at each call.
+        batch: the simulations' physics; without it the hooks ``feel`` and ``rewrite`` are not called.
         pad_shape: rows and columns of the sensor's pads.
 
     Letters in shapes: N simulations, A numbers of an action, P pads, R rows and C columns of a pad.
@@ -45,7 +45,7 @@ class AddedEffects:
         self.present = present(effects)
         rewritten = sorted({name for effect in self.present for name in effect.rewrites})
         self.rewrites = bool(rewritten)
-        """Whether the model changes from physics step to physics step."""
+        """True if an effect changes the model between physics steps."""
         self._live = LiveModel(batch, rewritten) if batch and self.present else None
         self._time_s = time_s
         self._scanned_s = np.array(time_s)
@@ -53,10 +53,10 @@ class AddedEffects:
         self._memory: list[Memory] = [{k: v.copy() for k, v in rows.items()} for rows in self._start]
         touch = [k for k, effect in enumerate(self.present) if effect.layer not in ("robot", "camera")]
         self.remember_touch = any(self._start[k] for k in touch)
-        """Whether a reading depends on earlier ones: then each step must scan the pads, whether somebody looks or not."""
+        """True if a reading depends on earlier ones: then every step must scan the pads, even if nobody reads them."""
         oldest_s = sum(effect.picture_age_s() for effect in self.present)
         self.past = PastScene(batch, oldest_s) if batch and oldest_s > 0 else None
-        """Where everything was, if a camera shows it; ``Simulation.advance`` keeps it up."""
+        """Positions of all bodies in the recent past, if a camera has a latency, else None; ``Simulation.advance`` updates it."""
 
     def command(self, targets: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         """Targets (N, A) that reach the controllers when targets (N, A) are sent and held for ``dt_s`` (N,)."""
@@ -65,8 +65,8 @@ class AddedEffects:
         return targets
 
     def feel(self, ids: np.ndarray, dt_s: float) -> None:
-        """Let effects observe simulations ``ids`` after a physics step of ``dt_s`` (0: after a reset) and change the model
-        for the next."""
+        """Call the hook ``feel`` of all effects for simulations ``ids`` after a physics step of ``dt_s`` (0: after a reset),
+        then ``rewrite`` for the next step."""
         if self._live:
             for effect, memory in zip(self.present, self._memory, strict=True):
                 effect.feel(self._live, memory, ids, dt_s)
@@ -79,7 +79,7 @@ class AddedEffects:
                 effect.rewrite(self._live, memory)
 
     def friction(self, friction: float) -> float:
-        """Sliding friction coefficient of parts after all effects, from that of the scene, ``friction``."""
+        """Sliding friction coefficient of parts after all effects, for the scene's coefficient ``friction``."""
         for effect in self.present:
             friction = effect.friction(friction)
         return friction
@@ -118,7 +118,7 @@ class AddedEffects:
         return reading
 
     def picture_age_s(self, camera: str) -> float:
-        """Age [s] of what the camera shows."""
+        """Age [s] of the scene that the camera's pictures show."""
         return sum(effect.picture_age_s() for effect in self.present if camera in effect.acts_on())
 
     def picture(self, pictures: np.ndarray, camera: CameraConfig) -> np.ndarray:
@@ -140,9 +140,9 @@ class AddedEffects:
         """Start new episodes: the memory of all effects returns to its initial state.
 
         Args:
-            ids: (n,) simulations that start anew.
+            ids: (n,) simulations that start a new episode.
             targets: (N, A) targets, taken as constant before the episode; rows of ``ids`` are read.
-            seeds: (n,) of the episodes, for effects that draw random numbers; 0 by default.
+            seeds: (n,) seeds of the episodes, for effects that draw random numbers; 0 by default.
         """
         seeds = np.zeros(len(ids), dtype=np.int64) if seeds is None else seeds
         for effect, memory, start in zip(self.present, self._memory, self._start, strict=True):
@@ -156,14 +156,15 @@ class AddedEffects:
         self._rewrite()
 
     def snapshot(self, ids: np.ndarray) -> Memory:
-        """Rows of ``ids``: ``"0/taxel_creep/crept"`` and the like, and when the pads were scanned last."""
+        """Memory of the simulations ``ids``: ``"0/taxel_creep/crept"`` and the like → rows, and the time of the last scan of the
+        pads."""
         return {key: values[ids].copy() for key, values in self._named().items()}
 
     def restore(self, rows: Memory, ids: np.ndarray) -> None:
-        """Put rows of ``snapshot`` back into ``ids``; other rows are passed over.
+        """Set the memory of the simulations ``ids`` from ``snapshot``; entries for others are ignored.
 
         Raises:
-            TaccorlError: they are of a twin with other effects.
+            TaccorlError: the snapshot is of a twin with other effects.
         """
         kept, named = {key for key in rows if "/" in key}, self._named()
         if kept != named.keys():
@@ -191,7 +192,7 @@ def present(effects: Sequence[Effect]) -> list[Effect]:
     """Effects that are not absent, in the order in which they act.
 
     Raises:
-        TaccorlError: two entries of one effect act on the same thing.
+        TaccorlError: two entries of one effect act on the same joint, pad or camera.
     """
     taken: dict[tuple[str, str], int] = {}
     for k, effect in enumerate(effects):
@@ -205,7 +206,7 @@ def present(effects: Sequence[Effect]) -> list[Effect]:
 
 
 def edit_model(spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-    """Build the effects of ``config`` into a model that is otherwise complete."""
+    """Edit a complete model specification so that it contains the effects of ``config``."""
     for effect in present(config.effects):
         if CELLS in effect.acts_on():
             raise TaccorlError(

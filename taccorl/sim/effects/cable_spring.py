@@ -59,7 +59,7 @@ class CableSpring(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Weak and strong, and relaxed at either side: k and k q₀ are what a recording sees."""
+        """Start values: a weak and a strong spring, each relaxed at either end of the range. Recordings determine k and k q₀."""
         return [
             {"stiffness_nm_per_rad": k, "rest_rad": rest}
             for k, rest in ((1 / 3, 0.0), (3.0, 0.0), (1.0, -1.0), (1.0, 1.0))

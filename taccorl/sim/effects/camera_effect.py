@@ -15,12 +15,13 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class CameraEffect(Effect):
-    """An effect of pictures: the same numbers for all cameras that are chosen. Cameras that differ get an entry each."""
+    """Base of effects on pictures, with the same parameters for all chosen cameras. Cameras with different parameters need one
+    entry each."""
 
     layer: ClassVar = "camera"
     needs: ClassVar = ("picture",)
     cameras: list[str] = field(default_factory=lambda: list(ROBOT.cameras))
-    """Names as in the twin's ``cameras``."""
+    """Names of cameras, as in the twin's ``cameras``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -55,7 +55,8 @@ def toned(picture: np.ndarray, gain: float, gamma: float) -> np.ndarray:
 
 
 def blurred(picture: np.ndarray, sigma_px: float) -> np.ndarray:
-    """A picture (rows, columns, 3) blurred by a Gaussian; its border pixels go on beyond it. Narrow ones fade in from nothing."""
+    """A picture (rows, columns, 3) blurred by a Gaussian. Beyond the border its border pixels are repeated. Widths near 0 change
+    the picture continuously."""
     if sigma_px <= 0:
         return picture
     reach = max(1, int(np.ceil(4 * sigma_px)))

@@ -18,7 +18,7 @@ class PastScene:
 
     Args:
         batch: the simulations' physics.
-        longest_s: the oldest that will be asked for.
+        longest_s: age of the oldest positions that are requested [s].
     """
 
     def __init__(self, batch: Batch, longest_s: float) -> None:
@@ -27,9 +27,9 @@ class PastScene:
         kept = math.ceil(longest_s / _GAP_S) + 2
         num_sims = len(self._now_s)
         self.positions = np.zeros((num_sims, kept, self._positions(np.arange(num_sims)).shape[1]))
-        """(N, H, W) the newest last: joints, then clamped bodies."""
+        """(N, H, W) positions, the newest last: joints, then clamped bodies."""
         self.time_s = np.zeros((num_sims, kept))
-        """(N, H)."""
+        """(N, H) times of the positions [s]."""
 
     def reset(self, ids: np.ndarray) -> None:
         """Fill the buffer with the present positions: before the reset nothing moved."""
@@ -37,7 +37,8 @@ class PastScene:
         self.time_s[ids] = self._now_s[ids, None] - _GAP_S * np.arange(self.time_s.shape[1])[::-1]
 
     def keep(self) -> None:
-        """Store the present positions. They replace the newest ones if those are no older than ``_GAP_S``."""
+        """Store the present positions. They replace the newest stored ones until those are ``_GAP_S`` later
+        than the ones before."""
         is_apart = (self.time_s[:, -1] - self.time_s[:, -2] >= _GAP_S * 0.999) & (self._now_s > self.time_s[:, -1])
         for kept in (self.positions, self.time_s):
             kept[is_apart, :-1] = kept[is_apart, 1:]
@@ -49,7 +50,7 @@ class PastScene:
 
 
 def place_past(data: mujoco.MjData, positions: np.ndarray, time_s: np.ndarray, age_s: float) -> None:
-    """Set the positions in ``data`` to those ``age_s`` before the newest of the stored states (H, W) of times (H,)."""
+    """Set the positions in ``data`` to those at ``age_s`` [s] before the newest of the stored states (H, W) with times (H,)."""
     when = time_s[-1] - age_s
     after = int(np.clip(np.searchsorted(time_s, when), 1, len(time_s) - 1))
     span = time_s[after] - time_s[after - 1]

@@ -1,4 +1,4 @@
-"""The registry in words: one entry for each effect, for ``taccorl effects`` and for docs/effects.md."""
+"""Descriptions of the registered effects as text, for ``taccorl effects`` and for docs/effects.md."""
 
 from collections.abc import Sequence
 
@@ -7,14 +7,14 @@ from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import KINDS, NEEDS, Effect, Parameter
 
 ALWAYS_FITTED = {"kp": "K_p", "kd": "K_d", "torque_ff": "T_ref", "k_n": "k_n", "k_d": "k_d"}
-"""Near-twins that are no effects but numbers that every fit has → how they are written."""
+"""Near-twins that are not effects but numbers that every fit contains → their notation."""
 
 
 def names_for(kind: str = "") -> list[str]:
     """Names of the effects that act on ``kind`` (a word of ``KINDS``); of all effects for an empty one.
 
     Raises:
-        TaccorlError: no such kind; names the nearest.
+        TaccorlError: no such kind; the message names the nearest.
     """
     if kind and kind not in KINDS:
         raise TaccorlError(f"--for={kind}: no effect acts on that; {nearest(kind, KINDS)}")
@@ -22,7 +22,8 @@ def names_for(kind: str = "") -> list[str]:
 
 
 def brief(cls: type[Effect]) -> list[str]:
-    """Lines of plain text: what it acts on, equation, parameters with units, what it needs, what shows it, its near-twins."""
+    """Lines of plain text about an effect: the parts it acts on, equation, parameters with units, required knowledge, recordings
+    that show it, near-twins."""
     lines = [f"{cls.name}  ({', '.join(cls.kinds())})  {cls.equation}"]
     lines += [f"    {parameter_words(p)}" for p in cls.parameters()]
     lines += [f"    needs: {', '.join(cls.needs)}", f"    record: {cls.to_record}"]
@@ -31,7 +32,7 @@ def brief(cls: type[Effect]) -> list[str]:
 
 
 def full(cls: type[Effect]) -> list[str]:
-    """``brief``, with what it is in words, and what tells it from each near-twin."""
+    """Lines of ``brief``, followed by a description in words and the recordings that separate the effect from each near-twin."""
     head, *rest = brief(cls)
     rest = [line for line in rest if not line.startswith("    near-twins: ")]
     rest = [line if not line.startswith("    needs: ") else f"    needs: {needs_words(cls.needs)}" for line in rest]
@@ -40,18 +41,18 @@ def full(cls: type[Effect]) -> list[str]:
 
 
 def needs_words(needs: Sequence[str]) -> str:
-    """``velocity (the joint's velocity)``"""
+    """Text of a requirement, such as ``velocity (the joint's velocity)``."""
     return ", ".join(f"{word} ({NEEDS[word]})" for word in needs)
 
 
 def parameter_words(p: Parameter) -> str:
-    """``F: torque_nm [N·m], absent at 0, 0 … 20, typically 0.4``"""
+    """Text of a parameter, such as ``F: torque_nm [N·m], absent at 0, 0 … 20, typically 0.4``."""
     absent = "shapes the effect" if p.absent is None else f"absent at {p.absent:g}"
     return f"{p.symbol}: {p.name} [{p.unit}], {absent}, {p.low:g} … {p.high:g}, typically {p.typical:g}"
 
 
 def section(cls: type[Effect]) -> list[str]:
-    """Lines of Markdown: the effect's section in docs/effects.md."""
+    """Lines of Markdown: the section about an effect in docs/effects.md."""
     lines = ["", f"## {cls.name}", "", f"`{cls.equation}`", "", cls.in_words, ""]
     lines += [f"- **Acts on:** {', '.join(cls.kinds())}; needs {needs_words(cls.needs)}"]
     lines += [f"- **What it does to a policy:** {cls.at_a_policy}", f"- **What to record:** {cls.to_record}"]

@@ -68,8 +68,8 @@ class Cogging(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Sine and cosine of both signs, at periods half as far apart as a recording over ``span_rad`` can tell apart, from half
-        a wave on; a twentieth of the torque that the motor is asked for."""
+        """Start values: sine and cosine of both signs; numbers of periods in steps of half the resolution of a recording over
+        ``span_rad``, from half a period in this range on; amplitude a twentieth of the torque that the controller commands."""
         apart = max(0.5 * math.pi / max(seen["span_rad"], 0.05), _MOST_PERIODS / _MOST_STARTS)
         periods = np.arange(min(max(2 * apart, 6.0), _MOST_PERIODS), _MOST_PERIODS + 1e-9, apart)
         torque_nm = float(np.clip(0.05 * seen["peak_torque_nm"], 1e-3, 5.0))

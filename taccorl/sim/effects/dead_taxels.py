@@ -35,7 +35,8 @@ class DeadTaxels(BoardEffect):
     )
 
     def dead(self, shape: tuple[int, int, int]) -> np.ndarray:
-        """Bool of ``shape`` (pads, rows, columns): round(s · taxels) on each pad, chosen or not."""
+        """Bool of ``shape`` (pads, rows, columns): round(s · taxels) dead taxels on each pad, also on pads that are not
+        chosen."""
         num_pads, num_taxels = shape[0], math.prod(shape[1:])
         rank = np.random.default_rng(self.seed).permuted(np.tile(np.arange(num_taxels), (num_pads, 1)), axis=1)
         return (rank < round(self.share * num_taxels)).reshape(shape)

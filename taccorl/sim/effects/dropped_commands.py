@@ -11,7 +11,7 @@ from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import JointEffect, Memory, parameter
 
 STRIDE, _FIRST, _SECOND = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
-"""SplitMix64's constants: between two numbers of a stream, and of its finaliser."""
+"""Constants of SplitMix64: the increment between two numbers of a stream, and the factors of its finaliser."""
 _WORD = 0xFFFFFFFF
 
 
@@ -52,7 +52,7 @@ class DroppedCommands(JointEffect):
         source="a choice; one in ten shows in a second of motion",
     )
     seed: int = 0
-    """Of the bus: another one loses other commands."""
+    """Seed of the bus: with another seed other commands are lost."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,7 +85,8 @@ class DroppedCommands(JointEffect):
 
 
 def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Random numbers (…) in [0, 1) for each bus, episode and command, all whole numbers below 2³²: equal on every machine."""
+    """Random numbers (…) in [0, 1) for buses, episodes and commands, each given by whole numbers below 2³²; the same on every
+    machine."""
     # Arrays of at least one number: they wrap around, scalars warn.
     key = (np.atleast_1d(seed).astype(np.uint64) << np.uint64(32)) + np.asarray(episode, dtype=np.uint64)
     bits = mixed(mixed(key) + (np.asarray(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(STRIDE))
@@ -93,7 +94,7 @@ def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> n
 
 
 def mixed(bits: Any) -> Any:
-    """(…) uint64: SplitMix64's finaliser, of arrays here and of numbers where ``joint_kernel`` compiles it."""
+    """(…) uint64: finaliser of SplitMix64, for arrays here and for numbers in the compiled ``joint_kernel``."""
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(_FIRST)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(_SECOND)
     return bits ^ (bits >> np.uint64(31))

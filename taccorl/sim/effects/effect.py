@@ -65,13 +65,14 @@ NEEDS = {
     "temperature": "the temperature beside the readings",
     "picture": "pictures of a camera",
 }
-"""Word in ``Effect.needs`` → what a model must know so that the effect can be computed."""
+"""Word in ``Effect.needs`` → knowledge that a model must have for the effect to be computed."""
 Memory = dict[str, np.ndarray]
-"""Name → array (N, …), changed in place."""
+"""State of an effect between steps: name → array (N, …), changed in place."""
 CELLS = "cells"
-"""What ``TouchEffect.pads`` names instead of pads where the effect is of a sensor of cells, which a cells file describes."""
+"""Value of ``TouchEffect.pads`` for an effect on a sensor of cells, which a cells file describes."""
 LAYERS = ("robot", "material", "spread", "taxel", "baseline", "camera")
-"""From the mechanics outwards; a pad's rubber comes before its wiring, and the wiring before the zero that is taken off."""
+"""Order in which effects act, from the mechanics outwards: a pad's rubber before its wiring, and the wiring before the
+subtraction of the baseline."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,20 +80,21 @@ class Parameter:
     """One number of an effect."""
 
     name: str
-    """With its unit as suffix, as the field of the effect."""
+    """Name of the effect's field, with the unit as suffix."""
     unit: str
     symbol: str
-    """In the effect's equation."""
+    """Symbol in the effect's equation."""
     absent: float | None
-    """At this value the effect is not there. None: it only shapes the effect and means nothing while that is absent."""
+    """Value at which the effect does nothing. None: the parameter only shapes the effect, and has no meaning while the effect is
+    absent."""
     low: float
     high: float
-    """Bounds for fitting; other values are refused."""
+    """Upper bound; with ``low`` the range for fitting. Other values are rejected."""
     typical: float
-    """Of a robot like this one: where a search starts."""
+    """Value for a robot such as the PiPER, at which a search starts."""
     source: str
     over: Literal["", "kp"] = ""
-    """``kp``: a torque, stiffness, damping, inertia or mass. Positions alone identify only (value − absent) / K_p of it
+    """``kp``: a torque, stiffness, damping, inertia or mass. From positions alone only (value − absent) / K_p is identifiable
     (``diagnosis.search.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""
 
 
@@ -116,36 +118,37 @@ def parameter(
 
 @dataclass(kw_only=True)
 class Effect:
-    """Base of all effects: a dataclass of parameters, with what is known about them."""
+    """Base of all effects: a dataclass of parameters, with their intervals and the evidence."""
 
     name: ClassVar[str]
-    """As registered."""
+    """Name under which the effect is registered."""
     layer: ClassVar[Literal["robot", "material", "spread", "taxel", "baseline", "camera"]]
     needs: ClassVar[tuple[str, ...]]
-    """What a model of the part must know to compute it, in words of ``NEEDS``."""
+    """Knowledge that a model of the part must have to compute the effect, in words of ``NEEDS``."""
     equation: ClassVar[str] = ""
     in_words: ClassVar[str] = ""
-    """What it is, on a robot, for somebody who has never met it."""
+    """Description of the effect on a robot, for readers who do not know it."""
     at_a_policy: ClassVar[str] = ""
-    """What it does to a policy that was trained without it."""
+    """Influence on a policy that was trained without the effect."""
     to_record: ClassVar[str] = ""
-    """Which recording shows it."""
+    """Recording that shows the effect."""
     near_twins: ClassVar[dict[str, str]] = {}
     """Name of another effect, or of a number that is always fitted (kp, kd, torque_ff, k_n, k_d) → why measurements can hardly
     tell them apart, and which recording can."""
 
     reduces_to: ClassVar[dict[str, str]] = {}
-    """Name of a simpler effect → own parameter at whose lower bound this effect equals it. The search prefers the simpler one."""
+    """Name of a simpler effect → parameter of this effect at whose lower bound both are equal. The search prefers the simpler
+    one."""
     fitted: ClassVar[bool] = True
-    """Whether a search may fit it. False for what does not repeat from one recording to the next: least squares cannot find its
-    numbers, so it is no candidate, and a twin that has it keeps it as it is."""
+    """Whether a search may fit it. False for effects that do not repeat from one recording to the next: least squares cannot fit
+    them, so they are no candidates, and a twin keeps theirs unchanged."""
     rewrites: ClassVar[tuple[str, ...]] = ()
     """Fields of ``mujoco.MjModel``, or ``qfrc_applied`` of ``mujoco.MjData``, that ``rewrite`` changes."""
 
     interval: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameter → 95 % interval of its estimate, in the parameter's unit."""
     evidence: str = ""
-    """Why it is believed to be there: measurements, error before and after."""
+    """Text: the measurements that show the effect, and the error before and after."""
 
     def __post_init__(self) -> None:
         if "__dataclass_fields__" not in type(self).__dict__:
@@ -179,17 +182,17 @@ class Effect:
 
     @classmethod
     def settings(cls) -> list[str]:
-        """Names of all that can be set: parameters, selectors, what is known about them."""
+        """Names of all fields that can be set: parameters, selectors, intervals and evidence."""
         return [f.name for f in dataclasses.fields(cls)]
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
-        """What it can act on."""
+        """Kinds of parts on which it can act, in words of ``KINDS``."""
         return ("scene",)
 
     @classmethod
     def works_with(cls, gives: Collection[str]) -> bool:
-        """Whether a part whose model knows ``gives`` (words of ``NEEDS``) has all that the effect needs."""
+        """Whether a model that knows ``gives`` (words of ``NEEDS``) has everything that the effect needs."""
         return set(cls.needs) <= set(gives)
 
     @property
@@ -201,12 +204,12 @@ class Effect:
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search: one dict of parameters for each start; parameters left out have their typical values.
 
-        By default a third of, all of and three times the typical strength, and for one that has two signs both of them; of a
-        torque 3, 10 and 30 % of what the motor is asked for.
+        By default a third of, equal to and three times the typical strength, with both signs if the parameter has two; for a
+        torque 3, 10 and 30 % of the largest commanded torque.
 
         Args:
-            seen: facts of the recordings that the parameters may hang on. Of joints: ``peak_torque_nm`` that the twin's
-                controller asks for, ``peak_motor_nm`` with the weight that is carried, ``peak_speed_rad_per_s`` of the targets,
+            seen: facts of the recordings on which start values may depend. Of joints: ``peak_torque_nm`` that the twin's
+                controller commands, ``peak_motor_nm`` including gravity compensation, ``peak_speed_rad_per_s`` of the targets,
                 ``span_rad`` of the targets, ``lowest_rad`` and ``highest_rad`` that were measured, ``duration_s``.
         """
         strength = next((p for p in cls.parameters() if p.absent is not None), None)
@@ -227,8 +230,8 @@ class Effect:
     def drive(self) -> dict[str, float] | None:
         """Parameters of the effect in the one-joint model of ``alignment.controller.joint_kernel``, under the names used there.
 
-        None: only MuJoCo knows it, and identification runs MuJoCo. Empty: it changes bodies only, and inertia and weight are
-        read from the compiled model.
+        None: that model does not have the effect, and identification uses MuJoCo. Empty: the effect changes bodies only, and
+            inertia and weight are read from the compiled model.
         """
         return None
 
@@ -237,10 +240,10 @@ class Effect:
         raise NotImplementedError
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-        """Change the twin's model. ``spec`` is complete: arms, parts, sensors."""
+        """Change the twin's model specification ``spec``, which is complete: arms, parts, sensors."""
 
     def friction(self, friction: float) -> float:
-        """Sliding friction of parts and fixtures where the scene's is ``friction``; asked at every reset."""
+        """Sliding friction of parts and fixtures for the scene's value ``friction``; called at every reset."""
         return friction
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
@@ -255,7 +258,7 @@ class Effect:
         """Prepare ``memory`` for new episodes of the simulations ``ids`` (n,), after a reset to its initial state.
 
         Args:
-            seeds: (n,) of the episodes, for effects that draw random numbers; 0 in simulations for a diagnosis.
+            seeds: (n,) seeds of the episodes, for effects that draw random numbers; 0 in simulations for a diagnosis.
         """
 
     def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
@@ -263,8 +266,8 @@ class Effect:
 
         Args:
             targets: joint angles [rad] and openings [m] in the order of actions.
-            dt_s: (N,) for how long they will stand. 0 for simulations that do not advance now, whose memory is to stay; and
-                after a reset, when the targets are those at rest.
+            dt_s: (N,) time for which the targets will be held. 0 for simulations that do not advance, whose memory must not
+                change; and after a reset, when the targets are those at rest.
         """
         return targets
 
@@ -272,25 +275,25 @@ class Effect:
         """Called after a physics step: store in ``memory`` what ``rewrite`` needs of simulations ``ids``. Forces are current.
 
         Args:
-            dt_s: of the physics step that has been made; 0 after a reset, when all has been as it is for ever. Only if an effect
-                of the twin rewrites it is called after physics steps, else after resets only.
+            dt_s: duration of the physics step; 0 after a reset, when the state counts as constant in the past. If no effect of
+                the twin has ``rewrites``, the hook is called after resets only.
         """
 
     def rewrite(self, live: "LiveModel", memory: Memory) -> None:
-        """Change the fields of ``rewrites``, which have the compiled model's values (and ``qfrc_applied`` none) and what effects
-        before this one made of them. Of the memory and the simulations' time only: a restored simulation must go on the same."""
+        """Change the fields of ``rewrites``. Before the call they have the compiled model's values (``qfrc_applied``: zero) with
+        the changes of earlier effects. The new values may depend only on the memory and the simulations' time, so that a
+        restored simulation continues identically."""
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
         """Reported values (N, A) [rad, m] for the true joint angles and openings ``values`` (N, A)."""
         return values
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        """What the pads read where ideal ones would read ``reading`` (N, P, R, C): as the sensor's law gives it, 0 without
-        contact, before gain, noise and rounding. To be returned as a new array of the same float type.
+        """Readings of the pads with the effect. ``reading`` (N, P, R, C) are those of ideal pads: from the sensor's law, 0
+        without contact, before gain, noise and rounding. Returns a new array of the same float type.
 
-        What is written into ``memory`` lasts from one scan to the next, and a scan is at the end of every
-        ``Simulation.advance``: a control step, or what a replay holds a command for. Who only looks gets a copy of it. With
-        ``dt_s`` = 0 the reading of the scan must come out again.
+        ``memory`` is kept from one scan to the next. Calls outside of scans get a copy of it, and with ``dt_s`` = 0 must return
+        the reading of the last scan.
 
         Args:
             time_s: (N,) since the reset.
@@ -299,10 +302,11 @@ class Effect:
         return reading
 
     def picture(self, picture: np.ndarray, scale: float) -> np.ndarray:
-        """What comes of a picture (rows, columns, 3), float32, 0 … 255, of a camera in ``acts_on``; without black bars.
+        """Picture with the effect, from ``picture`` (rows, columns, 3), float32, 0 … 255, of a camera in ``acts_on``, without
+        black bars.
 
         Args:
-            scale: size of the picture's pixels, as a share: 0.35 if the camera records 640 columns and these are 224.
+            scale: columns of the picture over columns that the camera records: 0.35 for 224 of 640.
         """
         return picture
 
@@ -313,11 +317,11 @@ class Effect:
 
 @dataclass(kw_only=True)
 class ArmEffect(Effect):
-    """An effect of a whole arm."""
+    """Base of effects on a whole arm."""
 
     layer: ClassVar = "robot"
     arm: ArmChoice = "both"
-    """One arm of the robot, or ``both`` for all of them."""
+    """Name of one arm of the robot, or ``both`` for all of them."""
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
@@ -337,10 +341,11 @@ class ArmEffect(Effect):
 
 @dataclass(kw_only=True)
 class JointEffect(ArmEffect):
-    """An effect of single joints: the same numbers for all that are chosen. Joints that differ get an entry each."""
+    """Base of effects on single joints, with the same parameters for all chosen joints. Joints with different parameters need
+    one entry each."""
 
     possible: ClassVar[tuple[str, ...]] = ROBOT.joints
-    """What ``joints`` may name."""
+    """Names that ``joints`` may contain."""
     joints: list[str] = field(default_factory=lambda: list(ROBOT.joints))
     """``joint1`` … ``joint6``, which the paper calls J0 … J5; for some effects ``gripper``, too."""
 
@@ -353,28 +358,29 @@ class JointEffect(ArmEffect):
 
     @property
     def columns(self) -> list[int]:
-        """Indices of the chosen joints in targets and reported values."""
+        """Indices of the chosen joints in the vectors of targets and reported values."""
         return [ROBOT.action_names.index(name) for name in self.acts_on()]
 
     def chosen(self, spec: mujoco.MjSpec) -> Iterator[mujoco.MjsJoint]:
-        """Joints of the model specification on which the effect acts."""
+        """Names of the joints, in the model specification, on which the effect acts."""
         for name in self.acts_on():
             yield spec.joint(name)
 
 
 @dataclass(kw_only=True)
 class TouchEffect(Effect):
-    """An effect of pads or of their taxels."""
+    """Base of effects on pads or on their taxels."""
 
     needs: ClassVar = ("reading",)
     windows: ClassVar[bool] = False
-    """Whether ``reading`` and ``memory`` also hold for a rectangle of each pad's taxels, where nothing touches beyond its rim."""
+    """Whether ``reading`` and ``memory`` are also correct for a rectangle of each pad's taxels, if nothing touches taxels
+    outside of it."""
     pads: list[str] = field(default_factory=lambda: list(ROBOT.pads))
-    """``left_a`` … ``right_b``; or ``CELLS`` alone."""
+    """Names of pads, ``left_a`` … ``right_b``; or ``CELLS`` alone."""
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
-        """A sensor of cells has readings, and no fingers, boards of a kind or parts in contact."""
+        """Kinds of parts on which it can act. A sensor of cells has readings, but no fingers, boards or parts in contact."""
         return ("pads", "cells") if cls.reading is not Effect.reading else ("pads",)
 
     def __post_init__(self) -> None:
@@ -387,24 +393,24 @@ class TouchEffect(Effect):
 
     @property
     def slots(self) -> list[int]:
-        """Indices of the chosen pads in the reading; a sensor of cells is the only one in its own."""
+        """Indices of the chosen pads in the reading; a sensor of cells is the only entry of its reading."""
         return [0] if self.pads == [CELLS] else [ROBOT.pads.index(pad) for pad in self.pads]
 
     def within(self, window: tuple[slice, slice]) -> "TouchEffect | None":
-        """The effect for readings of these rows and columns only; None if it must have whole pads (``windows``)."""
+        """The effect for readings of these rows and columns only; None if it requires whole pads (``windows``)."""
         return self if self.windows else None
 
 
 @dataclass(kw_only=True)
 class BoardEffect(TouchEffect):
-    """An effect that is drawn once for each board."""
+    """Base of effects whose random numbers are drawn once per board."""
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
         return ("pads",)
 
     seed: int = 0
-    """Of these boards: another one is another set of taxels."""
+    """Seed of these boards; with another seed other taxels are affected."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

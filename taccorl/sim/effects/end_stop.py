@@ -11,7 +11,7 @@ from taccorl.sim.effects.effect import JointEffect, Memory, parameter
 from taccorl.sim.effects.live_model import LiveModel
 
 DAMPING_S = 0.005
-"""Damping over stiffness: a choice. The drive's own K_d damps what moves against the stop far more."""
+"""Damping over stiffness [s]: a choice. The drive's own K_d damps motion against the stop far more."""
 
 
 @effects.register("end_stop")
@@ -65,7 +65,7 @@ class EndStop(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """At either end of the range that was recorded, and further in; stiff ones give way by 2 %, soft ones by 20 % of the
+        """Start values: stops at and within either end of the recorded range; stiff ones yield by 2 %, soft ones by 20 % of the
         range under the greatest torque."""
         stiffness, angle = cls.parameters()
         span = max(seen["span_rad"], 0.02)

@@ -10,7 +10,7 @@ _LINEAR = 1  # MuJoCo's ``interp``: with the default, a hold, the trajectory wou
 
 
 def delay(entry: mujoco.MjsActuator | mujoco.MjsSensor, delay_s: float, timestep_s: float) -> None:
-    """Let an actuator take its control, or a sensor its value, from ``delay_s`` ago, by linear interpolation.
+    """Delay the control of an actuator, or the value of a sensor, by ``delay_s``, with linear interpolation.
 
     Values are stored once a physics step, and read before the newest is stored: a delay below one step acts as one step.
     """
@@ -19,7 +19,8 @@ def delay(entry: mujoco.MjsActuator | mujoco.MjsSensor, delay_s: float, timestep
 
 
 def fill_histories(batch: Batch, ids: np.ndarray) -> None:
-    """After a reset: delayed controls and sensors have been as they are now for ever. MuJoCo's buffers begin with zeros."""
+    """After a reset, fill the buffers of delayed controls and sensors with their present values. MuJoCo's buffers begin with
+    zeros."""
     if not batch.model.nhistory:
         return
     model = batch.get_model(0)

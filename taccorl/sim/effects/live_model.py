@@ -28,18 +28,18 @@ class LiveModel:
         self._indices: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def own(self, name: str) -> np.ndarray:
-        """(N, …) live: a rewritten field."""
+        """(N, …) values of a rewritten field of the model, writable."""
         return self._own[name]
 
     def seen(self, name: str) -> np.ndarray:
-        """(N, …) live: a field of ``mujoco.MjData`` as it is after the newest physics step."""
+        """(N, …) values of a field of ``mujoco.MjData`` after the newest physics step."""
         if name not in self._seen:
             self._seen[name] = self._batch.bind(name)
             self._batch.forward()  # a field is zeros from its binding to the next step
         return self._seen[name]
 
     def make_nominal(self) -> None:
-        """Set every rewritten field back to the compiled model's values."""
+        """Reset every rewritten field to the compiled model's values."""
         for name, values in self._own.items():
             values[:] = self._nominal[name]
 
@@ -64,7 +64,7 @@ class LiveModel:
         return self._indices[key]
 
     def integrates(self, joints: Sequence[str]) -> np.ndarray:
-        """(number of joints,) whether the motor is MuJoCo's PID actuator, whose ``gainprm`` is the integral's."""
+        """(number of joints,) bool: the joint's motor is MuJoCo's PID actuator, whose ``gainprm`` belongs to the integral."""
         return self.model.actuator_gaintype[self.actuators(joints)] == mujoco.mjtGain.mjGAIN_PID
 
     def integrals(self, joints: Sequence[str]) -> np.ndarray:
@@ -72,8 +72,8 @@ class LiveModel:
         return self.model.actuator_actadr[self.actuators(joints)[self.integrates(joints)]]
 
     def error_rad(self, joints: Sequence[str]) -> np.ndarray:
-        """(N, number of joints) what the controllers see of q* − y, with the command that has arrived: it is read off the
-        motors' force. For effects that rewrite ``actuator_gainprm`` and ``actuator_biasprm``."""
+        """(N, number of joints) position error q* − y as the controllers see it, computed from the motors' force. For effects
+        that rewrite ``actuator_gainprm`` and ``actuator_biasprm``."""
         motors, pid = self.actuators(joints), self.integrates(joints)
         gain, bias = self.own("actuator_gainprm")[:, motors, 0], self.own("actuator_biasprm")[:, motors]
         speed = self.model.actuator_gear[motors, 0] * self.seen("qvel")[:, self.dofs(joints)]
@@ -90,6 +90,7 @@ class LiveModel:
         return torque + np.where(apart, self.seen("qfrc_gravcomp")[:, dofs], 0.0)
 
     def scale_carried(self, joints: Sequence[str], carried_nm: np.ndarray, factor: np.ndarray | float) -> None:
-        """Scale the motors' gravity compensation by ``factor``; ``carried_nm`` is what MuJoCo already applies."""
+        """Scale the motors' gravity compensation by ``factor``; ``carried_nm`` is the compensation that MuJoCo already applies
+        [N·m]."""
         applied, dofs = self.own("qfrc_applied"), self.dofs(joints)
         applied[:, dofs] = factor * (applied[:, dofs] + carried_nm) - carried_nm

@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class PadFrameEffect(TouchEffect):
-    """Base of effects that move the frame of a pad's taxels in the finger, and of the pad's box as far as it moves along.
+    """Base of effects that move the frame of a pad's taxels in the finger, and of the pad's box if it moves with them.
 
-    The twin's model is edited; the matched contact replay (``taccorl.alignment.touch.model``), which has no model, asks for
-    ``offset_pad_m`` and looks the depths up there.
+    The twin's model is edited; the matched contact replay (``taccorl.alignment.touch.model``), which has no model, evaluates the
+    depths at positions moved by ``offset_pad_m``.
     """
 
     layer: ClassVar = "robot"
     needs: ClassVar = ("depth",)
 
     def offset_pad_m(self, pad: str) -> np.ndarray:
-        """(3,) by how much the taxels of ``pad`` move, in its frame: across, from palm to tip, out of the pad. Across runs along
-        x of the TCP on fingers a and against it on fingers b."""
+        """(3,) displacement of the taxels of ``pad`` [m] in the pad's frame: across, from palm to tip, out of the pad. Across
+        runs along x of the TCP on fingers a and against it on fingers b."""
         raise NotImplementedError
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:

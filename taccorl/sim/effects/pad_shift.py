@@ -52,7 +52,7 @@ class PadShift(PadFrameEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Half a taxel each way: further off, patches that lie apart have no slope towards each other."""
+        """Start values: half a taxel in each direction. At larger shifts contact areas that do not overlap give no gradient."""
         half = 1e-3
         return [
             {"across_m": half, "along_m": 0.0},

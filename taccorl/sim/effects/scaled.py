@@ -27,26 +27,26 @@ _POWERS = {  # of force unit and length unit in each unit of a parameter
 """Units that are not here (1, s, 1/s …) are the same on every machine."""
 _SLIDE = {"N·m": "N", "rad": "m", "kg·m²": "kg"}
 OF_A_TURN = ("cogging", "encoder_eccentricity")
-"""Effects that repeat with the turns of a joint: no slide has them."""
+"""Effects that repeat with the turns of a joint; a linear axis does not have them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """Size of a machine's forces and motions over those of a joint of a small arm."""
+    """Size of a machine's forces and motions relative to a joint of a small arm."""
 
     unit: Literal["rad", "m"] = "rad"
     force: float = 1.0
-    """N·m or N."""
+    """Factor on forces, N·m or N."""
     length: float = 1.0
-    """rad or m."""
+    """Factor on positions, rad or m."""
 
     def factor(self, unit: str) -> float:
-        """Number of this machine / number of a small arm, for parameters in ``unit``."""
+        """Factor on parameters in ``unit``: value for this machine / value for a small arm."""
         force, length = _POWERS.get(unit, (0, 0))
         return self.force**force * self.length**length
 
     def unit_of(self, unit: str) -> str:
-        """Name of a parameter's unit on this machine: of a slide N for N·m, m for rad."""
+        """Unit of a parameter on this machine: for a slide N instead of N·m, m instead of rad."""
         if self.unit == "m":
             for angular, linear in _SLIDE.items():
                 unit = unit.replace(angular, linear)
@@ -55,7 +55,7 @@ class Scale:
 
 @functools.cache
 def scaled(name: str, scale: Scale) -> type[Effect]:
-    """The class of an effect for a machine of that size.
+    """Class of the effect with bounds and units for a machine of that size.
 
     Raises:
         TaccorlError: no such effect.

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 MOST_LOST = 0.5
-"""Share of the inertia that may be lost in MuJoCo, where all joints move in every pose. A choice: stable with all six. A delay
-that would take more is applied in part, with a warning."""
+"""Largest share of a joint's inertia by which the effect may reduce it in MuJoCo. A choice with which all six joints are stable.
+A longer delay is applied in part, with a warning."""
 POSES = 64
 
 

@@ -77,7 +77,7 @@ class TaxelCreep(RememberingEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Rising quickly, rising slowly, sinking."""
+        """Start values: rising quickly, rising slowly, sinking."""
         return [
             {"share": 0.3, "time_constant_s": 0.3},
             {"share": 0.3, "time_constant_s": 3.0},

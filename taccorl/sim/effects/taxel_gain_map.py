@@ -47,12 +47,12 @@ class TaxelGainMap(TouchEffect):
         source="1 is the map as it was measured; less fades it out",
     )
     gains: list[float] = field(default_factory=lambda: [0.0])
-    """g_i: one per taxel, row after row from palm to tip, pad after pad; or one for all of them. 0, as it is by default, is a
-    pad that is not connected."""
+    """g_i: one per taxel, row after row from palm to tip, pad after pad; or one for all of them. 0, the default, is a pad that
+    is not connected."""
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
-        """Of a sensor of cells each cell's gain is always fitted."""
+        """Kinds of parts on which it can act; not a sensor of cells, whose gains are always fitted."""
         return ("pads",)
 
     def __post_init__(self) -> None:
@@ -72,7 +72,7 @@ class TaxelGainMap(TouchEffect):
 
     @classmethod
     def of(cls, gains: np.ndarray, pads: Sequence[str]) -> "TaxelGainMap":
-        """The map of gains (P, R, C), rounded to six digits: fine enough to be fitted with, short enough to be read."""
+        """The effect with the gains (P, R, C), rounded to six digits."""
         return cls(share=1.0, pads=list(pads), gains=np.round(np.asarray(gains, float), 6).reshape(-1).tolist())
 
     def within(self, window: tuple[slice, slice]) -> "TaxelGainMap":

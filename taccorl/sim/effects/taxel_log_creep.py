@@ -51,7 +51,7 @@ class TaxelLogCreep(RememberingEffect):
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
-        """No candidate of the pads' search, whose presses are too short to tell it from ``taxel_creep``."""
+        """Kinds of parts on which it can act; not pads, whose presses are too short to tell it from ``taxel_creep``."""
         return ("cells",)
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
@@ -67,7 +67,7 @@ class TaxelLogCreep(RememberingEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Rising and sinking."""
+        """Start values: rising and sinking."""
         return [{"share": 0.05}, {"share": -0.05}]
 
 

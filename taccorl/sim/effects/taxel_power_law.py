@@ -57,7 +57,8 @@ class TaxelPowerLaw(TouchEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Steeper and flatter. The reference is no start: another one is another k_n."""
+        """Start values: steeper and flatter. The reference f₀ has one start only, because changing it is equivalent to changing
+        k_n."""
         return [{"exponent": 1.4}, {"exponent": 0.75}]
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:

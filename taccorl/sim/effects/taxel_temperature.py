@@ -11,7 +11,7 @@ from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Kind, Memory, TouchEffect, parameter
 
 NOMINAL_C = 20.0
-"""Temperature at which the effect does nothing; a simulation, which knows no temperature, is at it."""
+"""Temperature at which the effect does nothing [°C]; simulations have this temperature."""
 
 
 @effects.register("taxel_temperature")
@@ -57,12 +57,12 @@ class TaxelTemperature(TouchEffect):
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
-        """Recordings of pads hold no temperature."""
+        """Kinds of parts on which it can act; not pads, whose recordings hold no temperature."""
         return ("cells",)
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """More and less gain, the zero up and down."""
+        """Start values: gain up and down, zero up and down."""
         return [
             {"gain_per_k": 0.005, "zero_per_k": 0.0},
             {"gain_per_k": -0.005, "zero_per_k": 0.0},

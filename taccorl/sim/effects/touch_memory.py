@@ -13,21 +13,22 @@ from taccorl.sim.effects.effect import Memory, TouchEffect
 class RememberingEffect(TouchEffect):
     """Base of touch effects with memory: they compute a whole sequence of scans at once; one scan is a sequence of length 1.
 
-    Thousands of calls for a recording become one (``taccorl.alignment.touch.model``), by the same code as in the simulation. An
-    effect with a memory that is not of this class works as well, scan by scan.
+    A replay of a recording (``taccorl.alignment.touch.model``) thus needs one call instead of thousands, with the same code as
+    the simulation. Other effects with a memory work too, called scan by scan.
     """
 
     holds_scan: ClassVar[bool] = True
-    """Its input is held since the scan before; false where the path between scans changes nothing, or follows a line."""
+    """True: the input is taken as constant since the scan before. False: it is taken as linear, or the path between scans has no
+    influence."""
 
     @abstractmethod
     def scans(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
         """Readings of the chosen pads P in S consecutive scans, a new array (S, N, P, R, C) of the same type.
 
         Args:
-            own: (S, N, P, R, C) what ideal ones would read.
-            memory: arrays (N, …) as before the first scan; left as after the last.
-            dt_s: (S, N) since the scan before.
+            own: (S, N, P, R, C) readings of ideal pads.
+            memory: arrays (N, …) with the state before the first scan; changed to the state after the last.
+            dt_s: (S, N) time since the scan before.
         """
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:

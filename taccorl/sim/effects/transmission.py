@@ -1,13 +1,13 @@
-"""A second joint between a motor and its link, for what happens in the gear: play, or a spring."""
+"""A second joint between a motor and its link, for effects in the gear: backlash, or a spring."""
 
 import mujoco
 
 
 def add_transmission_joint(motor: mujoco.MjsJoint, what: str) -> mujoco.MjsJoint:
-    """A hinge after ``motor`` about the same axis, named ``{motor}_{what}``: the link's angle is the sum of both.
+    """Add a hinge after ``motor`` about the same axis, named ``{motor}_{what}``: the link's angle is the sum of both.
 
     The torque that carries the arm's weight comes from the motor. MuJoCo's gravity compensation acts on every joint; on this
-    one it is counted as an actuator's and limited to nothing, so that the weight loads the gear.
+    one it is counted as an actuator force and limited to zero, so that the weight loads the gear.
     """
     gear_kgm2 = 1e-5  # a gear's own inertia: with none, play and spring on one joint would be a singular chain
     joint = motor.parent.add_joint(name=f"{motor.name}_{what}", axis=motor.axis, pos=motor.pos, armature=gear_kgm2)

@@ -1,4 +1,4 @@
-"""Sensors of the twin, one file each: register a ``SensorConfig`` with ``@sensors.register("name")`` and it takes part.
+"""Sensors of the twin, one file each: register a ``SensorConfig`` with ``@sensors.register("name")`` to add one.
 
 Steps of every sensor, in this order (``Sensor.sense``):
 
@@ -6,7 +6,7 @@ Steps of every sensor, in this order (``Sensor.sense``):
 2. transforms: effects of the sensor's material and wiring, reading → reading, one after the other;
 3. gain, resting counts, noise, analogue-digital converter → counts on the wire.
 
-Effects (a law that is no straight line, creep, crosstalk, dead taxels, drift) are transforms and nothing else.
+Effects (a nonlinear law, creep, crosstalk, dead taxels, drift) are always transforms.
 
 Letters in shapes: N sims, P pads, K taxels = R rows · C columns.
 """
@@ -29,10 +29,11 @@ faster; or no noise."""
 
 
 class Transform(Protocol):
-    """One effect between law and gain."""
+    """Effect between the sensor's law and its gain."""
 
     def __call__(self, reading: np.ndarray, /) -> np.ndarray:
-        """(N, P, R, C) reading → the same shape. One with a memory keeps it per sim and is called once a scan."""
+        """Change a reading (N, P, R, C); the shape stays the same. A transform with a memory keeps it per simulation and is
+        called once per scan."""
         ...
 
 
@@ -43,7 +44,8 @@ class TactileFrames:
     counts: np.ndarray
     """(N, P, R, C) uint8 or uint16 counts on the wire, in the pads' own layout."""
     baseline: np.ndarray
-    """(P, R, C) counts at rest, without noise: what ingest finds as the median of a recording's first frames, but for noise."""
+    """(P, R, C) counts at rest, without noise: up to noise equal to the median of a recording's first frames, which ingest
+    uses."""
     pads: tuple[str, ...]
     spec: SensorSpec
 
@@ -57,7 +59,7 @@ class TactileFrames:
         """Frame (N, wire rows, wire columns) as the board of ``pad`` sends it, row after row.
 
         Raises:
-            TaccorlError: there is no such pad; names the nearest.
+            TaccorlError: there is no such pad; the message names the nearest.
         """
         if pad not in self.pads:
             raise TaccorlError(f"no pad {pad!r}; {nearest(pad, self.pads)}")
@@ -70,14 +72,15 @@ def as_wire(frames: np.ndarray, spec: SensorSpec) -> np.ndarray:
 
 
 class Sensor(abc.ABC):
-    """Simulated tactile pads of one kind: resting counts of this unit, and transforms (effects) between law and gain."""
+    """Simulated tactile pads of one kind: resting counts of the individual boards, and transforms (effects) between law and
+    gain."""
 
     def __init__(
         self, spec: SensorSpec, pads: Sequence[str], baseline: np.ndarray, transforms: Sequence[Transform]
     ) -> None:
         self.spec, self.pads, self.baseline = spec, tuple(pads), baseline
         self.transforms = list(transforms)
-        """Applied in this order; with none of them a reading goes on untouched, bit for bit."""
+        """Transforms in the order in which they are applied; without any, a reading passes unchanged bit for bit."""
 
     @abc.abstractmethod
     def reading(self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, time_s: np.ndarray | None) -> np.ndarray:
@@ -97,11 +100,11 @@ class Sensor(abc.ABC):
     ) -> TactileFrames:
         """Counts of the pads for depth [m] and depth rate [m/s] of their taxels (N, P, K).
 
-        Given as a history (S, N, P, K) with ``time_s`` (S,), rising, of which 0 is the stamp (the end of the scan), each row
-        of the wire reads at its own instant of the scan. Without ``time_s`` the whole pad reads at once.
+        With a history (S, N, P, K) and its times ``time_s`` (S,) (ascending; 0 is the stamp, which is the end of the scan) each
+        row of the wire is read at its own instant of the scan. Without ``time_s`` the whole pad is read at once.
 
         Raises:
-            TaccorlError: shapes do not fit, a history does not cover the scan, a transform changes the shape.
+            TaccorlError: shapes do not fit, the history does not cover the scan, or a transform changes the shape.
         """
         shape = (len(self.pads), self.spec.rows * self.spec.columns)
         if (
@@ -126,11 +129,11 @@ class SensorConfig(abc.ABC):
     """Settings of one kind of sensor."""
 
     seed: int = 0
-    """Of this unit: what differs from board to board (resting counts) is drawn from it."""
+    """Seed from which differences between boards (resting counts) are drawn."""
 
     @abc.abstractmethod
     def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> Sensor:
-        """The sensor on these pads, in their order, with effects between law and gain, in theirs."""
+        """Build the sensor for these pads, in their order, with these effects between law and gain, in their order."""
 
 
 sensors: Registry[type[SensorConfig]] = Registry("sensor", "taccorl.sim.sensors")
@@ -140,7 +143,7 @@ def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
     """Standard normal random numbers (N, ...) float32, one simulation after the other; None without noise.
 
     Raises:
-        TaccorlError: another number of generators than sims.
+        TaccorlError: the number of generators differs from that of simulations.
     """
     if noise is None:
         return None

@@ -25,22 +25,22 @@ from taccorl.sim.sensors import Noise, Sensor, SensorConfig, Transform, as_wire,
 def normal_reading(
     depth_m: np.ndarray, depth_rate_mps: np.ndarray, stiffness_per_m: float, damping_s_per_m: float
 ) -> np.ndarray:
-    """Spring-damper taxel reading, paper eq. 10: [k_n δ + k_d δ̇]₊, and 0 where δ is. Never pulls."""
+    """Reading of a spring-damper taxel, paper eq. 10: [k_n δ + k_d δ̇]₊, and 0 where δ is 0. It is never negative."""
     reading = stiffness_per_m * depth_m + damping_s_per_m * depth_rate_mps
     return np.maximum(reading, 0) * (depth_m > 0)
 
 
 def scan_instants_s(spec: SensorSpec) -> np.ndarray:
-    """Times (wire rows,) before the stamp at which each row of the wire is read: the middles of equal parts of the scan."""
+    """Times (wire rows,) before the stamp at which each row of the wire is read: middles of equal parts of the scan [s]."""
     share = (np.arange(spec.wire.rows) + 0.5) / spec.wire.rows
     return (share - 1) * spec.scan_time_s
 
 
 def at_scan_instants(samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec) -> np.ndarray:
-    """Samples (S, ..., R, C) at times (S,) → (..., R, C), each row of the wire at its instant, by linear interpolation.
+    """Samples (S, ..., R, C) at times (S,) → (..., R, C): each row of the wire at its own instant, by linear interpolation.
 
     Raises:
-        TaccorlError: times do not rise, or leave out an instant of the scan.
+        TaccorlError: times are not ascending, or do not cover the scan.
     """
     instants_s = scan_instants_s(spec)
     times = np.asarray(time_s, float)
@@ -65,7 +65,7 @@ def at_scan_instants(samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec) 
 
 
 class FlexiTac(Sensor):
-    """Pads as ``FlexiTacConfig`` describes them. Stateless but for transforms with a memory."""
+    """FlexiTac pads with the settings of ``FlexiTacConfig``. They have no state except for that of transforms with a memory."""
 
     def __init__(
         self, config: "FlexiTacConfig", spec: SensorSpec, pads: Sequence[str], transforms: Sequence[Transform]
@@ -143,24 +143,24 @@ class FlexiTacConfig(SensorConfig):
     """Settings of simulated FlexiTac-V2 pads."""
 
     spec: str = "flexitac_v2"
-    """Sensor file: taxels, wire, converter, scan. A name among data_specs/sensors, or a path."""
+    """Sensor file with taxels, wire format, converter and scan: a name in data_specs/sensors, or a path."""
     normal_stiffness_per_m: float = 1200.0
-    """k_n: reading for each metre of depth. A choice, see above."""
+    """k_n: reading per metre of depth. A choice; the module's docstring gives the reason."""
     normal_damping_s_per_m: float = 6.0
-    """k_d: reading for each m/s of rate. A choice: k_d / k_n = 5 ms, 5 counts at a closing speed of 10 mm/s."""
+    """k_d: reading per m/s of depth rate. A choice: k_d / k_n = 5 ms, 5 counts at a closing speed of 10 mm/s."""
     gain_count: float = 75.0
-    """Counts for a reading of 1."""
+    """Counts per reading of 1."""
     resting_count: tuple[int, int] = (10, 40)
     """Lowest and highest resting count of a taxel; each taxel draws its own from ``seed``."""
     noise_std_count: float = 1.3
-    """Standard deviation of a taxel's noise, from scan to scan. A choice, as in the stand-in recordings; the boards' own
-    no-contact threshold is 15 counts."""
+    """Standard deviation of a taxel's noise [counts], independent between scans. A choice, as in the stand-in recordings; the
+    boards' own no-contact threshold is 15 counts."""
 
     def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> FlexiTac:
         """The sensor on these pads, with effects between law and gain.
 
         Raises:
-            TaccorlError: a setting that no board can have.
+            TaccorlError: a setting is not possible for a board.
         """
         spec = load_sensor_spec(find_spec(self.spec))
         low, high = self.resting_count

@@ -26,19 +26,20 @@ _HALF, _LOW = np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
 class ScanNoise(NamedTuple):
-    """Standard normal noise of N simulations. Row i equals the first draws of ``np.random.default_rng((seeds[i], steps[i]))``."""
+    """Standard normal random numbers for N simulations. Row i equals the first draws of ``np.random.default_rng((seeds[i],
+    steps[i]))``."""
 
     seeds: np.ndarray
-    """(N,) 0 … 2⁶³ − 1."""
+    """(N,) seeds of the scenes, 0 … 2⁶³ − 1."""
     steps: np.ndarray
-    """(N,) 0 … 2³² − 1."""
+    """(N,) numbers of the steps, 0 … 2³² − 1."""
 
     def of(self, start: int, end: int) -> "ScanNoise":
-        """Noise of simulations ``start`` … ``end``."""
+        """The noise of simulations ``start`` … ``end`` (excluded)."""
         return ScanNoise(self.seeds[start:end], self.steps[start:end])
 
     def draw(self, shape: tuple[int, ...]) -> np.ndarray:
-        """(N, …) float32."""
+        """(N, …) float32 standard normal numbers."""
         normal = np.empty(shape, np.float32)
         _fill(self.seeds.astype(np.uint64), self.steps.astype(np.uint64), normal.reshape(shape[0], -1))
         return normal
