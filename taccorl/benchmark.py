@@ -1,4 +1,5 @@
-"""Benchmarks: figures with goal, rival, n and spread, measured in one run. ``make bench``, ``make bench ONLY=ingest``.
+"""Benchmarks: figures with a goal, a reference ("rival"), n and spread, measured in one run. ``make bench``, ``make bench
+ONLY=ingest``.
 
 A package registers its benchmarks in a module ``benchmarks`` with ``@benchmark("name")``: a function that yields ``Row``s.
 Timings are CPU-seconds or ratios within one run, because machines are shared and noisy. A goal is never one of CPU-seconds:
@@ -41,12 +42,12 @@ class Row:
     value: float
     unit: str
     goal: str = ""
-    """"≥ 4" or "< 1.5"; empty: no goal, for information."""
+    """Condition such as "≥ 4" or "< 1.5"; empty: no goal, for information."""
     rival: str = ""
-    """What it is compared with, in the same run."""
+    """Reference that the figure is compared with, measured in the same run."""
     rival_value: float | None = None
     n: int
-    """How often it was measured."""
+    """Number of measurements."""
     spread: float
     """(largest − smallest) / 2 of the n measurements, in the row's unit."""
     met: bool | None = None
@@ -69,7 +70,7 @@ def benchmark(name: str) -> Callable[[Callable[[], Iterator[Row]]], Callable[[],
 
 
 def spread(values: list[float]) -> float:
-    """Half the range of the measurements."""
+    """Half the range (largest − smallest) of the measurements."""
     return (max(values) - min(values)) / 2
 
 
@@ -108,7 +109,7 @@ def reference_step_s(repeats: int = 3) -> float:
 
 
 def against_reference(name: str, cpu_s: Sequence[float], goal: str = "") -> Row:
-    """A row of costs measured just now, in steps of the reference loop, which is run beside them."""
+    """Row with the costs just measured, in steps of the reference loop, which is measured in the same run."""
     step_s = reference_step_s()
     steps = [cost / step_s for cost in cpu_s]
     return Row(
@@ -124,7 +125,7 @@ def against_reference(name: str, cpu_s: Sequence[float], goal: str = "") -> Row:
 
 
 def meets(value: float, goal: str) -> bool | None:
-    """``meets(4.2, "≥ 4")`` is True; no goal is None."""
+    """Whether a value meets a goal: ``meets(4.2, "≥ 4")`` is True. None without a goal."""
     if not goal:
         return None
     sign, _, bound = goal.partition(" ")
@@ -138,7 +139,7 @@ def meets(value: float, goal: str) -> bool | None:
 
 
 def machine() -> str:
-    """Cores and processor, without anything that names the host."""
+    """Number of cores and name of the processor, without the name of the host."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -198,7 +199,7 @@ def _store(rows: list[Row]) -> None:
 
 
 def render(rows: list[dict[str, Any]]) -> str:
-    """The page of all rows."""
+    """Text of docs/benchmarks.md for all rows."""
     lines = [
         "# Benchmarks",
         "",
@@ -231,7 +232,7 @@ def render(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> int:
-    """``python -m taccorl.benchmark [--only=name]``"""
+    """Command line: ``python -m taccorl.benchmark [--only=name]``."""
     words = sys.argv[1:]
     only = [a.removeprefix("--only=") for a in words if a.startswith("--only=")]
     if len(only) != len(words) or len(words) > 1:

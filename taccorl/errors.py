@@ -29,7 +29,7 @@ class UnreachableError(TaccorlError):
 
 
 class LostError(TaccorlError):
-    """A state from which an expert cannot complete its task. Messages have no numbers: they are counted."""
+    """A state from which an expert cannot complete its task. Messages contain no numbers, so that equal ones can be counted."""
 
 
 def printable(text: object) -> str:

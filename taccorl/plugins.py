@@ -57,7 +57,7 @@ class Registry[T]:
         """The plug-in of that name.
 
         Raises:
-            TaccorlError: nothing is registered under ``name``; names the nearest.
+            TaccorlError: nothing is registered under ``name``; the message names the nearest.
         """
         self._load()
         if name not in self._entries:

@@ -1,10 +1,10 @@
-"""``taccorl add-effect coulomb_friction --twin=twin.yaml --joints=left_joint5``: the twin with one physical effect more.
-``taccorl add-effect taxel_creep --twin=twin.yaml --pads=left``: of pads.
+"""``taccorl add-effect coulomb_friction --twin=twin.yaml --joints=left_joint5``: add one physical effect to a twin.
+``taccorl add-effect taxel_creep --twin=twin.yaml --pads=left``: an effect of pads.
 
-The numbers are those of the last ``taccorl diagnose`` of this twin, with those that were refitted with the effect: gains of a
-joint, k_n and k_d of pads. It may also be an effect that was tied with the one that was chosen. ``--values={torque_nm: 0.4}``
-gives numbers by hand instead.
-Writes a copy, ``twin+coulomb_friction.yaml``, which collection, generation and training load.
+The values are those that the last ``taccorl diagnose`` of this twin fitted, and with them the values that were refitted
+together: gains of a joint, k_n and k_d of pads. An effect that was tied with the chosen one can also be added.
+``--values={torque_nm: 0.4}`` gives values by hand instead. Writes a copy, ``twin+coulomb_friction.yaml``, which collection,
+generation and training load.
 """
 
 import json
@@ -22,28 +22,29 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class AddEffectConfig:
-    """The twin with one physical effect more."""
+    """Add one physical effect to a twin."""
 
     effect: str
     """Name of the effect; docs/effects.md lists them."""
     twin: Path | None = None
     """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
-    """left_joint5; joint5 or J4 (the paper's name of it) for both arms. All that were diagnosed with it if not given."""
+    """left_joint5; joint5 or J4 (the paper's name of it) for both arms. If not given: all joints for which the diagnosis found
+    the effect."""
     pads: list[str] = field(default_factory=list)
-    """left, right: the pads of these arms. All that were diagnosed with it if not given."""
+    """left, right: the pads of these arms. If not given: the pads for which the diagnosis found the effect."""
     diagnosis: Path = Path("diagnosis")
-    """Folder of the diagnosis that fitted the numbers."""
+    """Folder of the diagnosis that fitted the values."""
     values: dict[str, float] = field(default_factory=dict)
-    """Numbers by hand, such as {torque_nm: 0.4}; no diagnosis is read then."""
+    """Values by hand, such as {torque_nm: 0.4}; no diagnosis is read then."""
     out: Path | None = None
-    """File to write; beside the twin with +EFFECT in its name if not given. A file that is there is left alone."""
+    """File to write; beside the twin, with +EFFECT in its name, if not given. An existing file is not overwritten."""
     in_place: bool = False
-    """Change the twin's own file."""
+    """Change the twin's own file instead of writing a copy."""
 
 
 def main(argv: list[str]) -> int:
-    """0: written."""
+    """Run ``taccorl add-effect``; exit status 0: written."""
     config = parse(AddEffectConfig, argv, positional="effect", prog="taccorl add-effect")
     out = _place(config)
     from taccorl.diagnosis.machines.load import load_machine

@@ -31,29 +31,29 @@ class AugmentConfig:
     source: Path
     """Dataset of successful demonstrations from the twin, of this task."""
     task: str
-    """Task: {tasks}."""
+    """Task of the demonstrations: {tasks}."""
     episodes: int = 200
     """Number of successful demonstrations to generate."""
     out: Path | None = None
-    """The dataset's folder; outputs/TASK_augmented if not given. It must not hold anything else."""
+    """The dataset's folder; outputs/TASK_augmented if not given. It must be empty or not exist."""
     store: Path = Path("outputs/store")
-    """Finished attempts are kept here, so that a second run continues where the first ended."""
+    """Folder that keeps finished attempts, so that a second run continues where the first ended."""
     difficulty: str = "train"
-    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: Path | None = None
-    """A twin.yaml; the nominal twin if not given. It need not be that of the sources."""
+    """A twin.yaml; the nominal twin if not given. It may differ from the twin of the source demonstrations."""
     spec: str | None = None
-    """Settings of the generation: a file like mimicgen.yaml of a task's folder; the task's own if not given."""
+    """MimicGen settings: a file like mimicgen.yaml of a task's folder; the task's own if not given."""
     images: bool = True
     """Render the three cameras (needs OpenGL)."""
     seed: int = 0
     """Seed of all attempts, at least 0; another seed gives other scenes."""
     stratify: bool = False
-    """After the first half, choose attempts that begin where episodes are few; the report shows the effect."""
+    """After the first half, start attempts in scenes like those with few successes so far; the report shows the effect."""
     rows: str = "dataset"
-    """dataset; or actions: seeds and actions alone, for taccorl execute."""
+    """What to write. dataset; or actions: only seeds and actions, for taccorl execute."""
     engine: Engine = field(default_factory=LocalEngine)
-    """Where to work: --engine.type=local --engine.workers=2, slurm, ray."""
+    """Where attempts run: --engine.type=local --engine.workers=2, slurm, ray."""
 
 
 def main(argv: list[str]) -> int:

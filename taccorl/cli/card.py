@@ -1,4 +1,5 @@
-"""Card of a dataset, written by every verb that makes one. A dataset is whole without: a fault is printed, not raised."""
+"""Card of a dataset, written by every verb that makes one. A failure to write it is printed, not raised, because the dataset is
+complete without it."""
 
 from pathlib import Path
 
@@ -6,7 +7,7 @@ from taccorl.errors import TaccorlError, printable
 
 
 def add_card(root: Path) -> None:
-    """Write ``README.md`` beside ``meta/`` and print where; a README.md that is there already stays as it is."""
+    """Write ``README.md`` beside ``meta/`` and print its path; an existing README.md is not changed."""
     from taccorl.views.card import write_card
 
     try:

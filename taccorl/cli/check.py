@@ -1,4 +1,4 @@
-"""``taccorl check PATH [--spec=piper_flexitac_mcap]``: what is wrong with a recording or a dataset.
+"""``taccorl check PATH [--spec=piper_flexitac_mcap]``: find faults of a recording or a dataset.
 
 A recording needs its spec; a dataset is checked against the spec that is stored in it.
 """
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class CheckConfig:
-    """Find what is wrong with a recording or a dataset."""
+    """Find faults of a recording or a dataset."""
 
     path: Path
     """A LeRobot dataset's folder, or a recording (file, bag folder, folder of recordings)."""
     spec: str | None = None
-    """Recording spec; needed for recordings."""
+    """Recording spec; required for recordings."""
     pictures: bool = True
-    """Look at every picture, too: finds frozen ones, takes a few seconds an episode."""
+    """Also decode every picture, to find frozen cameras; takes a few seconds per episode."""
     quick: bool = False
-    """Do not read all files of a dataset to compare them with the digests in its manifest."""
+    """Skip reading all files of a dataset to compare them with the digests in its manifest."""
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl check``; exit status 0: nothing worse than a note, 1: warnings or errors."""
+    """Run ``taccorl check``; exit status 0: notes at most, 1: warnings or errors."""
     config = parse(CheckConfig, argv, positional="path")
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)

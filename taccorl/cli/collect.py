@@ -25,31 +25,31 @@ class CollectConfig:
     """Collect demonstrations in the twin."""
 
     task: str | None = None
-    """Task: {tasks}. Action files state it."""
+    """Task: {tasks}. Files of actions state their own."""
     source: Source = field(default_factory=ExpertSource)
-    """Who demonstrates: --source.type=expert, keyboard, gamepad, leader, actions."""
+    """Source of the demonstrations: --source.type=expert, keyboard, gamepad, leader, actions."""
     episodes: int = 20
-    """Number of successful demonstrations, in a dataset or as recordings."""
+    """Number of successful demonstrations to write."""
     out: Path | None = None
-    """Folder of the dataset or the recordings; outputs/TASK if not given. It must not hold anything else."""
+    """Folder of the dataset or the recordings; outputs/TASK if not given. It must be empty or not exist."""
     store: Path = Path("outputs/store")
-    """Finished attempts are kept here, so that a second run continues where the first ended."""
+    """Folder that keeps finished attempts, so that a second run continues where the first ended."""
     difficulty: str = "train"
-    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Share of the paper's reset ranges, 0 … 1; 0: the nominal scene."""
+    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
     images: bool = True
     """Render the three cameras (needs OpenGL)."""
     as_recording: bool = False
     """Write MCAP recordings instead of a dataset."""
     keep_failures: bool = False
-    """Keep failed attempts as well."""
+    """Also write failed attempts."""
     seed: int = 0
     """Seed of all attempts, at least 0; another seed gives other scenes."""
     origin: str = ORIGIN
-    """Label of the origin in all outputs; write "surrogate: …" where the twin plays the robot."""
+    """Label of the origin in all outputs; write "surrogate: …" where the twin stands in for the robot."""
 
 
 def main(argv: list[str]) -> int:

@@ -1,11 +1,11 @@
-"""``taccorl compare --twin=twin.yaml --measurements=sweeps/``: how far the twin is from measurements, and where.
-``taccorl compare --twin=drive.yaml --measurements=bench/``: of another machine, whose file says ``kind: axis``.
+"""``taccorl compare --twin=twin.yaml --measurements=sweeps/``: the difference between the twin and measurements.
+``taccorl compare --twin=drive.yaml --measurements=bench/``: for another machine, whose file says ``kind: axis``.
 
-MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may say which
-are for validation, which repeat one another, and what the pads pressed: then touch is compared, pad by pad. Every recording's
-commands run through the twin. What is wrong with the data is said first; with errors nothing is compared.
+MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may state which
+are for validation, which repeat one another, and which object the pads pressed: then touch is compared, pad by pad. The commands
+of every recording are simulated in the twin. Faults of the data are printed first; with errors nothing is compared.
 
-    --against=other.yaml   another twin beside it: before and after
+    --against=other.yaml   a second twin beside it, such as the one before a change
     --out=DIR              report.html (one page, works anywhere) and report.json
     --rerun=x.rrd          measured, replayed, residual and noise floor over time, for the Rerun program
 """
@@ -29,51 +29,52 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class PressedConfig:
-    """A ball or a rod between the fingers."""
+    """Object between the fingers during the recordings: a ball or a rod."""
 
     shape: Literal["nothing", "sphere", "rod"] = "nothing"
-    """nothing: touch is not compared."""
+    """Shape of the object. nothing: touch is not compared."""
     radius_m: float = 0.012
     length_m: float = 0.03
-    """Of a rod."""
+    """Length of a rod [m]."""
     arm: str = "left"
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Its middle: in the TCP's frame (middle between the pads, z = approach, fingers close along y), or in the world's."""
+    """Centre of the object: in the TCP's frame (origin in the middle between the pads, z = approach, fingers close along y), or
+    in the world's, as ``frame`` says."""
     rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Fixed-axis roll, pitch, yaw; [0, 1.5708, 0] lays a rod across the pads."""
+    """Orientation of the object: fixed-axis roll, pitch, yaw; [0, 1.5708, 0] lays a rod across the pads."""
     frame: Literal["tcp", "world"] = "tcp"
 
 
 @dataclass(kw_only=True)
 class CompareConfig:
-    """How far the twin is from measurements, and where."""
+    """Measure the difference between a twin and measurements."""
 
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
     """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     against: Path | None = None
-    """Another such file, shown beside the first."""
+    """File of a second machine of the same kind, shown beside the first."""
     joints: list[str] = field(default_factory=list)
-    """Only these, such as left_joint5; all that were commanded to move if not given."""
+    """Only these joints, such as left_joint5; all that were commanded to move if not given."""
     spec: str | None = None
-    """Recording spec; needed where several shipped ones read the format."""
+    """Recording spec; required where several shipped ones read the format."""
     columns: Path | None = None
-    """Columns file of tables with other names or units than ours."""
+    """Columns file, for tables with other column names or units than taccorl's."""
     validation_every: int | None = None
-    """Every k-th motion is for validation; else as measurements.yaml says."""
+    """Every k-th motion is for validation; as measurements.yaml states if not given."""
     accept: list[str] = field(default_factory=list)
-    """Checks whose errors are known, such as frozen_channel: they become warnings, which stay in the report."""
+    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings, which stay in the report."""
     pressed: PressedConfig = field(default_factory=PressedConfig)
-    """What the fingers pressed in recordings with pads of which measurements.yaml does not say it."""
+    """Object that the fingers pressed, for recordings with pads whose object measurements.yaml does not state."""
     out: Path | None = None
-    """Folder for report.html and report.json. An earlier report is replaced, any other file left alone."""
+    """Folder for report.html and report.json. An earlier report is replaced; other files are not overwritten."""
     rerun: Path | None = None
-    """Write a Rerun file (.rrd); replaces as `out` does."""
+    """Rerun file (.rrd) to write. An earlier one of taccorl is replaced; other files are not overwritten."""
 
 
 def main(argv: list[str]) -> int:
-    """0: compared; 1: the measurements have errors, nothing was compared."""
+    """Run ``taccorl compare``; exit status 0: compared, 1: the measurements have errors, nothing was compared."""
     config = parse(CompareConfig, argv, positional="measurements")
     _check_outputs(config)
     from taccorl.alignment.checks.telemetry import check_names
@@ -156,7 +157,7 @@ def _pressed(config: PressedConfig) -> "PressedObject | None":
 
 
 def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> None:
-    """One line a signal and use."""
+    """Table of errors with one line per signal and use (fit, validation, test)."""
     from rich.table import Table
     from rich.text import Text
 

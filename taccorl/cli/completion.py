@@ -19,7 +19,7 @@ SECOND_WORDS = {
     "lineage": ("explain", "prune"),
     "completion": ("bash", "zsh", "fish"),
 }
-"""Verb → second words that it takes, such as ``explain`` of ``taccorl lineage explain``."""
+"""Verb → its second words, such as ``explain`` of ``taccorl lineage explain``."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -39,8 +39,8 @@ def main(argv: list[str]) -> int:
 def options_of(verb: str) -> list[str]:
     """Names of the options of a verb, nested ones with a dot: ``out``, ``engine.workers``.
 
-    They are read from the source of the config classes, because importing all of them takes seconds. Of a config that is one of
-    several kinds, the kinds in its own file are known.
+    They are read from the source of the config classes, because importing all of them takes seconds. If an option chooses one of
+    several config classes, only the classes in the same file are included.
     """
     module = f"taccorl.cli.{verb.replace('-', '_')}"
     calls = [node for node in _nodes(module) if isinstance(node, ast.Call)]

@@ -4,9 +4,9 @@ DAgger by takeover: the policy acts in the twin; at a drawn time after both part
 task's scripted expert takes over and completes the task. Only the expert's rows become a LeRobot dataset, to be merged with the
 demonstrations (taccorl merge) and trained on (lerobot-train). Give every round of corrections another --seed.
 
-    --takeover=failures       keep out episodes in which the policy succeeds by itself (all: correct them, too)
-    --engine.workers=8        experts in so many processes
-    --rows=actions            seeds and actions alone: taccorl execute makes one dataset of demonstrations and corrections
+    --takeover=failures       skip episodes in which the policy succeeds by itself (all: correct these too)
+    --engine.workers=8        number of processes that run experts
+    --rows=actions            write only seeds and actions; taccorl execute makes one dataset of demonstrations and corrections
 
 The policy's episodes and each correction are kept in the store: a run that was stopped continues.
 """
@@ -28,39 +28,39 @@ class CorrectConfig:
     """Collect the expert's corrections of a policy."""
 
     policy: PolicyChoice = field(default_factory=PolicyChoice)
-    """--policy.path=CHECKPOINT."""
+    """The policy to correct: --policy.path=CHECKPOINT."""
     task: str
-    """Task whose expert can take over: {tasks}."""
+    """Task; it must have a scripted expert: {tasks}."""
     out: Path | None = None
-    """The dataset's folder; outputs/TASK_corrections if not given. It must not hold anything else."""
+    """The dataset's folder; outputs/TASK_corrections if not given. It must be empty or not exist."""
     episodes: int = 128
-    """Scenes in which the policy acts; each gives one correction at most."""
+    """Number of scenes in which the policy acts; each gives one correction at most."""
     num_envs: int = 64
-    """Environments in which the policy acts at once."""
+    """Number of environments in which the policy acts at the same time."""
     seed: int = 0
     """Seed of scenes, takeovers and the policy's random numbers."""
     takeover: str = "failures"
     """failures: correct only episodes in which the policy does not succeed by itself; all: correct all episodes."""
     difficulty: str = "train"
-    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Share of the paper's reset ranges, 0 … 1; 0: the nominal scene."""
+    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
-    """Control steps until the policy is cut off; the task's own limit if not given."""
+    """Control steps after which an episode of the policy ends; the task's own limit if not given."""
     rows: str = "dataset"
-    """dataset; actions: seeds and actions alone, for taccorl execute --source=DEMONSTRATIONS --source=OUT, which makes
-    one dataset of both with frames for a GPU."""
+    """What to write. dataset; actions: only seeds and actions, for taccorl execute --source=DEMONSTRATIONS --source=OUT, which
+    makes one dataset of both with frames for a GPU."""
     images: bool = True
     """Render the dataset's cameras (needs OpenGL). A policy with camera inputs needs OpenGL even if
     this is false."""
     part_poses: bool = False
     """Write the poses of the task's parts into every row, as taccorl execute --part_poses=true."""
     store: Path = Path("outputs/store")
-    """Finished episodes are kept here."""
+    """Folder that keeps finished episodes, so that a second run continues where the first ended."""
     engine: Engine = field(default_factory=LocalEngine)
-    """Where experts work: --engine.type=local --engine.workers=2, slurm, ray."""
+    """Where experts run: --engine.type=local --engine.workers=2, slurm, ray."""
 
 
 def main(argv: list[str]) -> int:

@@ -1,15 +1,14 @@
-"""``taccorl diagnose --twin=twin.yaml --measurements=sweeps/``: which physical effect the twin lacks, and with what evidence.
+"""``taccorl diagnose --twin=twin.yaml --measurements=sweeps/``: find the physical effect that the twin lacks, with the evidence.
 
-Every joint that the recordings sweep is looked at by itself, then the pads of every arm for which measurements.yaml says what
-they pressed. First what the recordings can show and tell apart at all; then all
-known effects are tried, refitted together with the controller's numbers and chosen by their error on validation recordings, to
-which nothing is fitted. Test recordings, where there are any, take no part in any choice and give the final error.
-Effects that do as well as each other are shown as ties, with the recording that would tell them apart; structure that no known
-effect explains is called "something else".
+Every joint that moves in the recordings is diagnosed separately, then the pads of every arm for which measurements.yaml states
+the pressed object. First the effects are listed that the recordings can show and separate. Then all known effects are fitted
+together with the controller's gains, and chosen by their error on validation recordings, to which nothing is fitted. Test
+recordings, if there are any, have no influence on a choice and give the final error. Effects with equal errors are reported as
+ties, with the recording that would separate them; a residual that no known effect explains is reported as "something else".
 
     --joints=[J3,left_joint5] --pads=[left]    only these
-    --until=noise_floor    add effects until nothing is left above the noise floor, and write the mended twin
-    --out=DIR              report.html, report.json, which `taccorl add-effect` reads, and the mended twin.yaml
+    --until=noise_floor    add effects until the error is at the noise floor, and write the corrected twin
+    --out=DIR              report.html, report.json, which `taccorl add-effect` reads, and the corrected twin.yaml
 """
 
 import itertools
@@ -31,46 +30,49 @@ if TYPE_CHECKING:
 
 
 COLORS = {"high": "green", "moderate": "yellow", "low": "red"}
-"""Of a verdict by its confidence."""
+"""Colour of a verdict by its confidence."""
 MOST_NAMES = 6
-"""In one line; the report has the others."""
+"""Most names in a printed line; the report has the others."""
 
 
 @dataclass(kw_only=True)
 class DiagnoseConfig:
-    """Which physical effect the twin lacks, and with what evidence."""
+    """Find the physical effect that a twin lacks, with the evidence."""
 
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
     """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
-    """Only these: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If neither joints
-    nor pads are given, all that are swept and all that press something known."""
+    """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If neither joints nor pads are
+    given, all joints that move and all pads with a stated object are diagnosed."""
     pads: list[str] = field(default_factory=list)
     """Only the pads of these arms: left, right."""
     until: Literal["one", "noise_floor"] = "one"
-    """``one``: the most likely missing effect of each joint. ``noise_floor``: effects are added until nothing is left."""
+    """``one``: find the most likely missing effect of each joint. ``noise_floor``: add effects until the error is at the noise
+    floor."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
-    """``auto``: commanded gains stay fixed where every recording states them; free ones hide missing physics."""
+    """``auto``: gains are fixed to the commanded ones if every recording states them, since fitted gains can hide a missing
+    effect."""
     without: list[str] = field(default_factory=list)
-    """Effects that are not considered."""
+    """Effects to leave out of the search."""
     out: Path = Path("diagnosis")
-    """Folder of the report. An earlier report is replaced, any other file left alone."""
+    """Folder of the report. An earlier report is replaced; other files are not overwritten."""
     workers: int = 2
-    """Joints, or arms with pads, that are diagnosed at the same time."""
+    """Number of joints, or arms with pads, that are diagnosed at the same time."""
     spec: str | None = None
-    """Recording spec; needed where several shipped ones read the format."""
+    """Recording spec; required where several shipped ones read the format."""
     columns: Path | None = None
-    """Columns file of tables with other names or units than ours."""
+    """Columns file, for tables with other column names or units than taccorl's."""
     validation_every: int | None = None
-    """Every k-th motion is for validation; else as measurements.yaml says."""
+    """Every k-th motion is for validation; as measurements.yaml states if not given."""
     accept: list[str] = field(default_factory=list)
-    """Checks whose errors are known, such as frozen_channel: they become warnings, which stay in the report."""
+    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings, which stay in the report."""
 
 
 def main(argv: list[str]) -> int:
-    """0: diagnosed, and what remains is at the noise floor; 1: something else remains, or the measurements have errors."""
+    """Run ``taccorl diagnose``; exit status 0: the remaining error is at the noise floor, 1: something else remains, or the
+    measurements have errors."""
     config = parse(DiagnoseConfig, argv, positional="measurements")
     from taccorl.diagnosis.report.write import check_folder
 
@@ -142,7 +144,8 @@ def _diagnosed(
 
 
 def print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors | None" = None) -> None:
-    """What was found at one part of a machine: the verdict first, then what can be told, the evidence and the numbers."""
+    """Print the finding about one part of a machine: the verdict, the effects that can be separated, the evidence and the
+    numbers."""
     from rich.table import Table
     from rich.text import Text
 
@@ -218,8 +221,8 @@ def _why_invisible(finding: "Finding", name: str) -> str:
 
 
 def details(finding: "Finding") -> list[str]:
-    """The numbers behind the verdict: errors, identified and absolute numbers, near-twins, what does as well."""
-    from taccorl.diagnosis.report.evidence_words import to_record, unit_words
+    """Lines of text behind a verdict: errors, identified and absolute numbers, near-twins, tied effects."""
+    from taccorl.diagnosis.evidence_words import to_record, unit_words
 
     d = finding.diagnosis
     errors = d.errors["fitted"]["validation"], d.errors["after"]["validation"]

@@ -1,10 +1,10 @@
 """taccorl effects [NAME] [--for=joint|pads|camera|cells]
 taccorl effects new NAME [--out=NAME.py] [--for=joint|cells]
 
-The physical effects that a model may lack: equation, unit of each parameter, what a model must know to compute it, which
-recording shows it, and which other effects look alike. With NAME: all that is known of one.
+List the physical effects that a model may lack: equation, unit of each parameter, knowledge that a model needs to compute it,
+recording that shows it, and effects that look similar. With NAME: the whole description of one.
 
-new    a working example of an effect of one's own, with its test: an effect of joints, or of pads and cells
+new    write a working example of an effect of your own, with its test: an effect of joints, or of pads and cells
 """
 
 import keyword
@@ -18,28 +18,28 @@ from taccorl.errors import TaccorlError
 
 @dataclass(kw_only=True)
 class EffectsConfig:
-    """taccorl effects"""
+    """List the physical effects, or describe one."""
 
     name: str = ""
-    """One effect; all of them if not given."""
+    """Name of one effect; all effects if not given."""
     for_: str = ""
-    """Only effects that act on joint, pads, camera, cells or scene; all if not given."""
+    """List only effects that act on joint, pads, camera, cells or scene; all if not given."""
 
 
 @dataclass(kw_only=True)
 class NewEffectConfig:
-    """taccorl effects new"""
+    """Write an example of an effect of your own."""
 
     name: str
     """Name of the effect in twin.yaml: small letters, digits and underscores."""
     out: Path | None = None
-    """File to write; NAME.py if not given. A file that is there is left alone."""
+    """File to write; NAME.py if not given. An existing file is not overwritten."""
     for_: Literal["joint", "cells"] = "joint"
-    """``joint``: a torque at any driven joint. ``cells``: a reading of any sensor of cells, and of pads."""
+    """``joint``: a torque at a driven joint. ``cells``: a reading of a sensor of cells, or of pads."""
 
 
 def main(argv: list[str]) -> int:
-    """0: listed, or written."""
+    """Run ``taccorl effects``; exit status 0: listed, or written."""
     if argv[:1] == ["new"]:
         return _new(argv[1:])
     config = parse(EffectsConfig, argv, positional="name")

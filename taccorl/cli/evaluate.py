@@ -1,12 +1,12 @@
 """``taccorl evaluate --policy.path=CHECKPOINT --task=assembly_2 [--episodes=128] [--against=OTHER] [--twin=twin.yaml]``
 
-How good a policy is in the twin: success with its interval, partial credit, failure categories and times, episode by episode, on
-new scenes. The same success in the same scenes as lerobot-eval with the same --seed and batch size.
+Evaluate a policy in the twin on new scenes: success rate with its interval, partial credit, failure categories and times, for
+each episode. With the same --seed and batch size, scenes and success are the same as those of lerobot-eval.
 
-    --policy.type=expert      the scripted expert instead of a checkpoint, as a reference
-    --against=OTHER           a second checkpoint, expert, or the folder of an earlier evaluation, on the same scenes:
-                              difference of the success rates with its interval, McNemar's exact test
-    --twin=twin.yaml          in another twin
+    --policy.type=expert      evaluate the scripted expert instead of a checkpoint, as a reference
+    --against=OTHER           compare with a second checkpoint, ``expert``, or the folder of an earlier evaluation on the
+                              same scenes: difference of the success rates with its interval, McNemar's exact test
+    --twin=twin.yaml          evaluate in a changed twin
 
 Writes episodes.jsonl (one line an episode), evaluation.json, report.html and failures/*.rrd.
 """
@@ -35,43 +35,43 @@ class PolicyChoice:
     """The policy to evaluate: a checkpoint or the scripted expert."""
 
     path: Path | None = None
-    """A checkpoint's folder pretrained_model."""
+    """Folder ``pretrained_model`` of a checkpoint."""
     type: str | None = None
-    """expert: the task's scripted expert, which needs no checkpoint."""
+    """expert: the task's scripted expert, without a checkpoint."""
     device: str | None = None
-    """cpu, cuda, …; as in the checkpoint if not given."""
+    """Device of the policy: cpu, cuda, …; as in the checkpoint if not given."""
 
 
 @dataclass(kw_only=True)
 class EvaluateConfig:
-    """Scores of a policy in the twin."""
+    """Evaluate a policy in the twin."""
 
     policy: PolicyChoice = field(default_factory=PolicyChoice)
-    """--policy.path=CHECKPOINT or --policy.type=expert."""
+    """The policy to evaluate: --policy.path=CHECKPOINT or --policy.type=expert."""
     task: list[str] = field(default_factory=list)
     """Task, or several by repeating the option: {tasks}."""
     against: str | None = None
-    """A checkpoint, expert, or an earlier evaluation's folder, to compare with on the same scenes."""
+    """Compare with this on the same scenes: a checkpoint, ``expert``, or the folder of an earlier evaluation."""
     episodes: int = 128
-    """Scenes of each task; the paper's number."""
+    """Number of scenes of each task; 128 is the paper's number."""
     seed: int = 1000
-    """Scene seed of the first episode, then one more each; lerobot-eval's default."""
+    """Scene seed of the first episode; episode k has seed + k. 1000 is lerobot-eval's default."""
     out: Path = Path("outputs/evaluation")
     """Folder of the results. It must not exist, or be empty."""
     difficulty: str = "train"
-    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Share of the paper's reset ranges, 0 … 1; 0: the nominal scene."""
+    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
     batch_size: int | None = None
-    """Environments at once; all episodes of a task if not given."""
+    """Number of environments at the same time; all episodes of a task if not given."""
     failures: int = 4
-    """Failed episodes with pictures and a Rerun file; 0: none."""
+    """Number of failed episodes that are saved with pictures as a Rerun file; 0: none."""
     images: bool = True
-    """Render the cameras for these (needs OpenGL). A policy with camera inputs needs OpenGL even if this is
+    """Render the cameras for the saved failures (needs OpenGL). A policy with camera inputs needs OpenGL even if this is
     false."""
 
 
@@ -121,7 +121,7 @@ def main(argv: list[str]) -> int:
 
 @dataclass
 class OpenedPolicy:
-    """A policy whose weights are not loaded yet."""
+    """Policy that was checked against the environment, before its weights are loaded."""
 
     name: str
     digest: str
@@ -140,7 +140,7 @@ def open_policy(choice: PolicyChoice, twin: "TwinConfig") -> OpenedPolicy:
     """Print what the checkpoint and the environment state, and end the command if they differ.
 
     Raises:
-        TaccorlError: neither or both ways to name a policy, a checkpoint that cannot be used or does not fit.
+        TaccorlError: neither or both of policy.path and policy.type are given, or the checkpoint cannot be used or does not fit.
     """
     if (choice.path is None) == (choice.type is None):
         raise TaccorlError("give --policy.path=CHECKPOINT or --policy.type=expert, one of them")
@@ -192,7 +192,7 @@ def _check_places(config: EvaluateConfig) -> None:
 
 
 class TextProgress:
-    """A line on stderr every ten seconds."""
+    """Progress as text: one line on stderr every ten seconds."""
 
     def __init__(self) -> None:
         self._last_s = time.monotonic()

@@ -1,11 +1,11 @@
-"""``taccorl excite --twin=twin.yaml --joint=left_joint5 --effects=backlash,joint_compliance``: which motion to record next.
-``taccorl excite --twin=twin.yaml --pads=left --effects=taxel_creep,touch_lag``: how to press the pads next.
+"""``taccorl excite --twin=twin.yaml --joint=left_joint5 --effects=backlash,joint_compliance``: choose the motion to record next.
+``taccorl excite --twin=twin.yaml --pads=left --effects=taxel_creep,touch_lag``: choose the press to record next.
 
-Every motion or press of the library is scored by how far apart it keeps the rival explanations, in noise floors, however each is
-refitted; what is recorded already (--measurements) counts. Motions beyond the joint's limits or the motor's torque are refused,
-and presses beyond the gripper's range, its fingers' speed or the pads' travel.
-Writes a recording plan: plan.yaml, and for each motion or press a table of targets at 200 Hz, which a driver can send; for
-presses also what to say of them in measurements.yaml.
+The score of a motion or press is the difference, in noise floors, that remains between the rival effects after each is refitted,
+together with the recordings that exist already (--measurements). Motions beyond the joint's limits or the motor's torque are
+refused, and so are presses beyond the gripper's range, its fingers' speed or the pads' travel. Writes a recording plan:
+plan.yaml, and for each motion or press a table of targets at 200 Hz, which a driver can send; for presses also their entries of
+measurements.yaml.
 """
 
 import csv
@@ -32,32 +32,33 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class ExciteConfig:
-    """Which motion or press to record next, so that rival effects can be told apart."""
+    """Choose the motion or press to record next, so that rival effects can be separated."""
 
     joint: str | None = None
-    """left_joint5."""
+    """The joint to move, such as left_joint5."""
     pads: str | None = None
-    """left, right: the pads of this arm, instead of a joint."""
+    """The pads to press, instead of a joint: left or right, those of this arm."""
     effects: list[str] = field(default_factory=list)
-    """Rivals, two or more; those of the diagnosis in --diagnosis if not given."""
+    """Rival effects, two or more; those of the diagnosis in --diagnosis if not given."""
     twin: Path | None = None
-    """twin.yaml; the nominal twin if not given."""
+    """A twin.yaml; the nominal twin if not given."""
     measurements: Path | None = None
-    """Recordings that are there already."""
+    """Recordings that exist already."""
     diagnosis: Path = Path("diagnosis")
-    """Folder of a diagnosis: its fitted numbers, and its rivals where no effects are given."""
+    """Folder of a diagnosis, for its fitted values, and for its rival effects if --effects is not given."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
-    """Of a joint. ``fitted``: nobody knows the gains, which then take up more."""
+    """Gains of a joint. ``fitted``: they are unknown and are fitted with each effect, which makes effects harder to separate."""
     floor_rad: float = 2e-4
-    """Noise floor of a joint's angle; that of the recordings where there are any. Pads have the twin's own noise without."""
+    """Noise floor of a joint's angle, if there are no recordings to estimate it from. For pads without recordings it is the
+    twin's own noise."""
     num: int = 3
-    """So many motions or presses are written, best first."""
+    """Number of motions or presses to write, best first."""
     out: Path = Path("recording_plan")
-    """Folder of the plan; it must not be there yet."""
+    """Folder of the plan; it must not exist."""
 
 
 def main(argv: list[str]) -> int:
-    """0: something tells them apart; 1: nothing does."""
+    """Run ``taccorl excite``; exit status 0: a motion or press separates the effects, 1: none does."""
     config = parse(ExciteConfig, argv, positional="joint")
     part = _part(config)
     if not is_free(config.out):

@@ -1,7 +1,7 @@
 """``taccorl execute --source=outputs/many_actions --out=outputs/many [--pictures=video|cache|none] [--resolution=112x112]
 [--part_poses=true]``
 
-Stored actions (``taccorl augment --rows=actions``, ``taccorl correct --rows=actions``; --source as often as there are some) into
+Turn stored actions (``taccorl augment --rows=actions``, ``taccorl correct --rows=actions``; one --source for each folder) into
 one LeRobot dataset, on the machine where it is needed: every demonstration is executed once, in --engine.workers processes.
 Demonstrations that do not succeed here are left out and counted.
 
@@ -25,21 +25,22 @@ class ExecuteConfig:
     """Make a dataset from stored actions."""
 
     source: list[Path]
-    """Folder of stored actions: taccorl augment --rows=actions, taccorl correct --rows=actions; once for each."""
+    """Folder of stored actions, written by taccorl augment --rows=actions or taccorl correct --rows=actions; repeat the option
+    for several."""
     out: Path
-    """The dataset's folder. It must not hold anything else."""
+    """The dataset's folder. It must be empty or not exist."""
     store: Path = Path("outputs/store")
-    """Finished episodes and rendered frames are kept here; lerobot-train finds frames by --dataset.cache_store."""
+    """Folder that keeps finished episodes and rendered frames; lerobot-train finds the frames by --dataset.cache_store."""
     pictures: str = "video"
-    """video; cache: frames for lerobot-train --dataset.cache alone; none."""
+    """What becomes of pictures. video; cache: frames that only lerobot-train --dataset.cache can read; none."""
     part_poses: bool = False
     """Write the poses of the task's parts into every row (observation.environment_state), for
     --policy.part_poses and --policy.pose_loss."""
     resolution: str | None = None
-    """Resolution of frames in the cache, rows x columns: 112x112, as --policy.image_resolution; the cameras' own 224x224 if
+    """Rows x columns of frames in the cache, such as 112x112, equal to --policy.image_resolution; the cameras' own 224x224 if
     not given."""
     engine: Engine = field(default_factory=LocalEngine)
-    """Where to work: --engine.type=local --engine.workers=16, slurm, ray."""
+    """Where demonstrations are executed: --engine.type=local --engine.workers=16, slurm, ray."""
 
 
 def main(argv: list[str]) -> int:

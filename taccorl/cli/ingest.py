@@ -1,7 +1,7 @@
 """``taccorl ingest recordings/ --spec=piper_flexitac_mcap --out=outputs/my_dataset``
 
-Recordings (MCAP, ROS 2 and ROS 1 bags, HDF5, LeRobot datasets) into one LeRobot v3 dataset with touch.
-``--watch=true`` ingests what arrives in a folder until Ctrl-C.
+Turn recordings (MCAP, ROS 2 and ROS 1 bags, HDF5, LeRobot datasets) into one LeRobot v3 dataset with touch.
+``--watch=true`` ingests recordings as they arrive in a folder, until Ctrl-C.
 ``taccorl ingest inspect FILE`` prints the contents of a recording and drafts its specs.
 """
 
@@ -34,22 +34,22 @@ class IngestConfig:
     """Ingest recordings into one LeRobot dataset."""
 
     paths: list[Path]
-    """Files, bag folders, datasets, or folders of those."""
+    """Recordings: files, bag folders, datasets, or folders of those."""
     spec: str
-    """Recording spec: a file, or the bare name of one in data_specs/recordings/."""
+    """Recording spec: a file, or the name of one in data_specs/recordings/."""
     out: Path = Path("outputs/dataset")
-    """The dataset's folder. It must not hold anything else."""
+    """The dataset's folder. It must be empty or not exist, unless it holds the same dataset."""
     store: Path = Path("outputs/store")
-    """Finished recordings are kept here, so that a second run continues where the first ended."""
+    """Folder that keeps finished recordings, so that a second run continues where the first ended."""
     dry_run: bool = False
-    """Read, align and check, and write two rows into a scratch folder, but nothing that stays."""
+    """Read, align and check, but write no dataset (two rows are written into a scratch folder as a test)."""
     watch: bool = False
-    """Ingest what arrives in the folders, one line a recording, until Ctrl-C or SIGTERM; then publish the dataset of all that
-    are complete. A recording is complete when its files have not changed for 5 s."""
+    """Ingest recordings as they arrive in the folders, with one line each, until Ctrl-C or SIGTERM; then publish the dataset of
+    all complete ones. A recording is complete when its files have not changed for 5 s."""
     replace: bool = False
-    """If `out` holds another dataset, move that aside (out.old-1, …) and publish this one."""
+    """If `out` holds another dataset, move that one aside (out.old-1, …) and publish the new one."""
     engine: Engine = field(default_factory=LocalEngine)
-    """Where to work: --engine.type=local --engine.workers=2, slurm, ray."""
+    """Where recordings are ingested: --engine.type=local --engine.workers=2, slurm, ray."""
 
 
 @dataclass(kw_only=True)
@@ -57,18 +57,18 @@ class InspectConfig:
     """Print the contents of a recording, and draft its specs."""
 
     paths: list[Path]
-    """Files, bag folders, datasets, or folders of those."""
+    """Recordings: files, bag folders, datasets, or folders of those."""
     reader: str | None = None
-    """mcap, db3, rosbag1, hdf5, lerobot or a plug-in's; by the file's kind if not given."""
+    """mcap, db3, rosbag1, hdf5, lerobot or the name of a plug-in; chosen by the file's content if not given."""
     split_bag: bool = False
-    """Files x_0, x_1, … of a folder are one recording."""
+    """Treat files x_0, x_1, … of a folder as one recording."""
     draft: Path | None = None
-    """Write the draft spec here, and beside it the drafts of its dataset spec (…_dataset.yaml) and of an unknown kind of
-    pad (…_sensor.yaml), instead of printing them; existing files are left alone."""
+    """Write the draft recording spec to this file, and beside it the draft dataset spec (…_dataset.yaml) and, for an unknown
+    kind of pad, the draft sensor spec (…_sensor.yaml), instead of printing them. Existing files are not overwritten."""
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl ingest``; exit status 0: all written or split, 1: something was quarantined or refused."""
+    """Run ``taccorl ingest``; exit status 0: all recordings were written or split, 1: some were quarantined or refused."""
     if argv and argv[0] == "inspect":
         return _inspect(parse(InspectConfig, argv[1:], positional="paths", prog="taccorl ingest inspect"))
     return _ingest(parse(IngestConfig, argv, positional="paths"))

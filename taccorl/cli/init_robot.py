@@ -1,8 +1,8 @@
 """``taccorl init-robot my_arm.xml --out=my_robot.yaml``: a robot file for compare, diagnose and add-effect.
 
-MODEL is an MJCF or URDF file of any kinematic tree; its meshes need not be there. The file that is written names its joints with
-limits, inertias, actuators, damping and friction as the model has them, and TODO where only you know: gains of the drives, and
-whether they carry the weight.
+MODEL is an MJCF or URDF file of any kinematic tree; its meshes may be missing. The written file lists its joints with limits,
+inertias, actuators, damping and friction from the model, and TODO for facts that no model states: gains of the drives, and
+whether they compensate gravity.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from taccorl.errors import TaccorlError
 
 @dataclass(kw_only=True)
 class InitRobotConfig:
-    """A robot file from an MJCF or URDF file."""
+    """Write a robot file from an MJCF or URDF file."""
 
     model: Path
-    """MJCF or URDF file."""
+    """MJCF or URDF file of the robot."""
     out: Path | None = None
-    """File to write; beside the model, with _robot.yaml in its name, if not given. A file that is there is left alone."""
+    """File to write; beside the model, with _robot.yaml in its name, if not given. An existing file is not overwritten."""
 
 
 def main(argv: list[str]) -> int:
-    """0: written."""
+    """Run ``taccorl init-robot``; exit status 0: written."""
     config = parse(InitRobotConfig, argv, positional="model", prog="taccorl init-robot")
     out = config.out or config.model.with_name(f"{config.model.stem}_robot.yaml")
     if out.exists():

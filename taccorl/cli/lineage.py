@@ -1,9 +1,10 @@
 """taccorl lineage explain PATH [--store=outputs/store]
 taccorl lineage prune [--store=outputs/store] [--keep=DATASET ...] [--yes=true]
 
-explain  what a dataset or artefact was made from, down to the raw recordings, and what changed since (then it exits 1)
-prune    artefacts that no dataset needs; deletes them only with --yes=true. Datasets that are where they were written
-         are known; name moved or copied ones with --keep
+explain  list the inputs of a dataset or artefact, down to the raw recordings, and those that changed since (exit status 1 if
+         any did)
+prune    list artefacts that no dataset needs; delete them with --yes=true. Datasets are found where they were written; name
+         moved or copied ones with --keep
 """
 
 import sys
@@ -18,24 +19,24 @@ SHOWN_GONE = 10
 
 @dataclass(kw_only=True)
 class ExplainConfig:
-    """taccorl lineage explain PATH"""
+    """List the inputs of a dataset or artefact."""
 
     path: Path
-    """A dataset, an artefact, a file in one, or a raw recording."""
+    """A dataset, an artefact, a file in one of them, or a raw recording."""
     store: Path = DEFAULT_STORE
-    """Where to look for inputs that were moved; may be absent."""
+    """Store in which inputs that were moved are searched; it may be missing."""
 
 
 @dataclass(kw_only=True)
 class PruneConfig:
-    """taccorl lineage prune"""
+    """List, or delete, artefacts that no dataset needs."""
 
     store: Path = DEFAULT_STORE
-    """The store to free."""
+    """The store to clean up."""
     keep: list[Path] = field(default_factory=list)
-    """Further datasets whose whole lineage stays: moved or copied ones. Repeat --keep=DATASET for each."""
+    """Moved or copied datasets whose lineage must stay. Repeat --keep=DATASET for each."""
     yes: bool = False
-    """Delete. Without it, only list what would be freed."""
+    """Delete the artefacts. Without it they are only listed."""
 
 
 def main(argv: list[str]) -> int:

@@ -37,7 +37,8 @@ VERBS = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one verb. 0: done; 1: done, but something was quarantined, refused or found wrong; 2: could not."""
+    """Run one verb. Exit status 0: done, 1: done, but something was quarantined, refused or found wrong, 2: not done because of
+    an error."""
     if argv is None:  # we are the program and not a guest in somebody's process
         os.environ["TACCORL_PROGRAM"] = "1"
         argv = sys.argv[1:]

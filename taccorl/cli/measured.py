@@ -1,4 +1,4 @@
-"""What the verbs that look at measurements share: the twin they start from, and the checks before anything is concluded."""
+"""Code shared by the verbs that read measurements: loading of the twin, and the checks before any conclusion."""
 
 import dataclasses
 import math
@@ -15,16 +15,17 @@ if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 FAR_OFF = 0.3
-"""Share of a motion's RMS about its mean."""
+"""A replay explains hardly anything if its RMS error is more than this share of the motion's RMS about its mean."""
 AS_FAR_AS_TARGET = 0.8
-"""A simulated servo with 1000 times the supply, or kp 57 times too large or small, leaves 0.9 to 6 of it; with its own numbers
-and friction hidden 0.34."""
+"""A replay explains hardly anything if its RMS error is more than this share of the tracking error (measured − target). For a
+simulated servo the share was 0.9 to 6 with 1000 times the supply voltage, or with kp 57 times too large or small; 0.34 with the
+right values and a hidden friction."""
 FEWEST_FLOORS = 10.0
-"""Noise floors: a replay that is nearer explains enough."""
+"""A replay with an error below this many noise floors is never reported."""
 
 
 def twin_of(path: Path | None) -> "TwinConfig":
-    """The twin of a file; the nominal one without."""
+    """The twin of a file; the nominal twin without a file."""
     from taccorl.sim.twin import TwinConfig
     from taccorl.sim.twin_file import load_twin
 
@@ -34,8 +35,8 @@ def twin_of(path: Path | None) -> "TwinConfig":
 def checked(
     machine: "Machine", measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
 ) -> dict[str, list["Finding"]] | None:
-    """What the checks of telemetry and of the machine say, printed; None where they found errors, which ``verdict`` then says
-    first.
+    """Run the checks of telemetry and of the machine, and print their findings. Returns None if there are errors; the printed
+    text then begins with ``verdict``.
 
     Args:
         accept: checks whose errors become warnings.
@@ -62,7 +63,7 @@ def checked(
 
 
 def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) -> None:
-    """Say which accepted checks found nothing: they hide nothing, and need not be given."""
+    """Warn about accepted checks without findings: they change nothing and can be left out."""
     checks = {f.check for findings in found for own in findings.values() for f in own}
     for name in dict.fromkeys(accept):
         if name not in checks:
@@ -72,10 +73,10 @@ def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) ->
 def of_replays(
     comparison: "Comparison", findings: dict[str, list["Finding"]], accept: Sequence[str]
 ) -> dict[str, list["Finding"]]:
-    """What the replays say about clocks, recording by recording; a shift is a warning where the pose is unknown.
+    """Findings about clocks from the replays of each recording; a shift is only a warning where the pose is unknown.
 
     Args:
-        findings: of the checks before; ``pose_unknown`` names an arm, or nothing for all joints.
+        findings: findings of earlier checks; ``pose_unknown`` names an arm, or nothing for all joints.
         accept: checks whose errors become warnings.
     """
     from taccorl.alignment.checks.telemetry import accepted
@@ -98,8 +99,8 @@ def of_replays(
 
 
 def far_off(comparison: "Comparison") -> list[str]:
-    """One line for each signal whose replay explains hardly anything: it leaves more than ``FAR_OFF`` of the measured motion, or
-    ``AS_FAR_AS_TARGET`` of what the target by itself leaves, in the recordings of one use."""
+    """One line for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the measured motion,
+    or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation, test)."""
     import numpy as np
 
     lines: dict[str, str] = {}
@@ -125,7 +126,8 @@ def far_off(comparison: "Comparison") -> list[str]:
 
 
 def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
-    """Whether most recordings say that their time stamps are shifted; one that does alone may lack physics or other gains."""
+    """True if most recordings show that their time stamps are shifted. A single one may instead lack physics or have other
+    gains."""
     shifted = [name for name, found in late.items() if any(f.severity == "error" for f in found)]
     return 2 * len(shifted) > num_recordings
 
@@ -136,7 +138,7 @@ def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
 
 
 def print_findings(found: dict[str, list["Finding"]]) -> None:
-    """Errors and warnings recording by recording, those alike in one line; a note that many have once."""
+    """Print errors and warnings for each recording, with equal ones in one line, and notes that many recordings share once."""
     from rich.text import Text
 
     from taccorl.cli.tables import console, findings_table

@@ -16,16 +16,16 @@ from taccorl.errors import DatasetError
 
 @dataclass(kw_only=True)
 class MergeConfig:
-    """Merge datasets of both domains into one."""
+    """Merge datasets of the robot and of the twin into one."""
 
     out: Path
-    """The dataset's folder. It must not hold anything else."""
+    """The dataset's folder. It must be empty or not exist."""
     real: list[Path] = field(default_factory=list)
-    """Dataset of the robot, or of a surrogate that stands for it; once for each."""
+    """Dataset of the robot, or of a surrogate in its place; repeat the option for several."""
     sim: list[Path] = field(default_factory=list)
-    """Dataset of the twin: collected, augmented; once for each."""
+    """Dataset of the twin, collected or augmented; repeat the option for several."""
     store: Path = Path("outputs/store")
-    """Store for finished work and its lineage."""
+    """Folder that keeps finished work and its lineage."""
 
 
 def main(argv: list[str]) -> int:

@@ -32,11 +32,12 @@ def parse[ConfigT](
     """Parse ``argv`` into a ``config_class``. Paths and texts are taken as typed; other values are YAML, as in LeRobot.
 
     Args:
-        positional: field that bare words fill; a list field takes all of them.
-        prog: what was typed before ``argv``, for the help; ``taccorl`` and the name of the config's module if not given.
+        positional: name of the field that words without an option name fill; a list field takes all of them.
+        prog: words of the command line before ``argv``, for the help; ``taccorl`` and the name of the config's module if not
+            given.
 
     Raises:
-        TaccorlError: unknown option, value of the wrong type, missing or surplus word.
+        TaccorlError: an option is unknown, a value has the wrong type, or a word is missing or superfluous.
     """
     argv = joined(argv)
     words = [a for a in argv if not a.startswith("-")]
@@ -72,7 +73,7 @@ def parse[ConfigT](
 
 
 def joined(argv: Sequence[str]) -> list[str]:
-    """``--a b`` as ``--a=b``. Every option takes a value; one that begins with a minus is a number."""
+    """Replace ``--a b`` by ``--a=b``. Every option takes a value; one that begins with a minus must be a number."""
     found: list[str] = []
     for word in argv:
         before = found[-1] if found else ""
@@ -91,7 +92,8 @@ def _as_field(option: str, hints: dict[str, Any]) -> str:
 
 
 def given_names(argv: Sequence[str]) -> set[str]:
-    """Names of the options in ``argv`` and in its --config_path, after ``parse`` has accepted them: ``out``, ``ppo.clip``."""
+    """Names of the options that are set in ``argv`` and in its --config_path, after ``parse`` has accepted them: ``out``,
+    ``ppo.clip``."""
     import yaml
 
     names: set[str] = set()

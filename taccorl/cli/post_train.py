@@ -1,12 +1,13 @@
 """``taccorl post-train --policy.path=CHECKPOINT --env.task=assembly_2 --anchor.dataset=DATASET [--env.twin=twin.yaml]``
 
-PPO in the twin from a co-trained policy, held to real demonstrations by a supervised term (paper §3.4).
+Improve a co-trained policy with PPO in the twin; a supervised term (the anchor) keeps it close to real demonstrations (paper
+§3.4).
 
-    --anchor.weight=1         β; 0: no anchor
+    --anchor.weight=1         β, weight of the anchor; 0: no anchor
     --out=FOLDER              checkpoints/last/pretrained_model is a LeRobot policy; progress.jsonl has a line an iteration;
                               rollouts/*.rrd show an episode after each checkpoint (--rerun=false: none)
     --out=FOLDER --resume=true   continue from the last checkpoint there, with the settings of the run;
-                              --iterations=N, --save_freq and --keep_checkpoints may be others
+                              --iterations=N, --save_freq and --keep_checkpoints may be changed
     --config_path=FILE        settings from a file, such as configs/post_train/small.yaml
 
 Defaults are the paper's table of post-training parameters.

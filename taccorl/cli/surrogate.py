@@ -1,10 +1,10 @@
 """``taccorl surrogate --secret=7 [--pads=left] [--out=outputs/surrogate_7] [--effects=[coulomb_friction]] [--design=pack]``
 
-Recordings of a robot that is not there, with effects hidden in it that the seed draws, for ``taccorl compare`` and ``diagnose``.
-It is a simulation of its own, apart from the twin: other equations, finer steps, friction of bristles, a sampled controller.
-With --pads its fingers press known objects, and what is hidden is in the pads. With --cells=true it is a sensor of force cells,
-simulated, for a cells file (``taxel.yaml``).
-What is hidden lies in a sealed file; ``taccorl surrogate --reveal=outputs/surrogate_7`` prints it.
+Write recordings of a simulated robot with hidden effects, drawn from the seed, to try ``taccorl compare`` and ``diagnose``
+without a robot. The simulation is independent of the twin: other equations, finer steps, bristle friction, a sampled controller.
+With --pads its fingers press known objects, and the hidden effects are in the pads. With --cells=true it is a simulated sensor
+of force cells, for a cells file (``taxel.yaml``). The hidden effects are in a sealed file; ``taccorl surrogate
+--reveal=outputs/surrogate_7`` prints it.
 """
 
 import json
@@ -19,32 +19,34 @@ from taccorl.lineage.destinations import is_free
 
 @dataclass(kw_only=True)
 class SurrogateConfig:
-    """Recordings of a robot that is not there."""
+    """Write recordings of a simulated robot with hidden effects."""
 
     secret: int | None = None
-    """Seed of the robot, at least 0: which joint, which gains, what is hidden and how strong."""
+    """Seed of the robot, at least 0. It determines the joint, the gains, and the hidden effects and their strengths."""
     out: Path | None = None
-    """Folder; outputs/surrogate_SECRET if not given. It must not be there yet."""
+    """Folder to write; outputs/surrogate_SECRET if not given. It must not exist."""
     effects: list[str] | None = None
-    """What is hidden, instead of what the seed draws; [] for nothing."""
+    """Names of the hidden effects, instead of those that the seed draws; [] for none."""
     pads: Literal["no", "left", "right", "drawn"] = "no"
-    """Presses of known objects by the pads of this arm, instead of sweeps of a joint; ``drawn``: of either."""
+    """Record presses of known objects by the pads of this arm, instead of sweeps of a joint; ``drawn``: the seed chooses the
+    arm."""
     cells: bool = False
-    """Presses of a sensor of force cells, instead of a robot."""
+    """Record presses of a sensor of force cells, instead of a robot."""
     signal: str | None = None
-    """Joint under test, as left_joint5; drawn if not given."""
+    """Joint that moves and has the effects, such as left_joint5; drawn if not given."""
     strength: float | None = None
-    """Noise floors that each effect leaves after a refit of the gains; 1 to 30 if not given, 1.5 to 15 on pads."""
+    """Strength of each effect: the error, in noise floors, that remains without it after a refit of the gains. If not given,
+    drawn from 1 to 30, on pads from 1.5 to 15."""
     design: str = "pack"
-    """What is recorded for fitting: chirp (10 s, twice), or pack."""
+    """Motions of the fit recordings: chirp (10 s, twice), or pack."""
     gains_known: bool = False
-    """The commanded gains are the drive's, and written down."""
+    """True: the recordings state the gains that the drive really has. False: they do not."""
     reveal: Path | None = None
-    """Print what is hidden in this folder's robot, and do nothing else."""
+    """Print the hidden effects of the robot in this folder, and do nothing else."""
 
 
 def main(argv: list[str]) -> int:
-    """0: written."""
+    """Run ``taccorl surrogate``; exit status 0: written."""
     config = parse(SurrogateConfig, argv, positional=None)
     from taccorl.surrogate.writing import SWEEPS, TWIN, reveal
 

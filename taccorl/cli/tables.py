@@ -15,11 +15,11 @@ from taccorl.data.recording import without_place
 from taccorl.errors import printable
 
 WIDE = 150
-"""Columns of a log file or pipe, which has no width of its own."""
+"""Width of tables in a log file or pipe [characters]."""
 LINE_EVERY_S = 5.0
-"""Seconds between two lines of progress where there is no terminal for a bar."""
+"""Time between two lines of progress without a terminal [s]."""
 LONG_TEXT = 400
-"""Characters of a metadata record to show: rosbag2 writes pages of settings into one."""
+"""Most characters of a metadata record that are shown: rosbag2 writes pages of settings into one."""
 COLORS = {"written": "green", "split": "yellow", "quarantined": "red", "refused": "red"}
 SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
 
@@ -42,7 +42,8 @@ def console() -> Console:
 
 
 class Bars:
-    """Progress over recordings on stderr: rows of the one at work, or recordings done when several are at work.
+    """Progress over recordings on stderr: rows of the current recording, or the number of finished recordings if several are
+    processed at the same time.
 
     A bar in a terminal; elsewhere a line every ``LINE_EVERY_S`` with rate and time left.
     """
@@ -60,7 +61,7 @@ class Bars:
         self._task: Any = None
         self._line_s = time.monotonic()
         self._begin = (0, 0, self._line_s)
-        """Total, number done and time [s] where the rate is measured from."""
+        """Total, number done and time [s] from which the rate is measured."""
 
     def __enter__(self) -> "Bars":
         if self._progress.console.is_terminal:
@@ -73,7 +74,7 @@ class Bars:
             self._progress.stop()
 
     def update(self, name: str, done: int, total: int) -> None:
-        """``done`` of ``total`` of the recording ``name``."""
+        """Set the progress of the recording ``name``: ``done`` of ``total`` rows."""
         self._progress.update(self._task, description=printable(_shorten(name)), completed=done, total=total)
         if self._progress.console.is_terminal:
             return
@@ -89,7 +90,8 @@ class Bars:
 
 
 def ingest_table(report: dict[str, Any]) -> None:
-    """One line a recording, what was wrong below the table, in lines that are never cut or folded: they are copied."""
+    """Print one line per recording, and below the table their faults, in lines that are never cut or folded, so that they can be
+    copied."""
     table = Table(box=None, pad_edge=False)
     for column in ("recording", "outcome", "episodes", "rows"):
         table.add_column(column, overflow="fold", no_wrap=column != "recording")
@@ -126,7 +128,7 @@ def _name(r: dict[str, Any]) -> str:
 
 
 def findings_table(name: str, findings: list[Any]) -> None:
-    """Table of the findings of ``taccorl check`` in one episode or dataset."""
+    """Print the findings of ``taccorl check`` about one episode or dataset as a table."""
     out = console()
     worst = "error" if any(f.severity == "error" for f in findings) else "warning"
     if not any(f.severity in ("error", "warning") for f in findings):
@@ -138,7 +140,7 @@ def findings_table(name: str, findings: list[Any]) -> None:
 
 
 def inventory_table(inventory: Inventory) -> None:
-    """Channels, rates, gaps, clock skew and damage of one recording."""
+    """Print channels, rates, gaps, clock skew and damage of one recording as a table."""
     out = console()
     files = f" ({len(inventory.source.files)} files)" if len(inventory.source.files) > 1 else ""
     duration = f"{inventory.duration_s:.2f}" if inventory.times_known else "–"

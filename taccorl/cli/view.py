@@ -47,28 +47,28 @@ class ViewConfig:
     episode: int = 0
     """Number of the episode, counted from 0."""
     spec: str | None = None
-    """Recording spec; needed for recordings."""
+    """Recording spec; required for recordings."""
     against: Path | None = None
-    """Show this episode (B) beside the one of `path` (A): a dataset, a recording, an attempt, or a twin.yaml, whose twin
+    """Also show this episode (B) beside the one of `path` (A): a dataset, a recording, an attempt, or a twin.yaml, whose twin
     executes the actions of A."""
     against_episode: int = 0
     """Number of the episode in `against`, counted from 0."""
     against_spec: str | None = None
     """Recording spec of `against`; `spec` if not given."""
     align: str = "start"
-    """With `against`: 0 s is the first row of each (start), or the first contact of each (contact)."""
+    """Time 0 of two episodes, with `against`. start: their first rows; contact: their first contacts."""
     start_s: float | None = None
-    """Show rows from here on (seconds since the episode's first row; with `against`, of each)."""
+    """First time to show: seconds since the episode's first row; with `against`, of each."""
     end_s: float | None = None
-    """Show rows before this time."""
+    """Time at which to stop, in the same seconds."""
     save: Path | None = None
-    """Write a Rerun file (.rrd). An earlier one of ours is replaced, any other file is left alone."""
+    """Rerun file (.rrd) to write. An earlier one of taccorl is replaced; other files are not overwritten."""
     serve: bool = False
-    """Serve a page for a browser on this machine until Ctrl-C."""
+    """Serve a web page with the view on this machine until Ctrl-C."""
     screenshot: Path | None = None
-    """Write the view as a picture (.png); replaces as `save` does."""
+    """Picture of the view to write (.png); overwrites as `save` does."""
     sheet: Path | None = None
-    """Write a contact sheet (.png); replaces as `save` does."""
+    """Contact sheet to write (.png); overwrites as `save` does."""
 
 
 def main(argv: list[str]) -> int:

@@ -46,10 +46,10 @@ class AttemptPlan:
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Share of the paper's reset ranges: 0 is the nominal scene."""
+    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
     images: bool = True
     seed: int = 0
-    """Of all attempts."""
+    """Seed from which the seeds of all attempts follow."""
 
     def __post_init__(self) -> None:
         """
@@ -72,7 +72,7 @@ class AttemptPlan:
         """Make the simulation of this plan.
 
         Raises:
-            TaccorlError: unknown task or difficulty, with the near name.
+            TaccorlError: the task or difficulty is unknown; the message names the nearest.
         """
         return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
 
@@ -97,12 +97,13 @@ def run_attempts(
     progress: Progress,
     name: str = "attempt",
 ) -> list[tuple[Artefact, Entry]]:
-    """Run attempts on an engine, or find them in the store; artefacts and entries in the order of ``numbers``.
+    """Run attempts on an engine, except those that are in the store. Return their artefacts and entries in the order of
+    ``numbers``.
 
     Args:
-        run: makes the attempt of a number; pickled for worker processes. Of an attempt whose process died twice or did not end,
-            it is called here with the number and how that was.
-        said: what progress states of an entry.
+        run: function of an attempt's number that makes the attempt; pickled for worker processes. If the process died twice or
+            did not end, the function is called in this process with the number and the way the process ended.
+        said: function that returns the text of an entry for the progress display.
     """
     made = engine.map(
         run,
@@ -116,7 +117,7 @@ def run_attempts(
 
 
 def is_success(entry: Entry) -> bool:
-    """Whether an entry is that of a success."""
+    """Whether the entry states a success."""
     return entry["outcome"] == "success"
 
 
@@ -126,7 +127,7 @@ def successes(entries: Sequence[Entry]) -> int:
 
 
 def outcomes(entries: Sequence[Entry]) -> dict[str, int]:
-    """Outcome → how often, in alphabetical order."""
+    """Outcome → number of entries, in alphabetical order."""
     return dict(sorted(Counter(entry["outcome"] for entry in entries).items()))
 
 
@@ -136,18 +137,18 @@ def read_entry(folder: Path) -> Entry:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file with one key a line."""
+    """Write a JSON file with one key per line."""
     path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def check_destination(out: Path, stage: Stage, task: str, may_be_ours: Callable[[dict[str, Any]], bool]) -> None:
-    """Fail early if ``out`` is occupied: hours of attempts would end at the store's refusal.
+    """Fail early if ``out`` is occupied: otherwise the store would refuse only after hours of attempts.
 
     Args:
-        may_be_ours: whether a dataset of this stage with that manifest is the one that is to be made.
+        may_be_ours: function that decides from the manifest of an existing dataset whether it is the one to be made.
 
     Raises:
-        InTheWayError: states what is at ``out``.
+        InTheWayError: something else is at ``out``; the message states what.
     """
     if is_free(out):
         return
@@ -168,7 +169,7 @@ def check_destination(out: Path, stage: Stage, task: str, may_be_ours: Callable[
 
 
 def assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], folder: Path) -> None:
-    """Kept attempts, each dataset/ with episodes.json, merged at ``folder``, with their provenance in meta/taccorl/."""
+    """Merge the datasets of the kept attempts into one at ``folder``, with their provenance in meta/taccorl/."""
     from taccorl.data.lerobot_format import merge
 
     merge([shard / "dataset" for shard in shards], folder)

@@ -1,4 +1,5 @@
-"""Figures of reading and writing recordings, of the twin's experts and of MimicGen; ``make bench ONLY=ingest`` and the others."""
+"""Benchmarks of ingest, the corruption and kill tests, start-up, experts and MimicGen; ``make bench ONLY=ingest`` and the
+others."""
 
 import dataclasses
 import functools
@@ -23,7 +24,8 @@ from taccorl.demos.experts import tasks_with_expert
 RECORDING_S = 24.0
 LONG_RECORDING_S = 240.0
 RIVAL_ROWS = 150
-"""LeRobot's default writer takes 0.17 CPU-s a row: a part of the recording is enough to know its rate."""
+"""Number of rows for the reference writer. LeRobot's default writer takes 0.17 CPU-s per row, so that a part of the recording is
+measured."""
 REPEATS = 3
 EXPERT_EPISODES = 100
 PENETRATION_EPISODES = 20
@@ -69,7 +71,8 @@ def _stand_in(path: Path, duration_s: float) -> Path:
 
 @benchmark("ingest")
 def ingest_speed() -> Iterator[Row]:
-    """Rows a second against LeRobot's own default writer, real time, and the share of parsing."""
+    """Benchmark of ingest: rows per second relative to LeRobot's own default writer and to real time, and the share of
+    parsing."""
     from taccorl.data.lerobot_format import quiet_lerobot
 
     with quiet_lerobot():
@@ -175,7 +178,7 @@ def _parse_only(path: Path, spec: Any) -> Cost:
 
 @benchmark("memory")
 def ingest_memory() -> Iterator[Row]:
-    """Peak resident memory of the whole command, for a short and a long recording."""
+    """Benchmark of the peak resident memory of the whole command, for a short and a long recording."""
     peaks = {}
     with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
         folder = Path(name)
@@ -206,7 +209,7 @@ def _peak_mb(command: list[str]) -> float:
 
 @benchmark("corruption")
 def corruption() -> Iterator[Row]:
-    """The corruption suite, case by case: tests/end_to_end/test_corruption.py."""
+    """Benchmark that runs the corruption suite, case by case: tests/end_to_end/test_corruption.py."""
     passed, total = _pytest("tests/end_to_end/test_corruption.py")
     yield Row(
         name="cases in their right outcome", value=100 * passed / total, unit="%", goal="≥ 100", n=total, spread=0.0
@@ -215,7 +218,8 @@ def corruption() -> Iterator[Row]:
 
 @benchmark("kill")
 def kill() -> Iterator[Row]:
-    """kill -9 at 30 random moments of each of three commands, then a second run: tests/end_to_end/test_interrupted.py."""
+    """Benchmark that ends each of three commands by kill -9 at 30 random moments and runs it again:
+    tests/end_to_end/test_interrupted.py."""
     passed, total = _pytest("tests/end_to_end/test_interrupted.py", "-m", "slow")
     yield Row(
         name="ingest, merge and augment byte-identical after kill -9 and rerun",
@@ -240,8 +244,8 @@ def _pytest(*words: str) -> tuple[int, int]:
 
 @benchmark("start_up")
 def start_up() -> Iterator[Row]:
-    """Until the verbs are listed, beside an empty Python, and until ``taccorl check`` has looked at a recording (an empty one),
-    beside Python with NumPy: in CPU time, in turns."""
+    """Benchmark of CPU time until the verbs are listed, relative to an empty Python; and until ``taccorl check`` has read an
+    (empty) recording, relative to Python with NumPy. Measured in turns."""
     with tempfile.TemporaryDirectory() as name:
         empty = Path(name) / "empty.mcap"
         empty.touch()
@@ -275,7 +279,7 @@ def _children_cpu_s(command: list[str]) -> float:
 
 @benchmark("experts")
 def expert_rows() -> Iterator[Row]:
-    """The experts of all tasks under the paper's randomisation. Simulated."""
+    """Benchmark of the experts of all tasks under the paper's randomisation. Simulated."""
     from taccorl.demos.scoring import score_expert
 
     for task in tasks_with_expert():
@@ -325,7 +329,8 @@ def _mimicgen_sources(task: str, num_sources: int) -> Any:
 
 @benchmark("mimicgen_cost")
 def mimicgen_cost() -> Iterator[Row]:
-    """Cost of physics for what MimicGen keeps, beside the expert's own episodes in the same run. Simulated."""
+    """Benchmark of MimicGen's cost of physics per kept episode, relative to the expert's own episodes in the same run.
+    Simulated."""
     from taccorl.demos.mimicgen.scoring import score_generation
     from taccorl.demos.mimicgen.spec import load_mimic_spec
     from taccorl.demos.scoring import score_expert
@@ -344,8 +349,9 @@ def mimicgen_cost() -> Iterator[Row]:
 
 
 def mimicgen_cells(task: str, num_attempts: int, num_sources: int) -> Iterator[Row]:
-    """Yield of MimicGen on a task and beside it that of replay as MimicGen does it: end-effector poses as they were
-    commanded. ``num_attempts`` attempts for each cell, the same scenes in all of them, sources of the nominal twin. Simulated.
+    """Benchmark of the yield of generation on a task, relative to that of the original MimicGen, which replays commanded
+    end-effector poses. Each cell has ``num_attempts`` attempts in the same scenes, with sources from the nominal twin.
+    Simulated.
     """
     from taccorl.demos.mimicgen.scoring import score_generation, stiffened
     from taccorl.demos.mimicgen.spec import NoiseSpec, SplitNoiseSpec, load_mimic_spec, with_options

@@ -1,6 +1,5 @@
-"""Demonstrations in the twin into a LeRobot dataset, or into recordings as the robot's drivers would write them.
-
-Every attempt is a pure function of the configuration and its own seed, and is in the store once it is finished: a run that was
+"""Collect demonstrations in the twin into a LeRobot dataset, or into recordings in the format of the robot's drivers. Every
+attempt is a pure function of the configuration and its own seed, and is kept in the store when it has finished: a run that was
 stopped continues, and the same command gives the same dataset.
 """
 
@@ -45,11 +44,12 @@ class Source(draccus.ChoiceRegistry, abc.ABC):
     """Source of demonstrations: --source.type=expert, keyboard, gamepad, leader."""
 
     repeatable: ClassVar[bool] = True
-    """The same seed gives the same actions."""
+    """True if the same seed gives the same actions."""
 
     @abc.abstractmethod
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        """Actions (14,) of one attempt; reads the simulation between them. Ends when the demonstrator has finished."""
+        """Iterate over the actions (14,) of one attempt; the source reads the simulation between them. Ends when the
+        demonstration is finished."""
 
 
 @Source.register_subclass("expert")
@@ -58,7 +58,7 @@ class ExpertSource(Source):
     """The task's scripted expert, with human-like errors that it corrects when it is blocked."""
 
     hands: ScriptedExpertConfig = field(default_factory=ScriptedExpertConfig)
-    """How human the hands are."""
+    """Speeds and human-like errors of the expert's hands."""
 
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
         expert = expert_of(sim.task)(sim, rng, self.hands)
@@ -74,12 +74,12 @@ class Plan(attempts.AttemptPlan):
     """Settings of a collection: task, number of episodes, source, twin."""
 
     episodes: int = 20
-    """Successful ones."""
+    """Number of successful episodes to collect."""
     source: Source = field(default_factory=ExpertSource)
     keep_failures: bool = False
-    """Keep failed attempts as episodes too, labelled so."""
+    """True: failed attempts become episodes too, labelled as failures."""
     origin: str = ORIGIN
-    """Label of everything that is made: "surrogate: …" where the twin plays the robot."""
+    """Label of the origin in all outputs, such as "surrogate: …" if the twin stands in for the robot."""
 
     @property
     def num_attempts(self) -> int | None:
@@ -87,11 +87,12 @@ class Plan(attempts.AttemptPlan):
         return None
 
     def hopeless(self, attempts: int, successes: int) -> bool:
-        """True if an automatic demonstrator fails so often that something must be wrong. For a person there is no limit."""
+        """True if an automatic demonstrator fails so often that the task or the twin must be faulty. There is no limit for a
+        person."""
         return self.source.repeatable and attempts >= _MANY and successes < attempts / 4
 
     def attempt_seed(self, k: int) -> int:
-        """Seed of attempt ``k``: independent of all others and of how many there are."""
+        """Seed of attempt ``k``, independent of the other attempts and of their number."""
         sequence = np.random.SeedSequence(self.seed, spawn_key=(zlib.crc32(self.task.encode()), k))
         return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(2))
 
@@ -101,9 +102,9 @@ class Attempt(EpisodeRecorder):
     """Recorded data of one attempt, and its outcome."""
 
     outcome: str = "unfinished"
-    """As ``outcome_of``, or ``unreachable``: the demonstrator wanted a pose that its arm does not reach."""
+    """Outcome as from ``outcome_of``, or ``unreachable``: the demonstrator requested a pose that the arm cannot reach."""
     reason: str = ""
-    """Which pose."""
+    """Description of the unreachable pose; empty for other outcomes."""
 
     def is_kept(self, plan: Plan) -> bool:
         """Whether ``plan`` keeps the attempt as an episode. An attempt without rows is never kept."""
@@ -133,11 +134,12 @@ def outcome_of(sim: Simulation) -> str:
 
 
 def collect(plan: Plan, out: Path, store: Store, progress: attempts.Progress = print) -> dict[str, Any]:
-    """A LeRobot dataset of ``plan.episodes`` successes at ``out``; returns the report.
+    """Collect ``plan.episodes`` successes into a LeRobot dataset at ``out``; returns the report.
 
     Raises:
-        InTheWayError: ``out`` holds something else, as far as can be told before the first attempt; else after the last.
-        TaccorlError: three of four attempts of an expert fail: something is wrong with the task or the twin.
+        InTheWayError: ``out`` holds something else. Raised before the first attempt if that can be decided, otherwise after the
+            last.
+        TaccorlError: three of four attempts of an expert fail, which indicates a faulty task or twin.
     """
     attempts.check_destination(out, _COLLECTION, plan.task, lambda manifest: _may_be_of(plan, manifest, out, store))
     sim = plan.make()
@@ -231,12 +233,11 @@ def _report(plan: Plan, entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = print) -> list[Path]:
-    """``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` …, as the robot's drivers would write them.
-
-    Failures, if they are kept, are numbered with them and not counted.
+    """Collect ``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` … in the format of the robot's drivers. Failures,
+    if they are kept, get numbers of the same sequence, but do not count.
 
     Raises:
-        TaccorlError: ``out`` holds something already.
+        TaccorlError: ``out`` is not empty.
     """
     if not is_free(out):
         raise TaccorlError(f"{out} holds files already; nothing was touched: give another folder")

@@ -58,13 +58,13 @@ class PolicyEpisode:
     """Actions of a policy in one scene, up to the end of its episode."""
 
     seed: int
-    """Of the scene."""
+    """Scene seed of the episode."""
     outcome: str
-    """``success``, or as in ``taccorl evaluate``."""
+    """``success``, or a failure category as in ``taccorl evaluate``."""
     actions: np.ndarray
-    """(T, 14) float32, as they were given."""
+    """(T, 14) float32 actions as the policy returned them."""
     states: np.ndarray
-    """(T + 1, 14) float32 ``observation.state`` before each action, and after the last."""
+    """(T + 1, 14) float32 ``observation.state`` before each action, and after the last one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,23 +72,25 @@ class CorrectionPlan(attempts.AttemptPlan):
     """Settings of a round of corrections: policy, task, scenes, twin."""
 
     policy: str
-    """Name of the policy: the checkpoint's folder."""
+    """Name of the policy: its checkpoint's folder."""
     policy_digest: str
     episodes: int = 128
-    """Scenes in which the policy acts."""
+    """Number of scenes in which the policy acts."""
     episode_length: int | None = None
-    """Control steps after which the policy is cut off; None: the task's own limit."""
+    """Control steps after which an episode of the policy ends; None: the task's own limit."""
     takeover: str = "failures"
-    """``failures``: episodes in which the policy succeeds by itself are kept out; ``all``: they are corrected, too."""
+    """``failures``: episodes in which the policy succeeds by itself are skipped; ``all``: they are corrected, too."""
     rows: str = "dataset"
-    """``dataset``; or ``actions``: seeds and actions, which ``taccorl execute`` makes a dataset of, together with others."""
+    """``dataset``: write a dataset. ``actions``: write seeds and actions, from which ``taccorl execute`` makes a dataset, also
+    together with others."""
     part_poses: bool = False
-    """Rows have the poses of the task's parts (``observation.environment_state``)."""
+    """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
 
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: an unknown word (the nearest is given), a number out of its range, an expert that cannot take over.
+            TaccorlError: a setting has an unknown value (the message names the nearest), a number is out of its range, or the
+                task's expert cannot take over.
         """
         task = tasks.get(self.task)(self.difficulty)
         if not expert_of(task).can_resume():
@@ -107,7 +109,7 @@ class CorrectionPlan(attempts.AttemptPlan):
 
     @property
     def scene_seeds(self) -> list[int]:
-        """Scene seeds of the episodes; independent of their number, and different from those of other commands."""
+        """Scene seeds of the episodes. They do not depend on the number of episodes, and differ from those of other commands."""
         return [self._scene_seed(k) for k in range(self.episodes)]
 
     def _scene_seed(self, k: int) -> int:
@@ -140,7 +142,7 @@ def write_policy_episodes(episodes: Sequence[PolicyEpisode], folder: Path) -> No
 
 
 def read_policy_episode(folder: Path, k: int) -> PolicyEpisode:
-    """Episode ``k`` of what ``write_policy_episodes`` wrote."""
+    """Read episode ``k`` from the files of ``write_policy_episodes``."""
     table = json.loads((folder / "episodes.json").read_text(encoding="utf-8"))
     first, steps = sum(e["steps"] for e in table[:k]), table[k]["steps"]
     actions = np.load(folder / "actions.npy", mmap_mode="r")[first : first + steps]
@@ -153,21 +155,22 @@ class Correction:
     """Result of correcting one of the policy's episodes."""
 
     outcome: str
-    """``success``; ``policy succeeded``: nothing to correct; ``not taken over``: the expert cannot go on from there; else how the
-    expert failed: the task's own category, ``timeout``, ``diverged``, ``unfinished``, ``unreachable``; ``not reproduced``."""
+    """``success``; ``policy succeeded``: nothing to correct; ``not taken over``: the expert cannot complete the task from that
+    state; otherwise the expert's failure: the task's own category, ``timeout``, ``diverged``, ``unfinished``, ``unreachable``;
+    ``not reproduced``."""
     reason: str = ""
     takeover_step: int | None = None
-    """First action of the expert; None: it did nothing."""
+    """Number of the expert's first action; None if the expert did not act."""
     cause: str = ""
-    """Of the takeover: ``drawn``, ``stall``, or ``drawn before the grasp``: the parts were never in the hands."""
+    """Reason for the takeover: ``drawn``, ``stall``, or ``drawn before the grasp`` (the hands never held the parts)."""
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
-    """(S, 14) float32 all that were executed since the reset: the policy's, then the expert's."""
+    """(S, 14) float32 all actions executed since the reset: the policy's, then the expert's."""
     last_state: str = ""
-    """``state_digest`` after the last of them."""
+    """``state_digest`` after the last action."""
     felt: list[tuple[int, str]] = field(default_factory=list)
-    """(control step since the takeover, what the expert felt and corrected)."""
+    """(control step since the takeover, text of the contact that the expert detected and corrected)."""
     recorder: EpisodeRecorder | None = None
-    """Rows since the takeover."""
+    """Recorder with the rows since the takeover; None if there are none."""
 
 
 def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, episode: PolicyEpisode) -> Correction:
@@ -203,7 +206,8 @@ def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, ep
 
 
 def _execute_until_takeover(sim: Simulation, episode: PolicyEpisode) -> tuple[int, str] | None:
-    """Reset and execute the policy's actions; returns the step of the takeover and its cause, None if not reproduced.
+    """Reset the simulation and execute the policy's actions. Return the step of the takeover and its cause; None if the policy's
+    states are not reproduced.
 
     The step is drawn uniformly between the end of each arm's first subtask (both parts are held) and the policy's end, and over
     all of its steps where that never happens. A stall is an earlier takeover.
@@ -238,7 +242,8 @@ def _reproduced(sim: Simulation, episode: PolicyEpisode, t: int, cause: str) -> 
 
 
 def is_stall(states: np.ndarray, subtasks: np.ndarray) -> bool:
-    """Whether for a second no joint moved by 0.02 rad, no gripper by 1 mm, and no subtask ended; False if it is not yet a second.
+    """Whether the policy has stalled: for one second no joint moved by 0.02 rad, no gripper by 1 mm, and no subtask ended. False
+    if less than a second has passed.
 
     Args:
         states: (≤ 31, 14) joint angles [rad] and openings [m] of the last second.
@@ -257,14 +262,14 @@ def correct(
     engine: Engine | None = None,
     progress: attempts.Progress = print,
 ) -> dict[str, Any]:
-    """A LeRobot dataset at ``out`` of the expert's rows in the policy's episodes ``acted``; returns the report.
+    """Correct the policy's episodes ``acted`` and write the expert's rows as a LeRobot dataset at ``out``; returns the report.
 
     Args:
-        acted: folder of ``write_policy_episodes``, with ``plan.episodes`` of ``plan.scene_seeds``.
+        acted: folder of ``write_policy_episodes`` with ``plan.episodes`` episodes, whose seeds are ``plan.scene_seeds``.
 
     Raises:
         InTheWayError: ``out`` holds something else.
-        TaccorlError: no takeover succeeded, nothing is written.
+        TaccorlError: no takeover succeeded; nothing is written.
     """
     sim = plan.make()
     spec = plan.contract(sim)
@@ -322,10 +327,10 @@ def _dataset_config(plan: CorrectionPlan) -> dict[str, Any]:
 
 
 def check_out(plan: CorrectionPlan, out: Path) -> None:
-    """Fail before the policy acts if ``out`` cannot be the dataset.
+    """Fail before the policy acts if the dataset cannot be written to ``out``.
 
     Raises:
-        InTheWayError: says what is there.
+        InTheWayError: something else is there; the message states what.
     """
     attempts.check_destination(
         out, _stage(plan), plan.task, lambda manifest: manifest["config"] == _dataset_config(plan)
@@ -333,10 +338,11 @@ def check_out(plan: CorrectionPlan, out: Path) -> None:
 
 
 def run_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int, end: Failed | None = None) -> Artefact:
-    """Episode ``k`` corrected, or found in the store: entry.json, actions.npy; of a success dataset/ and episodes.json, too.
+    """Correct episode ``k``, unless the store has the result. The artefact holds entry.json and actions.npy, for a success also
+    dataset/ and episodes.json.
 
     Args:
-        end: how its process ended, if it did not come to an end of its own: that is the outcome then.
+        end: the way its process ended, if it died or was stopped; it is then the outcome.
     """
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
@@ -411,7 +417,7 @@ def _simulation(plan: CorrectionPlan) -> tuple[Simulation, DatasetSpec]:
 
 
 def correction_report(plan: CorrectionPlan, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Counts of what the policy and the expert did. Entries: as in an entry.json."""
+    """Counts of outcomes of the policy and the expert. Entries: as in an entry.json."""
 
     def count(values: Sequence[str]) -> dict[str, int]:
         return dict(Counter(values).most_common())

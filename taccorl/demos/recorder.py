@@ -32,8 +32,8 @@ def row_spec(sim: Simulation, *, pictures: bool, executed: bool = False, parts: 
     ``sim.state`` has the size of the task's scene, so datasets of different tasks merge only without it.
 
     Args:
-        executed: rows have what was executed, where ``action`` is what was intended.
-        parts: rows have the poses of the task's parts (``part_poses``), too.
+        executed: rows also hold the executed targets (``sim.executed``), because ``action`` holds the intended ones.
+        parts: rows also hold the poses of the task's parts (``part_poses``).
     """
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     own = {"unit": "1", "frame": "simulator", "rate_hz": float(spec.fps)}
@@ -73,26 +73,27 @@ class EpisodeRecorder:
 
     sim: Simulation
     spec: DatasetSpec
-    """``row_spec``."""
+    """Data spec of the rows, from ``row_spec``."""
     sensor_rng: np.random.Generator | None = None
-    """Noise of the pads; None: a noiseless sensor."""
+    """Random generator of the pads' noise; None: a noiseless sensor."""
     dense: bool = False
-    """Keep a 200 Hz trajectory as well, for recordings as the drivers would write them."""
+    """True: also keep a trajectory at 200 Hz, from which a recording in the format of the drivers is made."""
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
     physics_s: float = 0.0
-    """Of wall time, in all steps so far."""
+    """Wall time of the physics in all steps so far [s]."""
     touch_s: float = 0.0
-    """Likewise."""
+    """Wall time of touch in all steps so far [s]."""
 
     def __post_init__(self) -> None:
         self._dense = DenseRecorder(self.sim) if self.dense else None
 
     def step(self, action: np.ndarray, watch: Watch | None = None, intended: np.ndarray | None = None) -> None:
-        """One row and one control step. The action is rounded to float32 before it acts: what acts is what is stored.
+        """Record one row and make one control step. The action is rounded to float32 before it is executed, so that the executed
+        action is the stored one.
 
         Args:
-            watch: sees the state in between, if nothing dense is kept.
-            intended: the row's ``action``, where what is done differs: that is ``sim.executed`` then.
+            watch: callback for physics steps in between; only without ``dense``.
+            intended: the row's ``action``, if it differs from the executed one, which is then stored as ``sim.executed``.
         """
         action = np.asarray(action, dtype=np.float32)
         sim = self.sim
@@ -118,12 +119,12 @@ class EpisodeRecorder:
         self.rows.append(row)
 
     def trajectory(self) -> Trajectory:
-        """The dense record at 200 Hz."""
+        """The recorded trajectory at 200 Hz."""
         assert self._dense is not None, "make the recorder with dense=True"
         return self._dense.trajectory()
 
     def episode(self, name: str, simulation: dict[str, Any]) -> Episode:
-        """All recorded rows as an episode; ``simulation`` is stored in its provenance."""
+        """All recorded rows as an episode. ``simulation`` is stored in its provenance."""
         arrays = {key: np.stack([row[key] for row in self.rows]) for key in self.rows[0]}
         outcome = self.sim.judge.outcome
         keys = tuple(key for key in self.spec.keys("video"))

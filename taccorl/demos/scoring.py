@@ -1,4 +1,4 @@
-"""Score of a task's expert: success rate, cost, contact forces. All simulated."""
+"""Evaluate a task's expert: success rate, cost, contact forces. All simulated."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -19,14 +19,14 @@ class Score:
 
     outcomes: list[str] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
-    """Per episode, without pictures."""
+    """CPU time of each episode [s], without pictures."""
     duration_s: list[float] = field(default_factory=list)
     corrections: list[int] = field(default_factory=list)
-    """Corrections by touch per episode."""
+    """Number of corrections by touch in each episode."""
     penetration_m: list[float] = field(default_factory=list)
-    """Deepest between mating parts, per episode."""
+    """Deepest penetration between mating parts in each episode [m]."""
     force_n: list[float] = field(default_factory=list)
-    """Largest between mating parts, per episode."""
+    """Largest force between mating parts in each episode [N]."""
 
     @property
     def success_rate(self) -> float:
@@ -34,18 +34,19 @@ class Score:
 
     @property
     def failures(self) -> dict[str, int]:
-        """Category → how often."""
+        """Failure category → number of episodes."""
         return dict(Counter(o for o in self.outcomes if o != "success"))
 
 
 def score_expert(
     task: str, num_episodes: int, *, difficulty: str = "train", seed: int = 0, every_step: bool = False
 ) -> Score:
-    """Run the expert of ``task`` as ``taccorl collect`` does, under the paper's randomisation.
+    """Run the expert of ``task`` as ``taccorl collect`` does, under the paper's randomisation, and return success, cost and
+    contact forces.
 
     Args:
-        every_step: look at contacts after every physics step, not only after every control step: peaks last less than a
-            millisecond. Costs half as much again, so figures of cost are taken without.
+        every_step: measure contacts after every physics step, not only after every control step, since peaks last less than a
+            millisecond. This adds half to the cost, so that costs are measured without it.
     """
     plan = Plan(task=task, difficulty=difficulty, seed=seed)
     assert isinstance(plan.source, ExpertSource)

@@ -36,7 +36,7 @@ _LATE_S = 0.2  # a machine that is later than this is too slow for real time: it
 
 
 class Window(Protocol):
-    """Interface of the window: display and keyboard."""
+    """Interface of a teleoperation window: display and keyboard."""
 
     def tick(self, sim: Simulation, lines: Sequence[str], goals: Sequence[np.ndarray]) -> None:
         """Wait for the next control step, then show simulation 0, some lines of text, and a mark at each (4, 4) goal.
@@ -51,11 +51,11 @@ class Window(Protocol):
         ...
 
     def held(self, codes: Collection[int]) -> set[int]:
-        """Keys of ``codes`` that are pressed now."""
+        """Those of the key codes ``codes`` that are pressed now."""
         ...
 
     def locked(self) -> AbstractContextManager[Any]:
-        """While this is held the window's own thread does not poll devices."""
+        """Context manager: while it is open, the window's own thread does not poll devices."""
         ...
 
     def close(self) -> None:
@@ -64,18 +64,18 @@ class Window(Protocol):
 
 
 class Hands(Protocol):
-    """Interface of the controls of one attempt."""
+    """Interface of a person's controls in one attempt."""
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
         """Action (14,) [rad, m] for the next control step, and the person's commands."""
         ...
 
     def lines(self) -> list[str]:
-        """Lines of text to show to the person."""
+        """Lines of text to show in the window."""
         ...
 
     def goals(self) -> list[np.ndarray]:
-        """Poses, world-from-TCP (4, 4), to be marked in the window."""
+        """Poses, world-from-TCP (4, 4), to mark in the window."""
         ...
 
 
@@ -87,7 +87,7 @@ class ViewerWindow:
     """MuJoCo's passive viewer on a copy of the scene, in real time at 30 control steps a second.
 
     Raises:
-        TaccorlError: no display, or no window on it.
+        TaccorlError: there is no display, or a window cannot be opened on it.
     """
 
     def __init__(self, sim: Simulation) -> None:
@@ -205,27 +205,27 @@ _sessions: weakref.WeakKeyDictionary[Simulation, _Session] = weakref.WeakKeyDict
 
 @dataclass(frozen=True, kw_only=True)
 class HumanSource(Source):
-    """A person demonstrates. Base class; subclasses define the input device."""
+    """Base of sources in which a person demonstrates; subclasses define the input device."""
 
     folder: str = "outputs/teleop"
-    """Where action files go."""
+    """Folder for action files."""
     time_limit_s: float = 300.0
-    """Instead of the task's own limit, which is made for experts that move both hands at once."""
+    """Time limit of an attempt [s], in place of the task's own, which is made for experts that move both hands at once."""
     repeatable: ClassVar[bool] = False
 
     @abc.abstractmethod
     def device(self, window: Window) -> Any:
-        """Open the input device, and print how it is used. Called once; the device is read at each control step."""
+        """Open the input device, and print its controls. Called once; the device is read at each control step."""
 
     @abc.abstractmethod
     def hands(self, sim: Simulation, window: Window, device: Any) -> Hands:
-        """Controls of an attempt that begins now."""
+        """Controls of an attempt that starts now."""
 
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        """Actions of the finished demonstration of this scene; if there is none, the person demonstrates now.
+        """Actions of the finished demonstration of this scene; if there is none, the person is asked to demonstrate now.
 
         Raises:
-            TaccorlError: no display, no device, or the person has closed the window.
+            TaccorlError: there is no display or no device, or the person has closed the window.
         """
         scene, name = scene_of(sim), self.get_choice_name(type(self))
         folder = Path(self.folder).expanduser()
@@ -323,7 +323,7 @@ class KeyboardSource(HumanSource):
 @Source.register_subclass("gamepad")
 @dataclass(frozen=True, kw_only=True)
 class GamepadSource(HumanSource):
-    """A gamepad's sticks move one hand at a time; what does what is printed."""
+    """A gamepad's sticks move one hand at a time; the assignment of its buttons is printed."""
 
     def device(self, window: Window) -> GlfwGamepad:
         import glfw
@@ -352,7 +352,7 @@ class LeaderDevice(Protocol):
     """Leader arms that are connected."""
 
     def read(self) -> np.ndarray:
-        """(14,) joint angles [rad] and gripper openings [m] now, in the order of actions."""
+        """Present joint angles [rad] and gripper openings [m], (14,), in the order of actions."""
         ...
 
     def close(self) -> None:
@@ -365,7 +365,7 @@ _drivers: list[OpenLeader] = []
 
 
 def use_leader_driver(driver: OpenLeader) -> None:
-    """Set the function that opens leader arms: LeRobot's is in a higher layer, so the command line passes it."""
+    """Set the function that opens leader arms. The command line passes LeRobot's, which is in a higher layer."""
     _drivers[:] = [driver]
 
 
@@ -375,15 +375,17 @@ class LeaderSource(HumanSource):
     """Leader arms: any LeRobot teleoperator with 14 values, or with a mapping of its values to the 14."""
 
     teleop: str = ""
-    """LeRobot's name of it: bi_rebot_102_leader, bi_openarm_leader, …"""
+    """LeRobot's name of the teleoperator: bi_rebot_102_leader, bi_openarm_leader, …"""
     options: str = ""
-    """Its own options (ports, calibration id), as LeRobot has them, in a YAML or JSON file."""
+    """YAML or JSON file with the teleoperator's own options (ports, calibration id), named as in LeRobot."""
     names: dict[str, str | None] = field(default_factory=dict)
-    """Its name of a value → ours (left_joint_1.pos … right_gripper.pos), or null: not used. Only those that differ."""
+    """The teleoperator's name of a value → taccorl's (left_joint_1.pos … right_gripper.pos), or null: not used. Only names that
+    differ are needed."""
     joint_unit: str = ""
-    """Of its joints: rad, deg, or range_m100_100 (−100 … 100 over our joint's range). Has to be said: nothing tells by itself."""
+    """Unit of its joints: rad, deg, or range_m100_100 (−100 … 100 over the range of our joint). Must be given, because the
+    teleoperator does not state it."""
     gripper_unit: str = ""
-    """Of its grippers: m, or range_0_100 (0 closed, 100 open)."""
+    """Unit of its grippers: m, or range_0_100 (0 closed, 100 open)."""
 
     def device(self, window: Window) -> LeaderDevice:
         if not _drivers:
@@ -400,7 +402,7 @@ class LeaderSource(HumanSource):
 
 
 class LeaderHands:
-    """The twin's arms follow the leader; at first slowly, because they begin elsewhere."""
+    """Controls by leader arms: the twin's arms follow them, slowly at first, because they start at other angles."""
 
     def __init__(self, sim: Simulation, device: LeaderDevice) -> None:
         self._device, self._keyboard = device, Keyboard()

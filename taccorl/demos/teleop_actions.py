@@ -49,15 +49,16 @@ def scene_of(sim: Simulation) -> dict[str, Any]:
 
 
 def give_time(sim: Simulation, seconds: float) -> None:
-    """Set the time limit of an episode to ``seconds``: a person is slower than an expert."""
+    """Set the time limit of an episode to ``seconds`` [s], because a person is slower than an expert."""
     sim.judge.limit_steps = round(seconds * CONTROL_HZ)
 
 
 class ActionLog:
-    """Appends actions to a new file ``folder/TASK_SEED_NNN.jsonl``: each goes to the kernel at once, each second to the disk."""
+    """Appends actions to a new file ``folder/TASK_SEED_NNN.jsonl``. Each action is written at once, and the file is synchronised
+    to disk every second."""
 
     def __init__(self, folder: Path, sim: Simulation, source: str) -> None:
-        """For what ``source`` does in simulation 0 of ``sim``, which has just been reset."""
+        """Create the file for the actions of ``source`` in simulation 0 of ``sim``, which has just been reset."""
         scene = scene_of(sim)
         folder.mkdir(parents=True, exist_ok=True)
         self.path, self._descriptor = _create(folder, f"{scene['task']}_{scene['seed']}")
@@ -80,7 +81,7 @@ class ActionLog:
         _sync_folder(folder)
 
     def append(self, action: np.ndarray) -> None:
-        """One control step's action (14,), as float32."""
+        """Append the action (14,) of one control step, as float32."""
         # A float32 is written as the float64 of the same value, which JSON gives back exactly.
         self._write(np.asarray(action, np.float32).tolist())
         self.num_actions += 1
@@ -88,7 +89,7 @@ class ActionLog:
             os.fsync(self._descriptor)
 
     def end(self, end: str, outcome: str) -> None:
-        """Write the last line: how the demonstration ended."""
+        """Write the last line, which states how the demonstration ended."""
         assert end in _ENDS, end
         self._write({"end": end, "outcome": outcome})
         self.close()
@@ -137,9 +138,9 @@ class ActionFile:
     path: Path
     header: dict[str, Any]
     actions: np.ndarray
-    """(T, 14) float32."""
+    """(T, 14) float32 actions [rad, m]."""
     end: str | None
-    """finished or discarded; None: cut off, so the actions are all there is."""
+    """finished or discarded; None: the demonstration was interrupted, so that the actions are incomplete."""
     outcome: str | None
 
     @property
@@ -151,7 +152,7 @@ class ActionFile:
         """Read a file. An incomplete last line is left out.
 
         Raises:
-            TaccorlError: not an action file, or damaged; with file and line.
+            TaccorlError: it is not an action file, or damaged; the message names file and line.
         """
         try:
             lines = Path(path).read_bytes().split(b"\n")
@@ -183,7 +184,8 @@ def _value(path: Path, number: int, line: bytes) -> Any:
 
 
 def find_finished(folder: Path, scene: dict[str, Any], source: str) -> ActionFile | None:
-    """The newest finished demonstration of this very scene by this kind of source in this MuJoCo."""
+    """The newest finished demonstration of the same scene by the same kind of source, recorded with this version of MuJoCo; None
+    without one."""
     wanted = {**scene, "source": source, "mujoco": mujoco.__version__}
     for path in sorted(folder.glob(f"{scene['task']}_{scene['seed']}_*.jsonl"), reverse=True):
         file = ActionFile.read(path)
@@ -193,10 +195,10 @@ def find_finished(folder: Path, scene: dict[str, Any], source: str) -> ActionFil
 
 
 def replay(file: ActionFile, sim: Simulation) -> Actions:
-    """The actions of a file, one by one, as a source gives them.
+    """Iterate over the actions of a file, as a source does.
 
     Raises:
-        TaccorlError: the episode was over when these actions were recorded, and is not now.
+        TaccorlError: the episode had ended with these actions when they were recorded, and does not end now.
     """
     if file.header.get("mujoco") != mujoco.__version__:
         logger.warning(
@@ -216,12 +218,12 @@ def replay(file: ActionFile, sim: Simulation) -> Actions:
 @Source.register_subclass("actions")
 @dataclass(frozen=True, kw_only=True)
 class ActionsSource(Source):
-    """Re-executes action files: what a person or another source did, in the scenes in which they did it."""
+    """Source that executes action files again: the actions of a person or another source, in the original scenes."""
 
     path: str
-    """An action file, or a folder of them (outputs/teleop); those that say they were discarded are left out of a folder."""
+    """An action file, or a folder of them (outputs/teleop); discarded demonstrations in a folder are skipped."""
     digest: str = field(init=False, default="")
-    """Of the files' contents: other actions make other episodes."""
+    """Digest of the files' contents, so that other actions have other keys in the store."""
 
     _MADE_BY_FILE: ClassVar[tuple[str, ...]] = ("task", "difficulty", "randomization")
 
@@ -236,7 +238,7 @@ class ActionsSource(Source):
         """All action files, in the order in which they were made.
 
         Raises:
-            TaccorlError: there is none, or one is damaged.
+            TaccorlError: there is no file, or one is damaged.
         """
         paths = self._paths()
         files = [ActionFile.read(path) for path in paths]
@@ -259,7 +261,7 @@ class ActionsSource(Source):
         """``plan`` with the scenes of the files: their task, difficulty, twin, randomisation and seeds.
 
         Raises:
-            TaccorlError: the files are of several twins or tasks, or ``plan`` asks for another.
+            TaccorlError: the files are of several twins or tasks, or of another one than ``plan`` states.
         """
         files = [file for file in self.files() if plan.task in ("", file.header["task"])]
         if not files:
@@ -308,7 +310,7 @@ class ReplayPlan(Plan):
         """Scene seed of file ``k``.
 
         Raises:
-            TaccorlError: there are fewer: too few of them end in success.
+            TaccorlError: there are fewer files, because too few of them end in success.
         """
         if k >= len(self.files):
             names = ", ".join(file.path.name for file in self.files)

@@ -4,7 +4,8 @@ A hand moves along the bench's axes (x away from the arms, y left, z up) and tur
 y the fingers' closing direction, z the approach). A goal that is out of reach is refused, so that it never runs away from the
 hand, and the hand follows its goal no faster than an arm moves. Nothing here knows a window or a device.
 
-A wish is (7,): x, y, z, about x, about y, about z, gripper; in steps, + opens the gripper.
+A requested motion ("wish") is (7,): translation along x, y, z, rotation about x, y, z, and gripper, in steps; + opens the
+gripper.
 """
 
 import enum
@@ -43,7 +44,7 @@ STEP_SIZES = (StepSize("fine", 0.001, 0.01), StepSize("medium", 0.005, 0.05), St
 
 
 class Command(enum.Enum):
-    """Commands of a person other than motion."""
+    """Commands of a person that are not motions."""
 
     SWITCH_ARM = "other arm"
     STEP_SIZE = "next step size: fine, medium, coarse"
@@ -52,13 +53,13 @@ class Command(enum.Enum):
 
 
 class Axis(NamedTuple):
-    """Two opposite keys. Codes are GLFW's, which MuJoCo passes on (mjui.h)."""
+    """Two opposite keys for one axis of motion. Codes are GLFW's, which MuJoCo passes on (mjui.h)."""
 
     labels: str
     more: tuple[int, ...]
     less: tuple[int, ...]
     index: int
-    """In a wish."""
+    """Index of the axis in a wish (7,)."""
     meaning: str
 
 
@@ -98,19 +99,19 @@ _REST = (0,) * 15, (0.0, 0.0, 0.0, 0.0, -1.0, -1.0)  # buttons, axes
 
 
 def label(command: Command) -> str:
-    """Name of the key of a command."""
+    """Name of the key for a command."""
     return next(label for label, meant in COMMAND_KEYS.values() if meant is command)
 
 
 def key_map() -> str:
-    """Readable list of the keys and their functions."""
+    """Text that lists the keys and their functions."""
     rows = [(axis.labels, axis.meaning) for axis in AXES]
     rows += [(label, command.value) for label, command in COMMAND_KEYS.values()]
     return "\n".join(f"  {keys:16}{meaning}" for keys, meaning in rows)
 
 
 def gamepad_map() -> str:
-    """Readable list of the gamepad's sticks and buttons and their functions."""
+    """Text that lists the gamepad's sticks and buttons and their functions."""
     return "\n".join(f"  {what:21}{meaning}" for what, meaning in _GAMEPAD_MAP)
 
 
@@ -175,13 +176,13 @@ class JoggedHand:
     """Target of one jogged arm."""
 
     goal: np.ndarray
-    """World-from-TCP (4, 4) at which the hand is to arrive; always in reach."""
+    """World-from-TCP (4, 4) to which the hand moves; always reachable."""
     pose: np.ndarray
-    """World-from-TCP (4, 4) on the way there."""
+    """World-from-TCP (4, 4) of the present target on the way there."""
     joints_rad: np.ndarray
-    """(6,) that belong to ``pose``."""
+    """(6,) joint angles for ``pose`` [rad]."""
     bias_rad: np.ndarray
-    """(6,) how far the joints rest from their targets at the beginning."""
+    """(6,) offset of the joints at rest from their targets at the beginning [rad]."""
     opening_m: float
 
 
@@ -194,7 +195,7 @@ class Jogger:
         self.arm = ROBOT.arms[0]
         self.size = STEP_SIZES[1]
         self.notice = ""
-        """Why the newest wish was refused; empty if it was not."""
+        """Reason why the newest wish was refused; empty if it was not."""
         reported, targets = sim.proprioception()[0], sim.targets[0]
         self.hands = {}
         for arm in ROBOT.arms:
@@ -251,7 +252,7 @@ class Jogger:
 
 
 class JogHands:
-    """Controls of one attempt: converts steps and commands, read by ``read`` from the tapped keys, into actions."""
+    """Controls of one attempt: reads steps and commands with ``read`` from the pressed keys, and converts them into actions."""
 
     def __init__(self, sim: Simulation, read: Callable[[Sequence[int]], tuple[np.ndarray, list[Command]]]) -> None:
         self.jogger, self._read = Jogger(sim), read
@@ -275,7 +276,7 @@ class JogHands:
         return [f"{jogger.arm} hand, {step}, gripper {opening_mm:.0f} mm", *([jogger.notice] if jogger.notice else [])]
 
     def goals(self) -> list[np.ndarray]:
-        """World-from-TCP (4, 4) of the hand that moves."""
+        """World-from-TCP (4, 4) target of the selected hand."""
         return [self.jogger.hands[self.jogger.arm].goal]
 
 
@@ -283,7 +284,7 @@ class GlfwGamepad:
     """The first gamepad that GLFW (its Python module) finds.
 
     Raises:
-        TaccorlError: there is none; names the joysticks that are there.
+        TaccorlError: there is none; the message names the connected joysticks.
     """
 
     def __init__(self, glfw: Any) -> None:
@@ -310,5 +311,6 @@ def _text(name: str | bytes | None) -> str:
 
 
 def squeeze_m(robot: RobotConfig) -> float:
-    """Distance [m] of the command below the fingers' opening for the force ``GRIP_N``: F / k of the gripper's controller."""
+    """Distance [m] of the command below the fingers' opening that gives the force ``GRIP_N``: F / k of the gripper's
+    controller."""
     return GRIP_N / robot.grip_stiffness_n_per_m

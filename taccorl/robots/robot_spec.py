@@ -17,11 +17,11 @@ class Link:
 
     name: str
     pos_parent_m: tuple[float, float, float]
-    """Origin of the joint in the parent link's frame."""
+    """Origin of the joint in the parent link's frame [m]."""
     rpy_parent_rad: tuple[float, float, float]
     """Fixed-axis roll, pitch, yaw of the joint in the parent link's frame, as in URDF."""
     range_rad: tuple[float, float]
-    """Lowest and highest angle of the joint."""
+    """Lowest and highest angle of the joint [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Inertia:
     mass_kg: float
     com_link_m: tuple[float, float, float]
     inertia_kgm2: tuple[float, float, float, float, float, float]
-    """Ixx, Iyy, Izz, Ixy, Ixz, Iyz."""
+    """Ixx, Iyy, Izz, Ixy, Ixz, Iyz [kg·m²]."""
     about: Literal["link", "com"]
     """Point of reference of ``inertia_kgm2``."""
 
@@ -46,14 +46,14 @@ class Inertia:
 
 @dataclass(frozen=True, kw_only=True)
 class PadLayout:
-    """Taxels of one tactile pad. Taxel = row · columns + column."""
+    """Arrangement of the taxels of one tactile pad. Index of a taxel = row · columns + column."""
 
     rows: int
     """Number of rows, from palm to tip."""
     columns: int
     """Number of columns, across the finger."""
     pitch_m: float
-    """Distance of neighbouring taxels, along rows and columns alike."""
+    """Distance between neighbouring taxels [m], the same along rows and columns."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -74,25 +74,26 @@ class PadLayout:
         return self.columns * self.pitch_m
 
     def taxel_axes_m(self) -> tuple[np.ndarray, np.ndarray]:
-        """Places of the columns (columns,) on the pad's x axis and of the rows (rows,) on its y axis; 0 is the pad's middle."""
+        """Positions of the columns (columns,) along the pad's x axis and of the rows (rows,) along its y axis [m]; 0 is the
+        pad's middle."""
         x, y = ((np.arange(n) - (n - 1) / 2) * self.pitch_m for n in (self.columns, self.rows))
         return x, y
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMount:
-    """A colour camera of the robot as it is mounted nominally."""
+    """Nominal mount of one colour camera of the robot."""
 
     name: str
-    """As in the dataset's key, ``observation.images.<name>``."""
+    """Name of the camera, as in the dataset's key ``observation.images.<name>``."""
     body: str = "world"
-    """Body that carries it."""
+    """Body to which the camera is fixed."""
     model: str
     """Name of its imager in ``taccorl.sim.cameras.COLOR_SENSORS``."""
     position_m: tuple[float, float, float]
-    """Optical centre in the body's frame."""
+    """Optical centre in the body's frame [m]."""
     look_at_m: tuple[float, float, float]
-    """Point of the body's frame in the middle of the picture."""
+    """Point in the body's frame that appears in the middle of the picture [m]."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Direction in the body's frame that points up in the picture."""
 
@@ -102,21 +103,21 @@ class RobotSpec:
     """A robot of equal arms with a two-finger gripper each. State and action have the same numbers in the same order."""
 
     arms: tuple[str, ...]
-    """Prefixes of the names of everything an arm has."""
+    """Names of the arms; they are the prefixes of the names of everything on an arm."""
     joints: tuple[str, ...]
     """Names of one arm's joints without the arm's prefix, base to hand."""
     links: tuple[Link, ...]
     """Links of one arm, base to hand: link k is moved by joint k."""
     kp_nm_per_rad: tuple[float, ...]
-    """K_p of the joints' controllers, τ = K_p (q* − q) − K_d q̇ + T_ref."""
+    """K_p of each joint's controller [N·m/rad], in τ = K_p (q* − q) − K_d q̇ + T_ref."""
     kd_nms_per_rad: tuple[float, ...]
-    """K_d of the joints."""
+    """K_d of each joint's controller [N·m·s/rad]."""
     torque_ff_nm: tuple[float, ...]
-    """T_ref of the joints."""
+    """T_ref of each joint's controller [N·m]."""
     fingers: tuple[str, ...]
     """Names of the fingers of one gripper; each finger has a pad."""
     finger_stroke_m: float
-    """Travel of each finger."""
+    """Travel of each finger [m]."""
     finger_from_hand_m: float
     """Distance of the fingers' origin from the hand's origin, along the hand's z axis."""
     tcp_from_hand_m: float
@@ -125,7 +126,7 @@ class RobotSpec:
     """Greatest closing force of each finger."""
     pad: PadLayout
     pad_thickness_m: float
-    """Height of the taxels above the finger."""
+    """Height of the taxels above the finger [m]."""
     camera_mounts: tuple[CameraMount, ...]
 
     @property
@@ -135,7 +136,7 @@ class RobotSpec:
 
     @property
     def opening_max_m(self) -> float:
-        """Greatest distance of a gripper's pads."""
+        """Greatest distance between the pads of a gripper [m]."""
         return 2 * self.finger_stroke_m
 
     @property
@@ -162,12 +163,12 @@ class RobotSpec:
 
     @property
     def num_per_arm(self) -> int:
-        """Numbers of an action that are one arm's: joints and gripper."""
+        """Number of values in an action that belong to one arm: its joints and its gripper."""
         return self.num_joints + 1
 
     @property
     def num_actions(self) -> int:
-        """A: numbers of an action, and of a state."""
+        """A: number of values in an action, and in a state."""
         return len(self.arms) * self.num_per_arm
 
     @cached_property

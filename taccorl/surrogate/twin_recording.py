@@ -1,8 +1,9 @@
-"""A demonstration in the twin as the robot's drivers would have recorded it: MCAP with their rates and jitter.
+"""Write a demonstration in the twin as a recording of the robot's drivers: MCAP with their rates and jitter.
 
 The same streams as the stand-in's, computed from a trajectory of the twin: joints at 200 Hz, pads at 100 Hz with their rolling
 scan, pictures at 30 Hz from the state at their own stamps. No picture is lost on the way: two lost in a row would split the
-episode. Lost pictures are a fault, which the stand-in's recordings show. Nothing here comes from a robot, and the file says so.
+episode. (Lost pictures are among the faults of the stand-in's recordings.) Nothing here comes from a robot; the file's metadata
+states that.
 """
 
 import json
@@ -23,11 +24,11 @@ from taccorl.surrogate.stand_in.story import PADS, EpisodePlan
 from taccorl.surrogate.stand_in.streams import Streams
 
 LEAD_S = 1.0
-"""The arms rest this long before and after: the first frames of a pad are its baseline."""
+"""Time of rest before and after the demonstration [s]: the first frames of a pad are its baseline."""
 
 
 class TwinStory:
-    """Signals of the trajectory at any time of the recording. Before and after the trajectory everything is at rest."""
+    """True signals of a trajectory at any time of the recording. Before and after the trajectory everything is at rest."""
 
     def __init__(self, sim: Simulation, trajectory: Trajectory, outcome: str) -> None:
         self.sim, self.trajectory = sim, trajectory
@@ -84,7 +85,7 @@ class TwinStory:
         return low + share[:, None] * (high - low)
 
     def data_at(self, time_s: float, data: mujoco.MjData) -> None:
-        """Positions at an instant: from the sample before, moved on with its velocity."""
+        """Positions at an instant: those of the sample before, extrapolated with its velocity."""
         before, share = self._place(np.array(time_s))
         data.qpos[:] = self.trajectory.qpos[before]
         mujoco.mj_integratePos(self.sim.model, data.qpos, self.trajectory.qvel[before], float(share) / SAMPLE_HZ)
@@ -95,7 +96,7 @@ class TwinStory:
 
 
 class TwinScene:
-    """The twin's cameras, with a colour sensor's noise."""
+    """Pictures of the twin's cameras, with the noise of a colour sensor."""
 
     def __init__(self, story: TwinStory, camera_size: tuple[int, int]) -> None:
         self.story, self.size = story, camera_size
@@ -103,7 +104,7 @@ class TwinScene:
         self._renderers: dict[str, Renderer] = {}
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
-        """One uint8 picture (rows, columns, 3), blue first, per time."""
+        """Iterate over pictures, one uint8 (rows, columns, 3) in BGR per time."""
         if camera not in self._renderers:
             self._renderers[camera] = Renderer(self.story.sim.model, (camera,), *self.size)
         rows, columns = self.size
@@ -124,11 +125,11 @@ class TwinScene:
 
 
 def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, success: bool, origin: str) -> None:
-    """One episode as a recording of its own; replaces the file if there is one.
+    """Write one episode as one recording; an existing file is replaced.
 
     Args:
         sim: the simulation that the trajectory is of.
-        origin: what this is, e.g. "surrogate: …"; goes into the file and every dataset made of it.
+        origin: label such as "surrogate: …", stored in the file and in every dataset made from it.
     """
     story = TwinStory(sim, trajectory, "success" if success else "failure")
     config = StandInConfig(

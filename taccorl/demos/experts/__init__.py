@@ -1,4 +1,4 @@
-"""Scripted experts: they demonstrate in place of a person who teleoperates. A task names its own (``Task.expert``)."""
+"""Scripted experts: programs that demonstrate a task in place of a person. A task names its own (``Task.expert``)."""
 
 import pkgutil
 
@@ -11,7 +11,7 @@ def expert_of(task: Task | type[Task]) -> type[ScriptedExpert]:
     """The scripted expert that ``task`` names.
 
     Raises:
-        TaccorlError: it names none, or one that cannot be imported or is none.
+        TaccorlError: the task names none, or a class that cannot be imported or is not a scripted expert.
     """
     if task.expert is None:
         have = ", ".join(tasks_with_expert())

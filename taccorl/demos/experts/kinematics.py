@@ -51,9 +51,9 @@ class ArmKinematics:
     def solve(
         self, tcp_world: np.ndarray, start_rad: np.ndarray, tolerance_m: float = 1e-5
     ) -> tuple[np.ndarray, float]:
-        """Joint angles (6,) [rad] that bring the TCP closest to ``tcp_world`` (4, 4), and the error left.
-
-        The error is the position's [m] plus the rotation's at 0.15 m a radian. Starts at ``start_rad``: the nearest solution.
+        """Joint angles (6,) [rad] that bring the TCP closest to ``tcp_world`` (4, 4), and the remaining error. The error is that
+        of the position [m] plus 0.15 m/rad times that of the rotation. The search starts at ``start_rad``, so that it finds the
+        nearest solution.
         """
         joints = np.array(start_rad, dtype=np.float64)
         for _ in range(_NEWTON_ITERATIONS):
@@ -96,7 +96,7 @@ class ArmKinematics:
     def search(
         self, tcp_world: np.ndarray, rng: np.random.Generator, tries: int = 20, tolerance_m: float = 5e-4
     ) -> np.ndarray:
-        """The solution farthest from the joint limits among random starts.
+        """Of the solutions from random starts, the one farthest from the joint limits.
 
         Raises:
             UnreachableError: the pose is out of reach.

@@ -10,10 +10,10 @@ from taccorl.sim.part import Fit, Part, measure_fit
 
 
 class Seen(Protocol):
-    """Interface of the scene that an expert reads."""
+    """Interface of the scene as an expert observes it."""
 
     def body(self, name: str) -> np.ndarray:
-        """World-from-body (4, 4) now."""
+        """Present pose world-from-body (4, 4)."""
         ...
 
 
@@ -42,7 +42,7 @@ class Mating:
         return measure_fit(*self._relative(scene), self.num_turns)
 
     def axis(self, scene: Seen) -> np.ndarray:
-        """(3,) world, into the hole."""
+        """(3,) unit vector along the hole's axis into the hole, in the world frame."""
         return scene.body(self.holder)[:3, :3] @ self.holder_from_hole[:3, 2]
 
     def turned(self, scene: Seen) -> np.ndarray:
@@ -59,15 +59,15 @@ class Aim:
     """Target of a hand that inserts a held part, with the hand's aiming error."""
 
     off_m: np.ndarray
-    """(2,) error across the hole's axis."""
+    """(2,) error of the aim across the hole's axis [m]."""
     off_rad: np.ndarray
-    """(3,) error of the direction, about the part's leading end."""
+    """(3,) error of the direction, about the part's leading end [rad]."""
     part_from_tcp: np.ndarray
-    """(4, 4) how the hand held the part when it was last looked at."""
+    """(4, 4) pose of the TCP in the part's frame when the expert last observed it."""
     turned: np.ndarray
-    """(4, 4) about the hole's axis, among the turns that look the same."""
+    """(4, 4) rotation about the hole's axis, one of those that look the same."""
     given: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    """(6,) [m, rad], frame of the hole: how far the wrist has given way, about the TCP; never along the axis."""
+    """(6,) [m, rad] displacement of the compliant wrist about the TCP, in the hole's frame; 0 along the axis."""
 
     def pose(self, scene: Seen, mating: Mating, depth_m: float) -> np.ndarray:
         """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, with the hand's aiming error."""
@@ -79,7 +79,8 @@ class Aim:
         return pose
 
     def giving_way(self, scene: Seen, mating: Mating, push_world: np.ndarray) -> "Aim":
-        """The aim after the compliant wrist was displaced by ``push_world`` (6,) [m, rad], except along the hole's axis."""
+        """The aim after contact forces have displaced the compliant wrist by ``push_world`` (6,) [m, rad], except along the
+        hole's axis."""
         world_from_hole = (scene.body(mating.holder) @ mating.holder_from_hole)[:3, :3]
         sideways = world_from_hole.T @ push_world[:3] * (1, 1, 0)
         return replace(self, given=self.given + np.r_[sideways, world_from_hole.T @ push_world[3:]])

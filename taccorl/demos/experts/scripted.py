@@ -3,7 +3,7 @@
 Each arm is a generator of ``Wish``es (TCP pose, gripper opening), one a control step; ``act`` turns both into 14 joint targets.
 It sees the true poses, as a person sees the bench, but aims with an error: it detects a wrong aim only when the part is
 blocked, as a person does, backs off and has a smaller error in the next try. Those corrections are what a policy with touch is
-to learn. Figures of the human likeness: research notes on teleoperation in the issue, tuned to ~2 corrections per insertion.
+to learn. The human-like errors are tuned to about 2 corrections per insertion.
 """
 
 import math
@@ -46,30 +46,32 @@ class ScriptedExpertConfig:
     speed: float = 1.0
     """Factor on every speed."""
     tremor_m: float = 0.0004
-    """Standard deviation of the hand's tremor (Ornstein–Uhlenbeck, 0.3 s), per axis."""
+    """Standard deviation of the hand's tremor per axis [m] (Ornstein–Uhlenbeck process, time constant 0.3 s)."""
     tremor_rad: float = 0.004
-    """The same in rotation."""
+    """Standard deviation of the tremor in rotation, per axis [rad]."""
     waypoint_m: float = 0.004
-    """Spread of way points in free space."""
+    """Standard deviation of way points in free space [m]."""
     grasp_m: float = 0.0015
-    """Spread of where on a part the hand grips."""
+    """Standard deviation of the place on a part at which the hand grips [m]."""
     grasp_rad: float = 0.03
-    """Spread of how the hand is turned when it grips."""
+    """Standard deviation of the hand's rotation when it grips [rad]."""
     aim_m: float = 0.0010
-    """Spread of the seen position of a hole or mate, per axis."""
+    """Standard deviation of the perceived position of a hole or mate, per axis [m]."""
     aim_rad: float = 0.015
-    """Spread of its seen direction, per axis."""
+    """Standard deviation of its perceived direction, per axis [rad]."""
     grip_n: float = 30.0
-    """Closing force of each pad; PiPER's gripper is rated for 40 N."""
+    """Closing force of each pad [N]; PiPER's gripper is rated for 40 N."""
     feel_m: float = 0.0010
-    """The hand feels a block when it is held back by that much, or the part slips in it by that much: an arm has 5 N/mm
-    upwards and 7 N/mm sideways, and a part that is gripped with 25 N slips at 15 N if its friction is low."""
+    """Displacement [m] at which the hand detects that the part is blocked: contact holds the hand back, or the part slips in it,
+    by this much. For comparison: an arm has 5 N/mm upwards and 7 N/mm sideways, and a part that is gripped with 25 N slips at 15
+    N if its friction is low."""
     feel_rad: float = 0.06
-    """Or when the part turns over that much against the hole, or the hole since the hand last looked at it."""
+    """Rotation [rad] at which it detects the same: of the part relative to the hole, or of the hole since the hand last observed
+    it."""
     give_way: float = 0.1
-    """Share of a sideways push or turn to which the wrist yields, each control step."""
+    """Share of a sideways displacement or rotation by contact to which the wrist yields in each control step."""
     aim_kept: float = 0.45
-    """Share of the aiming error that is left after a correction by touch."""
+    """Share of the aiming error that remains after a correction by touch."""
 
 
 EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)
@@ -83,19 +85,20 @@ class Hand:
     """World-from-TCP (4, 4), without tremor."""
     opening_m: float
     joints_rad: np.ndarray
-    """(6,) of the last command without the correction."""
+    """(6,) joint angles of the last command, without the correction for the offset [rad]."""
     bias_rad: np.ndarray
-    """(6,) how far the joints rest from their targets: learned in free motion, as a person's eye corrects the hand."""
+    """(6,) offset of the joints at rest from their targets [rad], estimated in free motion, as a person corrects the hand by
+    eye."""
     predicted_rad: np.ndarray
-    """(6,) where the joints are now if nothing touches the arm."""
+    """(6,) joint angles that are expected now if nothing touches the arm [rad]."""
     goal: np.ndarray
-    """World-from-TCP (4, 4), with tremor."""
+    """World-from-TCP (4, 4) target, with tremor."""
     learns: bool = True
-    """Off in contact: what holds the hand back there is no bias."""
+    """False in contact: an offset that contact causes is not learned."""
     tremor: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    """(6,) [m, rad] now."""
+    """(6,) present tremor [m, rad]."""
     steadiness: float = 1.0
-    """Factor on the tremor."""
+    """Factor on the tremor, 0 … 1."""
 
 
 Script = Iterator[None]
@@ -127,22 +130,23 @@ class ScriptedExpert(ABC):
         self._tremor_rng = rng.spawn(1)[0]
         self._tremor = np.repeat((self.config.tremor_m, self.config.tremor_rad), 3)
         self.events: list[tuple[int, str]] = []
-        """(control step, what was felt): corrections by touch."""
+        """(control step, text): corrections after a block was detected by touch."""
         self.unreachable_m = 0.0
-        """Largest error that inverse kinematics left."""
+        """Largest remaining error of inverse kinematics [m]."""
         self.step_count = 0
         self.flags: set[str] = set()
-        """How the arms tell each other that a stretch is over."""
+        """Flags by which one arm signals the other that a part of its motion has ended."""
 
     @abstractmethod
     def script(self, arm: str) -> Script:
         """Motion of one arm as a generator: one yield per control step."""
 
     def finish(self, arm: str, subtask: str) -> Script:
-        """The rest of a subtask, starting with the held part close before its mate. An arm's last subtask ends with its retreat.
+        """Motion that completes a subtask, starting with the held part close before its mate. The last subtask of an arm ends
+        with its retreat.
 
         Raises:
-            TaccorlError: this demonstrator can only begin at the beginning.
+            TaccorlError: this expert can only start at the beginning of an episode.
         """
         raise TaccorlError(
             f"expert of {self.sim.task.name}: cannot begin in the middle of {subtask!r}; implement its finish()"
@@ -160,7 +164,7 @@ class ScriptedExpert(ABC):
         self.running = set(ROBOT.arms)
 
     def stand_by(self) -> None:
-        """Start after a reset of the simulation; another controller moves the arms until ``take_over``."""
+        """Start after a reset of the simulation, while another controller moves the arms until ``take_over``."""
         command = self.sim.arrays["ctrl"][0, self.sim.action_actuators]
         self.hands = {}
         for arm in ROBOT.arms:
@@ -177,7 +181,7 @@ class ScriptedExpert(ABC):
             )
         self._scripts: dict[str, Script] = {}
         self.running: set[str] = set()
-        """Arms that it moves."""
+        """Arms that the expert moves."""
         self.step_count = 0
         self.flags, self.events = set(), []
 
@@ -200,7 +204,7 @@ class ScriptedExpert(ABC):
 
         Raises:
             LostError: the task cannot be completed from there.
-            TaccorlError: this demonstrator can only begin at the beginning.
+            TaccorlError: this expert can only start at the beginning of an episode.
         """
         raise TaccorlError(
             f"expert of {self.sim.task.name}: cannot take over in the middle of a task; implement its remaining()"
@@ -212,7 +216,7 @@ class ScriptedExpert(ABC):
         return cls.remaining is not ScriptedExpert.remaining
 
     def resume(self) -> None:
-        """Take over both arms in the simulation's present state, whatever happened since its reset.
+        """Take over both arms in the simulation's present state, independently of what happened since its reset.
 
         The first action repeats the command in force, so that the arms do not jump.
 
@@ -273,7 +277,7 @@ class ScriptedExpert(ABC):
         turn_radps: float = 1.2,
         settle: bool = False,
     ) -> Script:
-        """Minimum-jerk to a TCP pose; a callable goal is followed while it moves."""
+        """Move to a TCP pose with a minimum-jerk motion; a callable goal is evaluated at each step."""
         hand, start = self.hands[arm], self.hands[arm].pose.copy()
         aim = goal if callable(goal) else lambda: goal
         distance = np.linalg.norm(aim()[:3, 3] - start[:3, 3])
@@ -299,12 +303,12 @@ class ScriptedExpert(ABC):
             yield
 
     def pause(self, arm: str, low_s: float = 0.08, high_s: float = 0.3) -> Script:
-        """Do nothing for a moment."""
+        """Keep still for a moment."""
         for _ in range(round(self.rng.uniform(low_s, high_s) * CONTROL_HZ)):
             yield
 
     def close(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
-        """Close on a part of that width, then squeeze with ``force_n`` (the configuration's by default).
+        """Close on a part of width ``width_m``, then squeeze with ``force_n`` (the configuration's by default).
 
         The command ends at 0, so a narrow part is squeezed with less: 26 N at 20 mm.
         """
@@ -325,7 +329,7 @@ class ScriptedExpert(ABC):
             yield from self.close(arm, width_m, force_n)
 
     def free(self, arm: str) -> Script:
-        """Open a hand that holds nothing, unless it is open."""
+        """Open a hand that holds nothing; no motion if it is open."""
         if self.hands[arm].opening_m < ROBOT.opening_max_m - _OPEN_ENOUGH_M:
             yield from self.open(arm)
 
@@ -348,18 +352,19 @@ class ScriptedExpert(ABC):
         yield from self.pause(arm, 0.15, 0.25)
 
     def wait_for(self, flag: str, longest_s: float = 25.0) -> Script:
-        """Hold still until the other arm has raised ``flag``."""
+        """Keep still until the other arm has set ``flag``."""
         for _ in range(round(longest_s * CONTROL_HZ)):
             if flag in self.flags:
                 return
             yield
 
     def insert(self, arm: str, mating: Mating, *, depth_m: float, enough_m: float, start_m: float = -0.02) -> Script:
-        """Bring a held part before a hole and push it in until ``enough_m``; it is pushed towards ``depth_m`` at most.
+        """Bring a held part before a hole and push it in to a depth of at least ``enough_m`` [m]; the target depth is at most
+        ``depth_m`` [m].
 
         Sideways and in rotation the hand is compliant, as a relaxed wrist is, so that the part aligns itself once it is in the
-        mouth. When it is blocked, it backs off, reads the pose of the part in the hand again, which may have turned, and aims
-        again with a smaller error. A part that is in the mouth already, and straight, is pushed on from where it is.
+        mouth. When the part is blocked, the hand backs off, reads the pose of the part again, which may have turned in the hand,
+        and aims again with a smaller error. A part that is in the mouth already, and straight, is pushed on from where it is.
         """
         hand, config = self.hands[arm], self.config
         depth, aim = start_m, self._first_aim(arm, mating)
@@ -395,7 +400,7 @@ class ScriptedExpert(ABC):
         yield from self.pause(arm, 0.1, 0.25)
 
     def is_in(self, mating: Mating) -> bool:
-        """Whether the part is past the mouth, and not wedged."""
+        """Whether the part is past the hole's mouth and not wedged."""
         fit = mating.fit(self)
         in_mouth = fit.depth_m > _AT_MOUTH_M and fit.lateral_m < _AT_MOUTH_M
         return bool(in_mouth and fit.tilt_rad < _STRAIGHT * self.config.feel_rad)
@@ -419,7 +424,7 @@ class ScriptedExpert(ABC):
         return aim
 
     def regain(self, arm: str) -> Script:
-        """Motion between a block and the next try. Experts whose other hand holds the hole wait until that hand is at rest."""
+        """Motion between a block and the next try. Subclasses whose other hand holds the hole wait until that hand is at rest."""
         yield from self.settle(arm, longest_s=0.2)
 
     def _held_back_m(self, arm: str, mating: Mating, aim: Aim, pushed: np.ndarray) -> float:
@@ -442,7 +447,7 @@ class ScriptedExpert(ABC):
         return replace(aim, part_from_tcp=part_from_tcp, turned=mating.turned(self), given=np.zeros(6))
 
     def pushed(self, arm: str) -> np.ndarray:
-        """(6,) [m, rad], world: displacement of the TCP by contact forces."""
+        """(6,) [m, rad] displacement of the TCP by contact forces, in the world frame."""
         return deflection(self.kinematics[arm].pose(self.hands[arm].predicted_rad), self.tcp(arm))
 
     # what a person sees and errs about ---------------------------------------------------------------------------------
@@ -463,8 +468,8 @@ class ScriptedExpert(ABC):
     ) -> np.ndarray:
         """TCP pose for a grasp of a part where it lies, with human spread.
 
-        ``lean_rad`` turns the hand about its closing direction, so that it comes from −x of the grasp's frame; about a point
-        ``pivot_m`` ahead of the TCP, where the part is gripped.
+        ``lean_rad`` turns the hand about its closing direction, so that it approaches from −x of the grasp's frame; the turn is
+        about a point ``pivot_m`` ahead of the TCP, where the part is gripped.
         """
         config, rng = self.config, self.rng
         spot = transform((0, 0, pivot_m))
@@ -497,15 +502,15 @@ class ScriptedExpert(ABC):
         """Check that a part is not held by the other hand.
 
         Raises:
-            LostError: it is.
+            LostError: the other hand holds it.
         """
         if any(self.holds(other, part) for other in ROBOT.arms if other != arm):
             raise LostError(f"{part.name} is in the other hand")
 
     def body(self, name: str) -> np.ndarray:
-        """World-from-body (4, 4) now."""
+        """Present pose world-from-body (4, 4)."""
         return self.sim.poses(name)[0]
 
     def tcp(self, arm: str) -> np.ndarray:
-        """World-from-TCP (4, 4) now."""
+        """Present pose world-from-TCP (4, 4)."""
         return self.sim.tcp(arm)[0]

@@ -34,7 +34,8 @@ _WORD = "mimicgen"  # apart from the scenes of ``taccorl collect`` with the same
 
 
 def attempt_seeds(root: int, task: str, k: int) -> tuple[int, np.random.Generator]:
-    """Scene seed and generator of attempt ``k``: ``SeedSequence(root, spawn_key=(task, k))``, independent of all others."""
+    """Scene seed and random generator of attempt ``k``: ``SeedSequence(root, spawn_key=(task, k))``, independent of other
+    attempts."""
     sequence = np.random.SeedSequence(root, spawn_key=(zlib.crc32(f"{_WORD} {task}".encode()), k))
     scene, rest = sequence.spawn(2)
     return int(scene.generate_state(1, np.uint64)[0] >> np.uint64(2)), np.random.default_rng(rest)
@@ -47,13 +48,13 @@ class Attempted:
     k: int
     scene_seed: int
     outcome: str
-    """``success``; a failure's category of the task; ``timeout``, ``diverged``, ``unfinished``: nothing failed, but nothing was
-    reached; ``unreachable``; ``deadlock``; or the gate that a success did not pass."""
+    """``success``; a failure's category of the task; ``timeout``, ``diverged``, ``unfinished`` (neither failure nor success);
+    ``unreachable``; ``deadlock``; or the acceptance criterion (gate) that a success did not meet."""
     reason: str = ""
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
-    """(T, 14) float32 as they were executed."""
+    """(T, 14) float32 executed actions."""
     intended: np.ndarray | None = None
-    """(T, 14) float32 what an attempt that is disturbed was to do; None: what it did."""
+    """(T, 14) float32 intended actions of a disturbed attempt; None: equal to ``actions``."""
     last_state: str = ""
     """``state_digest`` after the last action."""
     provenance: dict[str, object] = field(default_factory=dict)
@@ -65,12 +66,12 @@ class Attempted:
 
 
 def state_digest(sim: Simulation) -> str:
-    """SHA-256 of simulation 0's state row, bit for bit."""
+    """SHA-256 of the state row of simulation 0, bit for bit."""
     return hashlib.sha256(np.ascontiguousarray(sim.state_rows()[0]).tobytes()).hexdigest()
 
 
 class TwinScene:
-    """Interface of simulation 0 to the director: poses of hands and parts."""
+    """Poses of hands and parts in simulation 0, for the director."""
 
     def __init__(self, sim: Simulation) -> None:
         self.sim = sim
@@ -100,8 +101,9 @@ class Hands:
         """After a reset.
 
         Args:
-            max_joint_speed_radps: a wish that would take a joint there faster is followed as fast as that.
-            learn: wishes are where the joints are to be, not what to send.
+            max_joint_speed_radps: limit of the joint speed: a target that would need more is followed at this speed.
+            learn: targets are joint positions to reach, so that the steady-state offset is estimated and corrected; False: they
+                are sent unchanged.
         """
         self._max_step_rad = max_joint_speed_radps / CONTROL_HZ
         self.sim, self.kinematics, self.learn = sim, kinematics, learn
@@ -118,7 +120,7 @@ class Hands:
             self._rest[arm] = RestOffset(joints, command[ROBOT.joint_slice(arm)].copy(), lag_s)
 
     def action(self, wishes: Mapping[str, Wish], pushed: Collection[str] = ()) -> np.ndarray:
-        """(14,) float32 joint targets [rad] and openings [m]. For ``pushed`` (disturbed) arms the offset is not estimated."""
+        """(14,) float32 joint targets [rad] and openings [m]. The offset of ``pushed`` (disturbed) arms is not estimated."""
         action, qpos = np.empty(ROBOT.num_actions), self.sim.arrays["qpos"][0]
         may_learn = [arm for arm in ROBOT.arms if self.learn and arm not in pushed and not wishes[arm].contact]
         still = [arm for arm in may_learn if self._rest[arm].is_still]
@@ -145,7 +147,8 @@ class Hands:
 
 
 class Attempts:
-    """Attempts of one spec with one pool of sources in one simulation; ``run(k)`` does not depend on what ran before."""
+    """Attempts with one spec and one pool of sources in one simulation. The result of ``run(k)`` does not depend on earlier
+    runs."""
 
     def __init__(self, pool: SourcePool, sim: Simulation, seed: int) -> None:
         self.pool, self.spec, self.sim, self.seed = pool, pool.spec, sim, seed
@@ -156,7 +159,7 @@ class Attempts:
             check_closed_loop(self.spec)
 
     def run(self, k: int) -> Attempted:
-        """Attempt ``k``, physics only."""
+        """Run attempt ``k``: physics only, without touch and pictures."""
         began_s = time.process_time()
         sim, (scene_seed, rng) = self.sim, attempt_seeds(self.seed, self.spec.task, k)
         sim.reset([scene_seed])

@@ -59,25 +59,26 @@ class Made:
     """A finished attempt in the store."""
 
     folder: Path
-    """As ``run_attempt`` says, without rows."""
+    """Folder of the attempt as from ``run_attempt``, without rows."""
     entry: dict[str, Any]
-    """How it ended, its rows included."""
+    """Content of entry.json: outcome and number of rows."""
     seconds: float
-    """That its process took, rows included."""
+    """Time that its process took, rows included [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AugmentPlan(attempts.AttemptPlan):
-    """Settings of a generation: spec, which states the task, number of episodes, twin, seed."""
+    """Settings of a generation: spec (which states the task), number of episodes, twin, seed."""
 
     task: str = field(init=False)
     spec: MimicSpec
     episodes: int = 200
-    """Successful ones, in the plan's twin, which need not be the sources'."""
+    """Number of successful episodes to generate, in the plan's twin, which may differ from that of the sources."""
     stratify: bool = False
-    """Fill the poor boxes of the reset space (``stratify.py``). An attempt does not depend on it, only which are made."""
+    """True: choose attempts in boxes of the reset space with few episodes (``stratify.py``). It changes which attempts are made,
+    not their results."""
     rows: Rows = "dataset"
-    """What is written: a LeRobot dataset, or seeds and actions (``stored_actions.py``). Attempts are the same."""
+    """Kind of output: a LeRobot dataset, or seeds and actions (``stored_actions.py``). The attempts are the same."""
     origin: str = field(default=ORIGIN)
 
     def __post_init__(self) -> None:
@@ -92,7 +93,7 @@ class AugmentPlan(attempts.AttemptPlan):
 
     @functools.cached_property
     def space(self) -> ResetSpace:
-        """Reset space of the task; without rows that are not randomised."""
+        """Reset space of the task; without any row if ``randomization`` is 0."""
         return ResetSpace(self._rows if self.randomization > 0 else (), self.randomization)
 
     @functools.cached_property
@@ -140,7 +141,7 @@ def augment(
     """Generate ``plan.episodes`` successes from those at ``source`` into ``out``, as ``plan.rows`` states; returns the report.
 
     Raises:
-        TaccorlError: sources that do not fit or are not as written, something else at ``out``, or hardly any attempt succeeds.
+        TaccorlError: the sources do not fit or were changed, something else is at ``out``, or hardly any attempt succeeds.
     """
     sources = store.dataset(source)
     made: list[Artefact] = []
@@ -201,7 +202,7 @@ def check_out(plan: AugmentPlan, source: Path, out: Path, store: Store) -> None:
     """Fail early if ``out`` is occupied by something other than a dataset of this plan.
 
     Raises:
-        InTheWayError: says what is at ``out``.
+        InTheWayError: something else is at ``out``; the message states what.
     """
     attempts.check_destination(
         out, plan.stage, plan.task, lambda manifest: _may_be_of(plan, manifest, store.source(source), out, store)
@@ -227,7 +228,7 @@ def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> li
     """Read the plan's first ``num`` attempts from the store, without making any.
 
     Raises:
-        TaccorlError: one of them is not there, or the plan has all its successes after fewer attempts.
+        TaccorlError: one of them is missing, or fewer attempts give all successes of the plan.
     """
     sources, found, entries = store.source(source), [], []
     while len(found) < num:
@@ -252,11 +253,11 @@ def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> li
 
 
 def run_attempt(plan: AugmentPlan, sources: Artefact, store: Store, k: int, end: Failed | None = None) -> Artefact:
-    """Attempt ``k``, from the store if it has been made: entry.json, actions.npy, where disturbed intended.npy. Of a
-    success, where the plan wants rows, these: entry.json, dataset/, episodes.json.
+    """Make attempt ``k``, unless it is in the store: entry.json, actions.npy, and intended.npy if it is disturbed. For a success
+    whose rows the plan requires: also an artefact with entry.json, dataset/, episodes.json.
 
     Args:
-        end: how its process ended, if it did not come to an end of its own: that is the outcome then.
+        end: the way its process ended, if it died or was stopped; it is then the outcome.
     """
     lost = end and Attempted(k, plan.scene_seed(k), end.process, end.reason)
 
@@ -291,16 +292,17 @@ def demonstration_of(folder: Path) -> Demonstration:
 
 
 def is_attempt(folder: Path) -> bool:
-    """Whether ``run_attempt`` made that folder."""
+    """Whether a folder was written by ``run_attempt``."""
     manifest = read_manifest(folder) if folder.is_dir() else None
     return bool(manifest) and manifest["stage"] == _ATTEMPT.name
 
 
 def attempt_episode(folder: Path) -> Episode:
-    """An attempt, failed ones above all, executed again from its stored actions and its scene's seed, with touch.
+    """Execute an attempt, usually a failed one, again from its stored actions and scene seed, with touch, and return it as an
+    episode.
 
     Raises:
-        TaccorlError: it broke before its first action.
+        TaccorlError: the attempt ended before its first action.
     """
     config, entry, stored = _config(folder), attempts.read_entry(folder), demonstration_of(folder)
     if not len(stored.actions):
@@ -354,11 +356,11 @@ def _build_rows(plan: AugmentPlan, sources: Artefact, attempt: Path, config: dic
 def write_execution(
     done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path, kind: str = MIMICGEN
 ) -> None:
-    """Rows of an execution as dataset/ with one episode, and its record, episodes.json.
+    """Write the rows of an execution as dataset/ with one episode, and its record episodes.json.
 
     Args:
-        told: what the simulation was, for the episode's provenance.
-        kind: of stored actions; where the provenance says how the episode was made.
+        told: description of the simulation for the episode's provenance.
+        kind: kind of the stored actions; it is the key of the provenance that states how the episode was made.
     """
     from taccorl.data.lerobot_format import write_episodes
 

@@ -45,14 +45,15 @@ def object_delta(new: np.ndarray, source: np.ndarray, num_turns: int = 1) -> np.
 
 
 def translation(delta: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """The translation of the object at ``source`` in ``delta``, without its rotation."""
+    """The translation by which ``delta`` moves the object at ``source``, without its rotation."""
     shift = np.eye(4)
     shift[:3, 3] = (delta @ source)[:3, 3] - source[:3, 3]
     return shift
 
 
 def shaken(delta: np.ndarray, about: np.ndarray, shift_m: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
-    """``delta`` followed by a turn (3,) about where it brings the pose ``about``, and a shift (3,), world."""
+    """``delta`` followed by a rotation (3,) about the position to which it moves the pose ``about``, and by a translation (3,),
+    in world coordinates."""
     centre = (delta @ about)[:3, 3]
     extra = turn(turn_rad)
     extra[:3, 3] = centre - extra[:3, :3] @ centre + shift_m
@@ -79,7 +80,7 @@ def bridge(start: np.ndarray, end: np.ndarray, limits: BridgeSpec, hz: float) ->
 
 
 def minimum_jerk(x: float) -> float:
-    """Share of the way at share ``x`` of the time: 10x³ − 15x⁴ + 6x⁵."""
+    """Minimum-jerk profile: share of the path at share ``x`` of the time, 10x³ − 15x⁴ + 6x⁵."""
     return 10 * x**3 - 15 * x**4 + 6 * x**5
 
 

@@ -28,7 +28,7 @@ class Share:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 %, Wilson's; (0, 1) of none."""
+        """95 % interval of the rate (Wilson); (0, 1) without attempts."""
         if not self.attempts:
             return 0.0, 1.0
         ends = binomtest(self.successes, self.attempts).proportion_ci(method="wilson")
@@ -46,7 +46,7 @@ class Share:
 
 @dataclass(frozen=True, kw_only=True)
 class Bin:
-    """A box of the reset space (one row of the paper's table), and the outcomes of attempts that began in it."""
+    """A box of the reset space (a part of one row of the paper's table), and the outcomes of attempts that started in it."""
 
     row: str
     unit: str
@@ -66,11 +66,11 @@ class Attempt:
     sources: frozenset[str]
     draw: dict[str, np.ndarray]
     rows: int
-    """Actions that can be executed again."""
+    """Number of actions that can be executed again."""
     process_s: float
-    """Wall clock of the process that made it."""
+    """Wall time of the process that made it [s]."""
     folder: Path
-    """In the store."""
+    """Folder of the attempt in the store."""
 
     @property
     def success(self) -> bool:
@@ -78,12 +78,12 @@ class Attempt:
 
     @property
     def command(self) -> str:
-        """Command that shows the attempt in Rerun."""
+        """Command line that shows the attempt in Rerun."""
         return f"taccorl view {shlex.quote(str(self.folder))}"
 
 
 def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: int) -> list[Attempt]:
-    """Read attempts from the store. Draws follow from the seeds, also for attempts whose process died."""
+    """Read attempts from the store. Their random draws follow from the seeds, also for attempts whose process died."""
     found = []
     for made in made_attempts(plan, source, store, num_attempts):
         entry = made.entry
@@ -106,7 +106,7 @@ def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: i
 
 
 def bins_of(plan: AugmentPlan, attempts: Sequence[Attempt]) -> Iterator[Bin]:
-    """Every row of the task's randomisation, cut into equal boxes. Rows of which nothing is drawn have none."""
+    """Divide the range of every row of the task's randomisation into equal boxes; rows that draw nothing have none."""
     places = [plan.space.boxes(a.draw) for a in attempts]
     for r, row in enumerate(plan.space.rows):
         for box in range(plan.space.num_boxes(row)):
@@ -126,8 +126,8 @@ def share_of(attempts: Sequence[Attempt]) -> Share:
 
 
 def evenness(plan: AugmentPlan, draws: Sequence[Mapping[str, np.ndarray]]) -> dict[str, Any]:
-    """Evenness of episodes over the boxes, as JSON values: the emptiest box, and how many are at least half full.
-    The fair share of a box: all episodes over the boxes of its row."""
+    """Evenness of episodes over the boxes, as JSON values: the emptiest box, and the number of boxes with at least half their
+    fair share, which is the number of episodes divided by the number of boxes of the row."""
     counts = plan.space.count(plan.space.boxes(drawn) for drawn in draws)
     shares = [count * len(count) / max(len(draws), 1) for count in counts]
     r, box = min(((r, b) for r, row in enumerate(shares) for b in range(len(row))), key=lambda at: shares[at[0]][at[1]])

@@ -58,7 +58,7 @@ class Kinematics(Protocol):
         ...
 
     def solve(self, tcp_world: np.ndarray, start_rad: np.ndarray) -> tuple[np.ndarray, float]:
-        """Joints (6,) near ``start_rad`` that bring the TCP there, and the error left [m]."""
+        """Joint angles (6,) [rad] near ``start_rad`` that bring the TCP to the pose, and the remaining error [m]."""
         ...
 
 
@@ -70,14 +70,14 @@ class Wish:
     """World-from-TCP (4, 4)."""
     opening_m: float
     joints_rad: np.ndarray | None = None
-    """(6,) where the joints themselves are told; ``goal`` is theirs."""
+    """(6,) joint angles [rad], if the target is given in joint space; ``goal`` is then their pose."""
     contact: bool = False
-    """What is held touches its mate, or soon will: nothing is learnt of the arm's rest here."""
+    """True if the held object touches its mate or soon will: the offset of the arm is then not estimated."""
     noisy: bool = True
 
 
 class ContactHands(Protocol):
-    """Interface of a controller that moves the hands in contact instead of the source."""
+    """Interface of a controller that moves the hands in contact in place of the source's motion."""
 
     @property
     def corrections(self) -> list[tuple[int, str]]:
@@ -95,13 +95,14 @@ class ContactHands(Protocol):
 
 @dataclass(frozen=True)
 class Ahead:
-    """Control steps of an arm's present path, from the next one on, before it must be exact; 0: it must be in the next one;
-    infinite: not on this path, as far as is known."""
+    """Number of control steps, from the next one on, until the arm must follow its path exactly; 0: in the next one; infinite:
+    not on its present path, as far as known."""
 
     gripper: float
-    """Before its gripper begins to open or close."""
+    """Steps until its gripper begins to open or close."""
     contact: float
-    """Before contact (``contact_lead_steps`` before what it holds touches its mate), or before another moves it."""
+    """Steps until contact (``contact_lead_steps`` before the held object touches its mate), or until another controller moves
+    the arm."""
 
 
 @dataclass
@@ -111,9 +112,9 @@ class Choice:
     source: int
     segment: Segment
     delta: np.ndarray
-    """Δ (4, 4), world to world."""
+    """Δ (4, 4), world to world: transform of the source's motion to the new scene."""
     correction: np.ndarray
-    """C = G_src · G_new⁻¹ (4, 4) as it is now."""
+    """C = G_src · G_new⁻¹ (4, 4): correction for the present pose of the held object in the hand."""
 
 
 @dataclass
@@ -174,15 +175,16 @@ class Director:
     ) -> None:
         """
         Args:
-            openings_m: of the grippers now.
-            kinematics: arm → its own; only subtasks without an object_ref need it.
-            contact_hands: what moves the hands in contact, made with a generator of its own; None: the source.
+            openings_m: present openings of the grippers.
+            kinematics: arm → its kinematics; only subtasks without an object_ref need it.
+            contact_hands: factory of the controller that moves the hands in contact, which gets its own random generator; None:
+                the source's motion is used.
         """
         self.pool, self.spec, self.hz, self.kinematics = pool, pool.spec, hz, kinematics or {}
         self._rng, self._noise_rng = rng.spawn(2)
         self.contact_hands = contact_hands(rng.spawn(1)[0]) if contact_hands else None
         self._handed_over: set[str] = set()
-        """Arms that they move now."""
+        """Arms that the contact controller moves now."""
         self.schedule = Schedule(self.spec.signals, self.spec.constraints)
         self.choices: dict[Place, Choice] = {}
         self._hands = {
@@ -190,7 +192,7 @@ class Director:
         }
         self._chosen: dict[str, int] = {}
         self._shared: dict[int, tuple[int, np.ndarray]] = {}
-        """Coordination → the source and Δ that both arms use."""
+        """Coordination → index of the source and Δ that both arms use."""
         self._offsets: dict[Place, int] = {}
         for arm, subtasks in self.spec.subtask_configs.items():
             for k, subtask in enumerate(subtasks):
@@ -203,8 +205,8 @@ class Director:
         return self.schedule.done
 
     def step(self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None) -> dict[str, Wish]:
-        """Each arm's target for the next control step. ``joints_rad``: (6,) joint angles of each arm's last target, if it had
-        any.
+        """Each arm's target for the next control step. ``joints_rad``: arm → (6,) joint angles that the caller computed for the
+        arm's last target, if there was one.
 
         Raises:
             DeadlockError: the arms wait for each other.
@@ -230,7 +232,7 @@ class Director:
         return wishes
 
     def ahead(self, arm: str) -> Ahead:
-        """Steps until the arm must be exact, from its present path."""
+        """Steps until the arm must follow its path exactly."""
         hand, cue = self._hands[arm], self.schedule.upcoming(arm)
         if arm in self._handed_over:
             return Ahead(0, 0)

@@ -1,15 +1,15 @@
 """Disturbance of the arms in transport, so that new episodes contain recoveries.
 
-    executed(t) = intended(t) + strength(t) · drift(t)         the dataset's ``action`` is what was intended
+    executed(t) = intended(t) + strength(t) · drift(t)         the dataset's ``action`` is the intended target
 
-A policy that has only seen successes does not know what to do 10 mm beside them. Here an arm drifts off while the action that
-is shown still leads to where the demonstration was: DART, Laskey et al. 2017, Noise Injection for Robust Imitation Learning
+A policy that has only seen successes does not know what to do 10 mm beside them. Here an arm drifts away while the stored action
+still leads to the demonstrated position: DART, Laskey et al. 2017, Noise Injection for Robust Imitation Learning
 (arXiv:1703.09327), with noise that lasts, as an arm follows its command in a tenth of a second and white noise hardly moves it.
 
 The strength of an arm is 0 while its gripper moves, while it is ``Exact``, while either arm is at contact (from
 ``contact_lead_steps`` before it) or moved by an expert, 0.4 s before and after that, and 0.8 s before its gripper moves. It is
-known when an action is sent: what is ahead follows from the arm's path (``Director.ahead``). So the attempt itself is disturbed,
-nothing is executed twice, and an expert that moves the hands in contact acts on what the disturbed transport left.
+computed when an action is sent, from the arm's path ahead (``Director.ahead``). So the attempt itself is disturbed, nothing is
+executed twice, and an expert that moves the hands in contact starts from the disturbed state.
 """
 
 import math
@@ -39,10 +39,10 @@ class Disturbance:
         self._spec, self._rng = spec, rng
         self._off_rad = np.zeros(len(ROBOT.joint_indices))
         self._since = np.full(len(ROBOT.arms), np.inf)
-        """(2,) steps since an arm had to be exact."""
+        """(2,) steps since each arm last had to be exact."""
         self._opening_m: dict[str, float] = {}
         self.strength = np.zeros(len(ROBOT.arms))
-        """(2,) of each arm now, 0 … 1."""
+        """(2,) present strength of each arm, 0 … 1."""
         self._is_first = True
 
     @property
@@ -54,9 +54,9 @@ class Disturbance:
         """Advance the disturbance by one control step, and compute its strength for each arm.
 
         Args:
-            wishes: of the coming control step.
-            ahead: of each arm, after these wishes.
-            is_exact: (2,) of each arm now (``Exact``).
+            wishes: targets of the coming control step.
+            ahead: steps ahead of each arm, after these targets.
+            is_exact: (2,) whether each arm must be exact now (``Exact``).
         """
         contact = min(each.contact for each in ahead.values())
         before = np.empty(len(ROBOT.arms))
@@ -80,9 +80,9 @@ class Disturbance:
 
 
 class Exact:
-    """Decides when an arm may not be disturbed: it grips what something else holds fast, the table for one; or mating parts
-    have met and a hand still holds one of them. Inside its play a plug does not touch all the time, so that they have met is
-    remembered."""
+    """Decides when an arm may not be disturbed: it grips a part that something else holds (the table, for example); or mating
+    parts have touched and a hand still holds one of them. A plug with clearance does not touch all the time, so that a first
+    touch is remembered."""
 
     def __init__(self, sim: Simulation) -> None:
         """After a reset."""

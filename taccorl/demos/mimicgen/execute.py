@@ -44,9 +44,9 @@ class Executed:
     """Result of executing one demonstration again."""
 
     artefact: Artefact
-    """entry.json, and of a success dataset/ and episodes.json."""
+    """Artefact with entry.json, and for a success dataset/ and episodes.json."""
     seconds: dict[str, float]
-    """That each of its parts took; empty where the store had it."""
+    """Part of the work → time it took [s]; empty if the result was in the store."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class ExecutePlan:
     """Folders of stored actions of one task, difficulty, twin and randomisation."""
     pictures: PicturesAs = "video"
     part_poses: bool = False
-    """Rows have the poses of the task's parts (``observation.environment_state``)."""
+    """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
 
     def __post_init__(self) -> None:
         if not self.sources:
@@ -69,7 +69,7 @@ class ExecutePlan:
         """Data spec of the dataset's rows.
 
         Args:
-            executed: what was executed beside the action: if the arms were disturbed in one of the sources.
+            executed: rows also hold the executed targets, because the arms were disturbed in one of the sources.
         """
         return row_spec(sim, pictures=pictures, executed=executed, parts=self.part_poses)
 
@@ -90,7 +90,7 @@ def execute_stored(
     """Publish a LeRobot dataset at ``out``; returns its report and the mean seconds of each part of the executions made now.
 
     Raises:
-        DatasetError: no stored actions, or changed since they were written; none of them is a success here.
+        DatasetError: a source holds no stored actions, or they were changed; or none of them succeeds here.
         InTheWayError: something else is at ``out``.
     """
     sources = [_source(root, store) for root in plan.sources]
@@ -141,7 +141,7 @@ def execute_stored(
 
 
 def mean_seconds(seconds: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Part → mean of those that have any."""
+    """Part of the work → mean time of the executions that have it [s]."""
     known = [each for each in seconds if each]
     return {key: sum(each[key] for each in known) / len(known) for key in known[0]} if known else {}
 

@@ -30,21 +30,21 @@ class Demonstration:
     actions: np.ndarray
     """(T, 14) float32 joint targets [rad] and openings [m] as they were executed."""
     intended: np.ndarray | None
-    """(T, 14) float32 the dataset's ``action`` where that is another one; None: ``actions``."""
+    """(T, 14) float32 the dataset's ``action`` if it differs from the executed one; None: equal to ``actions``."""
     last_state: str
     """``state_digest`` after the last action."""
     provenance: dict[str, object] = field(default_factory=dict)
     first_row: int = 0
-    """First action that becomes a row: of a correction those before are the policy's."""
+    """First action that becomes a row. In a correction the actions before it are the policy's."""
 
 
 @dataclass(kw_only=True)
 class Execution:
-    """Result of a demonstration that was executed again."""
+    """Result of executing a demonstration again."""
 
     recorder: EpisodeRecorder
     outcome: str
-    """``success``; a failure's category of the task or ``not reproduced``; or the gate that was not passed."""
+    """``success``; a failure category of the task; ``not reproduced``; or the acceptance criterion (gate) that was not met."""
     reason: str
     is_same: bool
     """Whether the last state is that of the attempt, bit for bit."""
@@ -54,9 +54,9 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
     """Execute a demonstration in ``sim`` and record its rows.
 
     Args:
-        sim: of the task, difficulty, twin and randomisation that the demonstration was made in.
-        rows: what a row holds (``row_spec``).
-        gates: what an execution that differs must keep.
+        sim: simulation of the demonstration's task, difficulty, twin and randomisation.
+        rows: data spec of the rows (``row_spec``).
+        gates: acceptance criteria for an execution whose last state differs.
     """
     seed, intended = demonstration.scene_seed, demonstration.intended
     if intended is None and EXECUTED in rows.features:

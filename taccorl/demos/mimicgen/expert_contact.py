@@ -14,7 +14,8 @@ from taccorl.sim.simulation import Simulation
 
 
 class ExpertContact:
-    """Expert of one attempt. Returns poses of the hands; the caller corrects the steady-state joint offset."""
+    """Scripted expert of one attempt as a contact controller. Returns poses of the hands; the caller corrects the steady-state
+    joint offset."""
 
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
         """After a reset."""

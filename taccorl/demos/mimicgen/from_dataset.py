@@ -32,7 +32,7 @@ def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
     """Read every successful episode of a dataset as a source.
 
     Raises:
-        DatasetError: no simulator state, another task, or a twin that is no longer the same; with the way out.
+        DatasetError: the dataset has no simulator state, is of another task, or its twin's model has changed.
     """
     dataset = open_sources(root, spec.task)
     episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
@@ -47,7 +47,7 @@ def open_sources(root: Path, task: str) -> Dataset:
     """Open a dataset and check that it has the columns that sources need. Reads ``meta/`` only.
 
     Raises:
-        DatasetError: no dataset, no simulator state, or disturbed; with the way out.
+        DatasetError: it is not a dataset, has no simulator state, or its arms were disturbed.
     """
     dataset = Dataset(root)
     missing = [key for key in COLUMNS if key not in dataset.info["features"]]
@@ -68,7 +68,7 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
     """Make the simulation in which an episode was collected.
 
     Raises:
-        DatasetError: of another task, or nobody wrote down in which simulation.
+        DatasetError: the episode is of another task, or does not state its simulation.
     """
     told = episode.provenance.get("simulation")
     if not isinstance(told, dict) or "twin" not in told:
@@ -90,7 +90,7 @@ def simulation_told(told: Mapping[str, Any]) -> Simulation:
 
 
 class SourceReader:
-    """Reads episodes of one simulation; made once, used for all of them."""
+    """Reads episodes of one simulation as sources. Made once, used for all of them."""
 
     def __init__(self, sim: Simulation) -> None:
         self.sim = sim
@@ -101,7 +101,7 @@ class SourceReader:
         """Read one episode as a source.
 
         Raises:
-            DatasetError: states of another scene than this simulation's.
+            DatasetError: the states are of another scene than this simulation's.
         """
         states, actions = episode.arrays["sim.state"], episode.arrays["action"].astype(float)
         if states.shape[1] != self.sim.row_size or (states[:, 0] != self.sim.scene).any():

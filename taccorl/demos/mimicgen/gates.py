@@ -15,22 +15,22 @@ _JOINTS = np.array([not name.endswith("gripper") for name in ROBOT.action_names]
 
 @dataclass
 class Measured:
-    """Largest values over an episode."""
+    """Largest values over an episode, for the acceptance criteria."""
 
     force_n: float = 0.0
-    """Net force between mating parts."""
+    """Net force between mating parts [N]."""
     penetration_m: float = 0.0
-    """Overlap of mating parts."""
+    """Overlap of mating parts [m]."""
     joint_speed_radps: float = 0.0
     at_limit: str = ""
-    """A joint whose command was at its limit; empty: none."""
+    """Name of a joint whose command was at its limit; empty: none."""
 
     def told(self) -> dict[str, object]:
         """The values as JSON values, for the provenance."""
         return asdict(self)
 
     def refused(self, gates: GatesSpec) -> tuple[str, str] | None:
-        """First gate that is not passed, as (gate, reason); None if all are passed."""
+        """First acceptance criterion that is not met, as (name, reason); None if all are met."""
         checks = (
             ("force", self.force_n, gates.max_force_n, 1.0, "N between mating parts"),
             ("penetration", self.penetration_m, gates.max_penetration_m, 1e3, "mm overlap of mating parts"),
@@ -44,7 +44,7 @@ class Measured:
 
 @dataclass
 class GateKeeper:
-    """Measures what the gates need while simulation 0 is stepped, without changing it."""
+    """Measures the values for the acceptance criteria while simulation 0 is stepped, without changing it."""
 
     sim: Simulation
     measured: Measured = field(default_factory=Measured)
@@ -67,13 +67,13 @@ class GateKeeper:
         self.measured.joint_speed_radps = max(self.measured.joint_speed_radps, speed_radps)
 
     def see_actions(self, actions: np.ndarray) -> None:
-        """Take all actions (T, 14) of the episode, for the limits of joint speed."""
+        """Set all actions (T, 14) of the episode, for the limit of joint speed."""
         at_limit = ((actions <= ROBOT.action_low) | (actions >= ROBOT.action_high)).any(0) & _JOINTS
         self.measured.at_limit = ", ".join(np.array(ROBOT.action_names)[at_limit].tolist())
 
 
 def foreign_contact(sim: Simulation, states: np.ndarray) -> tuple[str, str] | None:
-    """("foreign contact", what touched what) if in any of the stored rows (T, row_size) an arm touches the other arm or the
+    """("foreign contact", names of the bodies) if in any of the stored rows (T, row_size) an arm touches the other arm or the
     table, or a part with anything but its fingers."""
     model, data = sim.model, mujoco.MjData(sim.model)
     owner = [_owner(sim, body) for body in model.geom_bodyid]

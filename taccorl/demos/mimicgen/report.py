@@ -30,10 +30,10 @@ _GOOD, _BAD, _CELL = "#0072b2", "#d55e00", "#009e73"
 
 
 class Spent(NamedTuple):
-    """Time that a run of ``taccorl augment`` took."""
+    """Time spent by a run of ``taccorl augment``."""
 
     cpu_s: float
-    """Of all its processes."""
+    """CPU time of all its processes [s]."""
     wall_s: float
 
 
@@ -41,7 +41,7 @@ def pages_of(out: Path) -> tuple[Path, Path]:
     """Paths of the report's HTML and JSON files beside the dataset at ``out``.
 
     Raises:
-        TaccorlError: a file that is not ours lies there.
+        TaccorlError: a file that taccorl did not write is there.
     """
     pages = tuple(out.with_name(f"{out.name}.augment_report.{kind}") for kind in ("html", "json"))
     for page in pages:
@@ -53,10 +53,11 @@ def pages_of(out: Path) -> tuple[Path, Path]:
 def write_report(
     plan: AugmentPlan, source: Path, out: Path, store: Store, num_attempts: int, *, spent: Spent | None = None
 ) -> Path:
-    """Both files of the plan's first ``num_attempts`` attempts; returns the page. An earlier report of ours is replaced.
+    """Write both files for the plan's first ``num_attempts`` attempts; returns the path of the page. An earlier report is
+    replaced.
 
     Args:
-        spent: what the whole run took, where all of its attempts were made in it.
+        spent: time of the whole run, if all of its attempts were made in it.
     """
     told = numbers(plan, read_attempts(plan, source, store, num_attempts), spent)
     told |= {"source": str(source), "dataset": str(out)}
@@ -332,7 +333,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[
 
 
 def coverage_figure(plan: AugmentPlan, told: dict[str, Any]) -> Any:
-    """A panel a row of the randomisation: draws of successes and failures, and the yield of its boxes."""
+    """Figure with one panel per row of the randomisation: draws of successes and failures, and the yield in its boxes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

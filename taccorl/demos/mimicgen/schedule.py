@@ -12,7 +12,7 @@ from typing import NamedTuple
 from taccorl.errors import TaccorlError
 
 Place = tuple[str, int]
-"""(arm, number of its subtask)."""
+"""(arm, index of its subtask)."""
 
 
 class DeadlockError(TaccorlError):
@@ -21,24 +21,24 @@ class DeadlockError(TaccorlError):
 
 @dataclass(frozen=True, kw_only=True)
 class Constraint:
-    """Constraint between a subtask of one arm and one of the other."""
+    """Constraint between a subtask of one arm and a subtask of the other."""
 
     former: Place
     latter: Place
     coordinated: bool
-    """Both at the same time, their ends aligned; else one after the other."""
+    """True: both run at the same time, with aligned ends. False: one after the other."""
     min_time_diff: int = -1
-    """Of a sequence. -1: the latter begins when the former has ended; m ≥ 0: the latter waits with m steps left."""
+    """For sequences. -1: the latter begins when the former has ended. m ≥ 0: the latter waits when it has m steps left."""
     synchronize_start: bool = False
-    """Of a coordination: both begin together."""
+    """For coordinations. True: both begin together."""
 
 
 class Cue(NamedTuple):
-    """Step of an arm in this control step: subtask and index of the step."""
+    """Step of an arm in the present control step: subtask and index of the step."""
 
     subtask: int
     step: int
-    """Of the subtask's trajectory."""
+    """Index of the step in the subtask's trajectory."""
 
 
 @dataclass
@@ -77,11 +77,11 @@ class Schedule:
         return all(arm.done for arm in self._arms.values())
 
     def subtask(self, arm: str) -> int:
-        """The arm's present subtask; their number when it has ended all."""
+        """Index of the arm's present subtask; the number of its subtasks when all have ended."""
         return self._arms[arm].subtask
 
     def upcoming(self, arm: str) -> Cue | None:
-        """Next step of the arm; None: nothing is planned."""
+        """Next step of the arm; None if nothing is planned."""
         state = self._arms[arm]
         return None if state.num_steps is None else Cue(state.subtask, state.step)
 
@@ -101,10 +101,10 @@ class Schedule:
         state.num_steps, state.step, state.num_together = num_steps, 0, num_together
 
     def tick(self, held: Collection[str] = ()) -> dict[str, Cue]:
-        """The arms that move in this control step, and their steps; ``held`` are those that must not.
+        """Advance by one control step: arms that move, and their steps. ``held`` are arms that must not move.
 
         Raises:
-            DeadlockError: nobody moves, and nobody outside holds anybody.
+            DeadlockError: no arm moves, and ``held`` is empty.
         """
         why = {arm: self._waits_for(arm) for arm in self._arms}
         moving = {arm for arm, state in self._arms.items() if not state.done and not why[arm] and arm not in held}
@@ -196,7 +196,7 @@ def rehearse(signals: Mapping[str, Sequence[str]], constraints: Sequence[Constra
     """Run the schedule with one step per subtask, to find deadlocks.
 
     Raises:
-        DeadlockError: it would never end, whatever the lengths.
+        DeadlockError: the schedule cannot end, for any lengths of the subtasks.
     """
     schedule = Schedule(signals, constraints)
     while not schedule.done:

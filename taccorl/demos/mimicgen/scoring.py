@@ -1,4 +1,4 @@
-"""Score of a generation: yield under all gates, cost, and whether kept episodes are reproduced. All simulated."""
+"""Evaluate a generation: yield under all acceptance criteria, cost, and whether kept episodes are reproduced. All simulated."""
 
 import dataclasses
 from collections import Counter
@@ -23,11 +23,11 @@ class Score:
 
     outcomes: list[str] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
-    """Physics of each attempt, failed ones too, once."""
+    """CPU time of the physics of each attempt, failed ones included [s]."""
     duration_s: list[float] = field(default_factory=list)
-    """Of the successes."""
+    """Duration of each successful episode [s]."""
     broken: int = 0
-    """Kept ones whose stored actions, in a simulation made anew, end in another state or with the goal not reached."""
+    """Number of kept attempts whose stored actions end in another state, or without reaching the goal, in a new simulation."""
 
     @property
     def share(self) -> Share:
@@ -35,7 +35,7 @@ class Score:
 
     @property
     def failures(self) -> dict[str, int]:
-        """Category → how often, the most frequent first."""
+        """Failure category → number of attempts, the most frequent first."""
         return dict(Counter(o for o in self.outcomes if o != "success").most_common())
 
 
@@ -48,11 +48,11 @@ def score_generation(
     seed: int = 0,
     check: bool = False,
 ) -> Score:
-    """Attempts 0 … ``num_attempts`` − 1 in ``twin``, as ``taccorl augment`` makes them, without pictures.
+    """Run attempts 0 … ``num_attempts`` − 1 in ``twin`` as ``taccorl augment`` does, without pictures, and return their score.
 
     Args:
-        sources: from any twin.
-        check: execute what is kept again, in a simulation of its own, for ``Score.broken``.
+        sources: source demonstrations, from any twin.
+        check: execute kept attempts again in a second simulation, for ``Score.broken``.
     """
     sim, other = (Simulation(tasks.get(spec.task)(), twin) for _ in range(2))
     attempts, score = Attempts(SourcePool(spec, sources), sim, seed), Score()

@@ -22,15 +22,15 @@ class ArmTrack:
     tcp: np.ndarray
     """(T, 4, 4) world-from-TCP."""
     goal: np.ndarray
-    """(T, 4, 4) where action t sends the TCP: what the hand wanted."""
+    """(T, 4, 4) world-from-TCP that action t is to reach."""
     joints_rad: np.ndarray
-    """(T, 6) of that."""
+    """(T, 6) joint angles of ``goal`` [rad]."""
     opening_m: np.ndarray
-    """(T,) gripper command of action t."""
+    """(T,) gripper command of action t [m]."""
     command: np.ndarray
-    """(T, 4, 4) TCP of the joints that action t commands: the goal, and what the arm rests off it."""
+    """(T, 4, 4) world-from-TCP of the commanded joint angles of action t: the goal corrected by the arm's steady-state offset."""
     command_rad: np.ndarray
-    """(T, 6) of that."""
+    """(T, 6) commanded joint angles [rad]."""
 
     @functools.cached_property
     def gripper_acts(self) -> np.ndarray:
@@ -49,11 +49,11 @@ class Source:
     objects: Mapping[str, np.ndarray]
     """Body → world-from-body (T, 4, 4)."""
     signals: Mapping[str, Mapping[str, np.ndarray]]
-    """Arm → name of a subtask → (T,) bool: whether it has ended."""
+    """Arm → name of a subtask → (T,) bool: the subtask has ended."""
     mated: Mapping[str, np.ndarray]
-    """Body → (T,) bool: it touches what it goes into, or what goes into it."""
+    """Body → (T,) bool: it touches its mate."""
     free: Mapping[str, np.ndarray]
-    """Body → (T,) bool: it touches nothing but hands, so a hand that holds it alone decides where it is."""
+    """Body → (T,) bool: it touches only hands, so that a single hand that holds it determines its pose."""
 
     @property
     def num_rows(self) -> int:
@@ -61,7 +61,7 @@ class Source:
 
     @property
     def as_commanded(self) -> "Source":
-        """The source with commands in place of goals."""
+        """The source with commands in place of goals, for ``retarget: eef_command``."""
         arms = {
             arm: replace(track, goal=track.command, joints_rad=track.command_rad) for arm, track in self.arms.items()
         }
@@ -75,7 +75,7 @@ class Segment:
     start: int
     end: int
     num_together: int = 0
-    """Of its last rows, how many run at the partner's side."""
+    """Number of its last rows that run at the same time as the partner's."""
 
     @property
     def rows(self) -> slice:
@@ -86,7 +86,7 @@ class Segment:
 
 
 def first_rise(signal: np.ndarray, after: int) -> int | None:
-    """First row r > ``after`` with signal[r − 1] false and signal[r] true: an edge from 0 to 1, never one back."""
+    """First row r > ``after`` with signal[r − 1] false and signal[r] true."""
     rises = np.flatnonzero(~signal[:-1] & signal[1:]) + 1
     later = rises[rises > after]
     return int(later[0]) if len(later) else None
@@ -96,7 +96,8 @@ def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, .
     """Row (excluded) at which each of the arm's subtasks ends; the last one ends with the source.
 
     Raises:
-        DatasetError: a signal is missing, or does not rise in its turn; names it, the arm and the source.
+        DatasetError: a signal is missing, or does not become true in its order; the message names the signal, the arm and the
+            source.
     """
     signals, ends, before = source.signals.get(arm, {}), [], 0
     for k, name in enumerate(names):
@@ -125,8 +126,8 @@ class SourcePool:
     def __init__(self, spec: MimicSpec, sources: Sequence[Source]) -> None:
         """
         Raises:
-            DatasetError: no sources, or one that does not fit: a missing object or signal, an order that contradicts the
-                spec, a subtask that an offset could leave without rows. Names all of it.
+            DatasetError: there is no source, or one does not fit: an object or signal is missing, the order contradicts the
+                spec, or an offset could leave a subtask without rows. The message lists all of them.
         """
         if not sources:
             raise DatasetError(f"mimicgen of {spec.task}: no sources; taccorl collect --task={spec.task} makes some")
@@ -143,8 +144,8 @@ class SourcePool:
     def segment(self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]) -> Segment:
         """Rows of source ``i`` that are subtask ``k`` of ``arm``, each subtask's end moved by its offset.
 
-        A subtask that had to wait for another arm begins where that arm's subtask ended: before, the arm only waited. Subtasks
-        that are to begin together begin at the later one's beginning.
+        A subtask that had to wait for another arm begins at the row where that arm's subtask ended, since the arm only waited
+        before it. Subtasks that must begin together begin at the later of their first rows.
         """
         start, end = self._begin(i, arm, k, offsets), self._end(i, arm, k, offsets)
         coordination = self.spec.coordination(arm, k)
@@ -196,7 +197,8 @@ class SourcePool:
 
 
 def contact_row(source: Source, bodies: Collection[str], segment: Segment, lead: int) -> int:
-    """First row of a segment that counts as contact: ``lead`` before one of ``bodies`` touches its mate; its end if none does."""
+    """First row of a segment that counts as contact: ``lead`` rows before one of ``bodies`` touches its mate; the segment's end
+    if none does."""
     mated = [source.mated[body][segment.rows] for body in bodies if body in source.mated]
     if not mated:
         return segment.end

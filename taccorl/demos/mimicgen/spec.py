@@ -43,21 +43,22 @@ class SubtaskSpec:
     """One subtask of one arm."""
 
     subtask_term_signal: str | None
-    """The task's subtask (``Task.subtasks``) that this one is; it ends when that one's ``done`` turns true. Null, last of
-    an arm: what it does until the source ends, its retreat say, so that nobody has to wait for that."""
+    """Name of the task's subtask (``Task.subtasks``) whose ``done`` ends this one. Null, for the last subtask of an arm only: it
+    lasts until the source ends (a retreat, for example), and the other arm does not wait for it."""
     object_ref: str | None = None
-    """Body that carries the motion over: T' = O_new · O_src⁻¹ · T_src. Null: the motion is repeated joint by joint, blended
-    into where the arm is and to where what it holds is to come."""
+    """Reference body for the transfer of the motion: T' = O_new · O_src⁻¹ · T_src. Null: the motion is repeated in joint space,
+    blended from the arm's present angles to those at which the held object reaches its target."""
     held_object: str | None = None
-    """Body in this hand: its path is carried over instead of the hand's (``retarget: held_object``)."""
+    """Body held by this hand: its path is transferred instead of the hand's (``retarget: held_object``)."""
     subtask_term_offset_range: tuple[int, int] = (0, 0)
-    """Steps after the signal, both included, of which one is drawn for each attempt. (0, 0) for an arm's last subtask."""
+    """Range of steps after the signal, both ends included, from which an offset is drawn for each attempt. (0, 0) for an arm's
+    last subtask."""
     selection_strategy: Strategy = "random"
     selection_strategy_kwargs: SelectionSpec = field(default_factory=SelectionSpec)
 
     @property
     def name(self) -> str:
-        """For schedules and messages."""
+        """Name of the subtask for schedules and messages."""
         return UNTIL_THE_END if self.subtask_term_signal is None else self.subtask_term_signal
 
 
@@ -66,19 +67,19 @@ class ConstraintSpec:
     """Constraint between two subtasks: order, or execution at the same time."""
 
     eef_subtask_constraint_tuple: tuple[tuple[str, int], tuple[str, int]]
-    """(arm, number of its subtask from 0), twice; of a sequence the former first."""
+    """Two of (arm, index of its subtask from 0); for a sequence the former first."""
     constraint_type: Literal["sequential", "coordination"]
     sequential_min_time_diff: int = -1
-    """-1: the latter begins when the former has ended. m ≥ 0: the latter waits with m steps left."""
+    """-1: the latter begins when the former has ended. m ≥ 0: the latter waits when it has m steps left."""
     coordination_scheme: Literal["replay", "transform", "translate"] = "replay"
-    """One source and one transform Δ for both: none, the object's, or the object's position only. The object is that of the
-    subtask that begins first."""
+    """Transform Δ that both arms use, with the same source. replay: none; transform: that of the object; translate: the object's
+    translation only. The object is that of the subtask that begins first."""
     coordination_scheme_pos_noise_scale: float = 0.0
-    """Half width [m] of a uniform shift of Δ, per axis: the hands meet elsewhere."""
+    """Half width [m] of a uniform random shift of Δ, per axis, so that the hands meet at another place."""
     coordination_scheme_rot_noise_scale: float = 0.0
-    """Half width [rad] of a uniform rotation vector of Δ about the object, per axis."""
+    """Half width [rad] of a uniform random rotation vector of Δ about the object, per axis."""
     coordination_synchronize_start: bool = False
-    """Both begin together, at the later one's beginning in the source; else only their ends run together."""
+    """True: both begin together, at the later of their first rows in the source. False: only their ends run together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +89,7 @@ class BridgeSpec:
     speed_mps: float = 0.25
     turn_radps: float = 1.5
     joint_speed_radps: float = 2.5
-    """Of any joint where joints are told."""
+    """Peak speed of any joint, for motions in joint space."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,13 +102,13 @@ class NoiseSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitNoiseSpec:
-    """Noise by what the hand does."""
+    """Noise in transport and in contact."""
 
     transport: NoiseSpec = field(default_factory=NoiseSpec)
-    """Everywhere else: in free motion and while it grips."""
+    """Noise in free motion and while gripping."""
     contact: NoiseSpec = field(default_factory=NoiseSpec)
-    """From ``contact_lead_steps`` before what it holds first touches its mate in the source. Not for closed_loop_expert, whose
-    hands tremble by themselves."""
+    """Noise from ``contact_lead_steps`` before the held object first touches its mate in the source. Not used with
+    closed_loop_expert, which has its own tremor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +119,7 @@ class DisturbanceSpec:
     joint_rad: float = 0.0
     """Standard deviation of each joint's drift; 0: none. 0.02 moves a hand by about 10 mm."""
     time_s: float = 0.7
-    """After which a drift is down to 1/e."""
+    """Time constant of the drift [s]: after it a drift has decayed to 1/e."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,24 +127,24 @@ class GenerationSpec:
     """Settings for all subtasks."""
 
     generation_select_src_per_subtask: bool = False
-    """Choose a source anew for each subtask; else once."""
+    """True: choose a source for each subtask; False: one source for the whole attempt."""
     generation_select_src_per_arm: bool = False
-    """Each arm chooses its own; coordinated subtasks always share one."""
+    """True: each arm chooses its own source; coordinated subtasks always share one."""
     retarget: Retarget = "held_object"
-    """What keeps its path: T' = Δ · T_src · G_src · G_new⁻¹ with the object's pose G in the hand; eef: T' = Δ · T_src. Both
-    carry over where the hand was to be, and learn how far from its command this twin lets it rest. eef_command: as MimicGen and
-    IsaacLab Mimic do, Δ · T_src of the poses that were commanded, sent as they are."""
+    """Object whose path is kept. held_object: T' = Δ · T_src · G_src · G_new⁻¹ with the object's pose G in the hand; eef: T' = Δ
+    · T_src. Both transfer the target poses of the hand, and correct the steady-state offset that the arm has in this twin.
+    eef_command: the method of MimicGen and IsaacLab Mimic, Δ · T_src of the commanded poses, sent unchanged."""
     contact_mode: ContactMode = "replay"
-    """Who moves the hands from where what they hold is about to touch its mate to the end of that subtask. replay: the source's
-    motion, which feels nothing. closed_loop_expert: the task's scripted expert, which feels a block, backs off and aims again,
-    with a human aiming error and tremor of its own. Kept in the provenance, there with its corrections."""
+    """Controller of the hands from shortly before a held object touches its mate to the end of that subtask. replay: the
+    source's motion, without feedback. closed_loop_expert: the task's scripted expert, which detects a block, backs off and aims
+    again, with a human-like aiming error and tremor. It is stored in the provenance, with the expert's corrections."""
     bridge: BridgeSpec = field(default_factory=BridgeSpec)
     num_settle_steps_before_gripper: int = 12
-    """At most so many steps, without noise, an arm waits to come to rest before its gripper opens or closes; its partner in a
-    coordination waits, too."""
+    """Most steps, without noise, for which an arm waits until it is at rest before its gripper opens or closes; its partner in a
+    coordination also waits."""
     num_settle_steps_before_contact: int = 30
-    """At most so many steps, likewise, it waits for the hand to come to its goal before contact begins (``contact_lead_steps``).
-    An arm that rests elsewhere in this twin than in the source's learns it then, and noise of the transport is gone."""
+    """Most steps for which it waits until the hand has reached its goal before contact begins (``contact_lead_steps``). In this
+    time the steady-state offset of the arm in this twin is estimated, and the noise of the transport decays."""
     contact_lead_steps: int = 15
     noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
     disturbance: DisturbanceSpec = field(default_factory=DisturbanceSpec)
@@ -154,11 +155,11 @@ class GatesSpec:
     """Limits that a success must meet to be kept: forces, penetration, joint limits and speeds."""
 
     max_force_n: float = 80.0
-    """Net force between mating parts."""
+    """Net force between mating parts [N]."""
     max_penetration_m: float = 0.0003
-    """Overlap of mating parts: less than the play on a side."""
+    """Overlap of mating parts [m]; it must be less than the clearance on a side."""
     max_joint_speed_radps: float = 3.1
-    """Of any joint, as it turns: PiPER's slowest turn by 180°/s."""
+    """Measured speed of any joint [rad/s]; PiPER's slowest joints reach 180°/s."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,18 +172,18 @@ class MimicSpec:
     """Arm → its subtasks in order."""
     task_constraint_configs: tuple[ConstraintSpec, ...] = ()
     symmetry: dict[str, int] = field(default_factory=dict)
-    """Body → how many turns about its own z axis look the same; 0: any."""
+    """Body → number of rotations about its own z axis, in equal steps, that look the same; 0: any angle."""
     datagen_config: GenerationSpec = field(default_factory=GenerationSpec)
     gates: GatesSpec = field(default_factory=GatesSpec)
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that decides; layout and comments of the file do not."""
+        """SHA-256 of everything in the spec that affects the result; layout and comments of the file do not."""
         return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
 
     @property
     def constraints(self) -> tuple[Constraint, ...]:
-        """Constraints in the form that ``Schedule`` takes."""
+        """The spec's constraints between subtasks of the two arms, as arguments of ``Schedule``."""
         return tuple(
             Constraint(
                 former=c.eef_subtask_constraint_tuple[0],
@@ -216,7 +217,7 @@ def load_mimic_spec(name: str | Path) -> MimicSpec:
     """Load a spec by path, or a task's own by the task's name.
 
     Raises:
-        SpecError: with file, line, the key, and the way out.
+        SpecError: the file is invalid; the message names file, line and key.
     """
     document = Document(MimicSpec, mimic_spec_path(name))
     spec = document.value
@@ -231,7 +232,7 @@ def mimic_spec_path(name: str | Path) -> Path:
     """Path of a spec: ``name`` itself if it is a file, else the file that the task of that name states (``Task.mimicgen``).
 
     Raises:
-        SpecError: neither a file nor a task, or a task without a spec.
+        SpecError: ``name`` is neither a file nor a task, or the task has no spec.
     """
     if Path(name).is_file():
         return Path(name)
@@ -350,7 +351,7 @@ def check_task(spec: MimicSpec, task: Task) -> None:
     """Check that the spec is of this task: the same subtasks in the same order, and only objects that it has.
 
     Raises:
-        SpecError: names what the task does not have, and what is near.
+        SpecError: the spec names something that the task does not have; the message gives the nearest name.
     """
     where = f"mimicgen spec of {spec.task}"
     if spec.task != task.name:
@@ -380,10 +381,10 @@ def check_task(spec: MimicSpec, task: Task) -> None:
 
 
 def check_closed_loop(spec: MimicSpec) -> None:
-    """Check that the task's expert can move the hands in contact, if the spec wants that (``closed_loop_expert``).
+    """Check that the task's expert can move the hands in contact, if the spec requires it (``closed_loop_expert``).
 
     Raises:
-        SpecError: the task's expert cannot begin in the middle, or other options contradict it.
+        SpecError: the task's expert cannot start in the middle of a task, or other options contradict it.
     """
     where = f"mimicgen spec of {spec.task}"
     for key, text in _closed_loop_mistakes(spec.datagen_config):
@@ -399,7 +400,7 @@ def with_options(spec: MimicSpec, **changes: object) -> MimicSpec:
     """The spec with other ``datagen_config`` fields.
 
     Raises:
-        TaccorlError: there is no such field, or it does not take that word.
+        TaccorlError: there is no such field, or the value is not allowed.
     """
     known = [f.name for f in dataclasses.fields(GenerationSpec)]
     words = {"retarget": get_args(Retarget), "contact_mode": get_args(ContactMode)}

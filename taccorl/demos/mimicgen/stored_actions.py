@@ -29,7 +29,7 @@ FORMAT = 2
 _FORMATS = (1, FORMAT)  # 1: without kind and first_row
 META, ACTIONS, INTENDED = "meta.json", "actions.npy", "intended.npy"
 SIMULATION = ("task", "difficulty", "twin", "randomization", "origin", "root_seed", "mujoco", "taccorl", "sources")
-"""What the episodes of a folder have in common, as an episode's provenance has it."""
+"""Keys that describe the simulation of all episodes in a folder, as in an episode's provenance."""
 MIMICGEN, CORRECTION = "mimicgen", "correction"
 
 
@@ -71,8 +71,8 @@ def write_stored(
     """Write a folder of stored actions.
 
     Args:
-        simulation: what ``SIMULATION`` names.
-        spec: of the generation, as JSON values; its ``gates`` are those that an execution must pass.
+        simulation: values for the keys ``SIMULATION``.
+        spec: spec of the generation as JSON values; an execution must meet its ``gates``.
     """
     intended = [d.intended for d in demonstrations if d.intended is not None]
     episodes = [
@@ -143,7 +143,7 @@ def read_stored(root: Path) -> StoredActions:
 
 
 def action_time() -> str | None:
-    """The convention of the data spec: when an action is reached."""
+    """Value of ``DatasetSpec.action_time`` for stored actions: when an action is reached."""
     return load_dataset_spec(find_spec("taccorl_bimanual")).action_time
 
 

@@ -29,7 +29,7 @@ GIVE_UP_FAILED, GIVE_UP_YIELD = (
 )  # failed attempts in a box, and the share of successes below which it is given up
 
 Boxes = tuple[int, ...]
-"""Of a draw: the number of its box in each row."""
+"""Box of a draw in each row, by index."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,15 @@ class ResetSpace:
 
     rows: tuple[Row, ...]
     scale: float
-    """Share of the ranges that is drawn from."""
+    """Factor on the ranges that are drawn from."""
 
     def limits(self, row: Row) -> tuple[np.ndarray, np.ndarray]:
-        """(components,) low and high of what is drawn."""
+        """(components,) lowest and highest drawn values."""
         low, high = (row.absent + self.scale * (np.array(ends) - row.absent) for ends in (row.low, row.high))
         return low, high
 
     def shape(self, row: Row) -> tuple[int, ...]:
-        """Boxes along each component."""
+        """Number of boxes along each component."""
         return (SPLITS.get(len(row.low), 1),) * len(row.low)
 
     def num_boxes(self, row: Row) -> int:
@@ -54,7 +54,7 @@ class ResetSpace:
         return math.prod(self.shape(row))
 
     def edges(self, row: Row, box: int) -> tuple[np.ndarray, np.ndarray]:
-        """(components,) low and high of a box."""
+        """(components,) lowest and highest values of a box."""
         low, high = self.limits(row)
         size = (high - low) / self.shape(row)
         start = low + np.array(np.unravel_index(box, self.shape(row))) * size
@@ -70,7 +70,7 @@ class ResetSpace:
         return tuple(found)
 
     def count(self, draws: Iterable[Boxes]) -> list[np.ndarray]:
-        """Row by row (boxes,): how many of ``draws`` lie in each box."""
+        """Row → (boxes,) number of ``draws`` in each box."""
         counts = [np.zeros(self.num_boxes(row)) for row in self.rows]
         for boxes in draws:
             for r, box in enumerate(boxes):
@@ -79,7 +79,7 @@ class ResetSpace:
 
 
 def first_attempts(episodes: int) -> int:
-    """Attempts 0, 1, … that are taken as they come: half of the episodes; hardly a box is full by then."""
+    """Numbers of the first attempts 0, 1, …, which are not selected: half of the episodes, after which hardly any box is full."""
     return -(-episodes // 2)
 
 
@@ -94,9 +94,9 @@ def next_round(
     """Numbers of the attempts of the next round, ascending.
 
     Args:
-        space: what is drawn from.
-        boxes_of: where the draw of an attempt lies.
-        episodes: successes wanted.
+        space: reset space of the draws.
+        boxes_of: function that returns the boxes of an attempt's draw.
+        episodes: number of requested successes.
         done: (number, success) of all attempts of the rounds before, in order.
     """
     size, first = min(max(episodes // 10, 4), 100), first_attempts(episodes)

@@ -14,7 +14,7 @@ class Touching:
         self.model, self.data, self._size = sim.model, mujoco.MjData(sim.model), sim.batch.nstate
         bodies = [sim.model.body(i).name for i in sim.model.geom_bodyid]
         self._owner = [next((arm for arm in ROBOT.arms if name.startswith(arm)), name) for name in bodies]
-        """Of each geom: an arm, a part, a clamped body, or the table (its name is world)."""
+        """Geom → name of its owner: an arm, a part, a clamped body, or the table (``world``)."""
         self._parts = sim.task.parts
         self.pairs: set[frozenset[str]] = set()
 
@@ -30,7 +30,7 @@ class Touching:
         return all(pair & set(ROBOT.arms) for pair in self.pairs if part in pair)
 
     def holds_fast(self, arm: str) -> bool:
-        """Whether the arm touches a part that something else touches too. Such a hand cannot reach its target, so its offset
-        must not be estimated: the command would push ever harder."""
+        """Whether the arm touches a part that something else touches too. Such a hand cannot reach its target, so that its
+        offset must not be estimated: a corrected command would push ever harder."""
         held = [part for part in self._parts if {arm, part} in self.pairs]
         return any(part in pair and arm not in pair for part in held for pair in self.pairs)

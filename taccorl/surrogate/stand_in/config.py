@@ -47,74 +47,77 @@ class StandInConfig:
     duration_s: float = 6.0
     seed: int = 0
     episodes: int = 1
-    """Equal time slots, each one attempt between its markers; at least 2 s each."""
+    """Number of episodes: equal time slots of at least 2 s, each with one attempt between its markers."""
     outcomes: tuple[str, ...] = ("success",)
-    """Closing markers, repeated over the episodes; in a ``failure`` the tube misses the hole."""
+    """Closing markers, repeated over the episodes; in an episode with ``failure`` the tube misses the hole."""
     instruction: str = "insert the test tube into the rack"
     camera_size: tuple[int, int] = (480, 640)
-    """Rows, columns."""
+    """Rows and columns of pictures."""
     jpeg_quality: int = 85
     encoding: Literal["ros2", "json", "protobuf"] = "ros2"
     compression: Literal["none", "lz4", "zstd"] = "lz4"
-    """Of MCAP chunks. JPEG does not shrink, so the cheap one."""
+    """Compression of MCAP chunks. The pictures are JPEG, which does not become smaller, so that a fast method suffices."""
     chunk_size_bytes: int = 1 << 20
     hdf5_jpeg: bool = True
-    """HDF5 only: pictures as padded JPEG (attribute ``compress``) or as raw RGB."""
+    """HDF5 only. True: pictures as padded JPEG (attribute ``compress``); False: raw RGB."""
 
     # How arms and drivers behave. "Jitter" is the standard deviation of a normal draw; a latency adds its magnitude.
     command_lead_s: float = 0.08
-    """Time constant with which the arms follow their command."""
+    """Time constant with which the arms follow their commands [s]."""
     contact_delay_s: float = 0.03
-    """From the fingers' stop to the pads' first count."""
+    """Time from the fingers' stop to the pads' first count [s]."""
     camera_stamp_jitter_s: float = 0.0006
     camera_latency_s: float = 0.030
-    """Log time − stamp."""
+    """Log time − stamp of pictures [s]."""
     camera_latency_jitter_s: float = 0.004
     camera_loss_probability: float = 0.004
-    """Per picture."""
+    """Probability that a picture is lost."""
     joint_latency_s: float = 0.0012
     joint_latency_jitter_s: float = 0.0004
     joint_repeat_probability: float = 0.02
-    """The 200 Hz loop found no new CAN frame and publishes the last values and stamp again."""
+    """Probability that a joint message repeats the last values and stamp, because the driver's loop at 200 Hz found no new CAN
+    frame."""
     command_silence_s: float = 0.04
-    """Until a command is seen on CAN, its messages have stamp 0 and zeros."""
+    """Time until the first command on CAN [s]; before it, messages have stamp 0 and zeros."""
     pad_latency_s: float = 0.004
-    """From the end of a scan to the end of the host's read, the only time a pad message has."""
+    """Time from the end of a scan to the end of the host's read [s]; the latter is the only time that a pad message has."""
     pad_latency_jitter_s: float = 0.0005
     pad_noise_counts: float = 1.3
-    """Standard deviation per taxel and frame."""
+    """Standard deviation of the noise of each taxel and frame [counts]."""
     pad_gain_spread: float = 0.10
-    """Standard deviation of the taxels' gains."""
+    """Standard deviation of the taxels' gains, relative to their mean."""
 
     # Faults
     joints_in_degrees: bool = False
     swap_arms: bool = False
-    """Joint topics of one arm carry the other's messages (CAN adapters swapped); cameras and pads are right."""
+    """Fault: the joint topics of each arm hold the other arm's messages (exchanged CAN adapters); cameras and pads are
+    correct."""
     sim_time_stamps: bool = False
-    """Header stamps count from 0 while log times are wall clock."""
+    """Fault: header stamps count from 0, while log times are wall-clock times."""
     clock_offset_s: dict[str, float] = field(default_factory=dict)
-    """Topic -> how far its clock is ahead: moves the header stamp, or the log time where there is no header."""
+    """Fault: topic → time by which its clock is ahead [s]. It moves the header stamp, or the log time of messages without a
+    header."""
     gap: Gap | list[Gap] | tuple[()] = ()
-    """Messages missing: (topic, from, to) or several of them, in seconds since the start."""
+    """Fault: missing messages, (topic, from, to) in seconds since the start; one or several."""
     frozen_camera: str | None = None
-    """After a third of the recording this camera repeats one picture with new stamps."""
+    """Fault: name of a camera that repeats one picture, with new stamps, after a third of the recording."""
     dead_taxels: Taxels = field(default_factory=dict)
-    """Always 0."""
+    """Fault: taxels that always read 0."""
     stuck_taxels: Taxels = field(default_factory=dict)
-    """Always the same count between 60 and 120."""
+    """Fault: taxels that always read the same count between 60 and 120."""
     saturated_taxels: Taxels = field(default_factory=dict)
-    """Always 255."""
+    """Fault: taxels that always read 255."""
     swap_pads: tuple[str, str] | None = None
-    """Two pads whose messages come under each other's topic."""
+    """Fault: two pads whose messages are published under each other's topic."""
     baseline_drift_counts_per_s: float = 0.0
     noise_only_touch: bool = False
-    """The pads never feel contact."""
+    """Fault: the pads never read contact."""
     tactile_lag_s: float = 0.0
-    """The pads feel everything this much later."""
+    """Fault: time by which all touch is late [s]."""
 
     @property
     def gaps(self) -> list[Gap]:
-        """``gap`` as a list, whichever way it was given."""
+        """``gap`` as a list."""
         given = self.gap
         return [given] if isinstance(given, tuple) and len(given) == 3 else list(given)
 

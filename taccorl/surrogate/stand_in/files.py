@@ -1,4 +1,4 @@
-"""Synthetic recording (stand-in): what a bimanual PiPER with FlexiTac pads would have written, with optional faults.
+"""Synthetic recording (stand-in): files like those of a bimanual PiPER with FlexiTac pads, with optional faults.
 
 Tests and benchmarks need files that look and fail like real ones, and whose true signals are known. Every file says
 ``surrogate``. The same configuration gives the same bytes.
@@ -62,7 +62,7 @@ SURROGATE = "surrogate stand-in, not a robot"
 
 
 def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
-    """Writes one recording as the robot's drivers and rosbag2 would; replaces the file if there is one."""
+    """Write one recording in the format of the robot's drivers and rosbag2; an existing file is replaced."""
     streams, story = _stand_in(config)
     publish(path, streams, _label(config))
     return streams.truth(story)
@@ -75,10 +75,10 @@ def _stand_in(config: StandInConfig) -> tuple[Streams, Story]:
 
 
 def publish(path: Path, streams: Streams, label: dict[str, str]) -> None:
-    """Write all messages into one MCAP file, as rosbag2 would; replaces the file if there is one.
+    """Write all messages into one MCAP file in the format of rosbag2; an existing file is replaced.
 
     Args:
-        label: the MCAP metadata record ``taccorl``: ``origin`` says what this is.
+        label: the MCAP metadata record ``taccorl``: its ``origin`` states what the file is.
     """
     config = streams.config
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,13 +108,13 @@ def _label(config: StandInConfig) -> dict[str, str]:
 
 
 def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
-    """Writes one episode in the layout of cobot_magic's ``collect_data.py``: 30 frames per second, no times, no task.
+    """Write one episode in the layout of cobot_magic's ``collect_data.py``: 30 frames per second, no times, no task.
 
     Row t of ``action`` is the command of frame t + 1. Pictures are RGB; as JPEG (``hdf5_jpeg``) they are ordinary files
     padded with zeros to one length, their own lengths in ``compress_len`` (camera, frame).
 
     Raises:
-        TaccorlError: more than one episode; the format has no place for a second.
+        TaccorlError: the configuration has more than one episode, and the format holds one only.
     """
     if config.episodes != 1:
         raise TaccorlError(f"stand-in: a cobot_magic file holds one episode, not {config.episodes}. Set episodes=1.")

@@ -10,7 +10,7 @@ SMALLEST_PICTURE = (_BITS[0] * BLOCK_PX * 3, _BITS[1] * BLOCK_PX)  # rows, colum
 
 
 def draw_frame_id(picture: np.ndarray, frame_id: int) -> None:
-    """Burns the lower 16 bits of ``frame_id`` into a uint8 picture (rows, columns, 3), white for one."""
+    """Draw the lower 16 bits of ``frame_id`` into a uint8 picture (rows, columns, 3); white is 1."""
     bits = (frame_id >> np.arange(15, -1, -1)) & 1
     corner = np.kron(bits.reshape(_BITS), np.full((BLOCK_PX, BLOCK_PX), 255)).astype(np.uint8)
     picture[: corner.shape[0], : corner.shape[1]] = corner[..., None]

@@ -56,12 +56,13 @@ def link_poses(arm: str, joints_rad: np.ndarray) -> np.ndarray:
 
 
 def tcp_pos_world(world_from_link6: np.ndarray) -> np.ndarray:
-    """Middle between the pads, (..., 3), from link-6 poses (..., 4, 4)."""
+    """(..., 3) point in the middle between the pads, from link-6 poses (..., 4, 4); world frame [m]."""
     return world_from_link6[..., :3, 3] + ROBOT.tcp_from_hand_m * world_from_link6[..., :3, 2]
 
 
 def solve_joints(arm: str, tcp_world: np.ndarray) -> np.ndarray:
-    """Joints (K, 6) that bring the pads' middle to (K, 3), gripper pointing down, by damped Gauss–Newton within limits.
+    """Joint angles (K, 6) [rad] that bring the middle between the pads to (K, 3) [m] with the gripper pointing down, by damped
+    Gauss–Newton within limits.
 
     The left gripper closes along x (across the rack), the right one along y (across the tube).
     """

@@ -29,7 +29,7 @@ _SUBPIXEL_BITS = 4
 
 
 class Scene:
-    """Draws the pictures of each camera for a story."""
+    """Draws the pictures of each camera from the true signals of a recording (``Story``)."""
 
     def __init__(self, story: Story, camera_size: tuple[int, int], seed: int) -> None:
         self.story = story
@@ -42,7 +42,8 @@ class Scene:
         self._backdrop_in_shade = cv2.convertScaleAbs(self._backdrop, alpha=SHADE)
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
-        """One uint8 picture (rows, columns, 3), blue first, per time. Noise depends on how many were drawn before."""
+        """Iterate over pictures, one uint8 (rows, columns, 3) in BGR per time. The noise depends on the number of pictures drawn
+        before."""
         if len(time_s) == 0:
             return
         frames = self._frames(time_s)

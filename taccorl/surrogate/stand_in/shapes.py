@@ -94,7 +94,7 @@ class View:
 
 @dataclass(frozen=True)
 class Polygons:
-    """Convex polygons of N pictures, P in each."""
+    """Convex polygons in N pictures, P in each."""
 
     outline_px: np.ndarray  # (N, P, C, 2)
     depth_m: np.ndarray  # (N, P)
@@ -148,7 +148,7 @@ def capsule_polygons(frames: dict[str, np.ndarray], view: View, hidden_arm: str 
 
 
 def hole_polygons(frames: dict[str, np.ndarray], view: View) -> Polygons:
-    """The holes in the rack's upper face, painted right after the piece of rack they are in."""
+    """Polygons of the holes in the rack's upper face, painted right after the piece of the rack that contains them."""
     angle = np.linspace(0, 2 * np.pi, 14, endpoint=False)
     ring = 0.012 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     points = np.stack([np.vstack([ring + np.array([0.0, y, 0.05]), [0.0, piece, 0.05]]) for y, piece in _HOLES_Y_M])
@@ -159,7 +159,7 @@ def hole_polygons(frames: dict[str, np.ndarray], view: View) -> Polygons:
 
 
 def shadow_outlines_px(frames: dict[str, np.ndarray], view: View) -> list[np.ndarray]:
-    """Outlines (S, C, 2) of all shadows on the table, one array per picture."""
+    """Outlines (S, C, 2) [pixels] of all shadows on the table, one array per picture."""
     ends, radius_m = _capsule_ends(frames, list(_SHADOW_CASTERS))
     ground = ends[..., :2] - ends[..., 2:] * _TO_LIGHT_WORLD[:2] / _TO_LIGHT_WORLD[2]
     outline = _stadium(ground, np.broadcast_to(radius_m[:, None], ground.shape[:-1]))

@@ -47,7 +47,7 @@ class EpisodePlan:
     place_world: np.ndarray
 
     def at(self, fraction: float) -> float:
-        """Time at which this fraction of the episode is over."""
+        """Time at which this fraction of the episode has passed [s]."""
         return self.start_s + fraction * (self.end_s - self.start_s)
 
     def closing_s(self, arm: str) -> tuple[float, float]:
@@ -64,7 +64,7 @@ class EpisodePlan:
 
 
 def plan_episodes(duration_s: float, episodes: int, outcomes: tuple[str, ...], seed: int) -> list[EpisodePlan]:
-    """Equal time slots; the parts start a little elsewhere in each."""
+    """Divide the recording into equal time slots; the parts start at a slightly different place in each."""
     plans, slot_s = [], duration_s / episodes
     for i in range(episodes):
         shift = np.random.default_rng([seed, 1, i]).uniform(-0.02, 0.02, (3, 2))
@@ -99,7 +99,8 @@ def _follow(command: np.ndarray, time_constant_s: float) -> np.ndarray:
 
 
 class Story:
-    """One recording's truth as functions of the time since its start. State and command are left arm first, (N, 14)."""
+    """True signals of one recording as functions of the time since its start [s]. State and command are (N, 14), left arm
+    first."""
 
     def __init__(
         self, plans: list[EpisodePlan], duration_s: float, command_lead_s: float, contact_delay_s: float, seed: int
@@ -164,11 +165,11 @@ class Story:
         return self._sample(self._state, time_s)
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
-        """Commands of the leader arms, same order, (N, 14)."""
+        """Commands of the leader arms in the same order, (N, 14) [rad, m]."""
         return self._sample(self._command, time_s)
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """Rate of the state, rad/s and m/s, (N, 14)."""
+        """Rate of the state, (N, 14) [rad/s, m/s]."""
         return self._sample(self._velocity, time_s)
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
@@ -184,7 +185,7 @@ class Story:
         return effort
 
     def grip(self, arm: str, time_s: np.ndarray) -> np.ndarray:
-        """Grip at the pads, 0 to 1, any shape."""
+        """Closing of the gripper on its part as the pads sense it, 0 to 1, in the shape of ``time_s``."""
         felt_m = self._sample(self._squeeze_m, np.asarray(time_s, float) - self.contact_delay_s)
         return felt_m[..., ARMS.index(arm)] / SQUEEZE_M
 

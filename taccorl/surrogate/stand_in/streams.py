@@ -47,17 +47,17 @@ class StandInTruth:
     state: np.ndarray
     """(T, 14) joints [rad] and gripper opening [m]."""
     command: np.ndarray
-    """(T, 14)"""
+    """(T, 14) commands [rad, m]."""
     contact_s: dict[str, list[tuple[float, float]]]
-    """Arm -> from when to when its pads feel the part, one interval per episode (``tactile_lag_s`` included)."""
+    """Arm → (start, end) of the contact of its pads [s], one interval per episode, with ``tactile_lag_s``."""
     baseline_counts: dict[str, np.ndarray]
-    """Pad -> (12, 32) resting counts at the start, before noise and rounding."""
+    """Pad → (12, 32) resting counts at the start, before noise and rounding."""
     sampled_s: dict[str, np.ndarray]
-    """Topic -> when what each message shows truly was: stamp without clock faults, middle of a pad's scan. MCAP only."""
+    """Topic → true time of what each message shows [s]: stamp without clock faults, or middle of a pad's scan. MCAP only."""
     log_s: dict[str, np.ndarray]
-    """Topic -> log time of each message, clock faults included. MCAP only."""
+    """Topic → log time of each message [s], clock faults included. MCAP only."""
     frame_ids: dict[str, np.ndarray]
-    """Camera -> frame id to be read in each published picture: the camera's tick, lost ones counted too."""
+    """Camera → frame id in each published picture: the index of the camera's tick, counting lost ones."""
 
     @property
     def episodes(self) -> list[EpisodePlan]:
@@ -70,7 +70,7 @@ class StandInTruth:
 
 
 class Told(Protocol):
-    """Interface of true signals at any time, in seconds since the start of the recording; N instants."""
+    """Interface for true signals at any time, in seconds since the start of the recording; N instants."""
 
     plans: list[EpisodePlan]
 
@@ -91,20 +91,21 @@ class Told(Protocol):
         ...
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
-        """(N, 12, 32) counts above baseline in wire order; ``time_s`` is (N,), or (N, 12): one instant a row."""
+        """(N, 12, 32) counts above baseline in wire order; ``time_s`` is (N,), or (N, 12) with one instant per row of the
+        wire."""
         ...
 
 
 class Seen(Protocol):
-    """Interface of the cameras' pictures."""
+    """Interface for the cameras' pictures."""
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
-        """One uint8 picture (rows, columns, 3), blue first, per time."""
+        """Iterate over pictures, one uint8 (rows, columns, 3) in BGR per time."""
         ...
 
 
 class Event(NamedTuple):
-    """One message on its way to the file."""
+    """One message to be written to the file."""
 
     log_s: float
     sampled_s: float
@@ -114,7 +115,7 @@ class Event(NamedTuple):
 
 
 def as_piper_publishes(joints: np.ndarray, in_degrees: bool) -> np.ndarray:
-    """Joints (N, 14) in rad and m as piper_ros gives them: CAN counts of 0.001° and 0.001 mm, times its own factor."""
+    """Joints (N, 14) [rad, m] as piper_ros publishes them: CAN counts of 0.001° and 0.001 mm, times its own factor."""
     published = np.empty_like(joints)
     published[:, ROBOT.gripper_indices] = np.round(joints[:, ROBOT.gripper_indices] * 1e6) * 1e-6
     degrees = np.round(np.degrees(joints[:, ROBOT.joint_indices]) * 1e3) * 1e-3
@@ -123,14 +124,14 @@ def as_piper_publishes(joints: np.ndarray, in_degrees: bool) -> np.ndarray:
 
 
 def jpeg(picture_bgr: np.ndarray, quality: int) -> bytes:
-    """An ordinary JPEG file."""
+    """Encode a picture as an ordinary JPEG file."""
     done, data = cv2.imencode(".jpg", picture_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done
     return data.tobytes()
 
 
 class Streams:
-    """The messages of one recording, and a note of what was published. Use one object for one file."""
+    """Streams of messages of one recording, and a record of what was published. Use one object per file."""
 
     def __init__(self, config: StandInConfig, story: Told, scene: Seen) -> None:
         self.config, self.story, self.scene = config, story, scene
@@ -156,7 +157,7 @@ class Streams:
         ]
 
     def note(self, event: Event) -> None:
-        """Remembers when a published message was sampled and logged."""
+        """Record when a published message was sampled and logged."""
         if event.topic in self._log_s:
             self._sampled_s[event.topic].append(event.sampled_s)
             self._log_s[event.topic].append(event.log_s)
