@@ -20,28 +20,28 @@ class EpisodeRow:
     """One episode of one policy."""
 
     policy: str
-    """As it was given: the checkpoint's folder, or ``expert``."""
+    """Name of the policy as given: the checkpoint's folder, or ``expert``."""
     task: str
     seed: int
-    """Scene seed: ``reset(seed=[seed])`` of an environment brings the scene back."""
+    """Scene seed: ``reset(seed=[seed])`` of an environment reproduces the scene."""
     outcome: str
     """``success``; the task's own failure category, ``timeout`` or ``diverged``; ``bad_action``; of an expert also
     ``unreachable`` and ``unfinished``."""
     partial: int
-    """Goals in place at the end, of ``max_partial``."""
+    """Number of goals in place at the end, out of ``max_partial``."""
     max_partial: int
     steps: int
-    """Control steps until the end."""
+    """Number of control steps until the end."""
     time_s: float
-    """The same in simulated seconds."""
+    """Simulated time until the end [s]."""
     subtask_end_s: dict[str, dict[str, float | None]]
-    """Arm → subtask → simulated time at which it ended [s]; None: it did not."""
+    """Arm → subtask → simulated time at which it ended [s]; None: it did not end."""
     clipped_steps: int
-    """Control steps with a target beyond the limits."""
+    """Number of control steps with a target beyond the limits."""
     measures: dict[str, float] = field(default_factory=dict)
-    """Of the task, at the end; names have units."""
+    """Measures of the task at the end; names state units."""
     reason: str = ""
-    """Of ``bad_action`` and ``unreachable``: which joint, which pose."""
+    """Explanation of ``bad_action`` (the joint) and ``unreachable`` (the pose); empty for other outcomes."""
 
     @property
     def success(self) -> bool:
@@ -67,13 +67,13 @@ class Summary:
     n: int
     successes: int
     interval_95: tuple[float, float]
-    """Wilson's, of the success rate."""
+    """95 % interval of the success rate (Wilson)."""
     partial_credit: float
-    """Mean of all episodes, 0 … 1."""
+    """Mean partial credit of all episodes, 0 … 1."""
     failures: dict[str, int]
-    """Category → episodes, the most frequent first."""
+    """Failure category → number of episodes, the most frequent first."""
     median_success_s: float | None
-    """Simulated seconds to success; None: no success."""
+    """Median simulated time to success [s]; None without a success."""
 
     @classmethod
     def of(cls, rows: Sequence[EpisodeRow]) -> "Summary":
@@ -108,7 +108,7 @@ class Summary:
 
 
 def summaries(rows: Iterable[EpisodeRow]) -> list[Summary]:
-    """One for each policy and task, in the order of the rows."""
+    """Summaries for each policy and task, in the order of the rows."""
     groups: dict[tuple[str, str], list[EpisodeRow]] = {}
     for row in rows:
         groups.setdefault((row.policy, row.task), []).append(row)
@@ -119,7 +119,7 @@ def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[s
     """Task → comparison of two policies, paired by scene seed.
 
     Raises:
-        TaccorlError: they were not scored on the same tasks and seeds.
+        TaccorlError: the policies were not evaluated on the same tasks and seeds.
     """
     one, other = ({(row.task, row.seed): row.success for row in rows} for rows in (first, second))
     if one.keys() != other.keys() or len(one) != len(first) or len(other) != len(second):
@@ -149,7 +149,7 @@ def read_rows(path: Path) -> list[EpisodeRow]:
     """Read rows that ``write_rows`` wrote.
 
     Raises:
-        TaccorlError: a line that is not a row.
+        TaccorlError: a line is not a row.
     """
     rows = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):

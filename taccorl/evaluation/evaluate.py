@@ -18,33 +18,33 @@ from taccorl.sim.twin_file import load_twin
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 PAPER_EPISODES = 128
-"""The paper scores every policy on so many scenes."""
+"""Number of scenes on which the paper evaluates every policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes:
-    """Tasks, scenes and twin on which policies are scored."""
+    """Tasks, scenes and twin on which policies are evaluated."""
 
     tasks: tuple[str, ...]
     episodes: int = PAPER_EPISODES
     """Number of scenes of each task."""
     seed: int
-    """Scene seed of the first episode; the next one has the next, as in ``lerobot-eval``."""
+    """Scene seed of the first episode; episode k has seed + k, as in ``lerobot-eval``."""
     difficulty: str = "train"
     twin: Path | None = None
     """A twin.yaml; None: the nominal twin."""
     randomization: float = 1.0
-    """Share of the task's reset ranges, 0 … 1."""
+    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
-    """Control steps until an episode is cut off; None: the task's own limit."""
+    """Control steps after which an episode ends; None: the task's own limit."""
     batch_size: int | None = None
-    """Environments at once; None: all episodes in one batch. A policy that draws noise gets other numbers than in
-    ``lerobot-eval`` in a last batch that is smaller: LeRobot fills it up with scenes that it discards."""
+    """Number of environments at the same time; None: all episodes in one batch. In a smaller last batch, a policy that draws
+    noise gets other random numbers than in ``lerobot-eval``, which fills the batch with scenes that it discards."""
 
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: no task, an unknown one (the nearest name is given), a number below its range.
+            TaccorlError: there is no task, a task is unknown (the message names the nearest), or a number is below its range.
         """
         if not self.tasks:
             raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
@@ -93,7 +93,7 @@ class Scenes:
 
 
 def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> list[Rollout]:
-    """Roll out all episodes of one policy, task by task, in the order of their seeds.
+    """Run all episodes of one policy, task by task, in the order of their seeds.
 
     Raises:
         TaccorlError: as ``roll_out`` and ``TaccorlVectorEnv``.
@@ -124,12 +124,12 @@ def _with_prefix(progress: Progress | None, prefix: str) -> Progress | None:
 
 @dataclass(frozen=True)
 class Stored:
-    """The episodes of an earlier evaluation, as its folder holds them."""
+    """Episodes of an earlier evaluation, read from its folder."""
 
     policy: str
     """Label: name of the first policy in that evaluation, followed by the folder in brackets."""
     rows: list[EpisodeRow]
-    """Of that policy."""
+    """Episodes of that policy."""
 
 
 def is_stored(path: Path) -> bool:
@@ -140,10 +140,10 @@ def is_stored(path: Path) -> bool:
 def read_stored(folder: Path, scenes: Scenes) -> Stored:
     """Rows of the first policy of an earlier evaluation, for a comparison on ``scenes``.
 
-    The twin may be another: then twins are compared, not only policies.
+    The twin may differ: the comparison is then also one of twins.
 
     Raises:
-        TaccorlError: it was scored on other tasks, seeds, difficulty, randomisation or episode length.
+        TaccorlError: it was evaluated on other tasks, seeds, difficulty, randomisation or episode length.
     """
     summary = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
     policy, its = summary["policies"][0]["name"], summary["scenes"]

@@ -15,13 +15,13 @@ EXPERT = "expert"
 
 
 class ExpertActor:
-    """The scripted expert as ``taccorl collect`` runs it, with the same random numbers in the same scene (``rollouts.Actor``)."""
+    """The scripted expert, with the same random numbers in a scene as in ``taccorl collect`` (``rollouts.Actor``)."""
 
     name = EXPERT
     needs_images = False
     needs_part_poses = False
     max_batch: int | None = 1
-    """An expert drives one simulation."""
+    """Largest number of environments: 1, because an expert drives one simulation."""
 
     def __init__(self) -> None:
         self._source = ExpertSource()
@@ -43,7 +43,8 @@ class ExpertActor:
         self._actions = self._source.actions(envs.sim, np.random.default_rng([int(envs.sim.seeds[0]), 1]))
 
     def act(self, observation: Observation) -> Acted:
-        """Gives up as ``unreachable`` at a pose that no joint angles reach, as ``unfinished`` at the end of its script."""
+        """Next actions. At a pose that no joint angles reach the expert gives up as ``unreachable``, at the end of its script as
+        ``unfinished``."""
         nothing = np.zeros((1, len(ROBOT.action_names)), dtype=np.float32)
         try:
             return Acted(np.asarray(next(self._actions), dtype=np.float32)[None])

@@ -1,4 +1,4 @@
-"""Failed episodes executed again from their actions: pictures at a few instants, and an ``Episode`` for Rerun."""
+"""Failed episodes, executed again from their actions: pictures at a few instants, and an ``Episode`` for Rerun."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,14 +20,15 @@ NUM_INSTANTS = 6
 
 @dataclass(frozen=True)
 class FailedEpisode:
-    """One failure, executed again."""
+    """One failed episode, executed again."""
 
     rollout: Rollout
     episode: Episode
     pictures: np.ndarray | None
-    """(cameras × rows, instants × columns, 3) uint8: a row a camera, instants from first to last; None: not rendered."""
+    """(cameras × rows, instants × columns, 3) uint8: one row of pictures per camera, instants from first to last; None: not
+    rendered."""
     instants_s: tuple[float, ...]
-    """Of the pictures' columns."""
+    """Episode times of the columns of pictures [s]."""
 
 
 def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
@@ -49,7 +50,7 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
         images: render the cameras (needs OpenGL).
 
     Raises:
-        TaccorlError: the end is another than the row's: the scenes are not those of the rollout.
+        TaccorlError: the outcome differs from that of the row, so that the scenes are not those of the rollout.
     """
     row = rollout.row
     sim = Simulation(tasks.get(row.task)(scenes.difficulty), scenes.twin_config(), scale=scenes.randomization)

@@ -36,10 +36,10 @@ def require_same_parts(config: Any, task: str, there: tuple[str, ...]) -> None:
     """Check that the environment's part poses are those with which the policy was trained.
 
     Args:
-        there: names of the poses of the task's parts.
+        there: names of the environment's poses of parts.
 
     Raises:
-        TaccorlError: the policy that is told the poses of the parts was trained with those of another task.
+        TaccorlError: the policy uses poses of parts, and was trained with those of another task.
     """
     own = tuple(config.part_names or ())
     if own != there:
@@ -55,8 +55,8 @@ def policy_batch(
     """Input of a policy: LeRobot's conversion of an environment's observation, then the policy's own preprocessor.
 
     Args:
-        observation: of N environments, in the units and types of ``observation_space``; pictures may be absent.
-        instructions: (N,) sentences.
+        observation: observation of N environments, in the units and types of ``observation_space``; pictures may be absent.
+        instructions: (N,) instructions.
     """
     batch: dict[str, Any] = preprocess_observation(raw_names(observation))
     batch["task"] = list(instructions)
@@ -93,13 +93,13 @@ class Checkpoint:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the folder's files."""
+        """SHA-256 of the files in the checkpoint's folder."""
         files = sorted(p for p in self.path.iterdir() if p.is_file() and not p.name.startswith("."))
         return digest_files({p.name: digest_file(p) for p in files})
 
     @property
     def training_dataset(self) -> dict[str, Any] | None:
-        """``meta/info.json`` of the dataset that it was trained on, as ``train_config.json`` names it; None: not there."""
+        """Content of ``meta/info.json`` of the training dataset that ``train_config.json`` names; None if it cannot be found."""
         try:
             dataset = json.loads((self.path / "train_config.json").read_text(encoding="utf-8"))["dataset"]
             return json.loads((Path(dataset["root"]) / "meta" / "info.json").read_text(encoding="utf-8"))
@@ -107,7 +107,8 @@ class Checkpoint:
             return None
 
     def facts(self) -> PolicyFacts:
-        """For the preflight: from the configuration, the processors' statistics and, where it is there, the training dataset."""
+        """Facts for the preflight, from the configuration, the processors' statistics and, if it is found, the training
+        dataset."""
         config: Any = self.config
         dataset = self.training_dataset or {}
         names = getattr(config, "action_feature_names", None) or dataset.get("features", {}).get("action", {}).get(
@@ -129,10 +130,11 @@ class Checkpoint:
         )
 
     def load(self, seed: int) -> "PolicyActor":
-        """With its weights. Random numbers start from ``seed`` before the policy is made, as in ``lerobot-eval --seed``.
+        """Load the policy with its weights. Random generators are seeded with ``seed`` before the policy is created, as in
+        ``lerobot-eval --seed``.
 
         Raises:
-            TaccorlError: weights are missing or not this policy's.
+            TaccorlError: weights are missing or of another policy.
         """
         torch.backends.cudnn.benchmark = True  # this and the next line: as lerobot-eval, for the same numbers
         torch.backends.cuda.matmul.allow_tf32 = True
@@ -162,13 +164,13 @@ def _statistics(steps: Sequence[Any]) -> tuple[dict[str, tuple[np.ndarray, np.nd
 
 
 def open_checkpoint(path: Path, device: str | None = None) -> Checkpoint:
-    """A folder that LeRobot's ``save_pretrained`` or ``lerobot-train`` wrote.
+    """Open a checkpoint, a folder that LeRobot's ``save_pretrained`` or ``lerobot-train`` wrote.
 
     Args:
-        device: cpu, cuda, …; None: as in the checkpoint, or what this machine has.
+        device: cpu, cuda, …; None: as in the checkpoint if this machine has it, else another one.
 
     Raises:
-        TaccorlError: no such folder, none of a policy, a type that is not installed, an adapter (PEFT).
+        TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT).
     """
     if not (path / "config.json").is_file():
         near = next(iter(sorted(path.glob("**/pretrained_model/config.json"))), None) if path.is_dir() else None
@@ -211,7 +213,7 @@ class PolicyActor:
 
     @property
     def needs_images(self) -> bool:
-        """Whether a picture is among the policy's inputs; of an unknown policy: yes."""
+        """Whether a picture is among the policy's inputs; True if the policy does not state its inputs."""
         features = getattr(self._config, "input_features", None)
         return features is None or any(feature.type is FeatureType.VISUAL for feature in features.values())
 
@@ -221,8 +223,8 @@ class PolicyActor:
         return PARTS_KEY in (getattr(self._config, "input_features", None) or {})
 
     def looks_now(self) -> bool:
-        """Whether a picture is used in this step: not while a policy without a history of observations (``n_obs_steps`` = 1)
-        still has actions of a chunk in LeRobot's ``_action_queue``. Rendering is most of the time of a rollout."""
+        """Whether a picture is used in this step. It is not while a policy without a history of observations (``n_obs_steps`` =
+        1) still has actions of a chunk in LeRobot's ``_action_queue``. Rendering is most of the time of a rollout."""
         queue = getattr(self.policy, "_action_queue", None)
         return getattr(self._config, "n_obs_steps", None) != 1 or not isinstance(queue, deque) or not queue
 
@@ -242,7 +244,7 @@ class PolicyActor:
         self._instructions = [envs.task_description] * envs.num_envs
 
     def act(self, observation: Observation) -> Acted:
-        """Next actions, as ``policy_actions``; in mixed precision if the checkpoint wants it."""
+        """Next actions, as from ``policy_actions``; in mixed precision if the checkpoint states it."""
         amp = bool(getattr(self._config, "use_amp", False))
         with torch.autocast(torch.device(self._config.device).type) if amp else contextlib.nullcontext():  # pyright: ignore[reportOptionalMemberAccess]
             return Acted(

@@ -1,4 +1,4 @@
-"""The policy's part of corrections (``demos/correct.py``): episodes in batches, kept in the store as seeds and actions."""
+"""The policy's episodes for corrections (``demos/correct.py``), run in batches and kept in the store as seeds and actions."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,11 +16,12 @@ VERSION = 2
 def policy_episodes(
     plan: CorrectionPlan, load: Callable[[], Actor], num_envs: int, store: Store, progress: Progress | None = None
 ) -> Artefact:
-    """Episodes of the policy in the plan's scenes, as ``write_policy_episodes`` writes them; from the store if they were made.
+    """Run the policy in the plan's scenes, unless the store has the episodes. The artefact holds the files of
+    ``write_policy_episodes``.
 
     Args:
-        load: makes the actor; called only if it has to act.
-        num_envs: environments at once.
+        load: function that creates the actor; called only if it must act.
+        num_envs: number of environments at the same time.
     """
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:

@@ -1,7 +1,7 @@
 """Preflight: compare a checkpoint with the environment before any rollout (cameras, state, touch, action, rate,
 normalisation, robot).
 
-Free of torch: a checkpoint's side comes as ``PolicyFacts``.
+The module does not import torch: the facts of a checkpoint are passed as ``PolicyFacts``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,13 +34,13 @@ class PolicyFacts:
     robot_type: str | None = None
     action_names: tuple[str, ...] | None = None
     touch_gain_per_count: float | None = None
-    """Normalised reading = counts × gain."""
+    """Gain of touch: normalised reading = counts × gain."""
     touch_layout: tuple[int, ...] | None = None
-    """Pads, rows, columns."""
+    """Number of pads, rows and columns."""
     ranges: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    """``action`` and ``observation.state`` → (low, high), each (14,): limits of the data by which they are normalised."""
+    """``action`` and ``observation.state`` → (low, high), each (14,): limits of the data with which they are normalised."""
     unnormalised: tuple[str, ...] = ()
-    """Features that are to be normalised, but the checkpoint has no statistics of them."""
+    """Features that must be normalised, but whose statistics the checkpoint lacks."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def refuse_differences(checks: Sequence[Check], policy: str) -> None:
     """Raise if any line of the preflight differs.
 
     Raises:
-        TaccorlError: a line of the preflight differs; names each with both sides.
+        TaccorlError: a line differs; the message names each one with the values of both sides.
     """
     wrong = [c for c in checks if c.verdict == "differs"]
     if wrong:

@@ -26,11 +26,11 @@ class Acted:
     actions: np.ndarray
     """(N, 14) targets [rad, m]."""
     given_up: dict[int, tuple[str, str]] = field(default_factory=dict)
-    """Environment → (category, reason): it has no action there, and the episode ends."""
+    """Environment → (category, reason), where the actor has no action; the episode ends."""
 
 
 class Actor(Protocol):
-    """A policy or an expert, as rollouts use it."""
+    """Interface of a policy or an expert for rollouts."""
 
     @property
     def name(self) -> str:
@@ -39,7 +39,7 @@ class Actor(Protocol):
 
     @property
     def needs_images(self) -> bool:
-        """Whether the actor uses camera pictures at all; if not, nothing is rendered."""
+        """Whether the actor ever uses camera pictures; if not, nothing is rendered."""
         ...
 
     @property
@@ -48,16 +48,16 @@ class Actor(Protocol):
         ...
 
     def looks_now(self) -> bool:
-        """Whether ``act`` uses the newest pictures; else it gets those of the last time, and nothing is rendered."""
+        """Whether ``act`` uses the newest pictures; otherwise it gets the previous ones, and nothing is rendered."""
         ...
 
     @property
     def max_batch(self) -> int | None:
-        """Environments at once; None: any number."""
+        """Largest number of environments; None: any number."""
         ...
 
     def restart(self) -> None:
-        """Before the first batch of a task: the state of its random numbers is that of a fresh evaluation."""
+        """Prepare for the first batch of a task: the state of the random numbers becomes that of a new evaluation."""
         ...
 
     def begin(self, envs: TaccorlVectorEnv) -> None:
@@ -65,7 +65,7 @@ class Actor(Protocol):
         ...
 
     def act(self, observation: Observation) -> Acted:
-        """Next action of each environment; rows of finished environments are ignored."""
+        """Next action of each environment; the rows of finished environments are ignored."""
         ...
 
 
@@ -75,7 +75,7 @@ class Rollout:
 
     row: EpisodeRow
     actions: np.ndarray
-    """(T, 14) float32, as they were given."""
+    """(T, 14) float32 actions as the actor returned them."""
     states: np.ndarray
     """(T + 1, 14) float32 ``observation.state`` before each action, and after the last."""
 
@@ -114,16 +114,15 @@ class _Running:
 def roll_out(
     envs: TaccorlVectorEnv, actor: Actor, seeds: Sequence[int], progress: Progress | None = None
 ) -> list[Rollout]:
-    """One episode in each of the N environments, in the scenes ``seeds``, in their order.
-
-    An episode ends alone: by success, failure, time limit, divergence or a bad action as the environment judges, or with the
-    category that the actor itself names.
+    """Run one episode in each of the N environments, in the scenes ``seeds``, in their order. Each episode ends by itself: by
+    success, failure, time limit, divergence or a bad action as the environment decides, or with a category that the actor
+    states.
 
     Args:
-        envs: with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
+        envs: environments with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
 
     Raises:
-        TaccorlError: not one seed for each environment, or actions of another shape than (N, 14).
+        TaccorlError: the number of seeds differs from that of environments, or the actions are not (N, 14).
     """
     observation, _ = envs.reset(seed=[int(seed) for seed in seeds])
     subtasks = {arm: [s.name for s in own] for arm, own in envs.sim.task.subtasks().items()}

@@ -38,7 +38,7 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
     """Two-sided p-value of McNemar's exact test: b of b + c under a binomial of 1/2. It is 1 if the two policies never disagree.
 
     Raises:
-        TaccorlError: a negative count.
+        TaccorlError: a count is negative.
     """
     if min(only_first, only_second) < 0:
         raise TaccorlError(f"McNemar's test: counts {only_first} and {only_second}; give numbers ≥ 0")
@@ -56,7 +56,7 @@ def paired_difference_interval(
     four margins), with ad − bc reduced by n / 2, to 0 at the least, where it is positive; 0 if a margin is empty.
 
     Raises:
-        TaccorlError: a negative count, or no pair at all.
+        TaccorlError: a count is negative, or all are 0.
     """
     a, b, c, d = both, only_first, only_second, neither
     n = a + b + c + d
@@ -90,7 +90,7 @@ class PairedComparison:
         """Compare the successes (n,) of both policies, scene by scene.
 
         Raises:
-            TaccorlError: not one pair a scene.
+            TaccorlError: the arrays have different lengths.
         """
         if len(first) != len(second):
             raise TaccorlError(f"paired comparison: {len(first)} and {len(second)} episodes; give one pair a scene")
@@ -105,17 +105,17 @@ class PairedComparison:
 
     @property
     def n(self) -> int:
-        """Number of scenes that both policies were scored on."""
+        """Number of scenes on which both policies were evaluated."""
         return self.both + self.only_first + self.only_second + self.neither
 
     @property
     def difference(self) -> float:
-        """p₁ − p₂, −1 … 1."""
+        """Difference p₁ − p₂ of the success rates, −1 … 1."""
         return (self.only_first - self.only_second) / self.n
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % of ``difference``, as ``paired_difference_interval``."""
+        """95 % interval of ``difference``, from ``paired_difference_interval``."""
         return paired_difference_interval(self.both, self.only_first, self.only_second, self.neither)
 
     @property
@@ -124,7 +124,7 @@ class PairedComparison:
         return mcnemar_exact(self.only_first, self.only_second)
 
     def to_json(self) -> dict[str, int | float | list[float]]:
-        """Counts, difference, its interval, p-value."""
+        """Counts, difference, its interval and p-value as JSON values."""
         counts = {name: getattr(self, name) for name in ("both", "only_first", "only_second", "neither")}
         return {
             "n": self.n,

@@ -1,7 +1,4 @@
-"""Importing this registers what TacCoRL adds to LeRobot. LeRobot does so by itself (see ``_shim.py``).
-
-Nothing else lives here.
-"""
+"""Importing this module registers TacCoRL's classes with LeRobot, which imports it by itself (see ``_shim.py``)."""
 
 import taccorl.lerobot_plugin.env
 import taccorl.policies.tactile_pi05.configuration_tactile_pi05

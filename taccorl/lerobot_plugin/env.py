@@ -36,24 +36,25 @@ _FPS = 30
 @EnvConfig.register_subclass("taccorl")
 @dataclass
 class TaccorlEnvConfig(EnvConfig):
-    """A task in the twin. Synchronous environments share one batch and its threads, asynchronous ones are processes."""
+    """Settings of a task in the twin for LeRobot. Synchronous environments share one batch and its threads, asynchronous ones
+    are processes."""
 
     task: str | None = "assembly_1"
     """A task of the twin, shipped or of your own; ``taccorl collect --help`` lists them."""
     fps: int = _FPS
-    """Control steps a second; the twin has no other."""
+    """Control steps per second; the twin supports no other value."""
     features: dict[str, PolicyFeature] = field(default_factory=lambda: dict(_FEATURES))
-    """By the names that the environment gives them."""
+    """Name in the environment → type and shape of the feature."""
     features_map: dict[str, str] = field(default_factory=lambda: dict(_FEATURES_MAP))
-    """To the names that datasets and policies give them."""
+    """Name in the environment → name in datasets and policies."""
     difficulty: str = "train"
-    """easy, train or hard: 1.0, 0.5 or 0.3 mm of clearance a side."""
+    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: str | None = None
     """Path of a twin.yaml; None: the nominal twin."""
     randomization: float = 1.0
-    """Share of the task's reset ranges: 0 is the nominal scene."""
+    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
-    """Control steps until an episode is cut off; None: the task's own time limit."""
+    """Control steps after which an episode ends; None: the task's own time limit."""
 
     part_poses: bool = False
     """Observe the poses of the task's parts, too (``observation.environment_state``), for policies with --policy.part_poses."""
@@ -71,7 +72,7 @@ class TaccorlEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Settings of one environment."""
+        """Keyword arguments of one environment."""
         return {
             "difficulty": self.difficulty,
             "twin": self.twin,
@@ -84,12 +85,12 @@ class TaccorlEnvConfig(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
-        """``{"taccorl": {0: environments}}``, as LeRobot wants them.
+        """Create the environments: ``{"taccorl": {0: environments}}``, in LeRobot's form.
 
         LeRobot's own way, ``gymnasium.make`` in each worker, fails: workers do not know the plug-in's ids.
 
         Raises:
-            TaccorlError: unknown task or difficulty (the nearest name is given), unreadable twin.
+            TaccorlError: task or difficulty is unknown (the message names the nearest), or the twin cannot be read.
         """
         from taccorl.sim.lerobot_env import LeRobotEnv, LeRobotVectorEnv
 

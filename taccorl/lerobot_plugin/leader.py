@@ -1,7 +1,7 @@
 """LeRobot's teleoperators as leader arms of the twin: ``taccorl collect --source.type=leader --source.teleop=NAME``.
 
-LeRobot gives a dict of named numbers without units. Which of them are the twin's and what they are measured in has to fit
-exactly, or be said: nothing is guessed, because an arm that takes degrees for radians hits the table.
+LeRobot gives a dict of named numbers without units. Names and units must match those of the twin or be given as options: nothing
+is guessed, because an arm that takes degrees for radians hits the table.
 """
 
 import importlib
@@ -31,17 +31,17 @@ _GRIPPERS = np.array(ROBOT.gripper_indices)
 
 
 class LeRobotLeader:
-    """A teleoperator that gives a value for every joint and gripper of the twin.
+    """A LeRobot teleoperator with a value for every joint and gripper of the twin.
 
     Raises:
-        TaccorlError: it gives other values than ``source`` says, or units are not said.
+        TaccorlError: its values differ from those that ``source`` states, or units are not stated.
     """
 
     def __init__(self, device: Teleoperator, source: LeaderSource) -> None:
         self._device, self._source = device, source
         _check_units(source)
         self.names = match_names(_given(device), source.names, source.teleop)
-        """Theirs, in the order of actions."""
+        """The teleoperator's names, in the order of the twin's actions."""
         self._checked = False
 
     def connect(self) -> None:
@@ -62,7 +62,7 @@ class LeRobotLeader:
         """(A,) joint angles [rad] and gripper openings [m] now.
 
         Raises:
-            TaccorlError: a value is missing, is no number, or shows at the first reading that the unit is wrong.
+            TaccorlError: a value is missing or not a number, or the first reading shows that the unit is wrong.
         """
         action = self._device.get_action()
         try:
@@ -99,10 +99,10 @@ class LeRobotLeader:
 
 
 def open_leader(source: LeaderSource) -> LeRobotLeader:
-    """The teleoperator that ``source`` names, connected.
+    """Open and connect the teleoperator that ``source`` names.
 
     Raises:
-        TaccorlError: unknown name, wrong options, other values than the twin's, no answer.
+        TaccorlError: its name is unknown, options are wrong, its values do not match the twin's, or it does not answer.
     """
     config = teleoperator_config(source.teleop, source.options)
     try:
@@ -118,7 +118,7 @@ def teleoperator_config(name: str, options: str = "") -> TeleoperatorConfig:
     """LeRobot's config of that name with the options of a YAML or JSON file.
 
     Raises:
-        TaccorlError: unknown name (says the nearest), unreadable or wrong options.
+        TaccorlError: the name is unknown (the message gives the nearest), or options are unreadable or wrong.
     """
     missing = _register_all()
     choices = TeleoperatorConfig.get_known_choices()
@@ -161,7 +161,7 @@ def match_names(given: Sequence[str], renamed: Mapping[str, str | None], teleop:
         renamed: the device's name → the twin's, or None for one that is not used.
 
     Raises:
-        TaccorlError: names those that are missing, left over, unknown or doubled.
+        TaccorlError: names are missing, superfluous, unknown or repeated; the message lists them.
     """
     wanted = load_dataset_spec(find_spec("taccorl_bimanual")).features["action"].names
     assert wanted is not None, "the data spec names the action's values"

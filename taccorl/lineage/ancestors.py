@@ -11,12 +11,12 @@ CARRIED = ("stage", "stage_version", "key", "digest", "created", "config", "conf
 
 Manifest = dict[str, Any]
 Entry = dict[str, Any]
-"""An input in a manifest: path, digest, and key if a stage made it."""
+"""Entry of a manifest for an input: path, digest, and key if a stage made it."""
 
 
 def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> dict[str, Manifest]:
-    """``{key: shortened manifest}`` of all artefacts from which ``inputs`` were made, directly or indirectly, as far as they
-    are found."""
+    """``{key: shortened manifest}`` of all artefacts from which ``inputs`` were made, directly or indirectly, except those that
+    cannot be found."""
     found: dict[str, Manifest] = {}
     carried: dict[str, Manifest] = {}
     todo = list(inputs)

@@ -1,10 +1,10 @@
 """Configs as plain JSON data: equal configs have equal text, and the text is part of a stage's key.
 
-Decided here:
+Rules:
 
 * A dataclass has a key ``type``: its draccus choice name, else its class name. Two plug-ins with the same fields
   must not share a key.
-* Fields declared ``field(compare=False)`` say how, not what (workers, progress): they are left out.
+* Fields declared ``field(compare=False)`` do not affect the result (workers, progress), and are left out.
 * ``Path`` and ``str`` are the same thing; an enum is its name; a tuple is a list; the order of a dict does not matter.
 * ``1`` and ``1.0`` differ: a stage may treat them differently.
 """
@@ -24,13 +24,13 @@ def canonical(config: Any) -> Any:
     """``config`` as plain JSON data with sorted keys.
 
     Raises:
-        ConfigError: NaN, infinity, a set, an array or any object that has no one JSON form; names the field.
+        ConfigError: NaN, infinity, a set, an array or an object without a unique JSON form; the message names the field.
     """
     return _plain(config, "config")
 
 
 def canonical_text(config: Any) -> str:
-    """The one JSON text of ``config``; ASCII, so that no locale plays a part."""
+    """Unique JSON text of ``config``, in ASCII, so that it does not depend on the locale."""
     return json.dumps(canonical(config), sort_keys=True, allow_nan=False, separators=(",", ":"))
 
 
@@ -127,7 +127,7 @@ def flatten(plain: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def show(value: Any) -> str:
-    """One setting as a person would type it."""
+    """A setting in the form in which a person would type it."""
     return value if isinstance(value, str) else repr(value) if value is _ABSENT else json.dumps(value)
 
 

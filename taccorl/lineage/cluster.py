@@ -44,7 +44,7 @@ class Job:
         """Write the job below ``work_dir``.
 
         Raises:
-            EngineError: ``fn`` or an item cannot be sent to another machine.
+            EngineError: ``fn`` or an item cannot be pickled.
         """
         require_datatrove()
         inner = fn
@@ -65,7 +65,7 @@ class Job:
         return cls(folder, len(items))
 
     def collect(self, taken: set[int], take: Take) -> None:
-        """Pass every result that arrived since the last call to ``take``."""
+        """Call ``take`` with every result that arrived since the last call."""
         for path in sorted((self.folder / "results").glob("*.pkl")):
             index = int(path.stem)
             if index not in taken:
@@ -73,7 +73,7 @@ class Job:
                 take(index, pickle.loads(path.read_bytes()))
 
     def name_the_lost(self, taken: set[int], take: Take) -> None:
-        """After the end of the job: report the items without a result as failed."""
+        """After the end of the job, report the items without a result as failed."""
         for index in range(self.num_items):
             if index not in taken:
                 take(index, Failed(f"its task ended without a result; logs: {self.folder / 'logs'}"))
@@ -102,7 +102,7 @@ def require_datatrove() -> Any:
     """Import the module ``datatrove.executor``.
 
     Raises:
-        EngineError: it is not installed.
+        EngineError: datatrove is not installed.
     """
     try:
         return importlib.import_module("datatrove.executor")
@@ -139,7 +139,7 @@ def _in_queue(job_id: str) -> bool:
 
 
 def run_on_ray(job: Job, take: Take, *, tasks: int, **ray: Any) -> None:
-    """Run the tasks on the Ray cluster that is running, then take all results."""
+    """Run the tasks on the running Ray cluster, then collect all results."""
     executor = require_datatrove().RayPipelineExecutor(
         [RankTask(job.folder)], tasks=tasks, logging_dir=str(job.folder / "logs"), **ray
     )

@@ -20,7 +20,7 @@ class Destinations:
         self.folder = folder
 
     def remember(self, path: Path, key: str) -> None:
-        """Record, in one atomic rename, that the artefact of ``key`` is or will be published at ``path``."""
+        """Record, with one atomic rename, that the artefact of ``key`` is or will be published at ``path``."""
         note = self.folder / f"{digest_bytes(os.fsencode(path))[:32]}.json"
         content = json.dumps({"path": str(path), "key": key}) + "\n"
         if note.is_file() and note.read_text(encoding="ascii") == content:
@@ -34,7 +34,7 @@ class Destinations:
         temp.replace(note)
 
     def present(self) -> list[Path]:
-        """Destinations that still contain what was published there."""
+        """Destinations that still contain the published artefact."""
         return [path for path, key in self._notes() if read_manifest(path).get("key") == key]
 
     def gone(self) -> list[Path]:

@@ -39,8 +39,8 @@ def digest_files(files: Mapping[str, str]) -> str:
 class DigestCache:
     """Digests of files by path, valid while size, times and inode are unchanged.
 
-    One small file per entry, renamed into place: processes need no lock and lose no entry of one another. As long as the
-    parent of ``folder`` is not there, entries are kept in memory: a command that is refused makes no store.
+    Each entry is one small file, renamed into place, so that processes need no lock and lose no entries. While the parent of
+    ``folder`` does not exist, entries are kept in memory, so that a rejected command creates no store.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -48,7 +48,7 @@ class DigestCache:
         self._kept: dict[Path, str] = {}
 
     def get(self, path: Path, stamp: list[int]) -> str | None:
-        """The digest of ``path`` if it was recorded under the same ``stamp``."""
+        """The digest of ``path``, if it was recorded with the same ``stamp``; else None."""
         file = self._entry(path)
         try:
             entry = json.loads(self._kept[file] if file in self._kept else file.read_text())
@@ -113,7 +113,8 @@ def stamp(path: Path) -> list[int]:
 
 
 def list_files(folder: Path, *, hidden: bool = False, also: Collection[str] = ()) -> dict[str, Path]:
-    """Every file below ``folder`` by its relative posix path, sorted; of the hidden ones all, or those in ``also``."""
+    """Every file below ``folder`` by its relative posix path, sorted. Hidden files are included if all are requested, or if they
+    are in ``also``."""
     found: dict[str, Path] = {}
     shown = {prefix for name in also for prefix in _prefixes(name)}
     for where, folders, names in os.walk(folder, onerror=_cannot_read):
@@ -150,5 +151,5 @@ def digest_each(
 
 
 def digest_folder(folder: Path, cache: DigestCache | None = None) -> str:
-    """Digest of a folder's visible files: equal content gives an equal digest, whatever the times and the place."""
+    """Digest of a folder's visible files: it depends on contents only, not on times or the folder's path."""
     return digest_files(digest_each(folder, cache))

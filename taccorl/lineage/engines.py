@@ -43,14 +43,14 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
         Args:
             fn: a function at the top level of a module; with more than one process it and the items are pickled.
             items: plain data such as paths.
-            on_done: called here with (item, result) as each item is done, whatever the order.
-            name: how an item is called in messages.
-            care: how patient to be with items that kill their process or never end; one process alone cannot tell.
-            instead: called here with (item, how its process ended) once patience has ended: what to take for the result.
-                But not if that is so of every one of several items: then the machine is at fault, not they.
+            on_done: function that is called in this process with (item, result) when an item is done, in any order.
+            name: function that returns an item's name for messages.
+            care: retry policy for items that kill their process or do not end; without effect with a single process.
+            instead: function that is called in this process with (item, way its process ended) after the last try, and returns
+                the result to use. It is not called if all of several items failed so, because then the machine is at fault.
 
         Raises:
-            EngineError: names each item that failed and why; all other items were done.
+            EngineError: an item failed; the message names each one and the reason. All other items were done.
         """
         items = list(items)
         outcomes: dict[int, Done | Failed] = {}
@@ -92,8 +92,8 @@ class LocalEngine(Engine):
     """Engine that runs items in processes of this machine."""
 
     workers: int = 1
-    """Processes; 1 works in this process, one item after another, which is best for a debugger. An item that kills its
-    process, or hangs, then ends the run."""
+    """Number of processes; with 1 the items run in this process, one after another, which suits a debugger. An item that kills
+    its process, or hangs, then ends the run."""
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -114,13 +114,13 @@ class SlurmEngine(Engine):
     """A Slurm cluster, through datatrove (extra ``cluster``). Waits until the job has ended."""
 
     partition: str
-    """Slurm partition."""
+    """Name of the Slurm partition."""
     work_dir: Path = Path("outputs/slurm")
-    """Items, results and logs pass through here: a folder that all nodes see. So must the store be."""
+    """Folder for items, results and logs that all nodes can access. The store must also be in such a folder."""
     tasks: int = 100
-    """Elements of the job array at most; each takes every tasks-th item. Below your cluster's MaxArraySize."""
+    """Most elements of the job array; each runs every tasks-th item. It must be below the cluster's MaxArraySize."""
     time: str = "24:00:00"
-    """Time limit of one task."""
+    """Time limit of one task, in Slurm's format."""
     cpus_per_task: int = 1
     mem_per_cpu_gb: int = 4
 
@@ -143,9 +143,9 @@ class RayEngine(Engine):
     """A running Ray cluster, through datatrove (extra ``cluster``). ``on_done`` is called at the end."""
 
     work_dir: Path = Path("outputs/ray")
-    """Items, results and logs pass through here: a folder that all nodes see. So must the store be."""
+    """Folder for items, results and logs that all nodes can access. The store must also be in such a folder."""
     tasks: int = 100
-    """Ray tasks at most; each takes every tasks-th item."""
+    """Most Ray tasks; each runs every tasks-th item."""
     cpus_per_task: int = 1
     mem_per_cpu_gb: int = 4
 
@@ -172,15 +172,15 @@ def map_stage(
     """Run one stage on many inputs, one artefact each, in order. Artefacts that are in the store already are not made again.
 
     Args:
-        store: where the artefacts go; what it has already is not made again.
-        stage: gets one input at a time.
-        config: the same for all.
-        inputs: what to run the stage on.
-        engine: where to run; in this process by default.
-        on_done: called with (input, artefact), first for those that were there.
+        store: store of the artefacts; those that it has are not made again.
+        stage: stage that gets one input at a time.
+        config: configuration, the same for all inputs.
+        inputs: inputs, for one run of the stage each.
+        engine: engine; by default in this process.
+        on_done: function that is called with (input, artefact), first for artefacts that were in the store.
 
     Raises:
-        EngineError: names each input that failed; the artefacts of all others are in the store.
+        EngineError: an input failed; the message names each one. The artefacts of all others are in the store.
     """
     found = {i: artefact for i, item in enumerate(inputs) if (artefact := store.find(stage, config, [item]))}
     for i, artefact in found.items():

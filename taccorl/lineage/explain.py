@@ -1,7 +1,7 @@
 """Explain an artefact: a tree, as text, of its inputs down to the raw recordings, with everything that changed since.
 
-``✗`` marks what no longer matches its record: a changed, missing or added file, or a raw source that is gone. An
-artefact that was removed from the store is no fault: the dataset contains its record.
+``✗`` marks what no longer matches its record: a changed, missing or added file, or a raw source that is gone. An artefact that
+was removed from the store is not marked, because the dataset contains its record.
 """
 
 from dataclasses import dataclass, field
@@ -34,20 +34,20 @@ class Origin:
 
 
 def explain(path: Path, store: Store | None) -> str:
-    """The tree of what ``path`` was made from, as text.
+    """Lineage of ``path`` as text: a tree of its inputs.
 
     Args:
         path: an artefact, a dataset, a file in one, or a raw source.
-        store: where to look for inputs that were moved, and for digests that are already known; or None.
+        store: store in which moved inputs and known digests are searched; or None.
     """
     return render(trace(path, store))
 
 
 def trace(path: Path, store: Store | None) -> Origin:
-    """The tree of what ``path`` was made from.
+    """Lineage of ``path``: a tree of its inputs.
 
     Raises:
-        LineageError: there is nothing at ``path``.
+        LineageError: ``path`` does not exist.
     """
     path = Path(path).absolute()
     if not path.exists():

@@ -18,7 +18,8 @@ from taccorl.lineage.errors import LineageError
 
 MANIFEST_PLACES = ("manifest.json", "meta/taccorl/manifest.json")  # an artefact; a LeRobot dataset
 CARD = "README.md"
-"""A dataset's card, written after its manifest for readers, and edited by them: no data, and in no digest of an artefact."""
+"""File name of a dataset's card. It is written after the manifest and may be edited, so that it belongs to no artefact's
+digest."""
 FORMAT = 1  # under the key "taccorl_manifest": tells our manifest.json from anybody else's
 
 _VERIFIED = ".verified.json"  # beside the manifest
@@ -35,7 +36,7 @@ def manifest_place(folder: Path) -> str | None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of the artefact in ``folder``; empty if it has none, as a raw source."""
+    """Read the manifest of the artefact in ``folder``; empty if it has none, such as for a raw source."""
     place = manifest_place(folder)
     return _load(folder, place) if place else {}
 
@@ -58,7 +59,7 @@ def _load(folder: Path, place: str) -> dict[str, Any]:
 
 
 def write_manifest(folder: Path, place: str, manifest: dict[str, Any]) -> None:
-    """Write ``manifest`` to its ``place`` in ``folder``, safe from a power cut from the moment this returns."""
+    """Write ``manifest`` to its ``place`` in ``folder``; when the function returns, the file survives a power cut."""
     path = folder / place
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("x", encoding="ascii") as file:
@@ -69,10 +70,9 @@ def write_manifest(folder: Path, place: str, manifest: dict[str, Any]) -> None:
 
 
 def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str]:
-    """``{relative path: digest}`` of the present files of a source folder or artefact, as far as they count.
-
-    That is every visible file and every file its manifest lists, without the manifest and without a card that the manifest
-    does not list: so an untouched artefact has today the digest that its manifest states.
+    """``{relative path: digest}`` of the present files of a source folder or artefact: every visible file and every file that
+    its manifest lists, except the manifest and a card that the manifest does not list. So the digest of an unchanged artefact
+    equals that in its manifest.
     """
     place = manifest_place(folder)
     listed: Collection[str] = read_manifest(folder).get("files", {})
@@ -87,17 +87,17 @@ class Verified:
 
     num_files: int
     changed: tuple[str, ...]
-    """Relative paths of files whose content is not what was written."""
+    """Relative paths of files whose content has changed since they were written."""
     missing: tuple[str, ...]
     unreadable: tuple[str, ...]
     """Relative path and reason of files that could not be read."""
 
 
 def verify(folder: Path) -> Verified | None:
-    """Read every file that the manifest in ``folder`` lists, and compare its SHA-256; None: there is no manifest of ours.
+    """Read every file that the manifest in ``folder`` lists, and compare its SHA-256; None if there is no manifest of taccorl.
 
-    Nothing is taken from a cache. Files that were added do not count. Where nothing is wrong, a hidden file keeps that for
-    ``is_verified``, if the folder can be written.
+    No cache is used. Added files are ignored. If nothing differs, a hidden file in the folder records it for ``is_verified``,
+    provided that the folder is writable.
 
     Raises:
         LineageError: the manifest is damaged, or cannot be read.
@@ -161,7 +161,7 @@ def is_verified(folder: Path) -> bool:
 
 @functools.cache
 def software() -> dict[str, str]:
-    """Versions of python, taccorl and the installed packages that shape results; nothing about the host."""
+    """Versions of Python, taccorl and the installed packages that affect results; nothing about the host."""
     versions = {"python": platform.python_version(), "taccorl": taccorl.__version__}
     for package in RECORDED_PACKAGES:
         try:

@@ -1,7 +1,6 @@
-"""A pool of worker processes that names the item a worker died on, and whose workers die with their parent.
-
-The standard pool cannot say which item broke it, and gives up all others. Here each worker has its own pipe, so the
-parent knows what each one holds: a worker that is killed, crashes or hangs costs that one item, and is replaced.
+"""A pool of worker processes that names the item at which a worker died, and whose workers end with their parent. The standard
+pool does not report which item broke it, and drops all others. Here each worker has its own pipe, so that the parent knows the
+item of each: a worker that is killed, crashes or hangs costs that one item, and is replaced.
 """
 
 import contextlib
@@ -43,9 +42,9 @@ class Failed:
 
     reason: str
     trace: str | None = None
-    """The traceback, when it is the program's fault rather than the input's."""
+    """Traceback, if the cause is a fault of the program rather than of the input; else None."""
     process: Literal["", "crashed", "hung"] = ""
-    """What the process that had the item did, if it came to no end of its own."""
+    """End of the process that had the item, if it did not end by itself: it ``crashed``, or it ``hung`` and was killed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,16 +53,17 @@ class Care:
     nothing would survive such an item."""
 
     limit_s: float = math.inf
-    """Wall clock after which a worker is killed with its item."""
+    """Wall time after which a worker is killed together with its item [s]."""
     tries: int = 1
-    """Items whose process died go to a new one, after all others and one at a time, until this many have died of it."""
+    """Number of processes that may die of an item before it fails. After a death the item is tried again after all others, one
+    at a time."""
 
 
 NO_CARE = Care()
 
 
 def attempt(fn: Callable[[Any], Any], item: Any) -> Done | Failed:
-    """``fn(item)``, with an exception turned into a `Failed`."""
+    """Call ``fn(item)``; an exception becomes a `Failed`."""
     try:
         return Done(fn(item))
     except Exception as error:
@@ -75,7 +75,7 @@ def pickled(thing: Any, what: str) -> bytes:
     """``thing`` as bytes for another process.
 
     Raises:
-        EngineError: it cannot be sent.
+        EngineError: it cannot be pickled.
     """
     try:
         return pickle.dumps(thing)
@@ -94,10 +94,10 @@ def run_in_processes(
     on_outcome: Callable[[int, Done | Failed], None],
     care: Care = NO_CARE,
 ) -> None:
-    """Run ``fn`` on every item in ``workers`` processes; ``on_outcome(index, outcome)`` is called as each one ends.
+    """Run ``fn`` on every item in ``workers`` processes; ``on_outcome(index, outcome)`` is called when an item has ended.
 
     Raises:
-        EngineError: ``fn`` or an item cannot be sent, or workers cannot start.
+        EngineError: ``fn`` or an item cannot be pickled, or workers cannot start.
     """
     fn_bytes = pickled(fn, f"function {getattr(fn, '__qualname__', fn)}")
     todo = [(i, pickled(item, f"item {name(item)}")) for i, item in enumerate(items)]

@@ -1,9 +1,8 @@
 """Delete from the store the artefacts that no dataset was made from, and leftovers of runs that died.
 
-What the store published is kept for as long as it lies where it was published; further datasets (moved, copied) are
-kept if they are named.
-Only folders that the store itself made are ever considered: ``<stage>/<key>`` and their temporary forms. Do not prune
-while a pipeline runs: it may be about to read an artefact that no dataset refers to yet.
+The lineage of a published dataset is kept while the dataset is at the path where it was published; that of other datasets
+(moved, copied) is kept if they are named. Only folders that the store itself made are ever considered: ``<stage>/<key>`` and
+their temporary forms. Do not prune while a pipeline runs: it may be about to read an artefact that no dataset refers to yet.
 """
 
 import os
@@ -32,14 +31,14 @@ class Unneeded:
     key: str
     size_bytes: int
     is_leftover: bool
-    """A dead run's temporary folder, rather than an artefact."""
+    """True: temporary folder of a run that died; False: an artefact."""
 
 
 def open_store(root: Path) -> Store:
-    """The store at ``root``, which must be one already.
+    """Open the existing store at ``root``.
 
     Raises:
-        LineageError: ``root`` is anything else.
+        LineageError: ``root`` is not a store.
     """
     if not is_store(root):
         raise LineageError(f"{root} is not a taccorl store: it has no {MARKER}. Name the store with --store=FOLDER.")
@@ -50,7 +49,7 @@ def unneeded(store: Store, keep: Sequence[Path] = ()) -> list[Unneeded]:
     """Artefacts that no published dataset and none of ``keep`` was made from, and leftovers; deletes nothing.
 
     Raises:
-        DatasetError: a dataset to keep does not exist or has no manifest, so what it needs is unknown.
+        DatasetError: a dataset to keep does not exist or has no manifest, so that its inputs are unknown.
     """
     needed = _needed_keys(store, keep)
     found = [_describe(path, path.name) for path in store.artefacts() if path.name not in needed]
@@ -58,7 +57,7 @@ def unneeded(store: Store, keep: Sequence[Path] = ()) -> list[Unneeded]:
 
 
 def delete(store: Store, folders: Sequence[Unneeded]) -> list[Unneeded]:
-    """Delete the ``folders`` from the store; returns those that another run is using right now, which stay."""
+    """Delete the ``folders`` from the store. Returns those that another run is using, which are not deleted."""
     busy = []
     for folder in folders:
         if not folder.path.resolve().is_relative_to(store.root):

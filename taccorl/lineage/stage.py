@@ -19,14 +19,14 @@ def _unbound(config: Any, inputs: list[Path], folder: Path) -> None:
 
 @dataclass(frozen=True)
 class Stage:
-    """A named step. Increase ``version`` when its code gives other results: old artefacts are then not used."""
+    """A named step of a pipeline. Increase ``version`` when its code gives other results; older artefacts are then not used."""
 
     name: str
     fn: Function = _unbound
-    """Reads the config and the inputs, writes files into the folder given last. It may remove and remake the folder."""
+    """Function of config, inputs and output folder that writes files into the folder. It may remove and recreate the folder."""
     version: int = 1
     manifest: str = MANIFEST_PLACES[0]
-    """Where in the artefact the manifest lies: one of MANIFEST_PLACES."""
+    """Relative path of the manifest in the artefact, one of MANIFEST_PLACES."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", self.name):
@@ -37,7 +37,7 @@ class Stage:
             )
 
     def bound(self, fn: Function) -> "Stage":
-        """The same stage with this function, which knows more than config and inputs: a simulation, say."""
+        """The same stage with another function, which has access to further objects, such as a simulation."""
         return dataclasses.replace(self, fn=fn)
 
 

@@ -59,10 +59,10 @@ class Store:
     """A folder of artefacts. It can be sent to other processes; all of them may use it at once."""
 
     def __init__(self, root: Path) -> None:
-        """Open the store in folder ``root``; a folder that is absent or empty becomes one when the first stage runs.
+        """Open the store in folder ``root``; a missing or empty folder becomes a store when the first stage runs.
 
         Raises:
-            LineageError: ``root`` is a file, or a folder that holds something else.
+            LineageError: ``root`` is a file, or a folder with other content.
         """
         self.root = Path(root).resolve()
         _check(self.root)
@@ -70,16 +70,16 @@ class Store:
         self.destinations = Destinations(self.root / ".destinations")
 
     def make(self) -> None:
-        """Make the store's folder if it is not there yet, as the first stage does: fails early where nothing may be written.
+        """Create the store's folder if it does not exist, as the first stage would, so that a missing permission is found early.
 
         Raises:
-            OSError: the folder cannot be made.
+            OSError: the folder cannot be created.
         """
         _mark(self.root)
         self.digests.write_kept()
 
     def source(self, path: Path) -> Artefact:
-        """A raw file or folder (or an earlier artefact, wherever it lies), addressed by its content as it is now."""
+        """A raw file or folder (or an earlier artefact, at any path), addressed by its present content."""
         path = Path(path).absolute()
         if not path.is_dir():
             return Artefact(path, digest_file(path, self.digests))
@@ -91,12 +91,11 @@ class Store:
         return Artefact(path, digest)
 
     def dataset(self, root: Path) -> Artefact:
-        """As ``source``, for a LeRobot dataset; checks that its files are as they were written, if a manifest states that.
-
-        Its ``meta`` may be another: LeRobot's commands compute statistics anew in place.
+        """As ``source``, for a LeRobot dataset; checks that its files are unchanged, if it has a manifest. Its ``meta`` may
+        differ, because LeRobot's commands recompute statistics in place.
 
         Raises:
-            LineageError: a file of ``data`` or ``videos`` is another now, or gone.
+            LineageError: a file of ``data`` or ``videos`` was changed or removed.
         """
         then = read_manifest(Path(root).absolute()).get("files", {})
         now = digests_now(Path(root).absolute(), self.digests) if then else {}
@@ -111,12 +110,12 @@ class Store:
         return self.source(root)
 
     def key(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> str:
-        """The address of what ``stage`` makes of ``config`` and ``inputs``."""
+        """Key of the artefact that ``stage`` makes from ``config`` and ``inputs``."""
         parts = [stage.name, str(stage.version), canonical_text(config), *(artefact.digest for artefact in inputs)]
         return digest_bytes(*(part.encode() for part in parts))[:KEY_DIGITS]
 
     def find(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> Artefact | None:
-        """The artefact if the store has it; never makes anything."""
+        """The artefact, if the store has it; else None. Never runs a stage."""
         key = self.key(stage, config, inputs)
         return _with_key(self._place(stage, key), key)
 
@@ -131,7 +130,7 @@ class Store:
         return [path for path in self.folders() if KEY.fullmatch(path.name)]
 
     def folders(self) -> list[Path]:
-        """Every folder below a stage's folder: artefacts, and what runs are building or left."""
+        """Every folder below a stage's folder: artefacts, and temporary folders of running or dead runs."""
         if not self.root.is_dir():
             return []
         stages = [path for path in sorted(self.root.iterdir()) if _is_own(path) and not path.name.startswith(".")]
@@ -146,18 +145,18 @@ class Store:
         destination: Path | None = None,
         sources: Sequence[Artefact] = (),
     ) -> Artefact:
-        """The artefact of ``stage``; made now if it is not there yet.
+        """Return the artefact of ``stage``; the stage is run if the store does not have it.
 
         Args:
-            stage: what to run.
-            config: a dataclass or plain JSON data; handed to the stage as it is.
-            inputs: handed to the stage as paths, in this order.
+            stage: stage to run.
+            config: a dataclass or plain JSON data; passed to the stage unchanged.
+            inputs: passed to the stage as paths, in this order.
             destination: publish the artefact there, outside the store, instead of under its key.
-            sources: with a destination, the raw sources of this very run. A recording's artefact only knows the path
-                where its content was first read; these are the paths that the destination's manifest names.
+            sources: with a destination, the raw sources of this run, whose paths its manifest states. (A recording's artefact
+                states only the path at which its content was first read.)
 
         Raises:
-            DatasetError: ``destination`` holds anything else; nothing of it is touched.
+            DatasetError: ``destination`` has other content, which is not changed.
         """
         job = self._job(stage, config, list(inputs), destination, list(sources))
         if (found := self._existing(job)) is not None:
@@ -234,13 +233,13 @@ class Store:
 
     @contextlib.contextmanager
     def lock(self, name: str, *, wait: bool = True, what: str = "") -> Iterator[None]:
-        """Hold the lock ``name`` of this store: the kernel frees it when its holder dies.
+        """Context manager that holds the lock ``name`` of this store. The kernel releases the lock when its process ends.
 
         Args:
-            what: what is made under the lock, for the message of those who wait; ``name`` if not given.
+            what: description of the work under the lock, for the message of waiting processes; ``name`` if not given.
 
         Raises:
-            filelock.Timeout: somebody else holds it and ``wait`` is False.
+            filelock.Timeout: another process holds it and ``wait`` is False.
         """
         self.make()
         folder = self.root / ".locks"

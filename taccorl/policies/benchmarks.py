@@ -18,7 +18,7 @@ REPEATS = 5
 
 @benchmark("touch_cost")
 def touch_cost() -> Iterator[Row]:
-    """Cost of touch in a training step and in a chunk of the small preset, all rows in contact."""
+    """Benchmark of the cost of touch in a training step and in a chunk of the small preset, with contact in all rows."""
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -38,7 +38,8 @@ def touch_cost() -> Iterator[Row]:
 
 @benchmark("full_size")
 def full_size() -> Iterator[Row]:
-    """π0.5's own size in bfloat16 on one GPU: a training step at batch 8, a chunk of 4 denoising steps at batch 1."""
+    """Benchmark of π0.5's full size in bfloat16 on one GPU: a training step at batch 8, and a chunk of 4 denoising steps at
+    batch 1."""
     import torch
 
     if not torch.cuda.is_available():
@@ -143,7 +144,7 @@ def _features() -> dict[str, Any]:
 
 
 def random_batch(rows: int, device: str, *, prompt_tokens: int) -> dict[str, Any]:
-    """Made-up inputs of ``random_policy``, and actions. All rows in contact; half of the prompt's tokens are there."""
+    """Random inputs of ``random_policy``, and actions. All rows are in contact; half of the prompt's tokens are valid."""
     import torch
 
     torch.manual_seed(0)

@@ -2,8 +2,8 @@
 
     δ_t = r_t + γ V'_t − V_t        A_t = δ_t + γ λ (1 − end_t) A_{t+1}        R_t = A_t + V_t
 
-r_t is the sum of rewards within a chunk. V'_t is the value of what follows decision t: of the next observation while the episode
-goes on, of its last observation, before the reset, where time ran out, and 0 after success or failure.
+r_t is the sum of rewards within a chunk. V'_t is the value after decision t: of the next observation while the episode
+continues, of the last observation before the reset if time ran out, and 0 after success or failure.
 
 Letters in shapes: T decisions of an environment, N environments.
 """
@@ -34,7 +34,7 @@ def estimate_advantages(
 
     Args:
         next_value_TN: V'; 0 where the episode succeeded or failed.
-        end_TN: bool, the episode ended in this decision, whichever way: no credit passes to the decision before a reset.
+        end_TN: bool, the episode ended in this decision, for any reason: no advantage is passed back over a reset.
     """
     advantage_TN, later_N = torch.zeros_like(reward_TN), torch.zeros_like(reward_TN[0])
     for t in reversed(range(len(reward_TN))):
@@ -44,7 +44,7 @@ def estimate_advantages(
 
 
 def normalise(advantage: Tensor) -> Tensor:
-    """Mean 0, deviation 1 over the whole rollout."""
+    """Scale to mean 0 and standard deviation 1 over the whole rollout."""
     return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-5)
 
 

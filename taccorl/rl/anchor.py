@@ -1,6 +1,6 @@
 """The real-data anchor, paper §3.4: L = L_PPO + β · E_real[ℓ_flow], with B_real rows in every optimiser step.
 
-The flow loss is the one that the policy is co-trained by, image randomisation included; steps of a chunk beyond an episode's end
+The flow loss is that of co-training, image randomisation included; steps of a chunk beyond an episode's end
 do not count.
 """
 
@@ -30,16 +30,16 @@ class Anchor(Protocol):
     """Interface of a loss that adds its gradient to that of PPO."""
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
-        """Add the gradient of β · ℓ of one optimiser step's rows; the loss ℓ, without β."""
+        """Add the gradient of β · ℓ for the rows of one optimiser step, and return the loss ℓ, without β."""
         ...
 
     def measure(self, generator: torch.Generator, num_rows: int) -> float:
-        """Loss ℓ of rows, with fixed noise: the drift from the real data."""
+        """Loss ℓ of rows with fixed noise, which measures the drift from the real data."""
         ...
 
 
 class _Options:
-    """What LeRobot's ``make_dataset`` and our cache read of a training's configuration."""
+    """The options that LeRobot's ``make_dataset`` and our cache read from a training's configuration."""
 
     def __init__(self, settings: AnchorSettings, policy_config: Any) -> None:
         self.dataset: Any = DatasetConfig(repo_id="local/anchor", root=str(settings.dataset))
@@ -48,12 +48,12 @@ class _Options:
 
 
 class RealAnchor:
-    """Rows of a LeRobot dataset, drawn with replacement, through the policy's own preprocessor."""
+    """Anchor with rows of a LeRobot dataset, drawn with replacement and passed through the policy's own preprocessor."""
 
     def __init__(self, settings: AnchorSettings, policy: TactilePI05Policy, preprocessor: Any) -> None:
         """
         Raises:
-            TaccorlError: no such dataset, a simulated one, or features that are not the policy's.
+            TaccorlError: the dataset does not exist, is simulated, or has other features than the policy.
         """
         assert settings.dataset is not None
         self._policy, self._preprocessor, self._settings = policy, preprocessor, settings

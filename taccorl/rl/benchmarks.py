@@ -36,8 +36,8 @@ def _process_shard(numbers: np.ndarray, num_threads: int) -> ProcessShard:
 
 @benchmark("rollout_shards")
 def rollout_shards() -> Iterator[Row]:
-    """Chunks of 16 actions and what is observed after them, parts in both hands, in one process with all threads and in as many
-    processes as CPUs, against the same physics steps alone in one process; wall time, in turns."""
+    """Benchmark of chunks of 16 actions and the observations after them, with parts in both hands: in one process with all
+    threads, and in as many processes as CPUs, relative to the physics steps alone in one process; wall time, in turns."""
     cpus = len(os.sched_getaffinity(0))
     sim, goal = holding()
     threaded = TaccorlVectorEnv("assembly_1", num_envs=NUM_SIMS, num_threads=cpus)
@@ -104,8 +104,8 @@ def rollout_shards() -> Iterator[Row]:
 
 @benchmark("full_post_training")
 def full_post_training() -> Iterator[Row]:
-    """π0.5's own size on one GPU: a decision of 128 environments and the paper's optimiser step of 512 decisions, without the
-    physics. Weights are random and observations made up: what is measured is time and memory."""
+    """Benchmark of π0.5's full size on one GPU: a decision of 128 environments and the paper's optimiser step of 512 decisions,
+    without the physics. Weights and observations are random: time and memory are measured."""
     import torch
 
     if not torch.cuda.is_available():
@@ -122,9 +122,9 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
     """Rows of ``full_post_training``, of any backbone and device.
 
     Args:
-        where: arithmetic and device, as the rows name them.
-        num_envs: environments, 128 in the paper.
-        num_decisions: of an optimiser step, 512 in the paper; a multiple of ``num_envs``.
+        where: name of arithmetic and device in the rows.
+        num_envs: number of environments, 128 in the paper.
+        num_decisions: decisions of an optimiser step, 512 in the paper; a multiple of ``num_envs``.
     """
     import torch
 

@@ -23,14 +23,14 @@ _TRAIN_CONFIG = "train_config.json"  # lerobot-train's; names the dataset that t
 
 
 def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict[str, Any]) -> Path:
-    """Write ``checkpoints/<iteration>``; returns it.
+    """Write ``checkpoints/<iteration>``; returns its path.
 
     Args:
         opened: the checkpoint that post-training began or resumed from, for its processors.
-        policy: with the weights of now.
+        policy: policy with its present weights.
 
     Raises:
-        TaccorlError: it cannot be written, as on a full disk.
+        TaccorlError: it cannot be written, for example on a full disk.
     """
     folder = out / "checkpoints" / f"{iteration:06d}"
     unfinished = folder.with_name(f".{folder.name}.unfinished")
@@ -57,7 +57,7 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
 
 
 def link(folder: Path, name: str) -> None:
-    """``checkpoints/<name>`` → ``folder``, in one step."""
+    """Make the link ``checkpoints/<name>`` to ``folder``, atomically."""
     new = folder.with_name(f".{name}.new")
     new.unlink(missing_ok=True)
     new.symlink_to(folder.name)
@@ -79,12 +79,12 @@ def policy_folder(out: Path, name: str = LAST) -> Path:
 
 
 def load_state(policy_path: Path) -> dict[str, Any]:
-    """State beside a policy folder. It is a pickle: load only what you wrote."""
+    """Load the state beside a policy folder. It is a pickle file: load only files that you wrote."""
     return torch.load(policy_path.parent / _STATE, map_location="cpu", weights_only=False)
 
 
 def prune(out: Path, keep: int) -> None:
-    """Delete all but the newest ``keep`` checkpoints, and those that are linked."""
+    """Delete all checkpoints except the newest ``keep`` and those with a link."""
     root = out / "checkpoints"
     linked = {(root / name).resolve() for name in (LAST, BEST)}
     folders = sorted(p for p in root.iterdir() if p.name.isdigit())

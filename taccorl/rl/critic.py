@@ -16,7 +16,7 @@ _MAX_NORMALISED = 10.0
 
 
 class Critic(nn.Module):
-    """(B, F) features and (B, P) privileged numbers → (B,) values."""
+    """Value head: (B, F) features and (B, P) privileged numbers → (B,) values."""
 
     mean_P: Tensor
     square_P: Tensor
@@ -38,7 +38,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def observe(self, privileged_BP: Tensor) -> None:
-        """Update mean and deviation, by which privileged numbers are normalised (Chan's parallel variance)."""
+        """Update mean and deviation of the privileged numbers, with which they are normalised (Chan's parallel variance)."""
         added = len(privileged_BP)
         total = self.count + added
         mean_P, distance_P = privileged_BP.mean(0), privileged_BP.mean(0) - self.mean_P

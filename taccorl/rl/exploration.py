@@ -23,14 +23,15 @@ _STEP_RAD = 1e-4  # of the finite difference of the forward kinematics
 
 @dataclass(frozen=True)
 class Noise:
-    """Root mean squares over decisions, executed steps and both arms, for decisions with the stochastic step k."""
+    """Effect of exploration noise, as root mean squares over decisions, executed steps and both arms, for decisions with the
+    stochastic step k."""
 
     step: int
     joints_rad: float
     hand_mm: float
-    """Displacement of the tool centre point, by the arm's Jacobian at the targets."""
+    """Displacement of the tool centre point [mm], by the arm's Jacobian at the targets."""
     offset_mm: float
-    """The same of the mean displacement over a chunk."""
+    """Displacement of the tool centre point by the mean over a chunk [mm]."""
     gripper_mm: float
 
 
@@ -42,7 +43,8 @@ def measure_noise(
     robot: RobotConfig,
     generator: torch.Generator,
 ) -> list[Noise]:
-    """For each denoising step (one stochastic step), or one entry with step −1 (all)."""
+    """Measure the noise of each denoising step (one stochastic step per decision), or give one entry with step −1 (all steps
+    stochastic)."""
     rows = len(next(iter(batch.values())))
     shape: tuple[int, int] = tuple(actor.scored_HD.shape)  # pyright: ignore[reportAssignmentType]
     draws = sde.draw(rows, shape, generator, actor.scored_HD.device)

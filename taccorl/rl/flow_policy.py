@@ -23,18 +23,18 @@ from taccorl.rl.settings import PolicySettings
 
 Batch = dict[str, Tensor]
 Compute = Callable[[Any, Velocity, Tensor], tuple[Tensor, ...]]
-"""(rows, velocity field of these rows, their features (n, F)) → tensors with n rows."""
+"""Function (rows, velocity field of these rows, their features (n, F)) → tensors with n rows."""
 
 
 class FlowPolicy(ABC):
-    """Interface of PPO to a policy."""
+    """Interface of a policy for PPO."""
 
     scored_HD: Tensor
-    """(H, D) bool: numbers of a chunk that are executed."""
+    """(H, D) bool: numbers of a chunk that are executed, and so count in the log-probability."""
 
     @abstractmethod
     def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
-        """``compute`` for groups of rows that are computed together; results in the order of the batch."""
+        """Call ``compute`` for groups of rows that are computed together; results are in the order of the batch."""
 
     @abstractmethod
     def actions(self, chunk_BHD: Tensor) -> Tensor:
@@ -42,11 +42,11 @@ class FlowPolicy(ABC):
 
     @abstractmethod
     def trained_parameters(self) -> list[nn.Parameter]:
-        """Parameters that the actor's optimiser moves."""
+        """Parameters that the actor's optimiser changes."""
 
     @torch.no_grad()
     def sample(self, batch: Batch, sde: FlowSDE, draws: Draws) -> tuple[Sampled, Tensor]:
-        """Chunks with their log-probability, and (B, F) features."""
+        """Sample chunks with their log-probabilities, and return the (B, F) features."""
 
         def compute(rows: Any, velocity: Velocity, features_BF: Tensor) -> tuple[Tensor, ...]:
             return *sde.sample(velocity, draws.rows(rows), self.scored_HD), features_BF
@@ -60,7 +60,7 @@ class FlowPolicy(ABC):
         return self.each(batch, lambda rows, velocity, features_BF: (features_BF,))[0]
 
     def log_prob(self, batch: Batch, sde: FlowSDE, before_BSHD: Tensor, after_BSHD: Tensor, step_BS: Tensor) -> Tensor:
-        """(B,) log-probability of stored steps; differentiable."""
+        """(B,) log-probability of stored stochastic steps; differentiable."""
 
         def compute(rows: Any, velocity: Velocity, features_BF: Tensor) -> tuple[Tensor, ...]:
             return (sde.log_prob(velocity, before_BSHD[rows], after_BSHD[rows], step_BS[rows], self.scored_HD),)
@@ -77,13 +77,15 @@ class _Prefix(NamedTuple):
 
 
 class TactileFlowPolicy(FlowPolicy):
-    """``TactilePI05Policy`` for PPO. Acts with its last weights: an exponential mean of weights is not what PPO moves."""
+    """``TactilePI05Policy`` for PPO. It acts with the trained weights, not with their exponential mean, because PPO changes the
+    former."""
 
     def __init__(self, policy: TactilePI05Policy, settings: PolicySettings, num_steps: int) -> None:
         """
         Args:
-            policy: in evaluation mode, so that weights that acted, possibly an exponential mean, are those that are trained.
-            num_steps: K_denoise, also of the checkpoints that are written.
+            policy: policy in evaluation mode; the weights with which it acts, possibly an exponential mean, become the trained
+                ones.
+            num_steps: K_denoise, also stored in the checkpoints.
         """
         policy.eval()
         policy.averaged, policy.config.average_decay = None, 0.0

@@ -23,7 +23,7 @@ from taccorl.rl.ppo import PPO, Decisions
 
 
 class FlowPPO(RLAlgorithm):
-    """``PPO`` with the interface of LeRobot. A batch is a rollout: ``Decisions``."""
+    """``PPO`` with LeRobot's interface. A batch is a rollout: ``Decisions``."""
 
     config_class, name = FlowPPOConfig, "flow_ppo"
 

@@ -19,7 +19,7 @@ class FlowPPOConfig(PPOSettings, RLAlgorithmConfig):
     policy: PolicySettings = field(default_factory=PolicySettings)
     noise: FlowSDESettings = field(default_factory=FlowSDESettings)
     num_privileged: int = 0
-    """Numbers of the simulator's state that the critic sees."""
+    """Number of values of the simulator's state that are inputs of the critic."""
     seed: int = 0
     """Seed of the random order in which decisions are used, and of the choice of real rows for the anchor."""
     policy_config: PreTrainedConfig | None = None

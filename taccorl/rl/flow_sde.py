@@ -34,17 +34,17 @@ from torch import Tensor
 from taccorl.rl.settings import FlowSDESettings
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
-"""(x (B, H, D), t (B,)) → dx/dt (B, H, D)."""
+"""Velocity field: (x (B, H, D), t (B,)) → dx/dt (B, H, D)."""
 
 
 class Draws(NamedTuple):
-    """Random numbers of a sample, drawn before it, so that rows can be computed in any grouping."""
+    """Random numbers of samples, drawn before sampling, so that rows can be computed in any grouping."""
 
     initial_BHD: Tensor
     """x at t = 1."""
     noise_BSHD: Tensor
     step_BS: Tensor
-    """Index k of the step that each noise belongs to; −1: unused."""
+    """Index k of the stochastic step for each noise; −1: unused."""
 
     def rows(self, rows: Any) -> "Draws":
         """The draws of some rows."""
@@ -61,13 +61,13 @@ class Sampled(NamedTuple):
 
 
 class FlowSDE:
-    """One function, ``mean``, gives the transition both for sampling and for scoring."""
+    """Flow-SDE sampler. One function, ``mean``, gives the transition for sampling and for scoring."""
 
     def __init__(self, settings: FlowSDESettings) -> None:
         self.num_steps, self.level, self.correlation = settings.num_steps, settings.level, settings.correlation
         last = self.num_steps - 1
         self.choices = [last] if settings.stochastic_steps == "last" else list(range(self.num_steps))
-        """Steps that can be stochastic."""
+        """Indices of the steps that can be stochastic."""
         self.num_stochastic = settings.num_steps if settings.stochastic_steps == "all" else 1
         # Same operations, in the same order, as lerobot.policies.common.flow_matching.euler_integrate: results are bit-identical.
         self.dt = -1.0 / self.num_steps
@@ -80,7 +80,8 @@ class FlowSDE:
         return [self.level * math.sqrt(-self.dt * t / r) for t, r in zip(self.times, rest, strict=True)]
 
     def draw(self, num_rows: int, shape: tuple[int, int], generator: torch.Generator, device: Any = "cpu") -> Draws:
-        """Draw the random numbers for ``num_rows`` samples of ``shape`` (H, D), on the CPU: the same on every device."""
+        """Draw the random numbers for ``num_rows`` samples of ``shape`` (H, D), on the CPU, so that they are the same for every
+        device."""
         initial = torch.randn(num_rows, *shape, generator=generator)
         noise = torch.randn(num_rows, self.num_stochastic, *shape, generator=generator)
         if self.num_stochastic == 1:
@@ -95,7 +96,7 @@ class FlowSDE:
     def mean(self, x_BHD: Tensor, v_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (B, H, D) and standard deviation (B, 1, 1) of a chunk after one denoising step, in normalised actions.
 
-        ``k_B`` (B,) says which step each chunk of the batch takes, counted from 0.
+        ``k_B`` (B,) is the index of the step for each chunk of the batch, from 0.
         Where ``noisy_BHD`` is False, the mean is that of Euler's step and the deviation does not apply.
         """
         t = torch.tensor(self.times, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]

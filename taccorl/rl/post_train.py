@@ -58,10 +58,10 @@ def post_train(settings: PostTrainSettings, report: Report = print, save_episode
     """Run all iterations; returns the policy's folder of the last checkpoint.
 
     Args:
-        save_episode: writes an episode of the rollouts as a file, such as ``views.episode.save_episode``.
+        save_episode: function that writes an episode of the rollouts as a file, such as ``views.episode.save_episode``.
 
     Raises:
-        TaccorlError: a policy, dataset, twin or folder that does not fit; out of GPU memory.
+        TaccorlError: the policy, dataset, twin or folder does not fit, or GPU memory is exhausted.
     """
     try:
         run = PostTraining(settings, report, save_episode)
@@ -78,7 +78,7 @@ def post_train(settings: PostTrainSettings, report: Report = print, save_episode
 
 
 class PostTraining:
-    """One run: everything that is made once, and the loop."""
+    """One run of post-training: its objects, and the loop."""
 
     def __init__(self, settings: PostTrainSettings, report: Report, save_episode: SaveEpisode | None = None) -> None:
         """
@@ -117,7 +117,7 @@ class PostTraining:
         )
         self._iteration, self._best = 0, 0.0
         self._recent: list[tuple[float, int]] = []
-        """Success and number of episodes of the last iterations in which some ended."""
+        """Success rate and number of episodes of recent iterations in which episodes ended."""
         self._wants_rerun = True
         if settings.resume:
             self._resume(checkpoint.load_state(self._opened.path))
@@ -197,7 +197,7 @@ class PostTraining:
         set_rng_state(state["random"])
 
     def run(self) -> None:
-        """The iterations that are left."""
+        """Run the remaining iterations."""
         settings = self.settings
         while self._iteration < settings.iterations:
             rollout = collect(

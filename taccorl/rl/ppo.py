@@ -5,9 +5,9 @@ minimises the flow loss on real data (``anchor``).
     L_PPO = −E[min(ratio · A, clip(ratio, 1 − ε, 1 + ε) · A)]        L = L_PPO + β · ℓ_flow(real)
 
 Log-probabilities are summed over the executed numbers of a chunk: one ratio for each decision. The critic has an optimiser and a
-gradient norm of its own, and learns from stored features: it costs no pass through the policy.
+gradient norm of its own, and learns from stored features: it needs no pass through the policy.
 
-Clipping does not bound a step: the gradient is that of before it. So KL(π_old ‖ π) is measured after each step of the actor; a
+Clipping does not bound a step: the gradient is computed before it. So KL(π_old ‖ π) is measured after each step of the actor; a
 step after which it is above ``kl_stop`` is undone, weights and moments, and ends the updates of the iteration.
 
 Letters in shapes: M decisions of a rollout, S stochastic steps, H horizon, D padded action, F features, P privileged numbers.
@@ -31,18 +31,20 @@ from taccorl.rl.settings import PPOSettings
 from taccorl.rl.step_undo import StepUndo
 
 RATIO_GUARD = 1e-3
-"""|ratio − 1| at the first minibatch of an iteration, above which sampling and scoring are not the same policy."""
+"""Largest accepted |ratio − 1| at the first minibatch of an iteration; above it sampling and scoring differ, which is an
+error."""
 FIRST_STEP_UNDONE, LATER_STEP_UNDONE, SMALL_STEPS = 0.5, 0.7, 1.2
-"""Factors on the actor's learning rate (``adapt_lr``)."""
+"""Factors on the actor's learning rate (``adapt_lr``): after a first step that was undone, after a later one, and after small
+steps only."""
 SMALL_KL = 0.2
 """Share of ``kl_stop`` below which the steps of an iteration are small."""
 MOST_LR = 10.0
-"""Largest learning rate of ``adapt_lr``, in multiples of the first one."""
+"""Largest learning rate of ``adapt_lr``, in multiples of the initial one."""
 
 
 @dataclass(frozen=True)
 class Decisions:
-    """M decisions of a rollout, for an update."""
+    """M decisions of a rollout, the data of an update."""
 
     batch: Batch
     before_MSHD: Tensor
@@ -78,7 +80,7 @@ class PPO:
     ) -> None:
         """
         Args:
-            ratio_guard: inf where kernels round too coarsely for a guard (TF32).
+            ratio_guard: limit on |ratio − 1| at the first minibatch; inf if kernels round too coarsely for it (TF32).
         """
         self.actor, self.critic, self.sde, self.settings, self.anchor = actor, critic, sde, settings, anchor
         self.ratio_guard = ratio_guard
@@ -86,7 +88,7 @@ class PPO:
         self.critic_optimizer = self._adam(list(critic.parameters()), settings.critic_lr)
         self._undo = StepUndo(self.actor_optimizer)
         self.num_updates = 0
-        """Calls of ``update``."""
+        """Number of calls of ``update``."""
 
     @property
     def actor_lr(self) -> float:
@@ -104,14 +106,14 @@ class PPO:
         """Train on a rollout; each decision is used once in each epoch.
 
         Args:
-            generator: on the CPU; draws the order, and the anchor's rows.
+            generator: random generator on the CPU for the order, and for the anchor's rows.
 
         Returns:
-            Means over the optimiser steps; counts, where ``actor_steps`` includes ``undone_steps``; ``last_kl`` of the policy
-            that remains; ``actor_lr`` of these steps.
+            Means over the optimiser steps; counts (``actor_steps`` includes ``undone_steps``); ``last_kl`` of the final policy;
+            ``actor_lr`` of these steps.
 
         Raises:
-            TaccorlError: the first ratios are not 1.
+            TaccorlError: a first ratio differs from 1 by more than ``ratio_guard``.
         """
         settings = self.settings
         advantage_M = normalise(decisions.advantage_M)
@@ -264,7 +266,7 @@ class PPO:
 
 
 def policy_loss(log_ratio_M: Tensor, advantage_M: Tensor, clip: float) -> Tensor:
-    """Clipped loss of PPO, L_PPO, a scalar."""
+    """Clipped loss of PPO, L_PPO (a scalar)."""
     ratio_M = log_ratio_M.exp()
     return -torch.minimum(ratio_M * advantage_M, ratio_M.clamp(1 - clip, 1 + clip) * advantage_M).mean()
 

@@ -1,7 +1,8 @@
 """Shards of environments in processes of their own, on this machine or, by Ray, on those of a cluster (extra ``ray``).
 
 Python runs in one thread of a process at a time, so that one process feeds about ten cores with environments. A remote shard
-makes its own environments and gives and takes arrays; the policy stays here, so no weights travel.
+makes its own environments, and receives and returns arrays; the policy stays in the main process, so that no weights are
+transferred.
 """
 
 import contextlib
@@ -87,7 +88,7 @@ class ProcessShard(RemoteShard):
         """
         Args:
             envs: arguments of ``TaccorlVectorEnv``.
-            shard: arguments of ``TwinShard`` but ``envs`` and ``starts``.
+            shard: arguments of ``TwinShard`` except ``envs`` and ``starts``.
             starts: arguments of ``StartStates``.
 
         Raises:
@@ -151,7 +152,7 @@ def start_ray() -> Any:
     """Start Ray and return its module: connected to the cluster of RAY_ADDRESS, else to one on this machine.
 
     Raises:
-        TaccorlError: it is not installed.
+        TaccorlError: Ray is not installed.
     """
     try:
         ray: Any = importlib.import_module("ray")
@@ -168,7 +169,7 @@ class RayShard(RemoteShard):
     def __init__(self, ray: Any, envs: dict[str, Any], shard: dict[str, Any], starts: tuple[float, int]) -> None:
         """
         Args:
-            ray: of ``start_ray``.
+            ray: module from ``start_ray``.
             envs: as of ``ProcessShard``; the actor takes as many CPUs as its ``num_threads``.
             shard: as of ``ProcessShard``.
             starts: as of ``ProcessShard``.

@@ -1,6 +1,7 @@
 """Rollouts of a flow policy with Flow-SDE noise: N environments in one process, T decisions of each.
 
-A decision is one chunk of actions. Episodes that end are reset at the end of the chunk and go on over the borders of iterations.
+A decision is one chunk of actions. Episodes that end are reset at the end of the chunk; running episodes continue in the next
+iteration.
 
 Letters in shapes: T decisions, N environments, H horizon, D padded action, A action, P privileged numbers.
 """
@@ -34,7 +35,7 @@ class Clock:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Add the time spent inside to ``name``."""
+        """Context manager that adds the time spent inside to the part ``name``."""
         begin_s = self._now_s()
         try:
             yield
@@ -47,7 +48,7 @@ class Clock:
         return time.perf_counter()
 
     def restart(self) -> dict[str, float]:
-        """Seconds of each part since the last call."""
+        """Time of each part since the last call [s]; the times restart at 0."""
         seconds, self.seconds = self.seconds, {}
         return seconds
 
@@ -66,15 +67,15 @@ class Acted:
 
     reward_N: Tensor
     terminated_N: Tensor
-    """bool: succeeded or failed."""
+    """(N,) bool: the episode succeeded or failed."""
     truncated_N: Tensor
-    """bool: out of time."""
+    """(N,) bool: the episode ran out of time."""
     last: Seen | None
-    """Of the environments that ran out of time, in their order: the observation before the reset. None: there is none."""
+    """Last observations, before the reset, of the environments that ran out of time, in their order; None if there are none."""
     outcomes: list[str | None]
-    """(N,) ``success``, ``timeout`` or the failure, of episodes that ended and had begun with a reset."""
+    """(N,) ``success``, ``timeout`` or the failure, for episodes that ended and had begun with a reset; else None."""
     later_outcomes: list[str | None] = field(default_factory=list)
-    """(N,) the same of episodes that had begun in a state of an earlier one (``start_states``)."""
+    """(N,) the same for episodes that had begun in a state of an earlier episode (``start_states``)."""
 
 
 class World(Protocol):
@@ -90,17 +91,17 @@ class World(Protocol):
         ...
 
     def act(self, actions_NHA: Tensor) -> Acted:
-        """Execute chunks (N, n, A), as the policy gives them; reset what ended."""
+        """Execute chunks (N, n, A) in the policy's units; reset environments whose episode ended."""
         ...
 
     def reset(self, rows_N: Tensor) -> None:
-        """Begin the next episode where ``rows_N`` (bool)."""
+        """Begin the next episode in the environments where ``rows_N`` (bool) is true."""
         ...
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """T · N decisions, and outcomes of the episodes that ended within."""
+    """T · N decisions, and outcomes of the episodes that ended in them."""
 
     decisions: Decisions
     outcomes: Counter[str]
@@ -118,11 +119,11 @@ def collect(
     clock: Clock,
     on_values: Callable[[Tensor], None] | None = None,
 ) -> Rollout:
-    """T decisions in every environment, with their advantages.
+    """Make T decisions in every environment, and compute their advantages.
 
     Args:
-        generator: on the CPU; draws the noise.
-        on_values: called with the values (N,) of each decision before it is executed.
+        generator: random generator on the CPU for the noise.
+        on_values: function that is called with the values (N,) of each decision before it is executed.
     """
     kept: list[dict[str, Tensor]] = []
     batches: list[Batch] = []
@@ -214,7 +215,7 @@ def _last_values(actor: FlowPolicy, critic: Critic, acted: Acted, like_N: Tensor
 def first_episodes(
     world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator, max_decisions: int
 ) -> list[str | None]:
-    """Outcome of the first episode of each environment of a world that was just restarted; None: not over by then."""
+    """Outcome of the first episode of each environment in a world that was just restarted; None: it has not ended."""
     found: list[str | None] = [None] * world.num_envs
     for _ in range(max_decisions):
         acted = _decide(world, actor, sde, generator)
@@ -225,9 +226,8 @@ def first_episodes(
 
 
 def stagger(world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator, num_decisions: int) -> None:
-    """Act for so many decisions, an episode's length, and reset each environment once, at a random one of them.
-
-    Else all environments would be in the same phase of the task in every iteration.
+    """Act for the number of decisions of an episode, and reset each environment once, at a random decision. Otherwise all
+    environments would be in the same phase of the task in every iteration.
     """
     begin_N = torch.randint(num_decisions, (world.num_envs,), generator=generator)
     for k in range(num_decisions):

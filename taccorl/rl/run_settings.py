@@ -25,10 +25,11 @@ def write(settings: PostTrainSettings) -> None:
 
 
 def complete[SettingsT: PostTrainSettings](settings: SettingsT, given: Collection[str]) -> SettingsT:
-    """Settings of the run in ``settings.out``, where ``given`` does not name them: ``ppo.clip``, ``iterations``.
+    """Replace settings that ``given`` does not name (such as ``ppo.clip``, ``iterations``) by those of the run in
+    ``settings.out``.
 
     Raises:
-        TaccorlError: there is no run.
+        TaccorlError: there is no run in ``settings.out``.
     """
     stored = {name: value for name, value in _read(settings.out).items() if name not in given}
     try:
@@ -53,7 +54,7 @@ def refuse_changes(settings: PostTrainSettings) -> None:
     """Check that a run can be resumed with these settings.
 
     Raises:
-        TaccorlError: there is no run in ``settings.out``, or it has other settings, or its twin is another now.
+        TaccorlError: there is no run in ``settings.out``, it has other settings, or its twin has changed.
     """
     before, now = _to_json(PostTrainSettings()) | _read(settings.out), _to_json(settings)
     fixed = [name for name in now if name not in _MAY_CHANGE]

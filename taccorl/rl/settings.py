@@ -16,18 +16,18 @@ class PolicySettings:
     """The policy to post-train."""
 
     path: Path | None = None
-    """Folder pretrained_model of a checkpoint of tactile_pi05, trained by flow matching."""
+    """Folder ``pretrained_model`` of a checkpoint of tactile_pi05, trained by flow matching."""
     device: str | None = None
-    """cpu, cuda, …; as in the checkpoint if not given."""
+    """Device of the policy: cpu, cuda, …; as in the checkpoint if not given."""
     trained: str = "expert"
-    """expert: action expert and touch, the vision-language model stays as it is; all: every weight."""
+    """Weights that are trained. expert: those of action expert and touch, not of the vision-language model; all: every weight."""
     tf32: bool = False
     """On a GPU, multiply float32 matrices with 10-bit mantissas: faster, but ratios before the first update differ from 1."""
 
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: unknown part.
+            TaccorlError: ``trained`` is not one of its values.
         """
         if self.trained not in _TRAINED:
             raise TaccorlError(f"--policy.trained={self.trained}: {nearest(self.trained, _TRAINED)}")
@@ -38,11 +38,11 @@ class EnvSettings:
     """Settings of the environments: task, twin, number of environments and processes."""
 
     task: str | None = None
-    """Task: {tasks}."""
+    """Task of the environments: {tasks}."""
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     num_envs: int = 128
-    """N_env: environments at once."""
+    """N_env: number of environments."""
     shards: int = 1
     """Groups of environments. With more than one, each runs in a process of its own: in one process about 10 of 32 CPUs were busy
     (docs/learning.md). Scenes do not depend on it, except with start_share: each group stores states of its own."""
@@ -53,11 +53,11 @@ class EnvSettings:
     decisions: int = 36
     """C: chunks of actions of each environment in an iteration. Episodes continue in the next one."""
     difficulty: str = "train"
-    """Clearance a side: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     randomization: float = 1.0
-    """Share of the paper's reset ranges, 0 … 1."""
+    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
-    """Control steps until an episode is cut off; the task's own limit if not given."""
+    """Control steps after which an episode ends; the task's own limit if not given."""
     start_share: float = 0.0
     """Share of episodes, 0 or more and below 1, that begin in a stored state of one of the policy's earlier episodes instead of a
     reset. States are stored after each arm has grasped its part. progress.jsonl counts these episodes apart (later_success)."""
@@ -70,7 +70,7 @@ class EnvSettings:
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: a number below 1.
+            TaccorlError: a number is out of its range.
         """
         _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions, start_states=self.start_states)
         if self.threads is not None:
@@ -93,8 +93,8 @@ class FlowSDESettings:
     level: float = 0.5
     """σ_SDE: standard deviation of the first stochastic step, in normalised actions. 0: no noise."""
     stochastic_steps: str = "one"
-    """one: a step drawn for each decision, the others are Euler's (paper); last: the last step of every decision, whose noise no
-    later step removes; all: every step."""
+    """Steps of a decision that are stochastic; the others are Euler steps. one: a randomly drawn step (paper); last: the last
+    step, whose noise no later step reduces; all: every step."""
     correlation: float = 0.0
     """ρ: correlation of the noise at neighbouring actions of a chunk, ρ^|i − j| between actions i and j. 0: white (paper). White
     noise of 16 actions moves their mean by a quarter of its deviation; with ρ = 0.9 by three quarters."""
@@ -102,7 +102,7 @@ class FlowSDESettings:
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: a setting out of its range.
+            TaccorlError: a setting is out of its range.
         """
         _at_least("noise", 1, num_steps=self.num_steps)
         _at_least("noise", 0, level=self.level, correlation=self.correlation)
@@ -117,25 +117,25 @@ class FlowSDESettings:
 
 @dataclass(kw_only=True)
 class AnchorSettings:
-    """The supervised term on real data."""
+    """Supervised loss on real data during PPO."""
 
     dataset: Path | None = None
     """Folder of a LeRobot dataset with real demonstrations; of a co-training dataset only its real rows are used."""
     weight: float = 1.0
     """β: weight of the supervised loss; 0: no anchor."""
     batch_size: int = 32
-    """B_real: rows of every optimiser step."""
+    """B_real: number of rows in every optimiser step."""
     allow_simulated: bool = False
-    """Take a dataset of simulated demonstrations."""
+    """Accept a dataset of simulated demonstrations."""
     cache: str = "none"
-    """none, disk, host or gpu: decode its pictures once (as lerobot-train's --dataset.cache)."""
+    """Cache of decoded pictures: none, disk, host or gpu (as --dataset.cache of lerobot-train)."""
     cache_store: Path = Path("outputs/store")
-    """Folder of decoded pictures."""
+    """Folder of the cache of decoded pictures."""
 
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: a number below its range.
+            TaccorlError: a number is out of its range.
         """
         _at_least("anchor", 0, weight=self.weight)
         _at_least("anchor", 1, batch_size=self.batch_size)
@@ -154,9 +154,9 @@ class PPOSettings:
     epochs: int = 1
     """E_update: epochs of updates per rollout."""
     batch_size: int = 512
-    """B_RL: decisions of an optimiser step; the last one of an epoch may have fewer."""
+    """B_RL: number of decisions in an optimiser step; the last one of an epoch may have fewer."""
     micro_batch: int = 128
-    """Decisions in memory at once; results do not depend on it but for rounding."""
+    """Number of decisions in memory at the same time; results do not depend on it except for rounding."""
     actor_lr: float = 5e-6
     """η_π: learning rate of the actor."""
     critic_lr: float = 1e-4
@@ -166,21 +166,22 @@ class PPOSettings:
     max_grad_norm: float = 1.0
     """Gradients of actor and critic are clipped to this norm separately."""
     kl_stop: float = 0.05
-    """A step of the actor after which KL(old ‖ new) is larger is undone, and the remaining ones of the iteration are left out."""
+    """KL limit: a step of the actor after which KL(old ‖ new) is larger is undone, and the remaining steps of the iteration are
+    skipped."""
     adapt_lr: bool = False
-    """Adapt the actor's learning rate: × 0.5 after an iteration whose first step was undone, × 0.7 where a later one was, × 1.2
-    where none was and the last KL is below kl_stop / 5, up to 10 × actor_lr. false: fixed (paper)."""
+    """Adapt the actor's learning rate: × 0.5 after an iteration whose first step was undone, × 0.7 if a later one was, × 1.2 if
+    none was and the last KL is below kl_stop / 5, up to 10 × actor_lr. false: fixed (paper)."""
     critic_epochs: int = 1
-    """Epochs of the critic alone: its inputs are stored, so they cost little."""
+    """Number of epochs of the critic; its inputs are stored, so that an epoch costs little."""
     critic_warmup: int = 0
-    """First iterations in which only the critic is trained."""
+    """Number of first iterations in which only the critic is trained."""
     privileged_critic: bool = False
-    """The critic also sees the simulator's state; it is discarded after training."""
+    """True: the simulator's state is an input of the critic, which is discarded after training."""
 
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: a number below its range.
+            TaccorlError: a number is out of its range.
         """
         _at_least("ppo", 1, epochs=self.epochs, batch_size=self.batch_size, micro_batch=self.micro_batch)
         _at_least("ppo", 0, actor_lr=self.actor_lr, critic_lr=self.critic_lr)
@@ -197,35 +198,35 @@ class PostTrainSettings:
     env: EnvSettings = field(default_factory=EnvSettings)
     """Task, twin and number of environments."""
     noise: FlowSDESettings = field(default_factory=FlowSDESettings)
-    """Exploration by Flow-SDE."""
+    """Exploration noise by Flow-SDE."""
     ppo: PPOSettings = field(default_factory=PPOSettings)
-    """Advantages, updates, critic."""
+    """Settings of PPO: advantages, updates, critic."""
     anchor: AnchorSettings = field(default_factory=AnchorSettings)
-    """Real data that keeps the policy near its demonstrations."""
+    """Supervised loss on real data, which keeps the policy near its demonstrations."""
     iterations: int = 100
-    """Rollouts, each with its update; of the whole run, also after --resume=true."""
+    """Number of iterations (a rollout and its update) of the whole run, also after --resume=true."""
     seed: int = 0
-    """Seed of scenes, noise and order."""
+    """Seed of scenes, noise and the order of training."""
     out: Path = Path("outputs/post_trained")
-    """Folder of checkpoints and progress.jsonl. It must not exist, or be empty, unless --resume=true."""
+    """Folder of checkpoints and progress.jsonl. It must be empty or not exist, unless --resume=true."""
     resume: bool = False
     """Continue from the last checkpoint in --out."""
     save_freq: int = 10
-    """Iterations between checkpoints."""
+    """Number of iterations between checkpoints."""
     keep_checkpoints: int = 3
-    """The newest that are kept, beside the best; 0: all."""
+    """Number of newest checkpoints that are kept, beside the best one; 0: all."""
     rerun: bool = True
     """After each checkpoint, write the first episode that ends in environment 0 to rollouts/iteration_NNNN.rrd."""
     noise_check: bool = True
     """Before the first iteration, compare success with and without noise, one episode in each environment."""
     collapse_iterations: int = 5
-    """After so many iterations with less than half of the best success: back to the best checkpoint, half the learning rate.
-    0: never."""
+    """Number of iterations with less than half of the best success rate after which training returns to the best checkpoint,
+    with half the learning rate. 0: never."""
 
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: a number below its range.
+            TaccorlError: a number is out of its range.
         """
         for name, least in (("iterations", 1), ("seed", 0), ("save_freq", 1), ("keep_checkpoints", 0)):
             if getattr(self, name) < least:

@@ -1,8 +1,8 @@
 """States from the policy's own episodes in which later episodes start: after each arm's first grasp, before an arm has finished.
 
-Most decisions of an episode are transport, which a policy that was trained on demonstrations knows. Episodes that begin where the
-parts are about to meet have several times as many decisions where it fails. The states are the policy's own, so that they are
-those that it gets into. The newest ones are kept, in a ring.
+Most decisions of an episode are transport, which a policy trained on demonstrations has learned. Episodes that begin shortly
+before the parts meet have several times as many decisions in the phase where the policy fails. The states come from the policy's
+own episodes, so that it really reaches them. The newest ones are kept in a ring buffer.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ class StartStates:
     def __init__(self, share: float, size: int) -> None:
         """
         Args:
-            share: of episodes that begin in such a state, once there are some.
-            size: states that are kept.
+            share: share of episodes that begin in a stored state, once there are some.
+            size: number of states that are kept.
         """
         self._share, self._size = share, size
         self.restart(0)
@@ -41,7 +41,7 @@ class StartStates:
         return len(self._kept)
 
     def see(self, sim: Simulation, window_NLK: np.ndarray, over_N: np.ndarray) -> None:
-        """Store states of environments whose episodes continue, except those in which the goal holds already."""
+        """Store states of environments whose episodes continue, except states in which the goal is reached."""
         if not self._share:
             return
         subtask, counts = sim.judge.subtask, [len(subtasks) for subtasks in sim.task.subtasks().values()]

@@ -1,4 +1,4 @@
-"""Undo the last step of an optimiser: weights and moments of Adam as they were before it.
+"""Undo the last step of an optimiser: restore weights and Adam's moments to the values before it.
 
 Memory: one copy of the trained weights and of both moments, 12 bytes for each float32 weight, on the policy's device: 3.6 GB for
 action expert and touch of the full size (0.3 billion weights), 40 GB for all of it (3.3 billion), 0.14 GB for ``small``.
@@ -21,7 +21,7 @@ class StepUndo:
 
     @torch.no_grad()
     def keep(self) -> None:
-        """Remember weights and moments of now. Memory is allocated once."""
+        """Store the present weights and moments. Memory is allocated once."""
         parameters = self._parameters()
         states = [self._optimizer.state.get(p, {}) for p in parameters]
         if [s.keys() for s in states] != [s.keys() for s in self._states]:  # Adam makes its moments in the first step
@@ -35,7 +35,7 @@ class StepUndo:
 
     @torch.no_grad()
     def restore(self) -> None:
-        """Restore weights and moments of the last ``keep``. Learning rates stay as they are."""
+        """Restore weights and moments of the last ``keep``. Learning rates are not changed."""
         for p, kept, state in zip(self._parameters(), self._weights, self._states, strict=True):
             p.copy_(kept)
             if not state:  # there were no moments yet

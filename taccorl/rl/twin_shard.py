@@ -43,11 +43,11 @@ class ShardActed:
     outcomes: list[str | None]
     later_outcomes: list[str | None]
     num_steps_N: np.ndarray
-    """Control steps that were executed: fewer than n where the episode ended."""
+    """(N,) number of executed control steps: fewer than n if the episode ended."""
     seed_N: np.ndarray
-    """Of the scenes of these episodes."""
+    """(N,) scene seeds of these episodes."""
     partial_N: np.ndarray
-    """How many of the task's goals are reached after the chunk, of each environment."""
+    """(N,) number of the task's goals that are reached after the chunk."""
 
 
 class Shard(Protocol):
@@ -87,10 +87,10 @@ class TwinShard:
     ) -> None:
         """
         Args:
-            envs: with ``AutoresetMode.DISABLED``, and pictures on request if ``images``.
-            history: L.
-            images: observe pictures.
-            privileged: give the simulator's state.
+            envs: environments with ``AutoresetMode.DISABLED``, and pictures on request if ``images``.
+            history: L, length of the touch history.
+            images: observations contain pictures.
+            privileged: observations contain the simulator's state.
             starts: states in which episodes may begin; None: all begin with a reset.
             first: number of the first environment among those of all shards.
         """
@@ -122,7 +122,7 @@ class TwinShard:
 
     @property
     def limit_steps(self) -> int:
-        """Control steps until an episode is cut off."""
+        """Control steps after which an episode ends."""
         return self.envs.sim.judge.limit_steps
 
     def restart(self, seed: int) -> None:
@@ -142,7 +142,7 @@ class TwinShard:
         return ShardSeen(chosen, self._window_NLK[ids], self._privileged_numbers(ids))
 
     def act(self, actions_NHA: np.ndarray) -> ShardActed:
-        """Execute chunks (N, n, A) [rad, m]; reset what ended."""
+        """Execute chunks (N, n, A) [rad, m]; reset environments whose episode ended."""
         chunk = self.envs.step_chunk(actions_NHA)
         facts = self.envs.facts()
         truncated, terminated = chunk.truncated, chunk.terminated
@@ -169,7 +169,7 @@ class TwinShard:
         )
 
     def reset(self, rows_N: np.ndarray) -> None:
-        """Begin the next episode where ``rows_N`` (bool)."""
+        """Begin the next episode in the environments where ``rows_N`` (bool) is true."""
         self._episode_N[rows_N] += 1
         observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": rows_N})
         self._window_NLK[rows_N] = self._repeated(observation[TACTILE_KEY][rows_N])
@@ -199,7 +199,7 @@ class TwinShard:
         return np.nan_to_num(numbers[ids], nan=0.0, posinf=0.0, neginf=0.0)  # of a diverged simulation
 
     def state_dict(self) -> dict[str, Any]:
-        """State from which a run continues bit for bit; between two calls of ``act`` no episode is finished."""
+        """State from which a run continues bit for bit; no episode may end between two calls of ``act``."""
         snapshot = self.envs.sim.snapshot()
         fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
         return {
@@ -215,7 +215,7 @@ class TwinShard:
         """Restore a state from ``state_dict``.
 
         Raises:
-            TaccorlError: of another number of environments, task, difficulty, twin or randomisation.
+            TaccorlError: the state is of another number of environments, task, difficulty, twin or randomisation.
         """
         if len(state["episode"]) != self.num_envs:
             raise TaccorlError(

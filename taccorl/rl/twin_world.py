@@ -36,7 +36,7 @@ def needs_images(config: Any) -> bool:
 
 
 class TwinWorld:
-    """A ``World`` of one task."""
+    """``World`` of one task in the twin."""
 
     def __init__(
         self,
@@ -49,7 +49,8 @@ class TwinWorld:
     ) -> None:
         """
         Args:
-            shards: alike but for their sizes, numbered through; with pictures if the policy has cameras.
+            shards: shards with equal settings except for their sizes, and consecutive numbers of environments; with pictures if
+                the policy has cameras.
             config: ``TactilePI05Config`` of the policy.
 
         Raises:
@@ -78,7 +79,7 @@ class TwinWorld:
 
     @property
     def limit_steps(self) -> int:
-        """Control steps until an episode is cut off."""
+        """Control steps after which an episode ends."""
         return self.shards[0].limit_steps
 
     @property
@@ -153,14 +154,14 @@ class TwinWorld:
         return Seen(batch, torch.from_numpy(privileged_NP).float().to(self._device))
 
     def state_dict(self) -> dict[str, Any]:
-        """State from which a run continues bit for bit; between two calls of ``act`` no episode is finished."""
+        """State from which a run continues bit for bit; no episode may end between two calls of ``act``."""
         return {"shards": self._each(lambda shard, *_: shard.state_dict()), "watch": copy.deepcopy(vars(self.watch))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from ``state_dict``.
 
         Raises:
-            TaccorlError: of another number of environments or shards, task, difficulty, twin or randomisation.
+            TaccorlError: the state is of another number of environments or shards, task, difficulty, twin or randomisation.
         """
         if "shards" not in state:
             raise TaccorlError(
@@ -179,7 +180,8 @@ class TwinWorld:
     def close(self) -> None:
         """Close all environments.
 
-        Those of this process are closed in the thread that rendered their pictures: an OpenGL context works in one thread only.
+        Environments of this process are closed in the thread that rendered their pictures, because an OpenGL context works in
+        one thread only.
         """
         if all(isinstance(shard, RemoteShard) for shard in self.shards):  # also while a thread waits for one of them
             for shard in self.shards:

@@ -1,7 +1,7 @@
 """Episodes of environment 0 of the rollouts for Rerun, with the critic's values.
 
-A rollout keeps only seed, actions and values. They are executed again apart from it, bit for bit, so that it costs the rollout
-nothing and changes none of its random numbers.
+A rollout keeps only seed, actions and values. They are executed again separately, bit for bit, so that watching costs the
+rollout nothing and does not change its random numbers.
 
 Letters in shapes: n executed actions of a decision, A action, T control steps.
 """
@@ -29,13 +29,13 @@ class WatchedEpisode:
     """Seed, actions and critic values of one finished episode of environment 0."""
 
     seed: int
-    """Of the scene."""
+    """Scene seed of the episode."""
     outcome: str
     partial: int
-    """Goals in place at the end."""
+    """Number of goals in place at the end."""
     actions_TA: np.ndarray
     values_T: np.ndarray
-    """V of the decision that a control step belongs to; NaN where no rollout was collected (``env.stagger``)."""
+    """Value V of the decision that each control step belongs to; NaN if no rollout was collected (``env.stagger``)."""
 
 
 @dataclass
@@ -73,12 +73,12 @@ def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, imag
     """Execute a watched episode again; returns its rows with the feature ``rl.value``.
 
     Args:
-        scenes: of the rollout; those with another seed than the episode's do not matter.
-        policy: its name in the episode.
+        scenes: settings of the rollout's scenes; only the scene with the episode's seed is used.
+        policy: name of the policy, for the episode's title.
         images: render the cameras.
 
     Raises:
-        TaccorlError: executed again the episode ends otherwise.
+        TaccorlError: the repeated episode has another outcome.
     """
     row = EpisodeRow(
         policy=policy,

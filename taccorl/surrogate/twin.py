@@ -21,13 +21,14 @@ GRAVITY_SHARE = (0.85, 1.1)
 DELAY_S = (0.005, 0.02)
 GAIN_LOG_STD = (0.1, 0.2)
 GAIN_RATIO = (0.85, 1.15)
-"""Counts for a reading of 1, over the nominal pads'."""
+"""Range of the factor on the nominal pads' counts per reading of 1."""
 CAMERA_TURN_RAD, CAMERA_SHIFT_M = 0.02, 0.01
-"""Standard deviations about and along each axis: a bracket screwed on by hand."""
+"""Standard deviations of camera rotations about, and of translations along, each axis [rad, m]: those of a bracket mounted by
+hand."""
 
 
 def draw_surrogate_twin(secret: int) -> TwinConfig:
-    """Draw a surrogate robot: another one for each ``secret``. Ranges are choices around the effects' typical values.
+    """Draw a surrogate robot: each ``secret`` gives another one. Ranges are choices around the effects' typical values.
 
     Raises:
         TaccorlError: the secret is negative.

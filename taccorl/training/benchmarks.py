@@ -21,7 +21,7 @@ CACHED_PX, CACHED_BATCH = 112, 128
 
 @benchmark("loading")
 def loading_speed() -> Iterator[Row]:
-    """Rows a second out of two worker processes, taccorl's reader beside LeRobot's own on the same dataset."""
+    """Benchmark of rows per second from two worker processes: taccorl's reader relative to LeRobot's on the same dataset."""
     from lerobot.datasets.dataset_reader import DatasetReader
 
     from taccorl.training.reading import FastReader

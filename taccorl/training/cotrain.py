@@ -38,15 +38,15 @@ class Part:
     episodes: int
     rows: int
     origins: tuple[str, ...]
-    """What its episodes say they are from, such as a surrogate robot; empty: they do not say."""
+    """Origins that its episodes state, such as a surrogate robot; empty: none is stated."""
 
 
 def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) -> list[Part]:
-    """Run ``merge_domains`` as a stage: its result is stored and shown by ``taccorl lineage explain``.
+    """Run ``merge_domains`` as a stage: its result is kept in the store, and ``taccorl lineage explain`` shows it.
 
     Raises:
         DatasetError: as ``merge_domains``.
-        LineageError: a dataset's numbers or pictures are not those that it was written with.
+        LineageError: numbers or pictures of a dataset were changed after it was written.
         InTheWayError: ``out`` holds something else.
     """
     check_domains(real, sim)
@@ -99,16 +99,16 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
     """Merge datasets of both domains into one at ``out``, with their common features and ``observation.is_sim``.
 
     A simulator's own columns (``sim.*``) and optional features that not all of them hold are left out. Statistics are computed
-    anew over all rows: LeRobot 0.6.1 takes the mean of the datasets' quantiles, which is no quantile of theirs together.
+    anew over all rows: LeRobot 0.6.1 averages the datasets' quantiles, which is not the quantile of all rows.
 
     Args:
         real: datasets of the robot, or of a surrogate that stands for it.
         sim: datasets of the twin.
 
     Raises:
-        DatasetError: none given, or they differ in a feature, fps or robot, or are merged already; one does not state its
-            action_time, so that its actions may be a row apart from the others'; episodes that say that they come from the
-            twin are given as real.
+        DatasetError: no dataset is given; they differ in a feature, fps or robot; one is merged already; one does not state its
+            action_time, so that its actions may be shifted by a row; or episodes that state the twin as their origin are given
+            as real.
         InTheWayError: something is at ``out``.
     """
     if not is_free(out):

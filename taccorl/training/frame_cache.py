@@ -32,9 +32,9 @@ from taccorl.lineage.store import Store
 Place = Literal["none", "disk", "host", "gpu"]
 PLACES: tuple[Place, ...] = get_args(Place)
 SHARE_OF_FREE = 0.8
-"""Of the memory that is free, so much may be taken: training wants some, too."""
+"""Largest share of the free memory that the cache takes; training needs the rest."""
 AT_ONCE = 64
-"""Frames that are resized together."""
+"""Number of frames that are resized together."""
 _log = logging.getLogger(__name__)
 
 
@@ -44,7 +44,7 @@ class CacheRequest:
 
     place: Place
     resolution: tuple[int, int] | None
-    """Rows and columns; None: as the dataset has them."""
+    """Rows and columns of cached frames; None: as in the dataset."""
     store: Path
     device: str
     """Torch device of the policy: ``cpu``, ``cuda`` or ``cuda:0``."""
@@ -96,7 +96,7 @@ def frames_file(folder: Path, key: str) -> Path:
 
 
 def empty_frames(folder: Path, key: str, num_rows: int, resolution: tuple[int, int]) -> np.memmap:
-    """Create that file, filled with zeros, as a writable memory map."""
+    """Create a camera's file of frames, filled with zeros, as a writable memory map."""
     shape = (num_rows, 3, *resolution)
     return np.lib.format.open_memmap(frames_file(folder, key), mode="w+", dtype=np.uint8, shape=shape)
 
@@ -165,9 +165,9 @@ class Frames:
 
     Args:
         arrays: camera → (N, 3, rows, columns) uint8.
-        numbers_bytes: what the dataset's numbers take beside them.
+        numbers_bytes: memory that the dataset's numbers take beside the frames.
 
-    What does not fit on the GPU is held in memory, what does not fit there stays on disk; the log says so.
+    Frames that do not fit on the GPU are held in main memory, and on disk if they do not fit there; the log states it.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], place: Place, device: str, numbers_bytes: int = 0) -> None:
@@ -185,7 +185,7 @@ class Frames:
             self.tensors[key] = held
 
     def rows(self, rows_B: Tensor) -> dict[str, Tensor]:
-        """Camera → (B, 3, rows, columns) uint8 of the dataset's rows."""
+        """Camera → (B, 3, rows, columns) uint8 frames of these rows of the dataset."""
         return {key: frames[rows_B] for key, frames in self.tensors.items()}
 
 
@@ -193,7 +193,7 @@ def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_r
     """Open the frames of the dataset at ``root``; they are decoded if they are not in the store.
 
     Raises:
-        DatasetError: damaged videos, or frames of another number than the dataset has rows.
+        DatasetError: a video is damaged, or the number of frames differs from that of rows.
     """
     arrays: dict[str, np.ndarray] = {}
     if cameras:

@@ -11,22 +11,22 @@ from taccorl.errors import DatasetError
 from taccorl.lineage.manifest import read_manifest
 
 FIRST_SEED = 1000
-"""Of the episodes that lerobot-eval scores: its default. The next one has the next."""
+"""Seed of the first episode that lerobot-eval scores (its default); each further episode has the next seed."""
 
 
 class Training:
     """One run of lerobot-train.
 
-    Its folder's name depends on data, recipe and options, so that other settings never use this run's policy.
+    The name of its folder depends on data, recipe and options, so that a run with other settings never uses its policy.
     """
 
     def __init__(self, recipe: Path, dataset: Path, words: Sequence[str], out: Path) -> None:
         """
         Args:
-            recipe: a file for ``--config_path``, such as those of configs/cotrain.
-            dataset: made by ``taccorl merge``.
-            words: more options, which count more than the recipe.
-            out: the run's folder lies in it.
+            recipe: file for ``--config_path``, such as those in configs/cotrain.
+            dataset: dataset written by ``taccorl merge``.
+            words: further options, which override the recipe.
+            out: parent folder of the run's folder.
 
         Raises:
             DatasetError: the dataset was not published by a taccorl verb.
@@ -40,7 +40,7 @@ class Training:
 
     @property
     def policy(self) -> Path:
-        """The last checkpoint, for ``--policy.path``."""
+        """Folder of the last checkpoint, for ``--policy.path``."""
         return self.folder / "checkpoints/last/pretrained_model"
 
     @property
@@ -74,7 +74,7 @@ class Scoring:
     def __init__(self, training: Training, words: Sequence[str], episodes: int) -> None:
         """
         Args:
-            words: options that say where: ``--env.task=…``, ``--env.twin=…``.
+            words: options of the environment: ``--env.task=…``, ``--env.twin=…``.
         """
         self._words = [*words, f"--eval.n_episodes={episodes}", f"--eval.batch_size={min(episodes, 10)}"]
         self._policy, key = training.policy, sha256("\n".join([*self._words, str(training.steps)]).encode()).hexdigest()

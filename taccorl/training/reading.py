@@ -2,10 +2,10 @@
 
 LeRobot 0.6.1 makes Python lists of every column of every row that a window or an action chunk names (dataset_reader.py,
 ``_query_hf_dataset``), opens a video anew for every picture where torchcodec finds no FFmpeg (video_utils.py), and gives a
-window to all observations or to none (factory.py, ``resolve_delta_timestamps``). Here rows are read out of the Arrow columns
-that are wanted, videos stay open, and a policy's ``window_delta_indices`` names the features that get a window. What comes out
-is the same, to the bit and the type; tests compare. With ``--dataset.cache=gpu|host|disk`` whole batches are gathered from
-numbers and decoded frames (``frame_cache``) instead of row by row.
+window to all observations or to none (factory.py, ``resolve_delta_timestamps``). Here rows are read from the requested Arrow
+columns, videos stay open, and a policy's ``window_delta_indices`` names the features that get a window. The result has the same
+bits and types; tests compare them. With ``--dataset.cache=gpu|host|disk`` whole batches are gathered from numbers and decoded
+frames (``frame_cache``) instead of row by row.
 
 With ``TACCORL_NO_PATCH=1``, or with a version of LeRobot other than the tested one, LeRobot is not changed.
 """
@@ -42,12 +42,13 @@ from taccorl.training.video_backend import default_video_backend
 
 COMPARED_VERSION = "0.6.1"
 OPEN_VIDEOS = 16
-"""Video files that a process keeps open, each with a decoder of a few MB."""
+"""Most video files that a process keeps open; the decoder of each takes a few MB."""
 _log = logging.getLogger(__name__)
 
 
 def install() -> bool:
-    """Let LeRobot make its datasets with ``FastReader``; once, however often it is called. False: not changed."""
+    """Make LeRobot create its datasets with ``FastReader``. Further calls change nothing. Returns False if LeRobot was not
+    changed."""
     from lerobot.datasets import factory, lerobot_dataset, video_utils
 
     if os.environ.get("TACCORL_NO_PATCH") == "1":
@@ -82,8 +83,8 @@ def install() -> bool:
 
 
 def add_cache_options() -> None:
-    """``--dataset.cache`` and ``--dataset.cache_store`` among LeRobot's options of a dataset; the default of
-    ``--dataset.video_backend`` is ``default_video_backend``."""
+    """Add ``--dataset.cache`` and ``--dataset.cache_store`` to LeRobot's options of a dataset; the default of
+    ``--dataset.video_backend`` becomes ``default_video_backend``."""
     if "cache" in {f.name for f in dataclasses.fields(DatasetConfig)}:
         return
     # none, disk, host or gpu: decode every frame once, at the policy's resolution, and gather whole batches.
@@ -99,7 +100,7 @@ def add_cache_options() -> None:
 
 
 _requested: CacheRequest | None = None
-"""Of the training that is being made: LeRobot hands its readers nothing of its dataset's options."""
+"""Request of the training that is being created, stored here because LeRobot passes no options of a dataset to its readers."""
 
 
 _reads_pictures = True
@@ -107,7 +108,7 @@ _reads_pictures = True
 
 
 def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """LeRobot's ``make_dataset`` with the reader set up for ``--dataset.cache``."""
+    """LeRobot's ``make_dataset``, with the reader set up for ``--dataset.cache``."""
 
     def make_with_cache(cfg: Any) -> Any:
         global _requested, _reads_pictures
@@ -122,10 +123,10 @@ def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def cache_request(cfg: Any) -> CacheRequest | None:
-    """Cache request of a training's options.
+    """Cache request from the options of a training.
 
     Raises:
-        TaccorlError: no such place, or options that go with no cache.
+        TaccorlError: there is no such place, or another option cannot be combined with a cache.
     """
     if getattr(cfg.dataset, "cache", "none") == "none":
         return None
@@ -147,7 +148,7 @@ def cache_request(cfg: Any) -> CacheRequest | None:
 
 
 class WholeBatch(dict):
-    """A batch as LeRobot's loader gives it, already collated."""
+    """A collated batch, as LeRobot's loader returns it."""
 
     def pin_memory(self) -> "WholeBatch":
         """Pin the tensors that are on the CPU."""
@@ -156,14 +157,14 @@ class WholeBatch(dict):
 
 
 def whole_batch(dataset: Any, rows: list[int]) -> list[Any]:
-    """``LeRobotDataset.__getitems__``: one ``WholeBatch`` where frames are cached, else row by row."""
+    """Replacement for ``LeRobotDataset.__getitems__``: one ``WholeBatch`` if frames are cached, else row by row."""
     dataset.hf_dataset  # loads it  # noqa: B018
     batch = dataset.reader.batch(rows) if isinstance(dataset.reader, FastReader) else None
     return [dataset[row] for row in rows] if batch is None else [batch]
 
 
 def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Callable[[Any, Any], dict[str, list] | None]:
-    """LeRobot's ``resolve_delta_timestamps``, to which a policy's ``window_delta_indices`` (feature → rows) are added."""
+    """LeRobot's ``resolve_delta_timestamps``, extended by a policy's ``window_delta_indices`` (feature → rows)."""
 
     def resolve_with_windows(cfg: Any, ds_meta: Any) -> dict[str, list] | None:
         deltas = Deltas(resolve(cfg, ds_meta) or {})
@@ -181,7 +182,8 @@ def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Calla
 
 
 def streamed(make: Callable[..., Any]) -> Callable[..., Any]:
-    """LeRobot's ``StreamingLeRobotDataset``, which no reader of ours is in: says what its statistics of relative actions are."""
+    """LeRobot's ``StreamingLeRobotDataset``, which does not use our reader, with a warning about its statistics of relative
+    actions."""
 
     def make_streamed(*args: Any, **kwargs: Any) -> Any:
         if any(isinstance(v, Deltas) and v.relative_actions for v in (*args, *kwargs.values())):
@@ -198,19 +200,19 @@ def streamed(make: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Deltas(dict):
-    """LeRobot's ``delta_timestamps``, which come to the reader as they are."""
+    """LeRobot's ``delta_timestamps``, passed to the reader unchanged, with the actions that are relative."""
 
     relative_actions: list[bool] | None = None
-    """Of each number of an action whether the policy learns it relative to the state; None: all as they are."""
+    """For each element of an action: whether the policy learns it relative to the state. None: none is relative."""
 
 
 class Column:
-    """One column of a table as NumPy views of its pieces: nothing is copied before a row is asked for."""
+    """One column of a table as NumPy views of its Arrow chunks; nothing is copied before a row is requested."""
 
     def __init__(self, column: pa.ChunkedArray) -> None:
         """
         Raises:
-            TypeError: no numbers, or some are missing.
+            TypeError: the column does not hold numbers, or some are missing.
         """
         kind = column.type
         size = 1
@@ -232,7 +234,8 @@ class Column:
         self.kind = torch.int64 if pa.types.is_integer(kind) else torch.float32
 
     def stored(self, rows: list[int]) -> Tensor:
-        """(len(rows), *shape), in as many bytes as the file has them: int16 touch is a quarter of what ``rows`` gives."""
+        """Values of these rows, (len(rows), *shape), in the file's data type: int16 touch needs a quarter of the memory of
+        ``rows``."""
         pieces = np.concatenate(self._pieces) if self._pieces else np.empty((0, 1))
         if pieces.dtype.kind == "f" and pieces.itemsize > 4:
             pieces = pieces.astype(np.float32)
@@ -259,7 +262,8 @@ def _warn_unverified(root: Path) -> None:
 
 
 class FastReader(DatasetReader):
-    """LeRobot's reader, replaced by a faster one for datasets of numbers and colour videos; others are read by LeRobot."""
+    """LeRobot's reader, replaced by a faster one for datasets of numbers and colour videos; other datasets are read by
+    LeRobot."""
 
     _columns: dict[str, Column] | None = None
     _gathered: "Gathered | None" = None
@@ -269,7 +273,7 @@ class FastReader(DatasetReader):
         _warn_unverified(Path(self.root))
         self._cache = _requested
         self.cameras: list[str] = self._meta.video_keys if _reads_pictures else []
-        """Whose pictures are read."""
+        """Cameras whose pictures are read."""
         cameras = self._meta.video_keys
         self._has_videos = all(f"videos/{key}/file_index" in self._meta.episodes.column_names for key in cameras)  # pyright: ignore
         if not self._has_videos:
@@ -336,7 +340,7 @@ class FastReader(DatasetReader):
         return statistics | {name: np.ascontiguousarray(statistics[name].T) for name in STEP_STATISTICS}
 
     def columns(self) -> dict[str, Column]:
-        """Feature → its column; empty: a dataset that is left to LeRobot."""
+        """Feature → its column; empty for a dataset that LeRobot reads."""
         if self._columns is None:
             dataset, features = self.hf_dataset, self._meta.features
             assert dataset is not None, "LeRobot loads the table before it reads rows"
@@ -348,11 +352,10 @@ class FastReader(DatasetReader):
         return self._columns
 
     def batch(self, rows: list[int]) -> "WholeBatch | None":
-        """The rows of a batch at once, as collating ``get_item`` of each would give them; None: no cache, or not for this
-        dataset.
+        """A whole batch of rows, equal to the collated results of ``get_item``; None if frames are not cached.
 
         Raises:
-            DatasetError: see ``open_frames``.
+            DatasetError: as ``open_frames``.
         """
         if self._cache is None:
             return None
@@ -425,12 +428,12 @@ class FastReader(DatasetReader):
 
 
 class Gathered:
-    """A dataset's numbers as tensors beside its cached frames: a batch is a few gathers on one device."""
+    """A dataset's numbers as tensors beside its cached frames: a batch is a few gather operations on one device."""
 
     def __init__(self, reader: FastReader, columns: dict[str, Column], request: CacheRequest) -> None:
         """
         Raises:
-            DatasetError: see ``open_frames``.
+            DatasetError: as ``open_frames``.
         """
         meta: Any = reader._meta
         assert reader.hf_dataset is not None and meta.tasks is not None, "LeRobot loads table and tasks first"
@@ -454,7 +457,7 @@ class Gathered:
         self.task_index = numbers["task_index"].reshape(-1).tolist()
 
     def batch(self, rows: list[int]) -> WholeBatch:
-        """B rows: key → (B, …), ``task`` a list of B sentences."""
+        """Batch of B rows: key → (B, …), ``task`` → list of B instructions."""
         rows_B = torch.tensor(rows, device=self.frames.device)
         found: dict[str, Any] = {}
         for key, numbers in self.numbers.items():
@@ -473,14 +476,14 @@ class Gathered:
 
 
 class OpenVideos(threading.local):
-    """Videos that stay open between pictures; each thread and each process has its own."""
+    """Video files that stay open between pictures, per thread and process."""
 
     def __init__(self) -> None:
         self._process = os.getpid()
         self._open: OrderedDict[Path, InputContainer] = OrderedDict()
 
     def picture(self, path: Path, time_s: float, tolerance_s: float) -> Tensor | None:
-        """Frame nearest to ``time_s``, (3, rows, columns) uint8; None if none is within the tolerance."""
+        """Frame nearest to ``time_s`` [s], (3, rows, columns) uint8; None if there is none within the tolerance."""
         nearest, distance_s = None, tolerance_s
         for frame, frame_s in self._frames(path, time_s):
             if abs(frame_s - time_s) < distance_s:

@@ -1,9 +1,9 @@
-"""Render frames for training from a dataset's simulator states into the cache, without any video.
+"""Render frames for training from a dataset's simulator states into the frame cache, without any video.
 
 The artefact is that of ``frame_cache``: the same stage, key and files, so that ``lerobot-train --dataset.cache=…`` finds it. Each
 worker renders the cameras of whole episodes at the size of the dataset's pictures, resizes them as the policy does, and writes
-the rows of these episodes into the memory-mapped arrays. An episode whose frames are in the store already, as one of another
-dataset, is copied: demonstrations are rendered once, however often corrections join them.
+the rows of these episodes into the memory-mapped arrays. Frames that the store already has for another dataset are copied:
+demonstrations are rendered once, even if corrections are added later.
 """
 
 import functools
@@ -38,13 +38,14 @@ def render_frames(
     engine: Engine,
     progress: Callable[[str], None] = print,
 ) -> tuple[Artefact, dict[str, float]]:
-    """The artefact of frames of the dataset at ``root``, and the mean seconds of an episode; from the store if it is there.
+    """Render the frames of the dataset at ``root``, unless they are in the store. Returns the artefact, and the mean time per
+    episode [s].
 
     Args:
-        resolution: rows and columns; None: as the dataset has them.
+        resolution: rows and columns; None: as in the dataset.
 
     Raises:
-        DatasetError: no simulator states, or no cameras.
+        DatasetError: the dataset has no simulator states, or no cameras.
     """
     seconds: list[dict[str, float]] = []
 

@@ -1,7 +1,6 @@
-"""PyAV as the decoder of LeRobot's videos where torchcodec cannot be loaded.
-
-LeRobot 0.6.1 chooses so, too (import_utils.py, ``get_safe_default_video_backend``), but prints about 180 lines each time that it
-asks: two tracebacks for each version of FFmpeg that torchcodec did not find.
+"""Choose PyAV as the decoder of LeRobot's videos if torchcodec cannot be loaded. LeRobot 0.6.1 makes the same choice
+(import_utils.py, ``get_safe_default_video_backend``), but prints about 180 lines each time: two tracebacks for each version of
+FFmpeg that torchcodec did not find.
 """
 
 import functools
@@ -11,7 +10,7 @@ import importlib.util
 
 @functools.cache
 def default_video_backend() -> str:
-    """``torchcodec``, or ``pyav`` where that is not installed or finds no FFmpeg."""
+    """Name of the video decoder: ``torchcodec``, or ``pyav`` if torchcodec is not installed or finds no FFmpeg."""
     if importlib.util.find_spec("torchcodec") is None:
         return "pyav"
     try:

@@ -15,7 +15,7 @@ REPEATS = 5
 
 @benchmark("one_episode")
 def one_episode() -> Iterator[Row]:
-    """Cost to check a stand-in episode of 720 rows and to write it for Rerun."""
+    """Benchmark of the cost of checking a stand-in episode of 720 rows and of writing it for Rerun."""
     from taccorl.data.checks import check_episode
     from taccorl.data.cutting import open_episodes
     from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap

@@ -16,14 +16,14 @@ FIGURE_NAME = "arms (schematic): joints in the plots' colours"
 PAD_GAP_TAXELS = 3.0
 MOST_IN_A_ROW, MOST_ROWS = 3, 6
 EYE_SIZES, EYE_M = 1.1, 1.15
-"""The eye's distance from the figure: in sizes of the figure, and at least so far (m)."""
+"""Distance of the viewer's eye from the figure: multiples of the figure's size, and the least distance [m]."""
 
 
 def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blueprint:
     """Blueprint with a view for each kind of data in the episode.
 
     Args:
-        at_s: stand still at this time (for pictures); None: play from the start.
+        at_s: time at which the view stops (for pictures) [s]; None: it plays from the start.
     """
     pads = pads_of(episode)
     parts = [part for part in (_space(episode, pads), _over_time(episode, pads)) if part is not None]
@@ -37,7 +37,7 @@ def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blu
 
 
 def time_panel(at_s: float | None) -> rrb.TimePanel:
-    """Play from the start, or stand still at ``at_s``."""
+    """Time panel that plays from the start, or stops at ``at_s`` [s]."""
     if at_s is None:
         return rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="all")
     # A blueprint cannot set the cursor. A loop one nanosecond long, reached in the first frame, holds it there.
@@ -74,7 +74,7 @@ def figure_view(episode: Episode, root: str, name: str, away: float = 1.0) -> rr
     """The arms below entity ``root``, seen from the front right, near enough that arms and tool paths fill the view.
 
     Args:
-        away: factor of the eye's distance; a narrow view needs more.
+        away: factor on the eye's distance; a narrow view needs a larger one.
     """
     points = np.concatenate([*tool_paths(episode).values(), list(BASE_POS_WORLD.values())])
     low, high = points.min(axis=0), points.max(axis=0) + np.array([0, 0, 0.3])  # elbows rise above the bases
@@ -110,7 +110,7 @@ def _heatmaps(pads: list[Pad]) -> rrb.Spatial2DView:
 
 
 def heatmap_places(pads: list[Pad]) -> dict[str, float]:
-    """Pad name (and ``scale``) → its left edge (taxels)."""
+    """Pad name (and ``scale``) → position of its left edge, in taxels."""
     places, x = {}, 0.0
     for pad in pads:
         places[pad.name] = x
@@ -163,7 +163,7 @@ def _joint_plots(episode: Episode) -> list[rrb.TimeSeriesView]:
 
 
 def plot(title: str, contents: list[str], legend: rrb.Corner2D | None) -> rrb.TimeSeriesView:
-    """Curves over the time that all views share; without a legend if it has no corner."""
+    """View of curves over time, on the common time axis; without a legend if no corner is given."""
     return rrb.TimeSeriesView(
         origin="/",
         contents=contents,

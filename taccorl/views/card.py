@@ -1,7 +1,7 @@
 """Dataset card: ``README.md`` beside ``meta/``, in the form that the Hugging Face Hub shows, with pictures in ``.card/``.
 
-It states what the dataset's own files state: origin, features with units, size, coverage, checks. What nobody stated, such as a
-licence, is not filled in. A card is no data: it is in no digest, and its owner may edit it.
+It states facts from the dataset's own files: origin, features with units, size, coverage, checks. Missing facts, such as a
+licence, are not filled in. The card belongs to no digest, and its owner may edit it.
 """
 
 import itertools
@@ -33,15 +33,15 @@ SHEET_WIDTH_PX = 1200
 LABEL_PX, BARS_PX, MAP_PX, ROW_PX, GAP_PX = 150, 380, 104, 24, 20
 LIGHT_BAR = (191, 205, 224)
 ORIGIN_TAGS = {"surrogate": "surrogate", "MuJoCo": "simulated", "simulated": "simulated"}
-"""First word of an origin → tag. No origin says that data is a robot's: nobody can check that here."""
+"""First word of an origin → tag of the card. No origin is tagged as a robot's, because that cannot be checked."""
 MOST_INSTRUCTIONS = 8
 
 
 def write_card(root: Path) -> Path | None:
-    """Write the card of the dataset at ``root``; returns its path, or None if there is a README.md already: it is left alone.
+    """Write the card of the dataset at ``root``; returns its path, or None if there is a README.md, which is not changed.
 
     Raises:
-        DatasetError: no LeRobot dataset, or not a whole one.
+        DatasetError: it is not a complete LeRobot dataset.
         OSError: the folder cannot be written.
     """
     path, temp = root / CARD, root / PICTURES / CARD
@@ -289,10 +289,11 @@ def _pictures(dataset: Dataset) -> Iterator[tuple[str, Image.Image]]:
 
 
 def draw_coverage(spec: DatasetSpec, stats: dict[str, dict[str, list[float]]]) -> Image.Image | None:
-    """Ranges of the state within its limits, and the 99 % quantile of every taxel's counts; None if there is neither.
+    """Draw the ranges of the state within its limits, and the 99 % quantile of every taxel's counts; None if the dataset has
+    neither.
 
     Args:
-        stats: LeRobot's ``meta/stats.json``, over all rows.
+        stats: content of LeRobot's ``meta/stats.json``, over all rows.
     """
     ranges, maps = state_ranges(spec, stats), pad_maps(spec, stats)
     if not ranges and not maps:
@@ -354,7 +355,7 @@ def state_ranges(spec: DatasetSpec, stats: dict[str, dict[str, list[float]]]) ->
 
 
 def pad_maps(spec: DatasetSpec, stats: dict[str, dict[str, list[float]]]) -> dict[str, np.ndarray]:
-    """Pad → (rows, columns) 99 % quantile of its counts, of the newest readings."""
+    """Pad → (rows, columns) 99 % quantile of its counts, from the newest reading of each row."""
     maps: dict[str, np.ndarray] = {}
     for key in sorted(spec.keys("tactile"), key=lambda k: spec.features[k].history):
         feature, sensor = spec.features[key], spec.sensors[key]

@@ -21,16 +21,16 @@ LINE_COLORS = (
 PAD_COLORS = ((86, 180, 233), (0, 190, 140), (230, 159, 0), (214, 140, 190))
 ARM_COLORS = {"left": (96, 165, 250), "right": (251, 146, 60)}
 PAIR_COLORS = ((235, 235, 235), (240, 90, 190))
-"""Of two episodes side by side: white and magenta, because blue and orange are the arms."""
+"""Colours of two episodes side by side: white and magenta, because blue and orange are the arms' colours."""
 NOISE_COLOR = (148, 163, 184)
 CONTACT_COLOR = (220, 38, 38)
 GROUND_COLOR = (15, 23, 42)
 HEATMAP = "turbo"
-"""Rerun's name of the heatmaps' colour map: low counts stay visible on a scale that covers all the sensor can say."""
+"""Rerun's name of the colour map for heatmaps. Low counts stay visible on a scale for the sensor's whole range."""
 
 
 def heat(share: np.ndarray) -> np.ndarray:
-    """(…, 3) uint8 RGB of the heatmaps' colour map; 0 … 1, beyond is the end's colour."""
+    """Colours (…, 3) uint8 RGB of the heatmaps' colour map for values 0 … 1; values outside get the end's colour."""
     level = (255 * np.clip(np.asarray(share, dtype=float), 0.0, 1.0)).astype(np.uint8)
     return _heat_table()[level]
 

@@ -25,22 +25,22 @@ from taccorl.views.rrd import recording_to
 
 COMMAND_COLOR, MEASURED_COLOR = (120, 130, 145), (235, 235, 235)
 TWIN_COLORS = ((230, 120, 40), (86, 180, 233))
-"""Before, after: the orange and blue of the report's figures, on dark ground."""
+"""Colours of the twin before and after a change: orange and blue as in the report's figures, for a dark background."""
 TWIN_NAMES = ("twin", "mended")
 FIRST_USES = ("validation", "test", "fit")
 PAD_GAP_TAXELS = 3
 MOST_ROWS = 5
-"""Recordings in one tab."""
+"""Most recordings in one tab."""
 
 
 def save_comparison(comparison: Comparison, rrd: Path, after: Comparison | None = None) -> None:
     """Write all compared signals and the layout of their views as one .rrd file.
 
     Args:
-        after: another twin on the same recordings.
+        after: comparison of a second twin on the same recordings.
 
     Raises:
-        OutputError: ``rrd`` is somebody else's file, or the disk is full.
+        OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full.
     """
     check_free(rrd)
     with replacing(rrd) as part, recording_to(part, comparison_blueprint(comparison)) as rec:
@@ -55,7 +55,7 @@ def save_comparison(comparison: Comparison, rrd: Path, after: Comparison | None 
 
 
 def comparison_blueprint(comparison: Comparison) -> rrb.Blueprint:
-    """One tab a signal; touch and provenance last."""
+    """Layout with one tab per signal; touch and provenance are last."""
     tabs: list[rrb.Container | rrb.View] = []
     for signal, kind in comparison.signals:
         traces = sorted(comparison.of(signal, kind), key=lambda t: FIRST_USES.index(t.use))

@@ -53,14 +53,14 @@ class Line:
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of the elements on the sheet, for tests."""
+    """Positions of the elements on the sheet [pixels], for tests."""
 
     instants: tuple[int, ...]
-    """Rows of the episode."""
+    """Rows of the episode that are shown."""
     cells: dict[tuple[int, str], tuple[int, int, int, int]]
-    """(instant's number, camera or pad name) → left, top, right, bottom."""
+    """(index of the instant, camera or pad name) → left, top, right, bottom."""
     plots: dict[str, tuple[int, int, int, int]]
-    """Title → the same."""
+    """Title of a plot → left, top, right, bottom."""
     size: tuple[int, int]
 
 
@@ -72,7 +72,8 @@ def contact_sheet(episode: Episode, path: Path) -> Layout:
 
 
 def choose_instants(episode: Episode, num: int = NUM_INSTANTS) -> tuple[int, ...]:
-    """Rows spread evenly from first to last; the one nearest to the strongest touch gives way to it."""
+    """Rows spread evenly from first to last; the one nearest to the strongest touch is replaced by the row of the strongest
+    touch."""
     rows = np.unique(np.linspace(0, episode.num_rows - 1, min(num, episode.num_rows)).round().astype(int))
     pads = pads_of(episode)
     if pads and len(rows) > 2:
@@ -327,7 +328,7 @@ def _draw_time_axis(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout)
 
 
 def nice_ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Round numbers for an axis, at most ``most``: the first at or below ``low``, the last at or above ``high``."""
+    """Round numbers for an axis, at most ``most`` of them: the first at or below ``low``, the last at or above ``high``."""
     for exponent in range(math.floor(math.log10(high - low)) - 1, 300):
         for step in (1.0, 2.0, 5.0):
             size = step * 10.0**exponent

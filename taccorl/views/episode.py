@@ -6,7 +6,7 @@
     /touch/{sum,peak,active}/<pad>, /touch/…/<line>
     /events/{contact_gate,outcome,stage}
     /figure                          the arms in 3-D
-    /provenance                      what it is, where it is from, how its samples met its rows
+    /provenance                      description, origin, and timing of its samples
 
 Time lines: ``time`` (seconds since row 0) and ``frame_index``. ``blueprint.py`` arranges the views.
 """
@@ -44,12 +44,12 @@ def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = Fa
     """Log all data of the episode; missing features are left out.
 
     Args:
-        at_s: of pictures and pads, log only what is shown at this time: a program that draws one picture does not wait until
-            it has loaded a long recording.
-        native: for the Rerun program on this machine: a video that it cannot decode here is logged as JPEG pictures.
+        at_s: log only those pictures and pads that are shown at this time [s], so that a program that draws one picture need not
+            load a long recording.
+        native: True: the log is for the Rerun program on this machine; a video that it cannot decode is logged as JPEG pictures.
 
     Raises:
-        DatasetError: a video file that is not what the dataset says.
+        DatasetError: a video file differs from the dataset's description.
     """
     episode, pads = log.episode, pads_of(log.episode)
     seen = log if at_s is None else at_one_time(log, at_s)
@@ -67,10 +67,11 @@ def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = Fa
 
 
 def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, native: bool = False) -> None:
-    """The episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as above.
+    """Write the episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as in
+    ``log_episode``.
 
     Raises:
-        OutputError: ``rrd`` is somebody else's file, or the disk is full.
+        OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full.
     """
     check_free(rrd)
     with replacing(rrd) as part, recording_to(part, episode_blueprint(episode, at_s=at_s)) as rec:
@@ -79,7 +80,7 @@ def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, nati
 
 
 def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
-    """The newest row at or before ``at_s``, or the first, as an episode of one row at its place on the time line."""
+    """The newest row at or before ``at_s`` [s] (else the first row), as an episode of one row at its place on the time line."""
     fps = log.episode.spec.fps
     row = min(max(math.floor((at_s - log.begins_s) * fps + 1e-6), 0), log.episode.num_rows - 1)
     part = part_of(log.episode, row / fps, (row + 1) / fps)
@@ -87,12 +88,12 @@ def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
 
 
 def log_page(log: EpisodeLog) -> None:
-    """Log the page of provenance."""
+    """Log the provenance page."""
     log.static("provenance", rr.TextDocument(provenance(log.episode), media_type=rr.MediaType.MARKDOWN))
 
 
 def log_pictures(log: EpisodeLog, *, native: bool) -> None:
-    """Log all cameras; as ``log_episode``."""
+    """Log the pictures of all cameras; arguments and errors as ``log_episode``."""
     episode = log.episode
     clips = {key: cut(episode.videos[key], episode.spec.fps) for key in episode.picture_keys if key in episode.videos}
     if native:
@@ -138,7 +139,7 @@ def _log_vector(log: EpisodeLog, key: str) -> None:
 def curve_style(
     key: str, colors: Sequence[tuple[int, int, int]], names: Sequence[str], width: float = 2.0
 ) -> rr.SeriesLines:
-    """Of curves of feature ``key``: the action's are thin and pale."""
+    """Style of the curves of feature ``key``: those of the action are thin and pale."""
     is_action = key == "action"
     return rr.SeriesLines(
         colors=[(*c, 130) if is_action else c for c in colors],
@@ -148,11 +149,11 @@ def curve_style(
 
 
 def log_heatmaps(log: EpisodeLog, places: dict[str, float], colors: Sequence[tuple[int, int, int]]) -> None:
-    """The pads side by side, each with its name. Negative counts are drawn as 0; the dataset keeps them.
+    """The pads side by side, each with its name. Negative counts are drawn as 0; the dataset is not changed.
 
     Args:
-        places: of ``heatmap_places``.
-        colors: of the names, in turn.
+        places: positions from ``heatmap_places``.
+        colors: colours of the names, in turn.
     """
     for i, pad in enumerate(pads_of(log.episode)):
         image = np.clip(pad.counts, 0, pad.sensor.max_count).astype(
@@ -166,7 +167,7 @@ def log_heatmaps(log: EpisodeLog, places: dict[str, float], colors: Sequence[tup
 
 
 def log_heat_scale(log: EpisodeLog, pads: list[Pad], x: float, height: float = 1.0) -> None:
-    """The colour scale of the heatmaps, at ``x`` (taxels), ``height`` times as high as a pad."""
+    """Log the colour scale of the heatmaps at position ``x`` [taxels], ``height`` times as high as a pad."""
     sensor = max((pad.sensor for pad in pads), key=lambda s: s.max_count)
     bar = np.repeat(np.linspace(sensor.max_count, 0, 4 * sensor.rows).astype(np.uint16)[:, None], 8, axis=1)
     path = "observation/tactile/scale"
@@ -184,12 +185,12 @@ def log_heat_scale(log: EpisodeLog, pads: list[Pad], x: float, height: float = 1
 
 
 def place(log: EpisodeLog, path: str, x: float, y: float = 0.0, scale: float = 1.0) -> None:
-    """Move an entity of a 2-D view (taxels, y down)."""
+    """Place an entity in a 2-D view [taxels, y down]."""
     log.static(path, rr.Transform3D(translation=(x, y, 0.0), scale=scale))
 
 
 def write(log: EpisodeLog, path: str, x: float, y: float, text: str, color: tuple[int, int, int]) -> None:
-    """Write a text into a 2-D view, centred at ``x``, below ``y``."""
+    """Write a text into a 2-D view, centred at ``x``, below ``y`` [taxels]."""
     log.static(path, rr.Points2D([(x, y)], labels=[text], colors=[color], radii=0.001, show_labels=True))
 
 
@@ -220,7 +221,7 @@ def _log_touch(log: EpisodeLog, pads: list[Pad]) -> None:
 
 
 def log_touch_curves(log: EpisodeLog, pad: Pad, color: tuple[int, int, int], name: str, width: float = 1.5) -> None:
-    """Sum, peak and number of active taxels of one pad over time, as curves called ``name``."""
+    """Log sum, peak and number of active taxels of one pad over time, as curves named ``name``."""
     for kind, values in (("sum", pad.sum_count), ("peak", pad.peak_count), ("active", pad.num_active)):
         path = f"touch/{kind}/{pad.name}"
         log.static(path, rr.SeriesLines(colors=color, names=name, widths=width))
@@ -228,7 +229,7 @@ def log_touch_curves(log: EpisodeLog, pad: Pad, color: tuple[int, int, int], nam
 
 
 def log_events(log: EpisodeLog, pads: list[Pad]) -> None:
-    """One lane each: contact gate, stage, success; a new state only where it changes."""
+    """Log events as one lane each: contact gate, stage, success; a state is logged only when it changes."""
     episode = log.episode
     if pads:
         gate = contact_gate(pads)

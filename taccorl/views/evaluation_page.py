@@ -38,16 +38,16 @@ class EvaluationPage:
 
     rows: Sequence[EpisodeRow]
     about: dict[str, str]
-    """Resolved settings, versions, digests."""
+    """Resolved settings, versions and digests, by name."""
     comparisons: dict[str, PairedComparison] = field(default_factory=dict)
-    """Task → the first policy against the second, on the same scenes."""
+    """Task → comparison of the first policy with the second on the same scenes."""
     preflight: dict[str, Sequence[Check]] = field(default_factory=dict)
-    """Policy → both sides."""
+    """Policy → lines of its preflight."""
     failures: Sequence[FailedEpisode] = ()
 
 
 def write_page(page: EvaluationPage, folder: Path) -> list[Path]:
-    """``report.html`` and ``failures/*.rrd`` in ``folder``; returns all files that were written, the page first.
+    """Write ``report.html`` and ``failures/*.rrd`` into ``folder``; returns the written files, the page first.
 
     Raises:
         OutputError: the disk is full, or a file of another program is in the way.

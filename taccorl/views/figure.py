@@ -1,4 +1,5 @@
-"""The two PiPER arms as a figure of capsules: joint frames as built, thicknesses and stands schematic. No physics, no meshes.
+"""The two PiPER arms as a figure of capsules: joint frames are exact, thicknesses and stands schematic. It uses no physics and
+no meshes.
 
 Frames: ``base`` is an arm's mounting plate (z up, x forward), ``link_i`` turns with joint i about its own z axis; in link 6,
 z points out of the gripper and y is the way the fingers slide. Letters in shapes: T rows (time).
@@ -35,7 +36,7 @@ FINGER_COLOR = (51, 65, 85)
 
 
 def arms_of(episode: Episode) -> dict[str, np.ndarray]:
-    """Side → (T, 7) joints 1 to 6 (rad) and gripper opening (m), for the PiPER arms that the episode's state names."""
+    """Side → (T, 7) joint angles 1 to 6 [rad] and gripper opening [m], for the PiPER arms that the episode's state names."""
     feature = episode.spec.features.get("observation.state")
     if feature is None or "piper" not in episode.spec.robot_type.lower():
         return {}
@@ -62,7 +63,7 @@ def link_poses(joints_rad: np.ndarray) -> np.ndarray:
 
 
 def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
-    """(T, 2, 4, 4) base_from_pad of the pads' faces; finger a slides along +y of link 6, finger b along −y."""
+    """(T, 2, 4, 4) base_from_pad, poses of the pads' faces; finger a slides along +y of link 6, finger b along −y."""
     poses = np.repeat(link6_poses[:, None], 2, axis=1)
     for finger, sign in enumerate((1.0, -1.0)):
         offset = np.zeros((len(opening_m), 3))
@@ -72,7 +73,7 @@ def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
 
 
 def tool_paths(episode: Episode) -> dict[str, np.ndarray]:
-    """Side → (T, 3) world positions of the middle between the pads."""
+    """Side → (T, 3) world positions of the point in the middle between the pads [m]."""
     paths = {}
     for side, joints in arms_of(episode).items():
         faces = pad_poses(link_poses(joints[:, :-1])[:, -1], joints[:, -1])
@@ -81,13 +82,13 @@ def tool_paths(episode: Episode) -> dict[str, np.ndarray]:
 
 
 def floor_z_m(episode: Episode) -> float:
-    """World height of the drawn floor: just below the lowest finger, because the arms' height is not recorded."""
+    """World height of the drawn floor [m]: just below the lowest finger, because the height of the arms is not recorded."""
     lowest = min(path[:, 2].min() for path in tool_paths(episode).values())
     return min(0.0, float(lowest) - ROBOT.pad.length_m / 2 - 0.01)
 
 
 def log_figure(log: EpisodeLog, pads: list[Pad]) -> None:
-    """The arms under ``/figure``; a pad's colour is its sum on the pad's fixed scale."""
+    """Log the arms under ``/figure``; the colour of a pad shows its sum of counts on the pad's fixed scale."""
     log.static("figure", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     by_name = {pad.name: pad for pad in pads}
     for side, joints in arms_of(log.episode).items():
@@ -109,7 +110,7 @@ def log_figure(log: EpisodeLog, pads: list[Pad]) -> None:
 
 
 def pad_colors(pad: Pad) -> np.ndarray:
-    """(T,) RGBA as uint32: colour of a pad, from 0 without active taxels up to ``Pad.full_sum_count``."""
+    """(T,) colour of a pad as RGBA in uint32, from 0 (no active taxels) up to ``Pad.full_sum_count``."""
     rgb = heat(pad.sum_count / pad.full_sum_count).astype(np.uint32)
     return (rgb[:, 0] << 24) | (rgb[:, 1] << 16) | (rgb[:, 2] << 8) | 255
 

@@ -8,9 +8,9 @@ from taccorl.data.spec import FeatureSpec
 from taccorl.robots import ROBOT
 
 MOST_NUMBERS = 64
-"""A feature of more numbers than this is no set of curves."""
+"""Most numbers of a feature that is shown as curves."""
 MOST_LINES = 8
-"""More lines than this are hard to tell apart: split by the first word of their names (left, right)."""
+"""Most lines in one plot; more are split by the first word of their names (left, right)."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class Group:
 
     @property
     def path(self) -> str:
-        """The last part of its entity path, e.g. ``left_arm_rad``."""
+        """Last part of the group's entity path, such as ``left_arm_rad``."""
         return re.sub(r"\W+", "_", self.title).strip("_")
 
 
 def short_name(key: str) -> str:
-    """Last part of a feature's name: ``observation.images.front`` → ``front``."""
+    """Last part of a feature's key: ``observation.images.front`` → ``front``."""
     return key.removeprefix("observation.images.").removeprefix("observation.").replace(".", "_")
 
 
@@ -56,7 +56,7 @@ def element_names(feature: FeatureSpec) -> tuple[str, ...]:
 
 
 def groups_of(feature: FeatureSpec) -> list[Group]:
-    """Every element of ``feature``, once, in plots of one unit."""
+    """Groups of the elements of ``feature``: every element is in one group, and a group has one unit."""
     units, names = units_of(feature), element_names(feature)
     groups = []
     for unit in dict.fromkeys(units):

@@ -14,22 +14,22 @@ from taccorl.errors import TaccorlError
 
 SOFTWARE = "taccorl view"
 APPLICATION = "taccorl_episode"
-"""Rerun's application id of our files; the viewer keeps one blueprint for each."""
+"""Rerun's application id of taccorl's files; the viewer keeps one blueprint per id."""
 RRD_MAGIC = b"RRF2"
 HEAD_BYTES = 1024
-"""An .rrd names its application in its first message."""
+"""Number of first bytes of an .rrd that are read: its first message names the application."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 class OutputError(TaccorlError):
-    """Error: the output file exists and is not ours, or the disk is full."""
+    """Error: the output file exists and was not written by taccorl, or the disk is full."""
 
 
 def check_free(path: Path) -> None:
-    """Check that ``path`` may be written: nothing is there, or a file that taccorl wrote.
+    """Check that ``path`` may be written: it does not exist, or taccorl wrote it.
 
     Raises:
-        OutputError: something else is there, or there is no such folder.
+        OutputError: another file is there, or the folder does not exist.
     """
     if not path.parent.is_dir():
         raise OutputError(f"{path.parent}: no such folder; make it first: mkdir -p {shlex.quote(str(path.parent))}")
@@ -53,10 +53,11 @@ def _is_ours(path: Path) -> bool:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A name beside ``path`` to write to; at the end it takes ``path``'s place at once, or goes if there was an error.
+    """Context manager that gives a temporary path beside ``path`` for writing. At the end the file replaces ``path`` atomically,
+    or is removed after an error.
 
     Raises:
-        OutputError: the disk is full, or a file may not be so large.
+        OutputError: the disk is full, or the file is larger than allowed.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -73,7 +74,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def save_png(image: Image.Image, path: Path, name: str, origin: str) -> None:
-    """PNG with the name and the origin of what it shows written inside."""
+    """Write a PNG whose metadata hold the name and the origin of the data that it shows."""
     check_free(path)
     note = PngInfo()
     note.add_text("Software", SOFTWARE)

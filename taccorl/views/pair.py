@@ -1,4 +1,4 @@
-"""Two episodes on one time line: what they share, what one of them lacks, and the page that says so."""
+"""Two episodes on one time line: their common curves and pads, those that only one has, and the page that describes them."""
 
 import functools
 from collections.abc import Iterator
@@ -17,12 +17,12 @@ from taccorl.views.touch import CONTACT_THRESHOLD, Pad, contact_gate, pads_of
 Align = Literal["start", "contact"]
 NAMES = ("A", "B")
 COLOR_WORDS = ("white", "magenta")
-"""``colors.PAIR_COLORS`` in words."""
+"""Names of the colours ``colors.PAIR_COLORS``."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One element of a feature, of all episodes that have it."""
+    """One element of a feature, from all episodes that have it."""
 
     element: str
     unit: str
@@ -35,7 +35,7 @@ class Curve:
 
     @property
     def name(self) -> str:
-        """The title, with the feature of a curve that is neither state nor action."""
+        """Title of the curve; it includes the feature unless that is state or action."""
         return self.title if self.family == "joints" else f"{self.family} {self.title}"
 
 
@@ -46,7 +46,7 @@ class Pair:
         align: ``start``: row 0 of each at 0 s; ``contact``: the first contact of each at 0 s.
 
     Raises:
-        TaccorlError: ``contact``, and one of them has no touch or no contact.
+        TaccorlError: ``align`` is ``contact``, and an episode has no touch or no contact.
     """
 
     def __init__(self, a: Episode, b: Episode, align: Align = "start") -> None:
@@ -70,14 +70,14 @@ class Pair:
 
     @property
     def best_time_s(self) -> float:
-        """Time at which touch is strongest in A while B runs; the middle of that time without touch in A."""
+        """Time at which touch is strongest in A while B runs [s]; the middle of that time if A has no touch."""
         rows = self.common_rows()[0] if len(self.common_rows()[0]) else np.arange(self.episodes[0].num_rows)
         touch = sum(pad.sum_count[rows] for pad in self.pads[0])
         row = rows[int(np.argmax(touch)) if np.any(touch) else len(rows) // 2]
         return self.begins_s[0] + float(self.episodes[0].time_s[row])
 
     def shared_pads(self) -> list[tuple[Pad, Pad]]:
-        """Pads of both with the same name, shape and gain, whose counts can be subtracted."""
+        """Pads that both episodes have with the same name, shape and gain, so that counts can be subtracted."""
         others = {pad.name: pad for pad in self.pads[1]}
         pairs = [(pad, others[pad.name]) for pad in self.pads[0] if pad.name in others]
         return [(a, b) for a, b in pairs if _layout(a) == _layout(b)]
@@ -92,7 +92,7 @@ class Pair:
 
     @functools.cached_property
     def full_difference(self) -> float:
-        """Counts at which the colour of a difference is full: the largest difference, but at least the contact threshold."""
+        """Difference of counts that gets the full colour: the largest difference, but at least the contact threshold."""
         rows_a, rows_b = self.common_rows()
         found = [np.abs(b.counts[rows_b].astype(np.int32) - a.counts[rows_a]).max() for a, b in self.shared_pads()]
         return float(max(*found, self.shared_pads()[0][0].gate_count))
@@ -113,7 +113,7 @@ def cameras_of(episode: Episode) -> list[str]:
 
 
 def page_of(pair: Pair) -> str:
-    """Which is which, where they are from, how they are aligned and what one of them lacks, in Markdown."""
+    """Markdown page: names and origins of both episodes, alignment, and data that one of them lacks."""
     lines = []
     for name, color, e in zip(NAMES, COLOR_WORDS, pair.episodes, strict=True):
         facts = f"outcome {outcome(e)}; {e.num_rows / e.spec.fps:.2f} s at {e.spec.fps} fps; {_contact_words(e)}"

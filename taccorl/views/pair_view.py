@@ -41,10 +41,10 @@ from taccorl.views.touch import Pad
 
 ROOTS = ("a/", "b/")
 WIDTHS = (3.0, 2.0)
-"""Of curves [points]: where both are the same, A is seen on either side of B."""
+"""Widths of the curves of A and B [points]: where both are equal, A is visible on either side of B."""
 PLOTS_IN_A_ROW, PLOTS_IN_A_TAB = 3, 15
 LABEL_TAXELS = 5.0
-"""Height of the names above a row of pads."""
+"""Height of the names above a row of pads [taxels]."""
 TOUCH_KINDS = {
     "sum": "touch sum of active taxels [counts]",
     "peak": "touch peak [counts]",

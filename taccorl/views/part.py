@@ -1,4 +1,4 @@
-"""A part of an episode, as an episode."""
+"""A part of an episode as an episode of its own."""
 
 import dataclasses
 import itertools
@@ -16,7 +16,7 @@ def part_of(episode: Episode, start_s: float | None, end_s: float | None) -> Epi
     """Rows from ``start_s`` up to, but not at, ``end_s`` (seconds since row 0; None: the episode's own).
 
     Raises:
-        TaccorlError: no row lies there.
+        TaccorlError: no row is in the range.
     """
     if start_s is None and end_s is None:
         return episode

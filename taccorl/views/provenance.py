@@ -12,13 +12,13 @@ NO_ORIGIN = "not stated by the recording"
 
 
 def outcome(episode: Episode) -> str:
-    """``success``, ``failure``, or a text that the outcome is not stated."""
+    """``success``, ``failure``, or a text that states that the outcome is unknown."""
     return {True: "success", False: "failure", None: "not stated"}[episode.success]
 
 
 def provenance(episode: Episode) -> str:
-    """Provenance page in Markdown: origin first, then contents, the sensor's numbers, the channels' timing, and whatever else
-    is known."""
+    """Provenance page in Markdown: origin first, then contents, the sensor's numbers, the channels' timing, and all other stored
+    facts."""
     spec = episode.spec
     lines = [
         f"**origin: {episode.origin or NO_ORIGIN}**",

@@ -23,16 +23,16 @@ class EpisodeLog:
     rec: rr.RecordingStream
     episode: Episode
     root: str = ""
-    """Entity above all those of the episode, such as ``a/``; empty if the recording holds no other episode."""
+    """Prefix of all entities of the episode, such as ``a/``; empty if the recording holds no other episode."""
     begins_s: float = 0.0
     """Time of row 0 on the time line."""
 
     def static(self, path: str, data: rr.AsComponents) -> None:
-        """Log what does not change."""
+        """Log values that do not change over time."""
         self.rec.log(f"{self.root}{path}", data, static=True)
 
     def send(self, path: str, columns: rr.ComponentColumnList, rows: Sequence[int] | None = None) -> None:
-        """Log what changes, for all rows or some."""
+        """Log values that change, for all or some rows."""
         index = np.asarray(range(self.episode.num_rows) if rows is None else rows, dtype=np.int64)
         # Rerun itself would round down.
         time_ns = np.round(1e9 * (self.begins_s + self.episode.time_s[index])).astype("timedelta64[ns]")
@@ -44,10 +44,10 @@ class EpisodeLog:
 
 @contextlib.contextmanager
 def recording_to(rrd: Path, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
-    """A recording that is gathered in memory and written to ``rrd`` when the context ends without an error.
+    """Context manager: a recording that is collected in memory and written to ``rrd`` when the context ends without an error.
 
     Raises:
-        OSError: ``rrd`` cannot be written, or not to its end.
+        OSError: ``rrd`` cannot be written completely.
     """
     with rr.RecordingStream(APPLICATION) as rec:
         stream = rec.binary_stream()

@@ -1,4 +1,4 @@
-"""A picture of the Rerun view, made without a screen: by the Rerun program itself, else by a browser."""
+"""Draw the Rerun view as a picture without a screen: with the Rerun program, else with a browser."""
 
 import importlib.util
 import io
@@ -32,26 +32,30 @@ BROWSER_ARGUMENTS = (
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",  # the page may talk to nobody but us
 )
 SETTLE_S = 8.0
-"""A web viewer that loads slowly looks finished, and the same twice, before its first picture is decoded."""
+"""Time before the first shot [s]: a slowly loading web viewer looks complete, and does not change, before its first picture is
+decoded."""
 CALM_LEVELS = 0.2
-"""Mean difference of two shots (of 255) below which the page has come to rest."""
+"""Mean difference of two shots [levels of 255] below which the page has stopped changing."""
 CALM_SHOTS = 3
-"""So many shots in a row must be like the one before: on a busy machine a view's text comes seconds after its pictures."""
+"""Number of consecutive shots that must equal the one before: on a busy machine a view's text appears seconds after its
+pictures."""
 BLANK_LEVELS = 15.0
-"""Standard deviation (of 255) below which a page shows nothing yet; measured: 8 while loading, 51 with all views."""
+"""Standard deviation of a shot [levels of 255] below which the page shows nothing yet; measured: 8 while loading, 51 with all
+views."""
 
 
 def screenshot(
     shown: Episode | Pair, png: Path, *, at_s: float | None = None, progress: Callable[[str], None] = lambda text: None
 ) -> str:
-    """The Rerun view of an episode or a pair as a PNG, at ``at_s`` or where touch is strongest. Returns who drew it.
+    """Draw the Rerun view of an episode or a pair as a PNG, at ``at_s`` [s] or where touch is strongest. Returns the name of the
+    program that drew it.
 
     Args:
-        progress: called with what is done next and how long it may take.
+        progress: function that is called with a text: the next step and how long it may take.
 
     Raises:
-        ViewerError: neither the Rerun program nor a browser can draw here.
-        OutputError: ``png`` is somebody else's file.
+        ViewerError: neither the Rerun program nor a browser can draw on this machine.
+        OutputError: ``png`` exists and was not written by taccorl.
     """
     at_s = best_time_s(shown) if at_s is None else at_s
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
@@ -74,7 +78,7 @@ def screenshot(
 
 
 def best_time_s(shown: Episode | Pair) -> float:
-    """Time at which touch is strongest; the middle of an episode without touch."""
+    """Time at which touch is strongest [s]; the middle of an episode without touch."""
     if isinstance(shown, Pair):
         return shown.best_time_s
     episode, pads = shown, pads_of(shown)
@@ -83,7 +87,7 @@ def best_time_s(shown: Episode | Pair) -> float:
 
 
 def picture_by_browser(rrd: Path, png: Path) -> str | None:
-    """Draw ``rrd`` into ``png`` with Debian's chromium; None, or why that cannot be done here."""
+    """Draw ``rrd`` into ``png`` with Debian's chromium. Returns None, or the reason why that is not possible on this machine."""
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         return f"no browser: none of {', '.join(BROWSERS)} is installed"

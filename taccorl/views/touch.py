@@ -12,9 +12,9 @@ from taccorl.data.episode import Episode
 from taccorl.data.spec import SensorSpec
 
 CONTACT_THRESHOLD = 0.4
-"""λ_f: a normalised reading beyond this is contact (paper Table 3)."""
+"""λ_f: a normalised reading above this is contact (paper Table 3)."""
 MIN_ACTIVE_TAXELS = 1
-"""m: so many taxels must be beyond λ_f (paper Table 3)."""
+"""m: number of taxels that must be above λ_f for contact (paper Table 3)."""
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class Pad:
 
     @property
     def num_active(self) -> np.ndarray:
-        """(T,) active taxels."""
+        """(T,) number of active taxels."""
         return self.active.sum(axis=(1, 2))
 
     @property
     def sum_count(self) -> np.ndarray:
-        """(T,) counts of the active taxels, added up: 0 as long as nothing touches."""
+        """(T,) sum of the counts of the active taxels; 0 without contact."""
         return np.where(self.active, self.counts, 0).sum(axis=(1, 2), dtype=np.int64)
 
     @property
     def peak_count(self) -> np.ndarray:
-        """(T,) counts of the highest taxel."""
+        """(T,) largest count of a taxel."""
         return self.counts.max(axis=(1, 2))
 
     @property
@@ -53,12 +53,12 @@ class Pad:
 
     @property
     def full_sum_count(self) -> float:
-        """Fixed scale of the sum where it is a colour: every taxel of the pad at twice λ_f, a firm full-face grip."""
+        """Sum of counts at the end of the fixed colour scale: every taxel of the pad at twice λ_f, a firm full-face grip."""
         return 2.0 * self.gate_count * self.sensor.rows * self.sensor.columns
 
 
 def pads_of(episode: Episode) -> list[Pad]:
-    """The episode's pads; of a feature with history the newest reading, and only where no other feature has the pad."""
+    """The episode's pads; from a feature with history the newest reading is used, and only if no other feature has the pad."""
     keys = [key for key in episode.spec.keys("tactile") if key in episode.arrays]
     found: dict[str, Pad] = {}
     for key in sorted(keys, key=lambda k: episode.spec.features[k].history):
@@ -74,5 +74,5 @@ def contact_gate(pads: list[Pad]) -> np.ndarray:
 
 
 def peak_row(pads: list[Pad]) -> int:
-    """The row with the highest sum over all pads; 0 without touch."""
+    """Index of the row with the highest sum over all pads; 0 without touch."""
     return int(np.argmax(sum(p.sum_count for p in pads))) if pads else 0

@@ -14,32 +14,33 @@ from taccorl.data.episode import Video
 from taccorl.errors import DatasetError
 
 MOST_REORDERED_FRAMES = 16
-"""H.264's and AV1's limit: so far before a frame shown now may stand frames shown later."""
+"""Largest number of frames by which decoding order and display order may differ: the limit of H.264 and AV1."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A small mp4. It begins at a keyframe, so frames from before the episode may lead it."""
+    """A small mp4 with an episode. It begins at a keyframe, so that frames from before the episode may come first."""
 
     mp4: bytes
     first_frame: int
-    """Which of its frames, in order of time, is the episode's row 0."""
+    """Index, in order of time, of the frame that is the episode's row 0."""
     codec: str
-    """``av1``, ``h264`` …"""
+    """Name of the codec: ``av1``, ``h264`` …"""
 
 
 def cut(video: Video, fps: int) -> Clip:
-    """The episode's packets, from the last keyframe at or before its first frame to the keyframe behind its last one.
+    """Copy the episode's packets into a small mp4, from the last keyframe at or before its first frame to the keyframe behind
+    its last one.
 
     Raises:
-        DatasetError: the file is not there, cannot be read, or holds fewer frames than the dataset says.
+        DatasetError: the file does not exist, cannot be read, or holds fewer frames than the dataset states.
     """
     with _opened(video) as source:
         return _cut(source, video, fps)
 
 
 def codec_of(video: Video) -> str:
-    """``av1``, ``h264`` …; as for ``cut`` if the file cannot be read."""
+    """Name of a video's codec: ``av1``, ``h264`` …; raises as ``cut`` if the file cannot be read."""
     with _opened(video) as source:
         return _codec(source)
 

@@ -1,4 +1,4 @@
-"""The Rerun program on this machine: a window, a picture without a window, or a page for a browser (127.0.0.1 only)."""
+"""Use the Rerun program on this machine: a window, a picture without a window, or a page for a browser (127.0.0.1 only)."""
 
 import contextlib
 import os
@@ -21,14 +21,14 @@ PICTURE_TIMEOUT_S = 180.0
 
 
 class ViewerError(TaccorlError):
-    """Error: no viewer is available. Names what is missing and the command that installs it."""
+    """Error: no viewer is available. The message names the missing program and the command that installs it."""
 
 
 def require_screen() -> None:
     """Check that there is a screen for a window.
 
     Raises:
-        ViewerError: there is no screen to open a window on; says what to do instead.
+        ViewerError: there is no screen; the message names the alternatives.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError(
@@ -38,7 +38,7 @@ def require_screen() -> None:
 
 
 def open_window(rrd: Path) -> None:
-    """Show ``rrd`` in a window until that is closed.
+    """Show ``rrd`` in a window, and return when the window is closed.
 
     Raises:
         ViewerError: the Rerun program could not open one.
@@ -49,7 +49,7 @@ def open_window(rrd: Path) -> None:
 
 
 def picture_without_window(rrd: Path, png: Path, width_px: int, height_px: int) -> str | None:
-    """Draw ``rrd`` into ``png``; None, or why that cannot be done here."""
+    """Draw ``rrd`` into ``png`` without a window. Returns None, or the reason why that is not possible on this machine."""
     command = [_program(), str(rrd), "--headless", "--screenshot-to", str(png), "--bind", LOOPBACK, "--port", "auto"]
     command += ["--window-size", f"{width_px}x{height_px}"]
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
@@ -71,7 +71,7 @@ def picture_without_window(rrd: Path, png: Path, width_px: int, height_px: int) 
 
 @contextlib.contextmanager
 def served(rrd: Path) -> Iterator[str]:
-    """The address of a page that shows ``rrd``, for as long as the context lasts. Reachable from this machine only."""
+    """Context manager that serves a page with ``rrd`` and gives its address, which is reachable from this machine only."""
     page_port, data_port = _free_ports(2)
     command = [_program(), str(rrd), "--serve-web", "--bind", LOOPBACK]
     command += ["--web-viewer-port", str(page_port), "--port", str(data_port)]
@@ -88,7 +88,8 @@ def served(rrd: Path) -> Iterator[str]:
 
 
 def can_decode(codec: str) -> bool:
-    """Can the Rerun program (not a browser) decode such a video here? AV1 it does itself, others it gives to ffmpeg."""
+    """Whether the Rerun program (not a browser) can decode such a video on this machine. It decodes AV1 itself, other codecs
+    with ffmpeg."""
     return codec == "av1" or shutil.which("ffmpeg") is not None
 
 

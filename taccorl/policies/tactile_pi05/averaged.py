@@ -1,9 +1,9 @@
-"""An exponential mean of a network's weights over training, with which the policy acts.
+"""Exponential mean of a network's weights over training; the policy acts with the mean.
 
     m ← d_n m + (1 − d_n) w,    d_n = min(d, (1 + n) / (10 + n))    after optimiser step n
 
-The ramp of d_n forgets the random start (as in TensorFlow's ExponentialMovingAverage). Noise of the last steps averages out; what
-that gives a policy is in docs/learning.md.
+d_n increases with n, so that the random initial weights are forgotten (as in TensorFlow's ExponentialMovingAverage). The mean
+averages the noise of the last steps; docs/learning.md has the measured effect on a policy.
 """
 
 import torch
@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 
 class Averaged(nn.Module):
-    """The mean of the floating-point parameters of ``network``, in buffers that checkpoints hold.
-
-    While the policy trains, ``network`` has the weights that are trained; while it acts, those are exchanged with the mean.
+    """Exponential mean of the floating-point parameters of ``network``, in buffers that checkpoints hold. In training,
+    ``network`` holds the trained weights; in use, they are exchanged with the mean.
     """
 
     num_updates: Tensor

@@ -27,7 +27,7 @@ _HEADS, _KV_HEADS = 8, 1
 
 @dataclass(frozen=True, kw_only=True)
 class Patches:
-    """SigLIP, a token for each patch of a picture."""
+    """Settings of SigLIP, which makes one token per patch of a picture."""
 
     px: int
     width: int
@@ -38,7 +38,7 @@ class Patches:
 
 @dataclass(frozen=True, kw_only=True)
 class Cameras:
-    """A ``CameraTower``. Numbers are of each camera."""
+    """Settings of a ``CameraTower``. Numbers are per camera."""
 
     channels: tuple[int, ...]
     points: int
@@ -47,7 +47,7 @@ class Cameras:
 
 @dataclass(frozen=True, kw_only=True)
 class Size:
-    """Widths are of hidden states; an ``mlp`` is the inner width of a layer's feed-forward half."""
+    """Sizes of a backbone. Widths are those of hidden states; ``mlp`` is the inner width of a layer's feed-forward part."""
 
     depth: int
     head_width: int
@@ -74,7 +74,7 @@ SIZES = {
 
 
 class FullBackbone(CompiledBackbone):
-    """LeRobot's PaliGemma with its action expert, without language heads."""
+    """LeRobot's PaliGemma with its action expert, without the output layers for text."""
 
     def __init__(self, config: Any) -> None:
         """
@@ -94,7 +94,7 @@ class FullBackbone(CompiledBackbone):
 
 
 class SmallBackbone(CompiledBackbone):
-    """LeRobot's PaliGemma and action expert with the widths and depth of a ``Size``, without the output layers for text.
+    """LeRobot's PaliGemma and action expert with widths and depth from a ``Size``, without the output layers for text.
 
     Its weights are float32 whatever ``--policy.dtype`` says: with bfloat16, LeRobot's trainer computes in it (autocast), and
     small changes of weights are not lost.

@@ -4,8 +4,9 @@
     (x, y)   = Σ softmax(sharpness · map) · position                          of each of K maps, −1 … 1 over the picture
     tokens   = MLP(x, y, sines and cosines of π · {1, 2, 4} of each; mean of the features)
 
-The mean of positions, weighed by a softmax, is the spatial softmax of Levine et al. 2016, End-to-End Training of Deep Visuomotor
-Policies, §4.1: where things are, to a fraction of a cell. Norms are of groups of channels (GroupNorm), which do not depend on the
+The mean of positions, weighted by a softmax, is the spatial softmax of Levine et al. 2016, End-to-End Training of Deep Visuomotor
+Policies, §4.1: it locates objects to a fraction of a cell. Norms are of groups of channels (GroupNorm), which do not depend on
+the
 batch: an average of weights (``averaged``) stays valid.
 """
 
@@ -27,7 +28,7 @@ def _norm(channels: int) -> nn.GroupNorm:
 
 
 class Residual(nn.Module):
-    """Two convolutions of 3 × 3 beside the identity, as in ResNet-18."""
+    """Residual block: two 3 × 3 convolutions whose output is added to the input, as in ResNet-18."""
 
     def __init__(self, channels: int, more: int, stride: int) -> None:
         super().__init__()
@@ -46,15 +47,16 @@ class Residual(nn.Module):
 
 
 class CameraEncoder(nn.Module):
-    """Tokens of one camera's pictures."""
+    """Encodes one camera's pictures into tokens."""
 
     def __init__(self, channels: tuple[int, ...], num_points: int, num_tokens: int, width: int) -> None:
         """
         Args:
-            channels: after the first convolution, and of each block; the second block halves the picture's side.
-            num_points: K.
-            num_tokens: M.
-            width: D.
+            channels: number of channels after the first convolution, and of each block; the second block halves the picture's
+                side.
+            num_points: K, number of maps.
+            num_tokens: M, number of tokens per picture.
+            width: D, width of a token.
         """
         super().__init__()
         self.num_tokens = num_tokens
@@ -88,7 +90,7 @@ class CameraEncoder(nn.Module):
 
 
 def encode_pictures(camera: nn.Module, images_B3RC: Tensor) -> Tensor:
-    """Tokens (B, M, D) of one camera's pictures."""
+    """Tokens (B, M, D) of one camera's pictures (B, 3, R, C)."""
     return camera(images_B3RC)
 
 
@@ -107,6 +109,6 @@ class CameraTower(nn.Module):
         """Tokens (B, M, D) of each camera's pictures (B, 3, R, C), in the order of the policy's features.
 
         Args:
-            encode: ``encode_pictures``, or what it is compiled to.
+            encode: ``encode_pictures``, or its compiled form.
         """
         return [encode(camera, image) for camera, image in zip(self.cameras, images, strict=True)]

@@ -16,13 +16,15 @@ from torch import Tensor, nn
 from taccorl.errors import TaccorlError
 
 STEP_STATISTICS = ("step_mean", "step_std")
-"""Of ``ACTION`` in a dataset's statistics, (H, A) each, in the units of actions; ``taccorl.training.reading`` computes them."""
+"""Keys of a dataset's statistics of ``ACTION``, each (H, A), in the units of actions; ``taccorl.training.reading`` computes
+them."""
 LEAST_STD = 0.01
-"""Of a normalised number, 2 of which are its range: a number that hardly moves is not blown up."""
+"""Lower bound of σ in LeRobot-normalised actions, whose range is 2: errors of an action that hardly moves are not amplified."""
 
 
 class ChunkSteps(nn.Module):
-    """μ and σ, (H, A), stored in a policy's checkpoint. Until they are read from a dataset: 0 and 1."""
+    """Normalisation of each step of a chunk with its own mean μ and deviation σ, (H, A), stored in a policy's checkpoint. Before
+    they are set from a dataset they are 0 and 1."""
 
     mean_HA: Tensor
     std_HA: Tensor
@@ -37,11 +39,12 @@ class ChunkSteps(nn.Module):
         """Make the normalisation from a dataset's statistics.
 
         Args:
-            statistics: LeRobot's of a dataset; None, or without those of steps: a checkpoint brings them, or nothing does.
-            config: the policy's.
+            statistics: LeRobot's statistics of a dataset. If None, or without ``STEP_STATISTICS``, μ and σ stay 0 and 1 until a
+                checkpoint is loaded.
+            config: configuration of the policy.
 
         Raises:
-            TaccorlError: actions are normalised in a way that is not known here.
+            TaccorlError: actions are normalised by an unknown method.
         """
         steps = cls(config.chunk_size, num_actions)
         told = (statistics or {}).get(ACTION, {})
@@ -64,7 +67,7 @@ class ChunkSteps(nn.Module):
         return steps
 
     def normalized(self, actions_BHA: Tensor) -> Tensor:
-        """x → z of the first steps of a chunk, (B, ≤ H, A)."""
+        """Normalise the first steps of a chunk, (B, ≤ H, A): x → z."""
         steps = actions_BHA.shape[-2]
         return (actions_BHA - self.mean_HA[:steps]) / self.std_HA[:steps]
 

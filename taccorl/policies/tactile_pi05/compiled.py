@@ -68,10 +68,11 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
 
     compiles_layers: bool = True
     tells_cameras_apart: bool = False
-    """Pictures go through ``embed_images`` only, as each camera has weights of its own."""
+    """Whether the model distinguishes cameras: each has weights of its own, so that pictures go through ``embed_images`` only."""
 
     def fuses(self, device: torch.device) -> bool:
-        """Whether this module's joint forward is used instead of LeRobot's. With recomputed activations LeRobot's is used."""
+        """Whether this module's joint forward is used instead of LeRobot's. With activation recomputation (gradient
+        checkpointing) LeRobot's is used."""
         models: Any = self.paligemma.model.language_model, self.gemma_expert.model
         checkpoints = any(model.gradient_checkpointing for model in models)
         return self.compiles_layers and self.training and device.type == "cuda" and not checkpoints
@@ -87,7 +88,7 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
         return list(tokens.to(images[0].dtype).chunk(len(images)))
 
     def embed_image(self, image: Tensor) -> Any:
-        """Tokens of a picture; tokens that ``embed_images`` made already pass through."""
+        """Tokens of a picture; tokens that ``embed_images`` made are returned unchanged."""
         return image if image.ndim == 3 else super().embed_image(image)
 
     def forward(
@@ -136,8 +137,8 @@ def joint_layer(
     modeling_pi05.py.
 
     Args:
-        mask_BT1K: what is added to scores, K a multiple of 8.
-        suffix_only: the prefix that comes out is None, as nothing follows that needs it.
+        mask_BT1K: additive attention mask, K a multiple of 8.
+        suffix_only: the returned prefix is None, because no later layer uses it.
     """
     text, expert = text_layer.self_attn, expert_layer.self_attn
     normed_prefix, prefix_gate = layernorm_forward(text_layer.input_layernorm, prefix)

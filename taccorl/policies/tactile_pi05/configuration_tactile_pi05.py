@@ -32,7 +32,8 @@ _BACKBONES = ("full", "small", "tiny")
 class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
     """LeRobot's cosine schedule over the whole training, with a warm-up of fixed length.
 
-    LeRobot's own shortens the warm-up with the training: 100 of 3000 steps become 33 of 1000, the paper's 100 are for both.
+    LeRobot's own schedule shortens the warm-up with the training (100 of 3000 steps become 33 of 1000); the paper uses 100 in
+    both cases.
     """
 
     def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
@@ -47,7 +48,8 @@ class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
 @OptimizerConfig.register_subclass("fused_adamw")
 @dataclass
 class FusedAdamW(AdamWConfig):
-    """LeRobot's AdamW; on a GPU PyTorch's fused kernel, half the time, and bfloat16 weights are rounded once a step."""
+    """LeRobot's AdamW, on a GPU with PyTorch's fused kernel, which takes half the time and rounds bfloat16 weights once per
+    step."""
 
     def build(self, params: OptimizerParams) -> AdamW:
         groups: Any = super().build(params).param_groups
@@ -81,11 +83,11 @@ class TactileFormat:
         """Read the format from a dataset's feature.
 
         Args:
-            feature: its entry in LeRobot's features dict.
-            where: the dataset, for errors.
+            feature: entry of the feature in LeRobot's features dict.
+            where: name of the dataset for error messages.
 
         Raises:
-            TaccorlError: the feature does not say its format, or says one that its shape denies.
+            TaccorlError: the feature does not state its format, or states one that contradicts its shape.
         """
         told = feature.get("tactile")
         if not isinstance(told, dict):
@@ -105,82 +107,86 @@ class TactileFormat:
 @PreTrainedConfig.register_subclass("tactile_pi05")
 @dataclass
 class TactilePI05Config(PI05Config):
-    """π0.5 with touch. Fields that are not here are those of LeRobot's pi05."""
+    """π0.5 with touch. Fields that are not listed here are those of LeRobot's pi05."""
 
     backbone: str = "full"
-    """full: π0.5's own size (3.4 billion parameters). From scratch, of the same code: small (11.7 million), for one GPU;
-    tiny (1.1 million), for tests and demonstrations on a CPU."""
+    """Size of the network. full: π0.5's own (3.4 billion parameters). Trained from scratch with the same code: small (11.7
+    million), for one GPU; tiny (1.1 million), for tests and demonstrations on a CPU."""
     base_checkpoint: str | None = None
-    """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: at random."""
+    """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: random
+    weights."""
     tokenizer: str | None = None
-    """Hub id, folder, ``words`` or ``bytes``. None: the backbone's own, PaliGemma's for full and words for small and tiny."""
+    """Tokenizer of the prompt: hub id, folder, ``words`` or ``bytes``. None: PaliGemma's for full, words for small and tiny."""
     discrete_state_input: bool | None = None
-    """True: the state is part of the prompt, 256 steps over each joint's range, as in π0.5. False: a token beside the actions, as
-    in π0, exact. None: the backbone's own, True for full and False for small and tiny."""
+    """Input of the robot's state. True: as part of the prompt, in 256 steps over each joint's range, as in π0.5. False: as a
+    token beside the actions, as in π0, without rounding. None: True for full, False for small and tiny."""
     hand_poses: bool | None = None
-    """Tell the state's token where both hands are, too (see ``hand_poses``). None: True where the state is a token and the
+    """Add the poses of both hands to the state's token (see ``hand_poses``). None: True where the state is a token and the
     names of the actions are those of the two arms whose geometry is known."""
     part_poses: bool = False
-    """Tell the state's token the poses of the task's parts (see ``part_poses``), which only a simulator knows: of datasets made
-    with taccorl execute --part_poses=true."""
+    """Add the poses of the task's parts to the state's token (see ``part_poses``). Only a simulator knows them: the dataset must
+    be made with taccorl execute --part_poses=true."""
     part_names: list[str] | None = None
-    """Names of the poses' numbers. None: read from the dataset when training starts, then kept in the checkpoint."""
+    """Names of the numbers of the parts' poses. None: read from the dataset when training starts, then kept in the checkpoint."""
     pictures: bool = True
-    """False: without cameras, whatever the dataset has; its frames are not read."""
+    """False: the policy uses no cameras, even if the dataset has some; their frames are not read."""
     pose_loss: float = 0.0
-    """Weight of an auxiliary loss, in training only: from the cameras' tokens and the robot's state, predict where the parts are
-    relative to each other and to both hands (see ``PoseHead``). Needs a dataset as for ``part_poses``. 0: none."""
+    """Weight of an auxiliary loss, in training only: from the cameras' tokens and the robot's state, predict the positions of
+    the parts relative to each other and to both hands (see ``PoseHead``). Needs a dataset as for ``part_poses``. 0: no such
+    loss."""
     tactile: bool = True
-    """False: vision only. The same policy without touch: with flow matching, LeRobot's pi05."""
+    """True: the policy uses touch. False: vision only; with flow matching the policy is then LeRobot's pi05."""
     tactile_history: int = 10
-    """L: readings in the window, one a row of the dataset."""
+    """L: number of readings in the tactile window, one per row of the dataset."""
     prefix_tokens: int = 8
-    """M_pre: touch tokens in the context of the vision-language model."""
+    """M_pre: number of touch tokens in the context of the vision-language model."""
     suffix_tokens: int = 8
-    """M_suf: touch tokens beside the actions, in the action expert."""
+    """M_suf: number of touch tokens beside the actions, in the action expert."""
     contact_threshold: float = CONTACT_THRESHOLD
-    """λ_f: a reading above this is contact."""
+    """λ_f: a normalised reading above this is contact."""
     noise_threshold: float = 0.0
-    """λ_noise: readings up to this count as nothing, in training and in use (paper, App. B.2: background noise of both domains is
-    suppressed by one threshold). In normalised readings: what alignment.touch.calibration measures in counts, times the gain.
-    0: readings as they are; of the twin alone there is one kind of noise."""
+    """λ_noise: normalised readings up to this are set to 0, in training and in use (paper, App. B.2: one threshold suppresses
+    the background noise of both domains). taccorl.alignment.touch measures it in counts; multiply by the gain. 0: readings are
+    unchanged, which suffices for data of the twin alone."""
     contact_min_active: int = MIN_ACTIVE
-    """m: taxels of one reading that have to be above it."""
+    """m: number of taxels of one reading that must be above λ_f for contact."""
     tactile_format: TactileFormat | None = None
-    """How touch is stored. None: read from the dataset when training starts, then kept in the checkpoint."""
+    """Format of touch. None: read from the dataset when training starts, then kept in the checkpoint."""
     fps: int | None = None
-    """Rows a second that the window and the actions count in. None: read from the dataset likewise."""
+    """Rows per second of the dataset, the unit of the tactile window and of the actions. None: read from the dataset likewise."""
     sim_weight: float = 0.5
-    """α: weight of the simulated loss against the real one. Used where the dataset tells them apart (``observation.is_sim``)."""
+    """α: weight of the simulated loss; the real loss has 1 − α. Used if the dataset marks simulated rows
+    (``observation.is_sim``)."""
     sim_share: float | None = None
-    """Of the rows that it was trained on, how many were simulated. Written by training."""
+    """Share of simulated rows in the training data, 0 … 1. Written by training."""
 
     image_randomization: bool = True
-    """In training, crop, turn and recolour every image by chance: the image rows of the paper's domain randomisation."""
+    """True: in training, randomly crop, rotate and recolour every image: the image rows of the paper's domain randomisation."""
     image_rotation_deg: float = ImageRandomizationConfig.rotation_deg
-    """Image randomisation: largest turn of an image about its middle [degrees]. 0: not turned."""
+    """Image randomisation: largest rotation of an image about its middle [degrees]. 0: no rotation."""
     image_noise_std: float = COTRAINING_NOISE_STD
-    """σ_v: normal noise on training images in [0, 1], after that. 0: none."""
+    """σ_v: standard deviation of normal noise on training images in [0, 1], added after the randomisation. 0: no noise."""
 
     cuda_graph: bool = True
-    """On a GPU, record a chunk's computation once and replay it (see ``graphed``). False: step by step, as LeRobot does."""
+    """True: on a GPU, record the computation of a chunk once and replay it (see ``graphed``). False: LeRobot's eager
+    computation."""
 
     compile_model: bool = True
     """On a GPU, train with compiled layers (see ``compiled``; ``compile_mode`` is not used). False: LeRobot's own forward."""
 
     chunk_size: int = 10
-    """H: actions that are predicted at once."""
+    """H: number of actions that are predicted at once."""
     n_action_steps: int = 10
-    """Actions of a chunk that are executed before the next one is predicted."""
+    """Number of actions of a chunk that are executed before the next chunk is predicted."""
     num_inference_steps: int = 4
     """K_denoise: number of denoising steps."""
     normalize_steps: bool | None = None
-    """Normalise each of the H × A numbers of a chunk of relative actions by its own mean and deviation, after LeRobot's
-    normalisation of all steps together (see ``chunk_steps``). None: the backbone's own, False for full, whose weights know
-    LeRobot's, and True for small and tiny."""
+    """True: normalise each of the H × A numbers of a chunk of relative actions by its own mean and deviation, after LeRobot's
+    normalisation of all steps together (see ``chunk_steps``). None: False for full, whose pretrained weights use LeRobot's
+    normalisation, and True for small and tiny."""
     average_decay: float | None = None
-    """d: act with an exponential mean of the weights (see ``averaged``). 0: with the last ones. None: the backbone's own, 0.999
-    for small and 0 for full and tiny."""
+    """d: decay of the exponential mean of the weights with which the policy acts (see ``averaged``). 0: it acts with the last
+    weights. None: 0.999 for small, 0 for full and tiny."""
     optimizer_lr: float = 2.5e-5
     """η_max: largest learning rate."""
     scheduler_warmup_steps: int = 100
@@ -191,7 +197,7 @@ class TactilePI05Config(PI05Config):
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: a setting out of its range or an unknown backbone.
+            TaccorlError: a setting is out of its range, or the backbone is unknown.
         """
         super().__post_init__()
         if self.backbone not in _BACKBONES:
@@ -244,7 +250,7 @@ class TactilePI05Config(PI05Config):
         self.image_changes()
 
     def image_changes(self) -> ImageRandomizationConfig | None:
-        """Image randomisation in training; None: none.
+        """Image randomisation in training; None: no randomisation and no noise.
 
         Raises:
             TaccorlError: noise or rotation is out of its range.
@@ -261,7 +267,7 @@ class TactilePI05Config(PI05Config):
 
     @property
     def normalizes_steps(self) -> bool:
-        """Whether steps of a chunk are normalised one by one: ``normalize_steps``, by default as the backbone wants; only for
+        """Whether each step of a chunk is normalised by itself: ``normalize_steps`` or the backbone's default; only with
         relative actions."""
         wanted = self.backbone != "full" if self.normalize_steps is None else self.normalize_steps
         return wanted and self.use_relative_actions
@@ -301,14 +307,14 @@ class TactilePI05Config(PI05Config):
 
     @property
     def num_bodies(self) -> int:
-        """P: parts whose poses are known."""
+        """P: number of parts whose poses are known."""
         return len(bodies_of(self.require_part_names()))
 
     def require_part_names(self) -> list[str]:
         """Names of the numbers in the pose input, part after part: position [m] and rotation.
 
         Raises:
-            TaccorlError: neither a dataset nor a checkpoint has them.
+            TaccorlError: neither a dataset nor a checkpoint has stated them.
         """
         if self.part_names is None:
             raise TaccorlError(
@@ -319,7 +325,7 @@ class TactilePI05Config(PI05Config):
 
     @property
     def window_delta_indices(self) -> dict[str, list[int]]:
-        """Features that come with their last rows, −(L−1) … 0. Read by ``taccorl.training.reading``."""
+        """Features of which the policy gets the last L rows → their offsets −(L−1) … 0. Read by ``taccorl.training.reading``."""
         return {TACTILE: list(range(1 - self.tactile_history, 1))} if self.tactile and self.tactile_history > 1 else {}
 
     def get_optimizer_preset(self) -> FusedAdamW:
@@ -336,8 +342,8 @@ class TactilePI05Config(PI05Config):
     def validate_features(self) -> None:
         """Keep only the policy's inputs: state, pictures, the parts' poses and, unless it is vision only, touch.
 
-        Touch becomes ``ENV``, a kind that LeRobot's normaliser leaves as it is. The rest (a flag, the touch of faster clocks)
-        would be normalised for nothing.
+        Touch gets the type ``ENV``, which LeRobot's normaliser does not change. Other features (a flag, the touch of faster
+        clocks) would be normalised without use.
         """
         super().validate_features()
         given = self.input_features or {}
@@ -349,10 +355,10 @@ class TactilePI05Config(PI05Config):
         self.input_features = kept
 
     def require_tactile_format(self) -> TactileFormat:
-        """Format of touch, which must be known.
+        """Format of touch in the dataset or checkpoint.
 
         Raises:
-            TaccorlError: neither a dataset nor a checkpoint has told it.
+            TaccorlError: neither a dataset nor a checkpoint has stated it.
         """
         if self.tactile_format is None:
             raise TaccorlError(
@@ -362,13 +368,14 @@ class TactilePI05Config(PI05Config):
         return self.tactile_format
 
     def match_dataset(self, meta: Any) -> None:
-        """Take the format of touch and the rate from the dataset's metadata, or compare with those known already.
+        """Take the format of touch and the rate from the dataset's metadata, or compare them with those already known.
 
         Args:
             meta: LeRobot's ``LeRobotDatasetMetadata``.
 
         Raises:
-            TaccorlError: no touch, another format or rate than the checkpoint's, episodes shorter than the window.
+            TaccorlError: the dataset has no touch, another format or rate than the checkpoint, or episodes shorter than the
+                window.
         """
         where = f"dataset {meta.repo_id} ({meta.root})"
         if self.fps is not None and self.fps != meta.fps:

@@ -14,7 +14,7 @@ def contact(readings_BLK: torch.Tensor, threshold: float, min_active: int) -> to
     Args:
         readings_BLK: normalised readings; all dimensions after L are taxels.
         threshold: λ_f, in normalised readings.
-        min_active: m, taxels that have to be above it in one and the same reading.
+        min_active: m, number of taxels that must be above it in the same reading.
     """
     active_BL = (readings_BLK.abs() > threshold).flatten(2).sum(-1)
     return active_BL.amax(1) >= min_active

@@ -36,12 +36,13 @@ class KeptConstants(TorchFunctionMode):
 
 
 class GraphedCall:
-    """``compute(*tensors)`` on a GPU, recorded for each combination of shapes. Weights may change in place, not move."""
+    """``compute(*tensors)`` on a GPU, recorded as a CUDA graph for each combination of shapes. Weights may be changed in place,
+    but not replaced."""
 
     def __init__(self, compute: Callable[..., Tensor]) -> None:
         """
         Args:
-            compute: takes tensors and gives one, reads nothing back, draws no random number.
+            compute: function of tensors that returns one tensor, copies nothing to the CPU and draws no random number.
         """
         self._compute = compute
         self._recorded: dict[Any, tuple[torch.cuda.CUDAGraph, list[Tensor], Tensor]] = {}

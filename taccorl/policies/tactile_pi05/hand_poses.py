@@ -27,30 +27,30 @@ if TYPE_CHECKING:
     from taccorl.sim.robot import RobotConfig
 
 HAND_POSES = "observation.hand_poses"
-"""(B, 27) [in units of ``WORLD_M`` and ``HAND_TO_HAND_M``; rotations without unit]."""
+"""Key of the hand poses, (B, 27): positions in units of ``WORLD_M`` and ``HAND_TO_HAND_M``, rotations without unit."""
 NUM_HAND_POSES = 27
 WORLD_M = 0.25
-"""Unit of positions in the world."""
+"""Unit of positions in the world frame [m]."""
 HAND_TO_HAND_M = 0.1
-"""Unit of the position of one hand in the other's frame."""
+"""Unit of the position of one hand in the other's frame [m]."""
 
 # B batch, J joints
 
 
 @functools.cache
 def arm_names() -> tuple[str, ...]:
-    """Names of the state's and the action's numbers in datasets of the robot whose geometry is known."""
+    """Names of the elements of state and action in datasets of the robot whose geometry is known."""
     names = load_dataset_spec(find_spec("taccorl_bimanual")).features["action"].names
     assert names is not None, "the data spec names its joints"
     return tuple(names)
 
 
 def arm_chains(robot: "RobotConfig | None" = None) -> list[list[list[list[float]]]]:
-    """Of each arm, (7, 4, 4): every link's frame in its parent's where the joint is at 0 (the first in the world), then the TCP
-    in link 6. A joint turns about its own z axis.
+    """Kinematic chain of each arm, (7, 4, 4): pose of every link in its parent's frame at joint angle 0 (the first in the
+    world), then of the TCP in link 6. A joint turns about its own z axis.
 
     Args:
-        robot: None: the nominal one.
+        robot: configuration of the robot; None: the nominal one.
     """
     import mujoco
 
@@ -112,7 +112,7 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def hand_poses(state_BS: Tensor, chains: Tensor) -> Tensor:
-    """(B, 27), see ``HAND_POSES``. Arguments as of ``tcp_poses``."""
+    """Hand poses (B, 27) as ``HAND_POSES`` describes. Arguments as of ``tcp_poses``."""
     left_B44, right_B44 = tcp_poses(state_BS, chains)
     turn_B33 = left_B44[:, :3, :3].transpose(1, 2)
     between_B3 = _product(turn_B33, right_B44[:, :3, 3:] - left_B44[:, :3, 3:])[:, :, 0]
@@ -128,7 +128,8 @@ def hand_poses(state_BS: Tensor, chains: Tensor) -> Tensor:
 
 @dataclass
 class HandPosesStep(ObservationProcessorStep):
-    """Adds ``HAND_POSES`` to an observation whose state is not normalised yet. A checkpoint holds the arms' geometry."""
+    """Preprocessor step that adds ``HAND_POSES`` to an observation whose state is not normalised yet. A checkpoint stores the
+    arms' geometry."""
 
     chains: list[list[list[list[float]]]] = field(default_factory=arm_chains)
 

@@ -1,11 +1,11 @@
 """The image rows of the paper's domain randomisation (App. E): crop-resize, rotation, brightness, contrast, saturation.
 
-They are those of π0.5's own training (its App. E). openpi's code turns and crops only the fixed camera and gives wrist
-cameras the colours alone; the paper says "camera" without exception, so every image gets every row here.
+They are those of π0.5's own training (its App. E). openpi's code rotates and crops only the fixed camera and changes only the
+colours of wrist cameras; the paper says "camera" without exception, so that here every row applies to every image.
 
-What is computed is what torchvision's RandomCrop, Resize, RandomRotation and ColorJitter make of an image, for a whole batch on
-its device, with two differences: crop and rotation are one sampling instead of two, which blurs less (0.001 off on a picture
-without edges), and the seam of the black corners is as bright as its share of the picture, not the square of it.
+The result is that of torchvision's RandomCrop, Resize, RandomRotation and ColorJitter, computed for a whole batch on its device,
+with two differences: crop and rotation are one sampling instead of two, which blurs less (0.001 off on a picture without edges),
+and the seam of the black corners is as bright as its share of the picture, not the square of it.
 """
 
 import math
@@ -27,20 +27,21 @@ _ORDERS = tuple(permutations(range(3)))  # of brightness, contrast and saturatio
 
 @dataclass(kw_only=True)
 class ImageRandomizationConfig:
-    """Ranges of the image randomisation. Every row applies to every image (the paper's probability is 1.0)."""
+    """Ranges of the image randomisation. Every change applies to every image (the paper's probability is 1.0)."""
 
     crop: float = 0.95
-    """f_crop: side of the random crop as a part of the image's side; scaled back to full size. 1: absent."""
+    """f_crop: side of the random crop relative to the image's side; the crop is scaled back to full size. 1: no crop."""
     rotation_deg: float = 5.0
-    """Δθ ~ U(±this), about the middle; corners that come in are black. 0: absent."""
+    """Δθ ~ U(±this) [degrees]: rotation about the middle; corners become black. 0: no rotation."""
     brightness: tuple[float, float] = (0.7, 1.3)
-    """j_b ~ U(range): image · j_b. (1, 1): absent."""
+    """j_b ~ U(range): factor on the image. (1, 1): no change."""
     contrast: tuple[float, float] = (0.6, 1.4)
-    """j_c ~ U(range): distance from the image's mean grey · j_c. (1, 1): absent."""
+    """j_c ~ U(range): factor on the difference from the image's mean grey. (1, 1): no change."""
     saturation: tuple[float, float] = (0.5, 1.5)
-    """j_s ~ U(range): distance of each pixel from its own grey · j_s. (1, 1): absent."""
+    """j_s ~ U(range): factor on the difference of each pixel from its own grey. (1, 1): no change."""
     noise_std: float = 0.0
-    """Normal noise on every value, after all else: 0.03 (σ_v) in the paper's co-training, none in its randomisation."""
+    """Standard deviation of normal noise on every value in [0, 1], added last: 0.03 (σ_v) in the paper's co-training, 0 in its
+    randomisation."""
 
     def __post_init__(self) -> None:
         if not 0 < self.crop <= 1:
@@ -58,17 +59,17 @@ class ImageRandomizationConfig:
 
     @classmethod
     def absent(cls, **rows: Any) -> "ImageRandomizationConfig":
-        """The configuration with only these rows."""
+        """Configuration without any change except those of the given fields."""
         one = (1.0, 1.0)
         return cls(**{"crop": 1.0, "rotation_deg": 0.0, "brightness": one, "contrast": one, "saturation": one, **rows})
 
     def build(self) -> "ImageRandomization":
-        """The transform itself; LeRobot takes it as a dataset's ``image_transforms``, too."""
+        """Build the transform; LeRobot also accepts it as a dataset's ``image_transforms``."""
         return ImageRandomization(self)
 
 
 class ImageRandomization(nn.Module):
-    """Draws anew for each image, from torch's global generator (``torch.manual_seed``)."""
+    """Random changes of images, drawn for each image from torch's global generator (``torch.manual_seed``)."""
 
     def __init__(self, config: ImageRandomizationConfig) -> None:
         super().__init__()
@@ -76,10 +77,10 @@ class ImageRandomization(nn.Module):
 
     @torch.no_grad()
     def forward(self, images: Tensor) -> Tensor:
-        """Images (…, 3, rows, columns) of float in [0, 1] → the same shape; each of the leading ones is drawn for itself.
+        """Images (…, 3, rows, columns) of float in [0, 1] → the same shape; random numbers are drawn for each image separately.
 
         Raises:
-            TaccorlError: another type or number of channels.
+            TaccorlError: images are of another type or number of channels.
         """
         if not images.is_floating_point() or images.ndim < 3 or images.shape[-3] != 3:
             raise TaccorlError(

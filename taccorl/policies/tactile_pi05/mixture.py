@@ -17,23 +17,24 @@ from torch import Tensor
 from taccorl.errors import TaccorlError
 
 IS_SIM = "observation.is_sim"
-"""1 for a simulated row, 0 for a real one (or one of a surrogate that stands for the real robot); shape (1,)."""
+"""Feature that is 1 for a simulated row and 0 for a real one (or one of a surrogate that stands for the real robot); shape
+(1,)."""
 _ROUNDING = 1e-9  # LeRobot's mean of the means of episodes, all of them 1, may be off by this
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Weights of simulated and real rows of a dataset."""
+    """Weights of simulated and real rows in the loss."""
 
     sim_weight: float
-    """α."""
+    """α: weight of the simulated loss."""
     sim_share: float
-    """p: simulated rows / all rows."""
+    """p: number of simulated rows / number of all rows."""
 
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: a domain that counts has no rows.
+            TaccorlError: a domain with a weight above 0 has no rows.
         """
         if not 0 <= self.sim_weight <= 1:
             raise TaccorlError(f"--policy.sim_weight={self.sim_weight}: α is a share, 0 … 1")
@@ -52,10 +53,10 @@ class Mixture:
         """Make the weights from a dataset's statistics.
 
         Args:
-            stats: the dataset's statistics, as LeRobot keeps them; None or without ``observation.is_sim``: one domain.
+            stats: the dataset's statistics in LeRobot's form; None or without ``observation.is_sim``: one domain.
 
         Raises:
-            TaccorlError: a domain that counts has no rows, or α is no share.
+            TaccorlError: a domain with a weight above 0 has no rows, or α is not in 0 … 1.
         """
         if not stats or IS_SIM not in stats:
             return None
@@ -63,7 +64,7 @@ class Mixture:
         return cls(sim_weight, float(round(share)) if abs(share - round(share)) < _ROUNDING else share)
 
     def weights(self, is_sim_B: Tensor) -> Tensor:
-        """(B,) w; 0 for a domain that does not count."""
+        """(B,) weight w of each row; 0 for a domain whose loss has weight 0."""
         sim = self.sim_weight / self.sim_share if self.sim_weight > 0 else 0.0
         real = (1 - self.sim_weight) / (1 - self.sim_share) if self.sim_weight < 1 else 0.0
         return torch.where(is_sim_B, sim, real)
@@ -71,8 +72,8 @@ class Mixture:
     def means(self, losses_B: Tensor, is_sim_B: Tensor) -> dict[str, Tensor]:
         """``loss_sim`` and ``loss_real``: each domain's expected loss as this batch estimates it.
 
-        Σ ℓ over its rows / (rows of it to be expected in a batch), not / (rows of it): so loss = α · loss_sim + (1 − α) ·
-        loss_real in every batch, and a batch without a domain's rows is no special case.
+        The sum of ℓ over a domain's rows is divided by the expected, not the actual, number of its rows in a batch, so that loss
+        = α · loss_sim + (1 − α) · loss_real in every batch, also in a batch without rows of one domain.
         """
         of_sim = torch.where(is_sim_B, losses_B, 0).mean()
         means = {}

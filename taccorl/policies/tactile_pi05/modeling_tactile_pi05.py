@@ -1,8 +1,8 @@
 """π0.5 with touch as a LeRobot policy: training's loss and the chunk of actions, around the ``network``.
 
-A row without contact is, with flow matching, what plain pi05 makes of it, bit by bit: when the whole batch is without, and on a
-CPU also beside rows with contact (``_by_contact``). Where a GPU computes by other kernels than LeRobot's (``compiled`` in
-training, ``graphed`` for a chunk), it is so up to rounding.
+With flow matching, the result for a row without contact equals that of plain pi05 bit by bit: if no row of the batch is in
+contact, and on a CPU also beside rows in contact (``_by_contact``). On a GPU with other kernels than LeRobot's (``compiled`` in
+training, ``graphed`` for a chunk) it is equal up to rounding.
 """
 
 import logging
@@ -56,13 +56,13 @@ class TactilePI05Policy(PI05Policy):
     ) -> None:
         """
         Args:
-            dataset_meta: LeRobot's metadata of the dataset that it is trained on; None when it is only used.
-            dataset_stats: its statistics, of which the share of simulated rows is used.
-            from_base: start from ``config.base_checkpoint``, if there is one; a checkpoint of its own needs no start.
+            dataset_meta: LeRobot's metadata of the training dataset; None if the policy is only used.
+            dataset_stats: statistics of the dataset, for the share of simulated rows.
+            from_base: start from ``config.base_checkpoint``, if there is one; False for loading a checkpoint of this policy.
 
         Raises:
-            TaccorlError: the dataset does not fit (see ``TactilePI05Config.match_dataset``), lacks a domain that counts, or
-                the base checkpoint does not fit.
+            TaccorlError: the dataset does not fit (see ``TactilePI05Config.match_dataset``), has no rows of a domain with a
+                weight above 0, or the base checkpoint does not fit.
         """
         PreTrainedPolicy.__init__(self, config)
         if dataset_meta is not None:
@@ -111,8 +111,8 @@ class TactilePI05Policy(PI05Policy):
     def from_pretrained(
         cls, pretrained_name_or_path: Any, *, config: Any = None, revision: str | None = None, **kwargs: Any
     ) -> "TactilePI05Policy":
-        """A checkpoint of this policy, in evaluation mode. LeRobot's own for pi05 goes on with random weights where it cannot
-        read them.
+        """Load a checkpoint of this policy, in evaluation mode. (LeRobot's own loader for pi05 continues with random weights if
+        it cannot read them.)
 
         Raises:
             TaccorlError: it cannot be read, or its weights are not exactly this policy's.
@@ -136,11 +136,11 @@ class TactilePI05Policy(PI05Policy):
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
         """The co-training loss (see ``mixture``) over ``action_losses``, and values for the log.
 
-        A row's loss is the mean over its action steps without those behind the episode's end (LeRobot's pi05 counts them,
-        too). Where there are none, and one domain, that of flow matching is LeRobot's to the bit.
+        A row's loss is the mean over its action steps except those beyond the episode's end (LeRobot's pi05 includes them).
+        Without such steps, and with one domain, the loss equals LeRobot's flow-matching loss bit by bit.
 
         Args:
-            reduction: "mean", or "none" for the rows, (B,), of which it is the mean.
+            reduction: "mean", or "none" for the losses of the rows, (B,).
         """
         losses_BHA, contact_B, tokens = self._losses_and_tokens(batch)
         rows, horizon = losses_BHA.shape[:2]
@@ -171,7 +171,7 @@ class TactilePI05Policy(PI05Policy):
     def action_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
         """(B, H, 32) squared errors of the velocity at a random time, and (B,) contact (None: vision only).
 
-        Draws noise and time from torch's generator as LeRobot's pi05 does; in training, first what changes the images.
+        Draws noise and time from torch's generator as LeRobot's pi05 does; in training, the image randomisation draws before.
         """
         losses_BHA, contact_B, _ = self._losses_and_tokens(batch)
         return losses_BHA, contact_B
@@ -244,7 +244,7 @@ class TactilePI05Policy(PI05Policy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor]) -> Tensor:
-        """The next action of each environment; called at every control step, as it is here that touch is remembered."""
+        """The next action of each environment. Must be called at every control step, because it stores the touch readings."""
         if self.config.tactile and TACTILE in batch and batch[TACTILE].ndim == 2:
             batch = {**batch, TACTILE: self._remember(batch[TACTILE])}
         state = batch.get(RAW_STATE)
@@ -258,10 +258,11 @@ class TactilePI05Policy(PI05Policy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """(B, H, A). ``observation.tactile`` is the window, (B, L, K): a caller that re-plans rarely has to bring it along.
+        """Predict a chunk of normalised actions, (B, H, A). ``observation.tactile`` is the whole window, (B, L, K), which the
+        caller must provide.
 
         Args:
-            kwargs: LeRobot's, for real-time chunking; and ``noise`` (B, H, 32) and ``num_steps``.
+            kwargs: LeRobot's arguments for real-time chunking; and ``noise`` (B, H, 32) and ``num_steps``.
         """
         self.eval()
         images, image_masks = self._preprocess_images(batch)
@@ -339,7 +340,7 @@ class TactilePI05Policy(PI05Policy):
         self.train(was_training)
 
     def prepare_action(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, H, 32) training target: normalised actions, by option each step by itself, padded to π0.5's 32."""
+        """(B, H, 32) training target: normalised actions, with ``normalizes_steps`` each step by itself, padded to π0.5's 32."""
         if self.steps is None:
             return super().prepare_action(batch)
         return super().prepare_action({**batch, ACTION: self.steps.normalized(batch[ACTION])})

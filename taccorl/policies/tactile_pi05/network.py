@@ -28,16 +28,16 @@ _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
 
 
 class Touch(NamedTuple):
-    """Tactile tokens of a batch, and where there is contact."""
+    """Tactile tokens of a batch, and the rows that are in contact."""
 
     prefix_BMD: Tensor
     suffix_BMD: Tensor
     contact_B: Tensor
-    """c_t: rows without contact do not have the tokens."""
+    """c_t, (B,) bool. Rows without contact do not use the tokens."""
 
 
 class TactileConditioning(nn.Module):
-    """All weights that touch adds to pi05: ``model.tactile.*`` of a checkpoint."""
+    """All weights that touch adds to pi05: the entries ``model.tactile.*`` of a checkpoint."""
 
     def __init__(self, config: TactilePI05Config, prefix_width: int, suffix_width: int) -> None:
         super().__init__()
@@ -61,13 +61,13 @@ class TactileConditioning(nn.Module):
 
 
 class TactilePI05Pytorch(PI05Pytorch):
-    """LeRobot's pi05 model with tactile tokens, which ``embed_prefix`` and ``embed_suffix`` add."""
+    """LeRobot's pi05 model with tactile tokens, added in ``embed_prefix`` and ``embed_suffix``."""
 
     config: TactilePI05Config
     paligemma_with_expert: CompiledBackbone
 
     def __init__(self, config: TactilePI05Config, rtc_processor: Any = None) -> None:
-        """As ``PI05Pytorch.__init__``, around a backbone of ours."""
+        """As ``PI05Pytorch.__init__``, with a backbone of ``taccorl``."""
         nn.Module.__init__(self)
         self.config, self.rtc_processor = config, rtc_processor
         self.paligemma_with_expert = _backbone(config)
@@ -94,9 +94,9 @@ class TactilePI05Pytorch(PI05Pytorch):
         """Context manager: the model uses this state and these tactile readings in all computations inside it.
 
         Args:
-            state_B1D: its token. None: it is in the prompt.
-            readings_BLPRC: None, or contact nowhere in the batch: plain pi05.
-            masked: tokens are there, masked, even if contact is nowhere; so that nothing is read back from a GPU.
+            state_B1D: token of the state. None: the state is in the prompt.
+            readings_BLPRC: tactile readings. None, or no contact in the batch: plain pi05.
+            masked: also compute (masked) tokens if there is no contact in the batch, so that nothing is copied from the GPU.
         """
         if readings_BLPRC is not None and contact_B is not None and (masked or bool(contact_B.any())):
             # Float32 in training, too, as in a chunk: casting the encoder's many small weights takes longer than using them.

@@ -1,4 +1,5 @@
-"""Poses of the task's parts for the state's token: absolute, between parts and relative to both hands. The preprocessor's part.
+"""Poses of the task's parts for the state's token: absolute, between parts and relative to both hands, computed in the
+preprocessor.
 
 Of each body (P of them) the observation has its pose in the world, ``observation.environment_state``. The policy gets
 
@@ -25,13 +26,13 @@ from taccorl.policies.tactile_pi05.hand_poses import HAND_TO_HAND_M, WORLD_M, ar
 from taccorl.sim.part_poses import PARTS_KEY, POSE_NAMES
 
 PART_POSES = "observation.part_poses"
-"""(B, ``num_part_numbers``), see above."""
+"""Key of the parts' poses, (B, ``num_part_numbers``), in the order of the module's table."""
 PART_TO_PART_M = HAND_TO_HAND_M
-"""Unit of positions in the frame of a body or a TCP."""
+"""Unit of positions in the frame of a body or a TCP [m]."""
 FINE_M = (0.01, 0.002)
-"""Units within tanh, of positions between bodies."""
+"""Units of positions between bodies within the tanh [m]."""
 TARGET_M = 0.01
-"""Unit of errors in the loss of ``PoseHead``: below it the loss is quadratic."""
+"""Error in the loss of ``PoseHead`` below which the loss is quadratic [m]."""
 _POSE = len(POSE_NAMES)
 _PAIR = _POSE + 3 * len(FINE_M)
 _ARMS = 2
@@ -54,7 +55,7 @@ def part_poses(poses_BN: Tensor, tcps: list[Tensor]) -> Tensor:
     """Input (B, ``num_part_numbers``) float32 of the policy from the parts' poses; see the module's table.
 
     Args:
-        poses_BN: (B, 9 P) as ``taccorl.sim.part_poses`` gives them.
+        poses_BN: (B, 9 P) as from ``taccorl.sim.part_poses``.
         tcps: world-from-TCP (B, 4, 4) of each arm.
     """
     poses_BP9 = poses_BN.to(torch.float32).unflatten(-1, (-1, _POSE))
@@ -84,7 +85,8 @@ def _turned_back(rotation: Tensor, vector: Tensor) -> Tensor:
 
 
 def relative_positions_m(part_poses_BN: Tensor, num_bodies: int) -> Tensor:
-    """(B, V, 3) [m] out of ``PART_POSES``: body i in the frame of body j, then the bodies in the frame of each TCP."""
+    """(B, V, 3) positions [m] extracted from ``PART_POSES``: body i in the frame of body j, then the bodies in the frame of each
+    TCP."""
     first, pairs = _POSE * num_bodies, num_pairs(num_bodies)
     between_BQ3 = (
         part_poses_BN[:, first : first + _PAIR * pairs].unflatten(-1, (pairs, _PAIR))[..., :3] if pairs else None
@@ -96,12 +98,13 @@ def relative_positions_m(part_poses_BN: Tensor, num_bodies: int) -> Tensor:
 
 @dataclass
 class PartPosesStep(ObservationProcessorStep):
-    """Adds ``PART_POSES`` to an observation whose state is not normalised yet. A checkpoint holds the arms' geometry."""
+    """Preprocessor step that adds ``PART_POSES`` to an observation whose state is not normalised yet. A checkpoint stores the
+    arms' geometry."""
 
     names: list[str]
-    """Of the numbers of ``observation.environment_state``."""
+    """Names of the elements of ``observation.environment_state``."""
     required: bool = True
-    """False: only training looks at the poses (the pose loss); without them nothing is added."""
+    """False: only training uses the poses (the pose loss), and an observation without them is accepted."""
     chains: list[list[list[list[float]]]] = field(default_factory=arm_chains)
 
     def __post_init__(self) -> None:
@@ -111,7 +114,7 @@ class PartPosesStep(ObservationProcessorStep):
         """Add the parts' poses to an observation.
 
         Raises:
-            TaccorlError: no poses of the parts, those of other parts, or another robot.
+            TaccorlError: the observation has no poses of the parts, or those of other parts, or is of another robot.
         """
         if PARTS_KEY not in observation and not self.required:
             return observation
@@ -149,7 +152,7 @@ class PartPosesStep(ObservationProcessorStep):
 
 
 def bodies_of(names: list[str]) -> list[str]:
-    """Bodies of the features' names, such as ``plug`` of ``plug.x``."""
+    """Bodies named in the features' names, such as ``plug`` in ``plug.x``."""
     return [name.rpartition(".")[0] for name in names[::_POSE]]
 
 
@@ -174,7 +177,7 @@ class PoseHead(nn.Module):
         return self.out(F.gelu(self.hidden(inputs))).unflatten(-1, (self.num_vectors, 3))
 
     def errors(self, cameras: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
-        """(B,) Huber loss, quadratic within ``TARGET_M``, and the root mean square of the vectors' errors [mm]."""
+        """(B,) Huber loss, quadratic below ``TARGET_M``, and the root mean square error of the positions [mm]."""
         target_BV3 = relative_positions_m(part_poses_BN, self.num_bodies) / TARGET_M
         predicted_BV3 = self(cameras, state_BS).to(torch.float32) * (PART_TO_PART_M / TARGET_M)
         loss_B = F.huber_loss(predicted_BV3, target_BV3, reduction="none").mean(dim=(1, 2))

@@ -36,10 +36,12 @@ SCHEME = "fixed_scale"
 
 @dataclass
 class TactileReadingStep(ObservationProcessorStep):
-    """Counts above baseline → readings, by the dataset's named scheme. ``fixed_scale``: reading = counts · gain.
+    """Preprocessor step that converts counts above baseline to readings by the dataset's scheme. ``fixed_scale``: reading =
+    counts · gain.
 
-    Touch never passes through LeRobot's normaliser: most taxels rest at 0, their 1 % and 99 % quantiles are equal, and what is
-    divided by their difference comes out as 2e8. Saved under its class's path, which LeRobot imports when it loads a checkpoint.
+    Touch never passes through LeRobot's normaliser: most taxels rest at 0, so that their 1 % and 99 % quantiles are equal, and a
+    division by their difference gives 2e8. A checkpoint names the step by its class's path, which LeRobot imports when it loads
+    a checkpoint.
     """
 
     scheme: str = SCHEME
@@ -54,7 +56,7 @@ class TactileReadingStep(ObservationProcessorStep):
             raise TaccorlError(f"touch normalised by {self.scheme!r}: only {SCHEME!r} is known")
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """``observation.tactile`` of any shape and number type → float32 of the same shape."""
+        """``observation.tactile`` of any shape and numeric type → float32 readings of the same shape."""
         if TACTILE in observation:
             observation[TACTILE] = torch.as_tensor(observation[TACTILE]).to(torch.float32) * self.gain_per_count
         return observation
@@ -81,9 +83,9 @@ class _KeepsFeatures(ProcessorStep):
 class RawStateStep(_KeepsFeatures):
     """Step that, at inference, also passes the unnormalised state to the policy: its relative actions refer to it.
 
-    LeRobot 0.6.1 adds the state of now to every action that comes out of a chunk, but all of them are relative to the state for
-    which the chunk was predicted: an arm that has moved since would be sent twice as far. So the policy says with each action how
-    far the state has moved since (``STATE_SINCE_PLAN``), and that is taken off again.
+    LeRobot 0.6.1 adds the present state to every action of a chunk, but all actions are relative to the state for which the
+    chunk was predicted: the motion since then would be added twice. So the policy returns with each action the change of the
+    state since the prediction (``STATE_SINCE_PLAN``), which is subtracted.
     """
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
@@ -107,7 +109,7 @@ class TakeStateSincePlanStep(_KeepsFeatures):
 
 @dataclass
 class FromPlansStateStep(RelativeActionsProcessorStep):
-    """After LeRobot's step has added the state of now: takes off how far it has moved since the chunk was predicted."""
+    """Step after LeRobot's addition of the present state: subtracts the change of the state since the chunk was predicted."""
 
     _registry_name = None  # not LeRobot's step of that name
 
@@ -132,7 +134,7 @@ def make_tactile_pi05_pre_post_processors(
     """Make the pre- and postprocessor of ``--policy.type=tactile_pi05``: pi05's steps, with touch before the prompt.
 
     Raises:
-        TaccorlError: touch of an unknown format, a tokenizer that cannot be loaded or that the backbone has no room for.
+        TaccorlError: the format of touch is unknown, or the tokenizer cannot be loaded or has more tokens than the backbone.
     """
     tokenizer = PromptTokenizerStep(tokenizer_name=config.tokenizer_name, max_length=config.tokenizer_max_length)
     if config.backbone in SIZES and len(tokenizer.input_tokenizer) > SIZES[config.backbone].vocabulary:

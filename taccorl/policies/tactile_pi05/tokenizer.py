@@ -33,7 +33,7 @@ class ByteTokenizer:
         return [_BEGIN, *(_FIRST + byte for byte in text.encode())]
 
     def __call__(self, texts: list[str], **_: Any) -> dict[str, torch.Tensor]:
-        """``input_ids`` and ``attention_mask``, (B, longest), filled up at the right."""
+        """``input_ids`` and ``attention_mask`` of prompts, (B, longest), padded on the right."""
         rows = [self.tokens(text) for text in texts]
         longest = max(len(row) for row in rows)
         ids = torch.tensor([row + [_PAD] * (longest - len(row)) for row in rows])
@@ -63,8 +63,9 @@ class WordTokenizer(ByteTokenizer):
 
 
 def write_number_embeddings(embedding_VD: torch.Tensor) -> None:
-    """Let the embeddings (vocabulary, D) of ``WordTokenizer``'s numbers start near to those of near numbers: sines and cosines of
-    ½ … 128 half turns over the range, as large as the others. At random, each of them is learnt by itself."""
+    """Initialise the embeddings (vocabulary, D) of ``WordTokenizer``'s numbers so that similar numbers have similar embeddings:
+    sines and cosines of ½ … 128 half periods over the range, of the size of the others. With random embeddings each number would
+    be learned separately."""
     numbers = torch.arange(_NUM_NUMBERS, device=embedding_VD.device)[:, None] / _NUM_NUMBERS
     half_turns = 2.0 ** torch.linspace(-1, 7, embedding_VD.shape[1] // 2, device=embedding_VD.device)
     waves = torch.cat([trig(math.pi * numbers * half_turns) for trig in (torch.sin, torch.cos)], dim=1)
@@ -77,9 +78,8 @@ _SHIPPED = {BYTES: ByteTokenizer, WORDS: WordTokenizer}
 
 
 class PromptTokenizerStep(TokenizerProcessorStep):
-    """LeRobot's step with ``words`` and ``bytes`` as further tokenizers. Never cuts a prompt: its end is the robot's state.
-
-    Saved under its class's path, which LeRobot imports when it loads a checkpoint.
+    """LeRobot's step with ``words`` and ``bytes`` as additional tokenizers. A prompt is never truncated, because the robot's
+    state is at its end. A checkpoint names the step by its class's path, which LeRobot imports when it loads a checkpoint.
     """
 
     _registry_name = None  # not LeRobot's step of that name

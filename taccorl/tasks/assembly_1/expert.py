@@ -28,9 +28,9 @@ class AirAssembly(ScriptedExpert):
     """Base of both assembly experts: both hands lift a part, the left one holds its part in the air, the right one inserts."""
 
     enough_m: float
-    """Depth from which the plug stays in its place."""
+    """Least depth at which the plug stays in its place [m]."""
     _held_like: np.ndarray | None = None
-    """(3, 3) how the left hand has come to hold the hole; level until then."""
+    """(3, 3) orientation of the hole in the left hand when it began to hold it; None: level."""
 
     @abstractmethod
     def holder(self) -> tuple[Part, str, str]:

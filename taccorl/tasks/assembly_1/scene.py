@@ -1,4 +1,4 @@
-"""Assembly #1: a tenon goes into a mortise in the air, the axes level; a direction that is off wedges or slides off.
+"""Assembly #1: a tenon goes into a mortise in the air, the axes level; with a wrong direction the plug wedges or slides off.
 
 The left hand holds the socket, the right hand the plug; both lie on the table at first, their axes along y.
 """
@@ -35,7 +35,7 @@ _AT_MOUTH_M = -0.002  # depth beyond which the plug's end is at the socket's fac
 
 @tasks.register("assembly_1")
 class Assembly1(Task):
-    """Plug into socket, both held."""
+    """Task: insert the plug into the socket, with both parts in the hands."""
 
     name = "assembly_1"
     instruction = "insert the orange plug into the grey socket in the air"
@@ -98,7 +98,7 @@ class Assembly1(Task):
 
 
 def lying_apart(plug: Part, holder: Part, draw: dict[str, np.ndarray]) -> Reset:
-    """Both on the table with their axes along y, the holder on the left, mating ends towards each other."""
+    """Poses of two parts on the table with their axes along y, the holder on the left, mating ends towards each other."""
     plug_xy, holder_xy = PLUG_AT_M + draw["plug_position"], SOCKET_AT_M + draw["socket_position"]
     return Reset(
         poses={
@@ -111,7 +111,7 @@ def lying_apart(plug: Part, holder: Part, draw: dict[str, np.ndarray]) -> Reset:
 
 
 def lift_and_join(holder: str, plug: str, joined: Callable[[Scene], np.ndarray]) -> dict[str, tuple[Subtask, ...]]:
-    """Subtasks of two hands that lift a part each and join them in the air."""
+    """Subtasks in which each hand lifts a part and both are joined in the air."""
 
     def lifted(part: str) -> Callable[[Scene], np.ndarray]:
         return lambda scene: scene.poses(part)[:, 2, 3] > LIFTED_M

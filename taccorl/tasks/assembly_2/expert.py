@@ -1,4 +1,5 @@
-"""Assembly #2: left holds the cradle open side up, right slides the plug in up to the stop, lets it down and lets go."""
+"""Assembly #2: the left hand holds the cradle, open side up; the right hand slides the plug in up to the stop, lowers it and
+releases it."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Plug and open cradle, which carries the plug only where its centre of mass is inside. Dimensions are choices."""
+"""Plug and open cradle, which supports the plug only if its centre of mass is inside. Dimensions are choices."""
 
 from dataclasses import replace
 

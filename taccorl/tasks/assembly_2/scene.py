@@ -1,7 +1,8 @@
-"""Assembly #2: a plug goes into an open cradle in the air, which carries it only if its centre of mass is inside.
+"""Assembly #2: a plug goes into an open cradle in the air, which supports it only if its centre of mass is inside.
 
 The left hand holds the cradle with its open side up, the right hand slides the plug in along the cradle's axis; both lie on
-the table at first, their axes along y. Let go too early, the plug tips over the cradle's lip (the paper's failure analysis).
+the table at first, their axes along y. If it is released too early, the plug tips over the cradle's lip (the paper's failure
+analysis).
 """
 
 from pathlib import Path
@@ -20,10 +21,10 @@ _IN_TILT_RAD, _IN_LATERAL_M = np.deg2rad(5.0), 0.004  # it lies on the cradle's 
 
 @tasks.register("assembly_2")
 class Assembly2(Task):
-    """Plug into cradle, both held, then only the cradle.
+    """Task: insert the plug into the cradle, with both parts in the hands, then release the plug.
 
-    Failures: ``fell_out``, the plug is in the air and neither hand nor cradle touches it; ``unsupported``, it has been let go
-    and hangs in the cradle with its centre of mass outside.
+    Failures: ``fell_out``: the plug is in the air, and neither hand nor cradle touches it; ``unsupported``: it was released and
+    hangs in the cradle with its centre of mass outside.
     """
 
     name = "assembly_2"

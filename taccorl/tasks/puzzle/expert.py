@@ -30,7 +30,8 @@ _HAND = {"triangle": "right", "circle": "left", "heart": "right"}
 
 
 class PuzzleExpert(ScriptedExpert):
-    """Expert of the puzzle: the right hand places triangle and heart, the left one the circle in between; one at a time."""
+    """Expert of the puzzle. The right hand places triangle and heart, the left hand the circle between them; one hand at a
+    time."""
 
     def script(self, arm: str) -> Script:
         return self._left() if arm == "left" else self._right()
@@ -234,7 +235,7 @@ def _is_in(shape: str) -> str:
 
 
 def raised(pose: np.ndarray, height_m: float) -> np.ndarray:
-    """The pose (4, 4) moved straight up."""
+    """A pose (4, 4) moved straight up."""
     up = pose.copy()
     up[2, 3] += height_m
     return up

@@ -1,4 +1,5 @@
-"""Do Puzzle: circle, heart and triangle go into their holes in a tray; a piece that is off by a millimetre rests on the rim.
+"""Do Puzzle: circle, heart and triangle go into their holes in a tray; a piece that is misplaced by a millimetre rests on the
+rim.
 
 The tray is clamped in the middle, its row of holes along y: circle to the left. The left hand places the circle, the right
 hand triangle and heart, one hand at the tray at a time.
@@ -34,7 +35,7 @@ _LEFT_ALONE_M = 0.10  # knob from both hands: nobody is about to pick it up agai
 
 @tasks.register("puzzle")
 class Puzzle(Task):
-    """Three pieces into a tray."""
+    """Task: put three pieces into a tray."""
 
     name = "puzzle"
     instruction = "put the circle, the heart and the triangle into their holes in the tray"
@@ -70,7 +71,7 @@ class Puzzle(Task):
         holes = [self.tray.holes[shape] for shape in PIECES]
         self._tray_from_hole = np.stack([hole.part_from_hole for hole in holes])
         self.in_depth_m = holes[0].depth_m - _ABOVE_FLOOR_M
-        """A piece is in when its underside is that far below the mouth; all holes are as deep."""
+        """Depth [m] of a piece's underside below the mouth from which the piece is inserted; all holes have the same depth."""
         mates = [piece.mate for piece in self.pieces.values() if piece.mate]
         self._piece_from_mate = np.stack([mate.part_from_mate for mate in mates])
         self._is_round = np.array([mate.num_turns is None for mate in mates])
@@ -100,7 +101,8 @@ class Puzzle(Task):
         return fit._replace(turn_rad=np.where(self._is_round[k], 0.0, turn_rad))
 
     def inside(self, fit: Fit) -> np.ndarray:
-        """Whether pieces with these pose errors are inserted: at most 2.5 mm above the floor, tilted by less than 3°."""
+        """Whether pieces with these pose errors are inserted: at most 2.5 mm above the hole's floor, and tilted by less than
+        3°."""
         # The other two are wider than any clearance: only what is in its own hole is within.
         turned = np.abs(fit.turn_rad) < _TURN_RAD
         return (fit.depth_m > self.in_depth_m) & (fit.tilt_rad < _TILT_RAD) & (fit.lateral_m < _LATERAL_M) & turned
@@ -127,12 +129,13 @@ class Puzzle(Task):
         )
 
     def placed(self, scene: Scene, shape: str) -> np.ndarray:
-        """(N,) whether a piece is in its hole and released."""
+        """(N,) bool: a piece is in its hole and released."""
         inside = self.inside(self.fits(scene, [PIECES.index(shape)]))[:, 0]
         return inside & ~scene.pads_touching(shape).any(axis=1)
 
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
-        """Subtasks: grasp and place for each piece. One hand places at a time: triangle, then circle (left), then heart."""
+        """Subtasks for each piece: grasp, then place. One hand places at a time: triangle (right), circle (left), heart
+        (right)."""
 
         def pair(shape: str) -> tuple[Subtask, Subtask]:
             def lifted(scene: Scene) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Test Tube Insertion: left grips the rack's handle; right lifts the tube, turns it upright and brings it in by touch."""
+"""Test Tube Insertion: the left hand grips the rack's handle; the right hand lifts the tube, turns it upright and inserts it,
+corrected by touch."""
 
 from dataclasses import replace
 from itertools import chain

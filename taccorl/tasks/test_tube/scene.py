@@ -31,7 +31,7 @@ _MOVED_M = 0.025  # from the nominal place: at least 20 mm from where it stood, 
 
 @tasks.register("test_tube")
 class TestTube(Task):
-    """One hand steadies the rack, the other brings the tube."""
+    """Task: one hand steadies the rack, the other inserts the tube."""
 
     __test__ = False  # pytest: not a test, whatever it is called
 
@@ -86,7 +86,7 @@ class TestTube(Task):
         return measure_fit(hole, scene.poses("tube") @ mate.part_from_mate, mate.num_turns)
 
     def inside(self, fit: Fit) -> np.ndarray:
-        """(N,) whether a tube with these pose errors is far enough in the hole."""
+        """(N,) bool: tubes with these pose errors are deep enough in the hole."""
         upright = fit.tilt_rad < _IN_TILT_RAD
         return (fit.depth_m >= _IN_DEPTH_M) & upright & (fit.lateral_m < _IN_LATERAL_M)
 
@@ -145,7 +145,7 @@ class TestTube(Task):
 
 
 def in_seat(stand_pose: np.ndarray, stand_from_part: np.ndarray) -> np.ndarray:
-    """World pose (7,) of a part in its seat (4, 4) of a stand at ``stand_pose`` (7,), a hair above it."""
+    """World pose (7,) of a part placed slightly above its seat (4, 4) in a stand at ``stand_pose`` (7,)."""
     turned = Rotation.from_quat(stand_pose[3:], scalar_first=True)
     pos = stand_pose[:3] + turned.apply(stand_from_part[:3, 3]) + (0, 0, 0.0002)
     return np.r_[pos, (turned * Rotation.from_matrix(stand_from_part[:3, :3])).as_quat(scalar_first=True)]
