@@ -231,7 +231,7 @@ class Effect:
         """Parameters of the effect in the one-joint model of ``alignment.controller.joint_kernel``, under the names used there.
 
         None: that model does not have the effect, and identification uses MuJoCo. Empty: the effect changes bodies only, and
-            inertia and weight are read from the compiled model.
+        inertia and weight are read from the compiled model.
         """
         return None
 
