@@ -32,7 +32,7 @@ lint: .venv/.ready  ## ruff, pyright and the order of imports
 	PYTHONPATH=. $(BIN)/lint-imports
 
 bench: .venv/.ready  ## measure; writes bench.json and docs/benchmarks.md (ONLY=ingest: one benchmark)
-	$(BIN)/python -m taccorl.benchmark $(if $(ONLY),--only=$(ONLY))
+	$(BIN)/python -m pipelines.benchmarks $(if $(ONLY),--only=$(ONLY))
 
 pictures: .venv/.ready  ## draw the pictures of the README and docs/effects.md again
 	$(BIN)/python -m pipelines.task_pictures

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 from pipelines.diagnosis_page import replace_section
-from taccorl.diagnosis.studies.cells import ASKED, FIRST_SEED, CellsRow, run_cells, table
+from pipelines.studies.cells import ASKED, FIRST_SEED, CellsRow, run_cells, table
 from taccorl.surrogate.cells import HIDDEN
 
 SENSORS, CLEAN, WORKERS = 5, 20, 2

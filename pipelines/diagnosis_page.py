@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from taccorl.diagnosis.report.figures_evidence import confusion_matrix, detection_curves, half_detected
-from taccorl.diagnosis.studies.joints_and_pads import (
+from pipelines.studies.joints_and_pads import (
     AT_FLOOR,
     MATERIAL,
     drop_said,
@@ -20,6 +19,7 @@ from taccorl.diagnosis.studies.joints_and_pads import (
     named,
     silently_wrong,
 )
+from taccorl.diagnosis.report.figures_evidence import confusion_matrix, detection_curves, half_detected
 
 PAGE = Path("docs/diagnosis.md")
 OTHERS = "<!-- Other machines: each section below is written by the command that it names. -->"

@@ -59,10 +59,10 @@ class AugmentConfig:
 def main(argv: list[str]) -> int:
     """Run ``taccorl augment``; returns the exit status 0."""
     config = parse(AugmentConfig, argv, positional=None)
-    from taccorl.benchmark import cpu_s
     from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts
     from taccorl.demos.mimicgen.coverage import Share
     from taccorl.demos.mimicgen.report import Spent, pages_of, write_report
+    from taccorl.lineage.processes import cpu_s
     from taccorl.lineage.store import Store
 
     plan = _plan(config)

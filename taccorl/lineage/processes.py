@@ -9,6 +9,7 @@ import math
 import multiprocessing
 import os
 import pickle
+import resource
 import signal
 import sys
 import threading
@@ -69,6 +70,14 @@ def attempt(fn: Callable[[Any], Any], item: Any) -> Done | Failed:
     except Exception as error:
         trace = None if isinstance(error, TaccorlError) else traceback.format_exc()
         return Failed(f"{type(error).__name__}: {error}", trace)
+
+
+def cpu_s(*, children: bool = False) -> float:
+    """CPU-seconds (user + system) of this process and, with ``children``, of those that ended."""
+    usages = [resource.getrusage(resource.RUSAGE_SELF)]
+    if children:
+        usages.append(resource.getrusage(resource.RUSAGE_CHILDREN))
+    return sum(u.ru_utime + u.ru_stime for u in usages)
 
 
 def pickled(thing: Any, what: str) -> bytes:

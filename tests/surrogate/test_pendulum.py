@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.studies.pendulums import CASES, jobs, removed
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
-from taccorl.diagnosis.studies.pendulums import CASES, jobs, removed
 from taccorl.surrogate.pendulum import (
     GAINS,
     LOADS,

@@ -8,10 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from taccorl.alignment.camera.calibration import CameraFit, CameraFrames, KnownPoint, calibrate_camera, pnp
-from taccorl.alignment.camera.fit import Matches, distances, moved, seen_from, slopes
-from taccorl.alignment.camera.view import TwinView, as_offset
-from taccorl.alignment.camera_benchmarks import (
+from pipelines.benchmarks.cameras import (
     ORIGIN,
     known_points,
     pose_error,
@@ -19,6 +16,9 @@ from taccorl.alignment.camera_benchmarks import (
     random_poses,
     surrogate_pictures,
 )
+from taccorl.alignment.camera.calibration import CameraFit, CameraFrames, KnownPoint, calibrate_camera, pnp
+from taccorl.alignment.camera.fit import Matches, distances, moved, seen_from, slopes
+from taccorl.alignment.camera.view import TwinView, as_offset
 from taccorl.errors import TaccorlError
 from taccorl.sim.cameras import Intrinsics
 from taccorl.sim.effects import make_effect

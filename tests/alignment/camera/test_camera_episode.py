@@ -6,9 +6,9 @@ import functools
 import numpy as np
 import pytest
 
+from pipelines.benchmarks.cameras import moving_joints, pose_error
 from taccorl.alignment.camera.calibration import calibrate_camera
 from taccorl.alignment.camera.episode import camera_frames, stage_rows
-from taccorl.alignment.camera_benchmarks import moving_joints, pose_error
 from taccorl.data.episode import Episode
 from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import TaccorlError

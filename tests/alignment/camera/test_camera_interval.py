@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pipelines.benchmarks.cameras import random_offset, random_poses, surrogate_pictures
 from taccorl.alignment.camera.calibration import CameraFrames, calibrate_camera
 from taccorl.alignment.camera.fit import levels, seen_from, solve
 from taccorl.alignment.camera.interval import JOINT_RAD, SHAPE_M, Covariance, _shifts, covariance
 from taccorl.alignment.camera.view import TwinView
-from taccorl.alignment.camera_benchmarks import random_offset, random_poses, surrogate_pictures
 from taccorl.sim.twin import TwinConfig
 
 SIZE = (240, 320)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipelines.benchmarks.cameras import random_poses, surrogate_pictures
 from taccorl.alignment.camera.calibration import CameraFrames
 from taccorl.alignment.camera.light import camera_light
-from taccorl.alignment.camera_benchmarks import random_poses, surrogate_pictures
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects.camera_exposure import blurred, toned
 from taccorl.sim.twin import TwinConfig

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pipelines.benchmarks.cameras import moving_joints, random_offset, random_poses, surrogate_pictures
 from taccorl.alignment.camera.timing import camera_latency
-from taccorl.alignment.camera_benchmarks import moving_joints, random_offset, random_poses, surrogate_pictures
 from taccorl.errors import TaccorlError
 from taccorl.sim.twin import TwinConfig
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from taccorl.alignment import benchmarks
+from pipelines.benchmarks import controller as benchmarks
 from taccorl.alignment.measurements.motions import CHIRP, RATE_HZ, REST_S, SWEEP_HZ, SWEEP_S, Room
 from taccorl.sim.twin import TwinConfig
 

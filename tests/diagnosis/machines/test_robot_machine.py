@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.studies import robots as robot_study
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition
 from taccorl.diagnosis.machines.robot import RobotMachine
-from taccorl.diagnosis.studies import robots as robot_study
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.surrogate.foreign import ROBOTS, Case, Plant, draw, with_robot, write_example

@@ -10,19 +10,24 @@ from pathlib import Path
 
 import pytest
 
-from taccorl import benchmark as module
-from taccorl.benchmark import BENCHMARKS, Row, benchmark, cpu_s, machine, meets, render, run, spread
+from pipelines.benchmarks import rows as module
+from pipelines.benchmarks import run as runner
+from pipelines.benchmarks.rows import BENCHMARKS, Row, benchmark, meets, spread
+from pipelines.benchmarks.run import machine, render, run
 from taccorl.errors import TaccorlError
+from taccorl.lineage.processes import cpu_s
 
 
 @pytest.fixture
 def only_mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """No registered benchmarks but the test's own; files go to an empty folder."""
-    monkeypatch.setattr(module, "BENCHMARKS", {})
-    monkeypatch.setattr(module, "ROOT", tmp_path)
-    monkeypatch.setattr(module, "JSON_PATH", tmp_path / "bench.json")
-    monkeypatch.setattr(module, "PAGE_PATH", tmp_path / "docs" / "benchmarks.md")
-    monkeypatch.setattr(module.pkgutil, "iter_modules", lambda path: iter(()))
+    registered: dict = {}
+    monkeypatch.setattr(module, "BENCHMARKS", registered)
+    monkeypatch.setattr(runner, "BENCHMARKS", registered)
+    monkeypatch.setattr(runner, "ROOT", tmp_path)
+    monkeypatch.setattr(runner, "JSON_PATH", tmp_path / "bench.json")
+    monkeypatch.setattr(runner, "PAGE_PATH", tmp_path / "docs" / "benchmarks.md")
+    monkeypatch.setattr(runner.pkgutil, "iter_modules", lambda path: iter(()))
     return tmp_path
 
 
@@ -99,7 +104,7 @@ def test_the_reference_loop_costs_the_same_whatever_ran_before() -> None:
 def test_no_goal_is_one_of_cpu_seconds_but_on_a_named_gpu() -> None:
     """The same code took 49 and 241 µs on two machines."""
     absolute = ("CPU-s", "s", "ms", "µs", "µs/env", "ms CPU", "s (wall)", "env steps/CPU-s")
-    rows = json.loads(module.JSON_PATH.read_text())
+    rows = json.loads(runner.JSON_PATH.read_text())
     judged = [row["name"] for row in rows if row["unit"] in absolute and row["met"] is not None]
     assert all("NVIDIA" in name for name in judged), judged
 
@@ -152,7 +157,7 @@ def test_a_partial_run_keeps_the_rows_of_the_others_and_replaces_its_own(only_mi
 
 def test_rows_of_another_machine_stay_beside_ones_own(only_mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kind = ["2 cores"]
-    monkeypatch.setattr("taccorl.benchmark.machine", lambda: kind[0])
+    monkeypatch.setattr(runner, "machine", lambda: kind[0])
 
     @benchmark("pictures")
     def _() -> Iterator[Row]:
@@ -199,7 +204,10 @@ def test_an_unknown_name_is_told_with_the_nearest(only_mine: Path) -> None:
 @pytest.mark.slow  # it imports every package
 def test_the_command_finds_registered_benchmarks_and_names_the_nearest() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "taccorl.benchmark", "--only=corupton"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "pipelines.benchmarks", "--only=corupton"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 2
     assert done.stderr == "no benchmark 'corupton'; did you mean 'corruption'?\n"
@@ -207,7 +215,7 @@ def test_the_command_finds_registered_benchmarks_and_names_the_nearest() -> None
 
 def test_a_bare_word_would_run_everything_and_is_refused() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "taccorl.benchmark", "ingest"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "pipelines.benchmarks", "ingest"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
     assert "--only=" in done.stderr
@@ -216,10 +224,10 @@ def test_a_bare_word_would_run_everything_and_is_refused() -> None:
 def test_every_registered_goal_can_be_read() -> None:
     import re
 
-    import taccorl.demos.benchmarks
+    import pipelines.benchmarks.recordings
 
     assert {"ingest", "memory", "corruption", "kill", "start_up"} <= set(BENCHMARKS)
-    source = Path(taccorl.demos.benchmarks.__file__ or "").read_text()
+    source = Path(pipelines.benchmarks.recordings.__file__ or "").read_text()
     goals = re.findall(r'goal="([^"]+)"', source) + re.findall(r'"(< [0-9.]+)"', source)
     assert len(goals) >= 7
     for goal in goals:

@@ -6,9 +6,9 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from statistics import median
 
-from taccorl.benchmark import Row, against_reference, benchmark, spread
-from taccorl.diagnosis.studies.cells import ASKED, FIRST_SEED, run_cells
-from taccorl.diagnosis.studies.joints_and_pads import Job, run, run_touch
+from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
+from pipelines.studies.cells import ASKED, FIRST_SEED, run_cells
+from pipelines.studies.joints_and_pads import Job, run, run_touch
 from taccorl.robots import ROBOT
 from taccorl.surrogate.cases import draw_case
 from taccorl.surrogate.recordings import recordings
@@ -87,7 +87,7 @@ def cells() -> Iterator[Row]:
 @benchmark("robots")
 def robots() -> Iterator[Row]:
     """One joint of robots that are not the PiPER, by their robot files; the whole study is ``diagnosis.studies.robots``."""
-    from taccorl.diagnosis.studies import robots as robot_study
+    from pipelines.studies import robots as robot_study
 
     rows = [robot_study.run(job) for job in robot_study.jobs()[:6]]
     hidden = [r for r in rows if r["hidden"] and r["fitted"] >= robot_study.MATERIAL_FLOORS]

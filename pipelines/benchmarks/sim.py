@@ -8,8 +8,9 @@ from statistics import median
 import mujoco
 import numpy as np
 
-from taccorl.benchmark import Row, against_reference, benchmark, cpu_s, spread
+from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
 from taccorl.errors import TaccorlError
+from taccorl.lineage.processes import cpu_s
 from taccorl.robots import ROBOT
 from taccorl.sim.grip_rig import gripped, in_hand_m, rest, shake
 from taccorl.sim.pad import OneSim, PadArray

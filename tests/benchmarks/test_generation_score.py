@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from taccorl.demos.benchmarks import mimicgen_cells
+from pipelines.benchmarks.demonstrations import mimicgen_cells
+from pipelines.benchmarks.generation_score import Score, _holds, score_generation, stiffened
 from taccorl.demos.mimicgen.attempt import Attempted, state_digest
 from taccorl.demos.mimicgen.from_dataset import read_sources
-from taccorl.demos.mimicgen.scoring import Score, _holds, score_generation, stiffened
 from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig

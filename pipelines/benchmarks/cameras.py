@@ -11,13 +11,14 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipelines.benchmarks.rows import Row, benchmark, spread
 from taccorl.alignment.camera.calibration import CameraFrames, KnownPoint, calibrate_camera, pnp
 from taccorl.alignment.camera.fit import pixels_of, seen_from
 from taccorl.alignment.camera.interval import JOINT_RAD, SHAPE_M
 from taccorl.alignment.camera.light import camera_light
 from taccorl.alignment.camera.timing import camera_latency
 from taccorl.alignment.camera.view import TwinView, as_offset
-from taccorl.benchmark import Row, benchmark, cpu_s, spread
+from taccorl.lineage.processes import cpu_s
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.camera_exposure import blurred, toned
 from taccorl.sim.rendering import Renderer

@@ -1,6 +1,6 @@
 """How often is the search right on hobby servos (simulated by ``surrogate.pendulum``) that hide one effect or none?
 
-``python -m taccorl.diagnosis.studies.pendulums rows.jsonl`` runs the cases that the file lacks and counts all. Each servo is
+``python -m pipelines.studies.pendulums rows.jsonl`` runs the cases that the file lacks and counts all. Each servo is
 recorded with five loads at three gains into tables, which are read as a user's are. Exact: the hidden effect is the one that
 is added. Removed: of the error on the test recordings (a load that was neither fitted nor chosen by), as it is with the data
 sheet's numbers refitted, the share above one noise floor that is gone. Silent: nothing hidden, or a data sheet that is wrong,
@@ -18,12 +18,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from pipelines.studies.robots import MATERIAL_FLOORS, is_exact, is_named, share_row
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.measurements.folder import read_measurements
 from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
-from taccorl.diagnosis.studies.robots import MATERIAL_FLOORS, is_exact, is_named, share_row
 from taccorl.sim.effects import effects
 from taccorl.surrogate.pendulum import Servo, write
 

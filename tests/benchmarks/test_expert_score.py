@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipelines.benchmarks.expert_score import score_expert
 from taccorl.demos.experts import expert_of, tasks_with_expert
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
-from taccorl.demos.scoring import score_expert
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from taccorl.benchmark import Row, benchmark, spread
+from pipelines.benchmarks.rows import Row, benchmark, spread
+from pipelines.benchmarks.sim import NUM_SIMS, REPEATS, holding
 from taccorl.rl.remote_shards import ProcessShard
 from taccorl.rl.twin_shard import Shard
-from taccorl.sim.benchmarks import NUM_SIMS, REPEATS, holding
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
@@ -128,7 +128,7 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
     """
     import torch
 
-    from taccorl.policies.benchmarks import random_batch, random_policy
+    from pipelines.benchmarks.policies import random_batch, random_policy
     from taccorl.rl.critic import Critic
     from taccorl.rl.flow_policy import TactileFlowPolicy
     from taccorl.rl.flow_sde import FlowSDE

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.benchmark import Row, benchmark, spread
+from pipelines.benchmarks.rows import Row, benchmark, spread
 from taccorl.robots import ROBOT
 
 EPISODES, EPISODE_ROWS = 2, 128

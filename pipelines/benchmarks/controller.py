@@ -15,7 +15,8 @@ from statistics import median
 import mujoco
 import numpy as np
 
-from taccorl.alignment import camera_benchmarks  # noqa: F401, registers its rows
+from pipelines.benchmarks import cameras as camera_benchmarks  # noqa: F401, registers its rows
+from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
 from taccorl.alignment.controller import arm_bench
 from taccorl.alignment.controller.identification import PAPER_BOUNDS, REFERENCE, identify_controller
 from taccorl.alignment.controller.joint_model import JointModel
@@ -24,7 +25,6 @@ from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import SWEEP_HZ, SWEEP_S
-from taccorl.benchmark import Row, against_reference, benchmark, spread
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
 from taccorl.sim.controller import ControllerConfig

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from statistics import mean, median
 from typing import Any
 
-from taccorl.benchmark import Row, benchmark, spread
+from pipelines.benchmarks.rows import Row, benchmark, spread
 from taccorl.robots import ROBOT
 
 REPEATS = 5

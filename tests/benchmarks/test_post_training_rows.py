@@ -2,7 +2,7 @@
 
 import pytest
 
-from taccorl.rl.benchmarks import post_training_rows
+from pipelines.benchmarks.rl import post_training_rows
 
 
 @pytest.mark.slow

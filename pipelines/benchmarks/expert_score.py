@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from taccorl.benchmark import cpu_s
 from taccorl.demos.collect import ExpertSource, Plan, outcome_of
 from taccorl.demos.experts import expert_of
 from taccorl.errors import UnreachableError
+from taccorl.lineage.processes import cpu_s
 from taccorl.sim.simulation import Watch
 from taccorl.sim.twin import CONTROL_HZ
 

@@ -7,8 +7,8 @@ import pytest
 from failing_work import work
 
 from pipelines import diagnosis_page, diagnosis_study
+from pipelines.studies.joints_and_pads import Job, failed, single
 from pipelines.worker_processes import Done, finished
-from taccorl.diagnosis.studies.joints_and_pads import Job, failed, single
 from taccorl.errors import TaccorlError
 
 

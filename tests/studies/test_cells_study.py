@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pipelines import diagnosis_page
-from taccorl.diagnosis.studies.cells import CellsRow, run_cells, table
+from pipelines.studies.cells import CellsRow, run_cells, table
 
 ROW = CellsRow(
     hidden="taxel_creep",

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from taccorl.benchmark import Row, against_reference, benchmark, cpu_s
+from pipelines.benchmarks.rows import Row, against_reference, benchmark
+from taccorl.lineage.processes import cpu_s
 from taccorl.robots import ROBOT
 
 EPISODE_S = 24.0

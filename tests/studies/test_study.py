@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from taccorl.diagnosis.studies.joints_and_pads import (
+from pipelines.studies.joints_and_pads import (
     IDENTICAL,
     MATERIAL,
     Conditions,

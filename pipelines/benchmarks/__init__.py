@@ -1,0 +1,1 @@
+"""Benchmarks of ``make bench``: a module of this folder registers them by ``@benchmark`` (``rows``)."""

@@ -1,0 +1,128 @@
+"""Run benchmarks; store all rows in ``bench.json`` and render ``docs/benchmarks.md`` from it."""
+
+import dataclasses
+import datetime
+import importlib
+import json
+import os
+import pkgutil
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from pipelines.benchmarks.rows import BENCHMARKS, Row, meets
+from taccorl.errors import TaccorlError, nearest
+
+ROOT = Path(__file__).resolve().parents[2]
+JSON_PATH = ROOT / "bench.json"
+PAGE_PATH = ROOT / "docs" / "benchmarks.md"
+
+
+def machine() -> str:
+    """Number of cores and name of the processor, without the name of the host."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    return f"{os.cpu_count()} cores, {model}, shared"
+
+
+def run(only: str | None = None) -> list[Row]:
+    """Run all benchmarks, or the one named ``only``, and store their rows, those of each as soon as it is done."""
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
+        if not module.name.startswith("__"):
+            importlib.import_module(f"{__package__}.{module.name}")
+    if only is not None and only not in BENCHMARKS:
+        raise TaccorlError(f"no benchmark {only!r}; {nearest(only, BENCHMARKS)}")
+    rows: list[Row] = []
+    for name in [only] if only else list(BENCHMARKS):
+        print(f"bench {name} …", flush=True)
+        first = len(rows)
+        for row in BENCHMARKS[name]():
+            full = dataclasses.replace(
+                row,
+                name=f"{name}: {row.name}",
+                value=float(row.value),  # NumPy's numbers are not JSON's
+                spread=float(row.spread),
+                met=meets(float(row.value), row.goal),
+                command=f"make bench ONLY={name}",
+                machine=machine(),
+                date=datetime.date.today().isoformat(),
+            )
+            print(f"  {_line(full)}", flush=True)
+            rows.append(full)
+        _store(rows[first:])
+    print(f"{JSON_PATH.name} and {PAGE_PATH.relative_to(ROOT)} written")
+    return rows
+
+
+def _line(row: Row) -> str:
+    met = {True: "met", False: "NOT MET", None: ""}[row.met]
+    rival = f"; {row.rival}: {row.rival_value:.4g}" if row.rival_value is not None else ""
+    return f"{row.name}: {row.value:.4g} ± {row.spread:.2g} {row.unit} (n={row.n}{rival}) {row.goal} {met}".rstrip()
+
+
+def _store(rows: list[Row]) -> None:
+    """Instead of the rows that the same benchmark made on the same machine; those of other machines stay beside them."""
+    before = json.loads(JSON_PATH.read_text()) if JSON_PATH.exists() else []
+    replaced = {(r.name.split(":")[0], r.machine) for r in rows}
+    kept = [r for r in before if (r["name"].split(":")[0], r["machine"]) not in replaced]
+    merged = kept + [dataclasses.asdict(r) for r in rows]
+    merged.sort(key=lambda r: r["name"].split(":")[0])
+    JSON_PATH.write_text(json.dumps(merged, indent=1, ensure_ascii=False) + "\n")
+    PAGE_PATH.parent.mkdir(exist_ok=True)
+    PAGE_PATH.write_text(render(merged))
+
+
+def render(rows: list[dict[str, Any]]) -> str:
+    """Text of docs/benchmarks.md for all rows."""
+    lines = [
+        "# Benchmarks",
+        "",
+        "Written by `make bench` from `bench.json`; do not edit. Value ± half the range of n measurements. Timings are",
+        "CPU-seconds or ratios within one run: the machine is shared. A reference step is one MuJoCo step of a chain of 12",
+        "links, run beside what is measured: machines differ by four times. Goals in CPU-seconds that were not measured again",
+        "since are not judged. Recordings and the twin are simulated: no robot was near.",
+        "",
+        "| what | value | unit | goal | met | rival in the same run | n | command | machine | date |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        met = {True: "yes", False: "**no**", None: ""}[r["met"]]
+        rival = f"{r['rival']}: {r['rival_value']:.4g}" if r["rival_value"] is not None else r["rival"]
+        value = f"{r['value']:.4g} ± {r['spread']:.2g}"
+        cells = [
+            r["name"],
+            value,
+            r["unit"],
+            r["goal"],
+            met,
+            rival,
+            str(r["n"]),
+            f"`{r['command']}`",
+            r["machine"],
+            r["date"],
+        ]
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """``python -m pipelines.benchmarks [--only=name]``"""
+    words = sys.argv[1:]
+    only = [a.removeprefix("--only=") for a in words if a.startswith("--only=")]
+    if len(only) != len(words) or len(words) > 1:
+        print(f"unknown {' '.join(words)!r}; usage: python -m pipelines.benchmarks [--only=name]", file=sys.stderr)
+        return 2
+    try:
+        rows = run(only[0] if only else None)
+    except TaccorlError as error:
+        print(error, file=sys.stderr)
+        return 2
+    missed = [r.name for r in rows if r.met is False]
+    print(f"{len(rows)} figures, {len(missed)} short of their goal" + (f": {'; '.join(missed)}" if missed else ""))
+    return 0
