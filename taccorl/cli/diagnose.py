@@ -222,7 +222,7 @@ def _why_invisible(finding: "Finding", name: str) -> str:
 
 def details(finding: "Finding") -> list[str]:
     """Lines of text behind a verdict: errors, identified and absolute numbers, near-twins, tied effects."""
-    from taccorl.diagnosis.evidence_words import to_record, unit_words
+    from taccorl.diagnosis.report.evidence_words import to_record, unit_words
 
     d = finding.diagnosis
     errors = d.errors["fitted"]["validation"], d.errors["after"]["validation"]

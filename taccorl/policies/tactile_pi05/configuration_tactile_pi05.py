@@ -146,8 +146,8 @@ class TactilePI05Config(PI05Config):
     """λ_f: a normalised reading above this is contact."""
     noise_threshold: float = 0.0
     """λ_noise: normalised readings up to this are set to 0, in training and in use (paper, App. B.2: one threshold suppresses
-    the background noise of both domains). taccorl.alignment.touch.calibration measures it in counts; multiply by the gain. 0: readings are
-    unchanged, which suffices for data of the twin alone."""
+    the background noise of both domains). taccorl.alignment.touch.calibration measures it in counts; multiply by the gain. 0:
+    readings are unchanged, which suffices for data of the twin alone."""
     contact_min_active: int = MIN_ACTIVE
     """m: number of taxels of one reading that must be above λ_f for contact."""
     tactile_format: TactileFormat | None = None
