@@ -1,13 +1,14 @@
 """Camera calibration: move the twin's camera until its arms match those in the pictures (paper App. B.3).
 
-From the joints that were reported with some pictures, the arms' outlines are drawn at the pose that is believed now and laid over
-the edges of the pictures (``edges``); what they are apart, across the edges, is brought down by least squares
-(``fit``), and the outlines are drawn anew, from coarse pictures to fine ones. Only the arms are used: joint angles say
-nothing about the table and the parts. It works for a fixed camera and for one on a wrist, whose pose is relative to the
-link that carries it.
+The arms' outlines are rendered at the joint angles that were reported with the pictures and at the present estimate of the
+camera pose, and matched with the edges of the pictures (``edges``). Least squares reduce the distances across the edges
+(``fit``), and the outlines are rendered again, from coarse pictures to fine ones. Only the arms are used: joint angles say
+nothing about the table and the parts. It works for a fixed camera and for one on a wrist, whose pose is relative to the link to
+which it is fixed.
 
-The start is the twin's own mount, within about 3° and 30 mm along each axis; or points of the arms that somebody found in the
-pictures, by PnP, from anywhere. Intrinsics are taken as they are in the twin: give it the camera_info of your own camera.
+The start is the twin's own mount, within about 3° and 30 mm along each axis; or, for larger errors, the PnP solution from known
+points of the arms that were found in the pictures. Intrinsics are those of the twin: set them to the camera_info of your own
+camera.
 
 Letters in shapes: F frames.
 """
@@ -51,22 +52,23 @@ _VAGUE = 10.0  # times ``WANTED``, 3° or 40 mm: wider than the errors that cali
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFrames:
-    """Pictures of one camera, and what the joints reported when they were taken.
+    """Pictures of one camera, and the joint angles reported at their times.
 
     Raises:
-        TaccorlError: shapes that do not fit each other.
+        TaccorlError: the shapes do not fit together.
     """
 
     pictures: np.ndarray
-    """(F, rows, columns, 3) uint8 RGB: as recorded, or letterboxed by ingest."""
+    """(F, rows, columns, 3) uint8 RGB pictures, as recorded or letterboxed by ingest."""
     joints: np.ndarray
-    """(F, 14) rad, m: in the order of actions."""
+    """(F, 14) joint angles [rad] and gripper openings [m], in the order of actions."""
     stages: dict[str, int] = field(default_factory=dict)
-    """"initial", "grasp", "insertion" → number of the frame; kept out of the fit, shown in the overlays."""
+    """"initial", "grasp", "insertion" → index of the frame. These frames are not used in the fit and are shown in the
+    overlays."""
     name: str = "pictures"
-    """For people: the episode they are of."""
+    """Name of the episode, for messages."""
     origin: str = ""
-    """What made them, e.g. "surrogate …"."""
+    """Origin of the pictures, such as "surrogate …"."""
 
     def __post_init__(self) -> None:
         if self.pictures.ndim != 4 or self.pictures.shape[-1] != 3 or self.pictures.dtype != np.uint8:
@@ -87,48 +89,50 @@ class CameraFrames:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownPoint:
-    """A point of an arm or of the bench that was found in a picture, by hand or from a marker."""
+    """Point of an arm or of the bench that was found in a picture, by hand or from a marker."""
 
     frame: int
-    """Number of the picture."""
+    """Index of the picture."""
     body: str
-    """MuJoCo body that it belongs to; "world" for the bench."""
+    """MuJoCo body of the point; "world" for the bench."""
     position_m: tuple[float, float, float]
-    """In the body's frame."""
+    """Position of the point in the body's frame [m]."""
     pixel: tuple[float, float]
-    """(u, v) in the picture as given, bars included; (0, 0) is the middle of its top left pixel."""
+    """(u, v) in the picture as given, black bars included [pixels]; (0, 0) is the centre of its top left pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFit:
     """Result of a calibration. Poses (6,) are relative to the nominal mount, as ``CameraOffset``: rotation vector [rad],
-    shift [m]."""
+    translation [m]."""
 
     camera: CameraConfig
-    """The twin's camera with its new offset, for ``save_twin``; the old one where ``problems`` is not empty."""
+    """The twin's camera with its new offset, for ``save_twin``; unchanged if ``problems`` is not empty."""
     start: np.ndarray
-    """(6,) where the twin had it."""
+    """(6,) pose in the twin before the calibration."""
     offset: np.ndarray
-    """(6,) the estimate."""
+    """(6,) estimated pose."""
     half_width: np.ndarray
-    """(6,) of its 95 % interval: noise of the edges, shapes and joint zeros of the twin; infinite where nothing fixes it."""
+    """(6,) half width of the estimate's 95 % interval, from edge noise and from errors of the twin's shapes and joint zeros;
+    infinite for directions that the pictures do not determine."""
     noise_half_width: np.ndarray
-    """(6,) from the noise alone: how well the same pictures would give it again."""
+    """(6,) the same from edge noise alone: the repeatability with the same pictures."""
     correlation: np.ndarray
-    """(6, 6)."""
+    """(6, 6) correlation matrix of the estimate."""
     before_px: float
-    """Mean distance of the outlines from the pictures' edges in held-out frames, across the edges, in pixels of the pictures."""
+    """Mean distance across the edges between outlines and picture edges in held-out frames, before the calibration [pixels of
+    the pictures]."""
     after_px: float
     found_before: float
-    """Share of the held-out outlines that have an edge of like direction within 6 px."""
+    """Share of the held-out outlines, before the calibration, that have a picture edge of similar direction within 6 px."""
     found_after: float
     known_before_px: float
-    """RMS reprojection error of the known points of held-out frames; NaN without any."""
+    """RMS reprojection error of the known points in held-out frames, before the calibration [px]; NaN without such points."""
     known_after_px: float
     problems: tuple[str, ...]
-    """Why this is no calibration: not converged, not identifiable. Empty if it is one."""
+    """Reasons why the result is not a valid calibration (not converged, not identifiable); empty if it is valid."""
     overlays: dict[str, np.ndarray]
-    """Stage → picture as in the paper: picture, twin, outlines before and after; (rows, columns, 3) uint8 RGB."""
+    """Stage → picture as in the paper: picture, twin, outlines before and after, (rows, columns, 3) uint8 RGB."""
     num_frames: int
     num_held_out: int
     name: str
@@ -145,10 +149,11 @@ class CameraFit:
         return float((start.inv() * end).magnitude()), float(np.linalg.norm(self.offset[3:] - self.start[3:]))
 
     def twin(self, config: TwinConfig) -> TwinConfig:
-        """``config`` with this camera. The offset contains the whole change, so effects that moved only this camera are removed.
+        """``config`` with the calibrated camera. The offset contains the whole change, so that effects that moved only this
+        camera are removed.
 
         Raises:
-            TaccorlError: this is no calibration, or one effect moves this camera and others.
+            TaccorlError: the calibration is not valid, or one effect moves this camera and others.
         """
         if self.problems:
             raise TaccorlError(f"camera {self.camera.name}: {'; '.join(self.problems)}. The twin keeps its camera")
@@ -169,14 +174,15 @@ def calibrate_camera(
 ) -> CameraFit:
     """Fit the pose of the twin's ``camera`` so that its arms match those in the pictures.
 
-    Every fourth frame and the stages are kept out of the fit, for the figures and overlays before and after.
+    Every fourth frame and the stages are not used in the fit; figures and overlays before and after are made from them.
 
     Args:
-        known: at least ``FEWEST_POINTS`` points that start it by PnP; without them it starts at the twin's mount. Those of
-            held-out frames are only used to judge it.
+        known: at least ``FEWEST_POINTS`` points for a start by PnP; without them the fit starts at the twin's mount. Points in
+            held-out frames are used for validation only.
 
     Raises:
-        TaccorlError: no such camera, too few frames or points, pictures of another stream, no arm in view.
+        TaccorlError: there is no such camera, there are too few frames or points, the pictures are of another stream, or no arm
+            is in view.
     """
     if len(frames.joints) < FEWEST_FRAMES:
         raise TaccorlError(
@@ -226,7 +232,7 @@ def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.n
     """Pose (6,) from known points and their pixels (OpenCV: SQPNP, then Levenberg–Marquardt).
 
     Raises:
-        TaccorlError: too few of them, or no pose explains them.
+        TaccorlError: there are too few points, or no pose explains them.
     """
     if len(known) < FEWEST_POINTS:
         raise TaccorlError(

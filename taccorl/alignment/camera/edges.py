@@ -1,9 +1,9 @@
 """Edges that camera calibration compares: outlines of the twin's arms, and edges of a picture.
 
-The twin's are where the body that a pixel shows changes, or its depth jumps, with the place in space of the nearer one. A
-picture's are Canny's, refined to a fraction of a pixel along the gradient. The two are matched nearest to nearest among edges
-of like direction, and compared by the distance from the twin's point to the line of the picture's edge: along an edge nothing
-is measured. Whether it is brighter inside or outside does not count, so light and colour may differ.
+An edge of the twin is where neighbouring pixels show different bodies or a jump of depth; its position in space is that of the
+nearer body. Edges of a picture are Canny's, refined to a fraction of a pixel along the gradient. Each point of the twin is
+matched with the nearest picture edge of similar direction, and compared by its distance from the line of that edge:
+displacements along an edge are not measured. The sign of the contrast is ignored, so that light and colour may differ.
 
 Letters in shapes: P points, D directions.
 """
@@ -17,7 +17,8 @@ from scipy.ndimage import map_coordinates
 from taccorl.sim.cameras import Intrinsics
 
 NUM_DIRECTIONS = 8
-"""An edge is looked for among those within 180° / 8 = 22.5° of the nearest of so many directions."""
+"""Number of directions into which edges are sorted; a match is searched among edges within 180° / 8 = 22.5° of the nearest of
+them."""
 _JUMP_M = 0.01  # of depth within one body: one of its shapes stands before another
 _STEEP = 3.0  # such a jump is so many times the steps beside it, else it is a face seen at a slant
 _SMOOTH_PX = 1.0  # of a picture before its edges are looked for
@@ -32,15 +33,15 @@ class TwinEdges:
     """Points on the outlines of the twin's arms in one view."""
 
     points: np.ndarray
-    """(P, 3) [m] in the camera's frame."""
+    """(P, 3) positions [m] in the camera's frame."""
     normals: np.ndarray
-    """(P, 2) unit, across the edge in the picture; its sign means nothing."""
+    """(P, 2) unit vectors across the edge in the picture; the sign is arbitrary."""
     bodies: np.ndarray
-    """(P,) number of the body whose outline it is."""
+    """(P,) index of the body to which the outline belongs."""
 
 
 def twin_edges(bodies: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) -> TwinEdges:
-    """Outlines in a view of body numbers (rows, columns), 0 for what is no arm, and depths."""
+    """Outlines in a view, from the body index of each pixel (rows, columns), 0 if it shows no arm, and its depth [m]."""
     near_depth = np.where(bodies > 0, depth_m, np.inf)
     # A value of its own for each body: whatever meets, its gradient points across the edge.
     value = ((bodies * 0.618034) % 1.0).astype(np.float32) + (bodies > 0)
@@ -111,16 +112,16 @@ class PictureEdges:
         edge[[0, -1]] = edge[:, [0, -1]] = False
         v, u = np.nonzero(edge)
         self.normals = np.stack([dx[v, u], dy[v, u]], axis=1) / size[v, u][:, None]
-        """(P, 2) unit."""
+        """(P, 2) unit vectors across the edges."""
         self.pixels = np.stack([u, v], axis=1) + self.normals * _peak(size, u, v, self.normals)[:, None]
-        """(P, 2) as (u, v)."""
+        """(P, 2) positions as (u, v) [px]."""
         self._shape = edge.shape
         self._nearest = self._maps(u, v)
 
     def match(
         self, pixels: np.ndarray, normals: np.ndarray, reach_px: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The picture's edges nearest to (P, 2) points with normals (P, 2), of like direction.
+        """For points (P, 2) with normals (P, 2), the nearest edges of similar direction in the picture.
 
         Returns:
             Pixels (P, 2) and normals (P, 2) of those edges, and (P,) bool: there is one within ``reach_px``.

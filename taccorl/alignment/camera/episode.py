@@ -1,6 +1,6 @@
 """Select frames of an episode for camera calibration.
 
-Frames in which the arms are at rest do not depend on the latency; different poses are worth more than many frames.
+Frames in which the arms are at rest are independent of the latency; different poses determine more than many frames.
 """
 
 from collections.abc import Iterator
@@ -24,10 +24,10 @@ def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s
     """Select rows of an episode at which the arms are at rest in different poses, and the stages of the paper's figure.
 
     Args:
-        latency_s: what a picture shows is that much older than its row; 0 where ingest has taken it off already.
+        latency_s: age of the scene in a picture relative to its row [s]; 0 if ingest has already corrected for it.
 
     Raises:
-        TaccorlError: no such camera, or a state that is not the robot's joints and grippers.
+        TaccorlError: there is no such camera, or the state does not hold the robot's joints and grippers.
     """
     joints = joint_rows(episode)
     time_s = episode.time_s
@@ -50,7 +50,7 @@ def joint_rows(episode: Episode) -> np.ndarray:
     """(T, 14) joints and openings [rad, m] as reported, in the order of actions.
 
     Raises:
-        TaccorlError: the state lacks one of them.
+        TaccorlError: the state lacks a joint or gripper.
     """
     names = signal_names(episode.spec)
     if missing := [name for name in ROBOT.action_names if name not in names]:
@@ -62,7 +62,8 @@ def joint_rows(episode: Episode) -> np.ndarray:
 
 
 def stage_rows(joints: np.ndarray) -> dict[str, int]:
-    """Rows of the paper's figure, from joints (T, 14) alone: the start, hands just closed, and hands closest together."""
+    """Rows of the stages in the paper's figure, from joints (T, 14) alone: the start, hands just closed, and hands closest
+    together."""
     stages = {"initial": 0}
     openings = joints[:, ROBOT.gripper_indices]
     closed = (openings < openings.min(0) + 0.25 * np.ptp(openings, axis=0)) & (
@@ -91,7 +92,7 @@ def _different(joints: np.ndarray, num_frames: int) -> list[int]:
 
 
 def all_pictures(episode: Episode, camera: str) -> Iterator[np.ndarray]:
-    """The (rows, columns, 3) uint8 pictures of a camera, row by row.
+    """Iterate over the (rows, columns, 3) uint8 pictures of a camera, row by row.
 
     Raises:
         TaccorlError: the episode has no such camera.

@@ -33,34 +33,34 @@ _SOFT_PX = 1.0  # residuals beyond it count less (soft L1)
 
 
 class Level(NamedTuple):
-    """The pictures at one size."""
+    """The pictures at one size of the image pyramid."""
 
     intrinsics: Intrinsics
     edges: list[PictureEdges]
 
 
 class Outlines(NamedTuple):
-    """Points on the arms' outlines of all frames, drawn at one pose."""
+    """Points on the arms' outlines in all frames, rendered at one camera pose."""
 
     points: np.ndarray
-    """(P, 3) [m] in the mount's frame."""
+    """(P, 3) positions in the mount's frame [m]."""
     normals: np.ndarray
-    """(P, 2) across the outline in the picture."""
+    """(P, 2) unit vectors across the outline in the picture."""
     frames: np.ndarray
-    """(P,) number of the frame."""
+    """(P,) index of the frame."""
     bodies: np.ndarray
-    """(P,) number of the body."""
+    """(P,) index of the body."""
 
 
 class Matches(NamedTuple):
-    """Outlines and the pictures' edges next to them."""
+    """Picture edges that were matched with points of the outlines."""
 
     found: np.ndarray
-    """(P,) bool: there is an edge of like direction within reach."""
+    """(P,) bool: a picture edge of similar direction is within reach."""
     edges: np.ndarray
-    """(P, 2) pixels as (u, v)."""
+    """(P, 2) positions of the matched edges as (u, v) [px]."""
     across: np.ndarray
-    """(P, 2) unit, the edges' normals."""
+    """(P, 2) unit normals of the matched edges."""
 
 
 @dataclass(frozen=True)
@@ -68,15 +68,15 @@ class Solution:
     """Result of the least squares: pose and misfit."""
 
     offset: np.ndarray
-    """(6,) pose."""
+    """(6,) estimated pose."""
     last_change: np.ndarray
-    """(6,) of the pose, by the last render."""
+    """(6,) change of the pose in the last iteration."""
     outlines: Outlines
     matches: Matches
 
 
 def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level]:
-    """The pictures (rows, columns, 3) at a quarter, half and all of their size, as far as they stay large enough."""
+    """Pictures (rows, columns, 3) at a quarter, half and full size; sizes that would be too small are left out."""
     found = []
     for factor in (4, 2, 1, 0.5):
         rows, columns = round(intrinsics.rows / factor), round(intrinsics.columns / factor)
@@ -87,8 +87,8 @@ def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level
 
 
 def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrinsics) -> Outlines:
-    """Outlines of the twin's arms at joints (F, 14), drawn at a pose (6,) in pictures like ``at``. At most ``_POINTS`` a
-    frame."""
+    """Outlines of the twin's arms at joints (F, 14), rendered at a camera pose (6,) at the size of ``at``. At most ``_POINTS``
+    per frame."""
     rng = np.random.default_rng(0)
     position, turn = view.pose(offset)
     parts = []
@@ -109,13 +109,13 @@ def seen_from(view: TwinView, offset: np.ndarray, points: np.ndarray) -> np.ndar
 
 
 def pixels_of(seen: np.ndarray, at: Intrinsics) -> np.ndarray:
-    """Project points (P, 3) of the camera's frame to pixels (P, 2) as (u, v); not-a-number behind the camera."""
+    """Project points (P, 3) of the camera's frame to pixels (P, 2) as (u, v); NaN for points behind the camera."""
     depth = np.where(seen[:, 2] < 0, -seen[:, 2], np.nan)
     return np.stack([at.cx_px + at.fx_px * seen[:, 0] / depth, at.cy_px - at.fy_px * seen[:, 1] / depth], axis=1)
 
 
 def match(drawn: Outlines, seen: np.ndarray, level: Level, reach_px: float) -> Matches:
-    """The edges next to outlines that are ``seen`` (P, 3) in the camera's frame."""
+    """Match outlines, at positions ``seen`` (P, 3) in the camera's frame, with picture edges."""
     pixels = pixels_of(seen, level.intrinsics)
     found = np.zeros(len(pixels), bool)
     edges, across = np.zeros((len(pixels), 2)), np.zeros((len(pixels), 2))
@@ -126,7 +126,7 @@ def match(drawn: Outlines, seen: np.ndarray, level: Level, reach_px: float) -> M
 
 
 def distances(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
-    """(M,) signed, from the edges' lines to the points [px], for those that have a match."""
+    """(M,) signed distances from the edges' lines to the matched points [px]."""
     apart = pixels_of(seen[matches.found], at) - matches.edges[matches.found]
     return (apart * matches.across[matches.found]).sum(1)
 
@@ -149,16 +149,16 @@ def slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
 
 
 def moved(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """A pose (6,) turned and shifted by ``step`` (6,) in its own frame."""
+    """A pose (6,) rotated and translated by ``step`` (6,) in its own frame."""
     turn = Rotation.from_rotvec(offset[:3])
     return np.r_[(turn * Rotation.from_rotvec(step[:3])).as_rotvec(), offset[3:] + turn.apply(step[3:])]
 
 
 def solve(view: TwinView, joints: np.ndarray, levels: Sequence[Level], start: np.ndarray, *, search: bool) -> Solution:
-    """The pose (6,) at which the outlines of the arms at joints (F, 14) lie on the pictures' edges.
+    """Fit the pose (6,) at which the outlines of the arms at joints (F, 14) coincide with the pictures' edges.
 
     Args:
-        search: look around ``start`` first, as far as ``_AROUND``.
+        search: first compare many poses around ``start``, within ``_AROUND``.
     """
     reaches = _REACH_PX[-len(levels) :] if len(levels) > 1 else [_REACH_PX[0] + _REACH_PX[-1]]
     starts = _starts(view, joints, levels[0], start) if search else [start]
@@ -180,7 +180,7 @@ def _distinct(tried: list[Solution]) -> list[Solution]:
 
 
 def misfit(view: TwinView, offset: np.ndarray, drawn: Outlines, level: Level) -> float:
-    """Misfit of outlines at a pose (6,): mean distance as a share of ``_FAR_PX``; points without an edge count 1."""
+    """Misfit of outlines at a pose (6,): mean distance divided by ``_FAR_PX``; points without a matched edge count as 1."""
     seen = seen_from(view, offset, drawn.points)
     matches = match(drawn, seen, level, _FAR_PX)
     apart = np.abs(distances(seen, matches, level.intrinsics))
@@ -213,7 +213,7 @@ def _descend(
 
 
 def weights(apart: np.ndarray) -> np.ndarray:
-    """Weights of residuals [px] under the soft L1 loss: 1 for small ones."""
+    """Weights of residuals [px] under the soft L1 loss; close to 1 for small residuals."""
     return 1 / np.sqrt(1 + (apart / _SOFT_PX) ** 2)
 
 

@@ -1,9 +1,9 @@
 """Uncertainty of a fitted camera pose, from noise of the edges and from errors of the twin's shapes and joint zeros.
 
-Noise: residuals of one body's outline in one frame go together, so these groups are what is independent (a sandwich estimate).
-Beyond it, however many pictures there are, each body may have another shape than the twin's, by ``SHAPE_M``, and each joint may
-report ``JOINT_RAD`` beside the truth; both stay the same in all frames. Carried through the least squares they say what a set
-of poses can tell: frames that are all alike average nothing.
+Noise: residuals of one body's outline in one frame are correlated, so that these groups are treated as the independent samples
+(a sandwich estimate). In addition each body's shape may differ from the twin's by ``SHAPE_M``, and each joint may have a zero
+error of ``JOINT_RAD``; both are the same in all frames, so that more pictures do not reduce them. They are propagated through
+the least squares: frames with equal poses average nothing.
 
 Letters in shapes: M matched points, J joints of both arms.
 """
@@ -20,13 +20,14 @@ from taccorl.alignment.camera.view import TwinView
 from taccorl.robots import ROBOT
 
 AXES = ("turn about right", "turn about up", "turn about back", "shift right", "shift up", "shift back")
-"""The six numbers of a pose: rotation vector [rad] about, and shift [m] along the nominal camera's x, y, z."""
+"""Names of the six numbers of a pose: rotation vector [rad] about, and translation [m] along, the nominal camera's x, y, z."""
 SHAPE_M = 0.001
-"""Standard deviation, along each axis, of a body's outline off the twin's. A choice: covers and fingers differ by so much."""
+"""Standard deviation, along each axis, of the displacement of a body's outline from the twin's [m]. A choice: covers and fingers
+differ by so much."""
 JOINT_RAD = 0.002
-"""Standard deviation of a joint's zero. A choice: 1 mm at half a metre."""
+"""Standard deviation of the error of a joint's zero [rad]. A choice: 1 mm at half a metre."""
 WANTED = np.r_[np.full(3, np.deg2rad(0.3)), np.full(3, 0.004)]
-"""How well each is to be known: 0.3°, 4 mm. Only ratios to it are compared between angles and lengths."""
+"""Requested accuracy of each number: 0.3°, 4 mm. It is used only to compare angles with lengths."""
 _SHARE = 0.35  # of the longest component: an axis that has less is not named
 
 
@@ -35,9 +36,9 @@ class Covariance:
     """Covariance of a fitted pose (6,)."""
 
     noise: np.ndarray
-    """(6, 6) from the scatter of the edges."""
+    """(6, 6) part from the scatter of the edges."""
     twin: np.ndarray
-    """(6, 6) from shapes and joint zeros that may be wrong."""
+    """(6, 6) part from errors of the twin's shapes and joint zeros."""
 
     @property
     def total(self) -> np.ndarray:
@@ -56,7 +57,7 @@ class Covariance:
         return self.total / np.outer(deviation, deviation)
 
     def worst(self) -> tuple[float, str]:
-        """Least certain direction: half of its 95 % interval as a multiple of ``WANTED``, and its components."""
+        """The least certain direction: half width of its 95 % interval as a multiple of ``WANTED``, and its components."""
         values, vectors = np.linalg.eigh(self.total / np.outer(WANTED, WANTED))
         along = vectors[:, -1] / vectors[np.argmax(np.abs(vectors[:, -1])), -1]
         named = [k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= _SHARE]

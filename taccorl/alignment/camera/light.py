@@ -1,9 +1,10 @@
 """Brightness and sharpness of a camera's pictures relative to the twin's: parameters of the effect ``camera_exposure``.
 
-At a pose that has been fitted, pixels of picture and twin show the same thing. Tone: log y = γ (log g + log x), a straight line
-through the medians of the picture's grey values over those of the twin. Light, the colours of things and the camera's own
-exposure are one here: no picture tells them apart. Blur: blurring an edge once more makes it flatter the less the softer it was
-already, by √((σ² + s₂²) / (σ² + s₁²)) from one extra blur to another (Zhuo and Sim 2011); the twin's own σ is taken off.
+At the fitted pose, a pixel of the picture and the same pixel of the twin show the same object. Tone: log y = γ (log g + log x),
+a straight line through the medians of the picture's grey values over those of the twin. Light, the objects' colours and the
+camera's exposure are described together, because pictures cannot separate them. Blur: an additional blur flattens an edge less
+if the edge is already soft, by √((σ² + s₂²) / (σ² + s₁²)) from one extra blur to another (Zhuo and Sim 2011); the twin's own σ
+is taken off.
 """
 
 from collections.abc import Callable
@@ -29,27 +30,27 @@ _LEAST_STEP = 15.0  # grey values across an edge whose width is measured
 
 @dataclass(frozen=True, kw_only=True)
 class LightFit:
-    """Tone and blur of a camera beside the twin's. Intervals: 95 %, from the scatter over frames."""
+    """Tone and blur of a camera relative to the twin. Intervals are 95 %, from the scatter over frames."""
 
     gain: float
     gain_interval: tuple[float, float]
     gamma: float
     gamma_interval: tuple[float, float]
     blur_px: float
-    """Of the recorded stream, more than the twin's own; 0 if the pictures are sharper."""
+    """Blur of the recorded stream beyond the twin's own [px]; 0 if the pictures are sharper."""
     blur_interval_px: tuple[float, float]
     grey_before: float
-    """Mean difference of the grey values, of 255, away from edges."""
+    """Mean difference of the grey values between picture and twin [levels of 255], away from edges."""
     grey_after: float
-    """The same with gain and gamma on the twin's."""
+    """The same after gain and gamma are applied to the twin."""
 
 
 def camera_light(frames: CameraFrames, config: TwinConfig, camera: str) -> LightFit:
-    """Gain, gamma and blur of ``camera`` in pictures that its pose in the twin fits already.
+    """Fit gain, gamma and blur of ``camera``, whose pose in the twin is already calibrated.
 
     Raises:
-        TaccorlError: less than three frames, the twin's pictures or the given ones are of one grey, or no edge of the twin is
-            in the pictures.
+        TaccorlError: there are fewer than three frames, the twin's or the given pictures have a single grey value, or no edge of
+            the twin is in the pictures.
     """
     if len(frames.joints) < 3:
         raise TaccorlError(f"{frames.name}: {len(frames.joints)} frames; brightness and blur need at least three")

@@ -14,13 +14,14 @@ _STRIP = 22  # rows for a panel's title
 def overlay(
     view: TwinView, picture: np.ndarray, joints: np.ndarray, before: np.ndarray, after: np.ndarray, origin: str = ""
 ) -> np.ndarray:
-    """Four panels side by side: the picture; the twin after; the twin's outlines on the picture before, and after.
+    """Picture with four panels side by side: the picture; the twin after the calibration; the picture with the twin's outlines
+    before, and after.
 
     Args:
         picture: (rows, columns, 3) uint8 RGB without bars.
         joints: (14,) rad, m.
         before, after: poses (6,).
-        origin: what made the picture; "surrogate …" is written above it.
+        origin: origin of the picture; "surrogate …" is written above it.
     """
     kind = "picture" if not origin else "surrogate picture" if "surrogate" in origin else "picture"
     panels = [(kind, picture), ("twin, after", view.picture(joints, after))]

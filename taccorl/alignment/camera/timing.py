@@ -1,10 +1,10 @@
 """Latency of a camera, from the change between consecutive pictures compared with that in the twin.
 
-The twin is drawn where the joints were at each picture's time; what changes between two of its pictures rises and falls with the
-arms' motion, without any delay. The measured pictures' change is the same curve, later: the shift at which the two agree best is
+The twin is rendered with the joint angles at each picture's time; the change between two of its pictures follows the arms'
+motion without delay. The change between measured pictures is the same curve with a delay: the shift with the best agreement is
 the latency, to a fraction of a frame. Light and colours scale the curve and do not move it. The camera's pose hardly matters.
 
-The change is taken in cells of the picture, because in one cell the arm comes while it leaves another.
+The change is computed in cells of the picture, because the arm enters one cell while it leaves another.
 
 Letters in shapes: T pictures, S shifts, C cells.
 """
@@ -22,7 +22,7 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.twin import TwinConfig
 
 EARLIEST_S, LATEST_S = -0.1, 0.3
-"""Latencies looked for. Negative ones would be pictures ahead of the joints: a clock that is off."""
+"""Range of latencies that are searched [s]. A negative latency would mean pictures ahead of the joints: a clock error."""
 _STEP_S = 0.001
 _ROWS, _CELL = 60, 10  # pixels of the small pictures that are compared, and of the cells in which they are
 _BLOCK_S = 0.7  # of the bootstrap: longer than a movement's rise
@@ -36,13 +36,13 @@ class LatencyFit:
     """Estimated latency of a camera, with its interval."""
 
     latency_s: float
-    """A picture shows what was that long before its time."""
+    """Latency [s]: a picture shows the scene at its time stamp minus this."""
     interval_s: tuple[float, float]
-    """95 %, by a bootstrap over blocks of pictures."""
+    """95 % interval [s], by a bootstrap over blocks of pictures."""
     correlation: float
-    """Of the two curves, at that latency."""
+    """Correlation of the two curves at that latency."""
     problems: tuple[str, ...]
-    """Why this is no estimate; empty if it is one."""
+    """Reasons why the result is not valid; empty if it is."""
 
 
 def camera_latency(
@@ -54,7 +54,7 @@ def camera_latency(
         joints: (T, 14) rad, m, as reported at the same times.
 
     Raises:
-        TaccorlError: less than 3 s, times that are not even, or as many rows as there are not pictures.
+        TaccorlError: the pictures cover less than 3 s, times are not even, or the number of rows differs from that of pictures.
     """
     time_s = np.asarray(time_s, float)
     if len(time_s) < 3 or time_s[-1] - time_s[0] < _FEWEST_S:

@@ -1,8 +1,9 @@
-"""View of one camera of the twin with the arms at given joint angles, for comparison with a picture.
+"""Render one camera of the twin with the arms at given joint angles, for comparison with a picture.
 
-Frames: *mount* is the body that carries the camera (``CameraConfig.body``: the world, or link 6 of an arm), *camera* is MuJoCo's
-(x right, y up, looking along −z). A pose is a vector (6,) = (ω, t) [rad, m] off the nominal mount, as ``CameraOffset``:
-R = R₀·exp(ω), p = p₀ + R₀·t. Pixels as in ``taccorl.sim.cameras``. Only arms and table are there: where parts are, no joint says.
+Frames: *mount* is the body to which the camera is fixed (``CameraConfig.body``: the world, or link 6 of an arm), *camera* is
+MuJoCo's (x right, y up, looking along −z). A pose is a vector (6,) = (ω, t) [rad, m] relative to the nominal mount, as
+``CameraOffset``: R = R₀·exp(ω), p = p₀ + R₀·t. Pixels as in ``taccorl.sim.cameras``. The scene has arms and table only, because
+joint angles do not determine the poses of parts.
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ _BAR = 24  # counts: JPEG and video leave black bars this dark
 class TwinView:
     """The twin's camera ``name`` in pictures of ``size`` (rows, columns), which may be letterboxed as ingest does it.
 
-    Free it with ``close`` or use it in a ``with``.
+    Call ``close`` at the end, or use it in a ``with`` statement.
 
     Raises:
         TaccorlError: the twin has no such camera.
@@ -38,7 +39,7 @@ class TwinView:
         self.size = size
         self.window: Window = letterbox_window(self.camera.recording_size, size)
         self.intrinsics = self.camera.recorded_intrinsics().scaled(self.window.rows, self.window.columns)
-        """Of the picture without its bars."""
+        """Intrinsics of the picture without its black bars."""
         spec = empty_bench(config)
         add_cameras(spec, [self.camera])
         style(spec)
@@ -55,9 +56,9 @@ class TwinView:
         self._nominal = bare.pose()
         turn = Rotation.from_quat(self.model.cam_quat[0], scalar_first=True).as_matrix()
         self.start = self.offset_of(self.model.cam_pos[0].copy(), turn)
-        """(6,) where the twin has it: its offset, and what effects add to it."""
+        """(6,) camera pose in the twin: its offset, and the change by effects."""
         self.robot = np.array([self.model.body(i).name.startswith(ROBOT.arms) for i in range(self.model.nbody)])
-        """(bodies,) bool: of an arm."""
+        """(bodies,) bool: the body belongs to an arm."""
         self._renderers: dict[tuple[int, int], Renderer] = {}
 
     def pose(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +81,8 @@ class TwinView:
         mujoco.mj_comPos(self.model, self.data)
 
     def labels(self, joints: np.ndarray, offset: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Body (rows, columns) int that each pixel shows, 0 for what is no arm, and its depth [m] along the optical axis."""
+        """Index of the body that each pixel shows, (rows, columns) int, 0 if it shows no arm, and its depth [m] along the
+        optical axis."""
         self._turn(joints, offset)
         geoms, depth_m = self._renderer(rows, columns).labels(self.data)[0]
         bodies = np.where(geoms >= 0, self.model.geom_bodyid[geoms], 0)
@@ -95,7 +97,7 @@ class TwinView:
         """A point (3,) of a body's frame in the mount's frame, for joints (14,).
 
         Raises:
-            TaccorlError: no such body.
+            TaccorlError: there is no such body.
         """
         names = [self.model.body(i).name for i in range(self.model.nbody)]
         if body not in names:
@@ -109,7 +111,7 @@ class TwinView:
         """The pictures (F, rows, columns, 3) without their black bars.
 
         Raises:
-            TaccorlError: another size, or there is something where bars should be.
+            TaccorlError: the pictures have another size, or the bars are not black.
         """
         if pictures.shape[1:] != (*self.size, 3) or pictures.dtype != np.uint8:
             raise TaccorlError(
@@ -158,6 +160,6 @@ class TwinView:
 
 
 def as_offset(offset: np.ndarray) -> CameraOffset:
-    """(6,) = (ω, t) as what a ``CameraConfig`` holds."""
+    """A pose (6,) = (ω, t) as the ``CameraOffset`` of a ``CameraConfig``."""
     x, y, z, right, up, back = offset.tolist()
     return CameraOffset(rotation_rad=(x, y, z), translation_m=(right, up, back))

@@ -1,1 +1,1 @@
-"""Checks of measurements before the twin is blamed: clocks, time stamps, wiring, ranges, repeats."""
+"""Checks of measurements before a twin is compared with them: clocks, time stamps, wiring, ranges, repeats."""

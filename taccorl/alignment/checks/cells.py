@@ -1,4 +1,4 @@
-"""What is wrong with recordings of a sensor of cells, each with the line to write or what to record instead."""
+"""Checks of recordings of a sensor of cells. Each finding states the line to write or what to record instead."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,32 +14,33 @@ ERRORS = (
     *("other_rate", "load_held", "load_unit", "beyond_ends", "constant_load", "no_rest", "saturated", "no_reading"),
     "wrong_sign",
 )
-"""Checks that can end in an error, and so be accepted."""
+"""Checks that can end in an error, and so can be accepted with ``--accept``."""
 UNLOADED, LOADED = 0.02, 0.05
 """Shares of the rated load below which a cell counts as unloaded, and above which it counts as loaded."""
 REST_S = 0.5
 """Time without load that a set of recordings must have, for the offsets."""
 CONSTANT = 0.05
-"""A load that varies by less than this share of the rated load says nothing about gain and law."""
+"""A load whose variation is below this share of the rated load does not determine gain and law."""
 MOST_CUT = 0.9
-"""Share of the loaded rows at an end of the converter from which a cell counts as saturated throughout."""
+"""Share of the loaded rows at an end of the converter from which on a cell counts as always saturated."""
 WRONG_WAY = -0.5
-"""Correlation of load and reading, with the sign of the file, from which the file's sign is wrong."""
+"""Correlation of load and reading, with the file's sign, below which the file's sign is wrong."""
 RATE = 0.05
-"""Share by which a recording's rate may differ from the file's."""
+"""Largest share by which a recording's rate may differ from the file's."""
 FEWEST_HELD, HELD = 3, 0.9
-"""A load whose changes lie at multiples of so many rows, that share of them, was recorded at a lower rate and held."""
+"""Load changes that lie at multiples of at least so many rows, in this share of cases, show that the load was recorded at a
+lower rate and held."""
 TOO_MUCH, TOO_LITTLE = 3.0, 0.02
-"""Multiples of the rated load that point to another unit."""
+"""Load as a multiple of the rated load above, or below, which its unit is probably wrong."""
 
 
 def check_cells(
     config: CellsConfig, measurements: Sequence[CellMeasurement], fit_names: Sequence[str]
 ) -> dict[str, list[Finding]]:
-    """Recording → findings. What only all fit recordings together lack is said at the first of them.
+    """Recording → findings. A finding about all fit recordings together is given at the first of them.
 
     Args:
-        fit_names: recordings that are fitted to.
+        fit_names: names of the fit recordings.
     """
     found = {m.name: [*m.findings, *_of_recording(config, m)] for m in measurements}
     together = [m for m in measurements if m.name in fit_names]

@@ -1,9 +1,9 @@
 """Check that command and measurement are on one clock, to less than a row.
 
 * No joint moves before it is commanded: a measurement that **leads** its command has wrong time stamps, whatever the physics.
-* A measurement that comes **late** may have a late clock or a real delay. Positions alone do not tell the one from the other.
-* Within one row (5 ms) this shows in the first movement after a step, or where the joint is a lag as ``first_order`` has it.
-  Where it is not, an offset of a row looks like a missing effect; the finding says that it was not judged.
+* A measurement that comes **late** may have a late clock or a real delay. Positions alone do not distinguish them.
+* Offsets below one row (5 ms) are found in the first movement after a step, or if the joint responds as a first-order lag
+  (``first_order``). Otherwise an offset of a row looks like a missing effect, and the finding states that it was not judged.
 """
 
 import math
@@ -20,31 +20,33 @@ from taccorl.data.lag_checks import LAG_SURE, find_lag
 from taccorl.errors import TaccorlError
 
 MOVING = 0.02
-"""rad (a tenth of it in m): a joint that is commanded further than this tells about time."""
+"""Least range of a command for judging the clock [rad; a tenth of it in m]."""
 SURE = 4.0
-"""Standard deviations beyond which an offset is one."""
+"""Number of standard deviations above which an offset is significant."""
 HALF_ROW_MOST = 0.75
-"""Rows: a lead below this may come from targets that are held in the replay and were not by the drive."""
+"""A lead below this [rows] can arise because the replay holds targets that the drive interpolated."""
 LEAD_ROWS = 0.3
-"""A lead of less could be the fit's own error."""
+"""Least lead that is reported [rows]; a smaller one can be an error of the fit."""
 LATE_ROWS = 1.2
-"""Second poles (inertia over K_d) count as delay: up to 5.7 ms at the twin's joints 2 and 3, so less than this is expected."""
+"""Least delay that is reported [rows]. A second pole (inertia over K_d) counts as delay, up to 5.7 ms at the twin's joints 2 and
+3, so that less is expected."""
 FITTING = 3.0
-"""The lag describes a joint if it leaves less than so many noise floors …"""
+"""A first-order lag describes a joint if its residual is below so many noise floors …"""
 FITTING_ROWS = 0.05
-"""… or less than this share of what an offset of one row would leave: it can shift the delay by a sixth of a row at most."""
+"""… or below this share of the residual that an offset of one row would cause; the delay is then wrong by a sixth of a row at
+most."""
 STEP_FLOORS = 8.0
-"""A step is judged if the joint's first row of movement is so many noise floors."""
+"""Least motion in the first row after a step for judging it [noise floors]."""
 REST_S = 0.25
-"""All commands must have rested so long before a step."""
+"""Time for which all commands must have rested before a step [s]."""
 EXCHANGED = 0.7
-"""Columns of target and position are exchanged if the lag, fitted from position to target, leaves less than this share of what it
-leaves from target to position."""
+"""Columns of target and position are exchanged if the residual of a lag fitted from position to target is below this share of
+that from target to position."""
 ROUGHER = 3.0
-"""… or, where neither fit decides, if the column given as the target has so many times the noise of the other."""
+"""… or, if neither fit decides, if the noise of the column given as the target is this many times the other's."""
 USUAL_TAU_S = 0.12
-"""The slowest joint of the paper (Fig. "Per-joint controller SysID"): what a step moves in its first row is at least
-step · period / τ."""
+"""Slowest time constant of a joint in the paper (Fig. "Per-joint controller SysID"): a step moves a joint in its first row by at
+least step · period / τ."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +55,14 @@ class CommandTiming:
 
     signal: str
     lag_s: float
-    """By correlation: what the controller and all delays take together; NaN where velocities hardly correlate (steps)."""
+    """Lag by correlation [s]: delays and the controller's response together; NaN if velocities hardly correlate (steps)."""
     fit: FirstOrder
     described: bool
-    """The lag describes the joint, so that its delay means something."""
+    """True if the lag describes the joint, so that its delay is meaningful."""
 
 
 def command_timing(m: Measurement, floor: dict[str, float]) -> list[CommandTiming]:
-    """Timing of every joint that moves enough.
+    """Lag and delay of every joint that moves enough.
 
     Args:
         floor: signal → noise floor (rad, m).
@@ -82,7 +84,7 @@ def command_timing(m: Measurement, floor: dict[str, float]) -> list[CommandTimin
 
 
 def moving_signals(m: Measurement) -> list[int]:
-    """Numbers of the signals whose command and whose measurement move enough to correlate."""
+    """Indices of the signals whose command and measurement both move enough to correlate."""
     scale = np.array([_scale(m, j) for j in range(len(m.signals))])
     moves = (np.ptp(m.target, axis=0) * scale > MOVING) & (np.nan_to_num(_span(m.measured)) * scale > MOVING / 4)
     return [int(j) for j in np.flatnonzero(moves)]
@@ -97,7 +99,7 @@ def _span(values: np.ndarray) -> np.ndarray:
 
 
 def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
-    """Leads, late answers, arms on different clocks, and what could not be judged."""
+    """Findings about the clock: leads, late answers, arms on different clocks, and signals that could not be judged."""
     stepped = _early_steps(m, floor)
     findings = [_lead_at_step(m, name, rows) for name, rows in stepped.items()]
     timings = command_timing(m, floor)
@@ -137,15 +139,13 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
 def check_against_twin(
     m: Measurement, reported: np.ndarray, floor: dict[str, float], uncertain: Collection[str] = ()
 ) -> list[Finding]:
-    """Rows by which the measurement lies beside the twin's replay of its commands.
-
-    A shift is reported only where it can be told from other gains (both are fitted together) and from a missing effect (little
-    must be left).
+    """Findings about time shifts between the measurement and the twin's replay of its commands. A shift is reported only if it
+    can be distinguished from other gains (both are fitted together) and from a missing effect (the residual must be small).
 
     Args:
-        reported: (T, J) the twin's positions, row by row with ``m.target``.
-        uncertain: signals of drives whose numbers (gains, k_t, back-EMF) diagnose fits because nobody knows them. Wrong ones
-            shift the twin, too, so that a lead of theirs is a warning.
+        reported: (T, J) positions of the twin, in the rows of ``m.target``.
+        uncertain: signals of drives with unknown numbers (gains, k_t, back-EMF), which diagnose fits. Wrong numbers also shift
+            the replay, so that a lead of these signals is only a warning.
     """
     findings = []
     period_s = m.period_s

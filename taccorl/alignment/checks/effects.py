@@ -1,6 +1,6 @@
-"""What every effect must keep, checked without a simulation of the robot. Tests of an outside package's effects call it.
+"""Checks of rules for every effect, without a simulation of the robot. Tests of an outside package's effects call them.
 
-    check_effect(MyEffect)    # raises AssertionError with what is wrong
+    check_effect(MyEffect)    # raises AssertionError with the rule that is violated
 
 Effects with ``drive`` run in the one-joint model, effects with ``reading`` on a small pad that is pressed, held and released.
 The project's own tests of registered effects (``tests/sim/effects/test_every_effect.py``) run the whole robot in addition.
@@ -18,7 +18,8 @@ from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import NEEDS, Effect, TouchEffect
 
 NEARLY, MOST = 0.01, 0.1
-"""A hundredth of the way from absent to typical may do at most a tenth of what the typical values do."""
+"""An effect at the first share of the way from absent to typical values may change the result by at most the second share of
+what the typical values change."""
 SCAN_S = 0.01
 
 
@@ -26,7 +27,7 @@ def check_effect(cls: type[Effect]) -> None:
     """Check that an effect is described, bounded, absent at its absent values, present at its typical ones, and fades out.
 
     Raises:
-        AssertionError: it is not; the message says which rule and with which numbers.
+        AssertionError: a rule is violated; the message states the rule and the numbers.
     """
     _check_described(cls)
     absent, typical = cls(), cls(**_typical(cls))

@@ -1,10 +1,11 @@
-"""Was a row's effort taken before its target acts, or after? Both are usual, and they differ by what the target moves in one row.
+"""Decide whether a row's effort was measured before or after the row's target acts. Both are usual; the efforts differ by the
+response to the change of the target in one row.
 
     τ_k − K_p (q*_(k−1) − q_k) = r K_p (q*_k − q*_(k−1)) − a q̇_k + b q̈_k + S sin q_k + C cos q_k + c
 
-r is 0 for an effort from before and 1 for one from after; a is the damping, b an age of position or velocity, S and C carried
-weight. Least squares find it whatever moves the joint: friction and inertia are in no controller. On the simulated robots of
-``docs/robot_study.jsonl`` with efforts r is within 0.3 of 0 in all recordings where the law is the file's.
+r is 0 if the effort was measured before, and 1 if after; a is the damping, b an age of position or velocity, S and C the
+compensated weight. The equation is that of the controller, so that it holds whatever friction and inertia the joint has. On the
+simulated robots of ``docs/robot_study.jsonl`` with efforts r is within 0.3 of 0 in all recordings where the law is the file's.
 """
 
 import numpy as np
@@ -15,18 +16,18 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding
 
 NEAR = 0.3
-"""r is that near to 0 or to 1, …"""
+"""Largest distance of r from 0 or 1 for a decision, …"""
 SURE = 0.1
-"""… with a standard error of at most this; else nothing is said. A drive that receives targets faster than they are logged is
-in between."""
+"""… and largest standard error of r; otherwise there is no finding. A drive that receives targets faster than they are logged
+lies in between."""
 CLIPPED = 0.98
-"""Of the effort limit: rows beyond say nothing of the target."""
+"""Rows with an effort above this share of the effort limit are not used."""
 SMOOTH_S = 0.05
-"""Window of the quadratic whose slope is the velocity."""
+"""Window of the quadratic whose slope is the velocity [s]."""
 
 
 def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> list[Finding]:
-    """Error if a recording's efforts were taken on the other side of the target than ``law`` says.
+    """Error if the efforts were measured before the target acts and ``law`` states after, or vice versa.
 
     Args:
         file: name of the file that states the law.
@@ -49,7 +50,7 @@ def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> 
 
 
 def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
-    """r and its standard error; None where the recording cannot tell."""
+    """The estimate of r and its standard error; None if the recording does not determine them."""
     j = m.column(signal)
     q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
     if m.torque_ff.size:

@@ -2,9 +2,9 @@
 
     y(t) = g · f(t − d) + b,   τ ḟ = q* − f
 
-A PiPER joint is nearly that (K_d / K_p ≈ 0.1 s; its second pole, inertia over K_d, lies below 3 ms and shows as delay). The delay
-tells about clocks: no joint answers before it is asked, so d < 0 is a fault of time stamps. Where the lag does not describe the
-joint (friction, backlash, …), d means nothing, and ``rms`` says so.
+A PiPER joint nearly responds like that (K_d / K_p ≈ 0.1 s; its second pole, inertia over K_d, is below 3 ms and appears as
+delay). The delay is used to check clocks: no joint responds before its command, so that d < 0 is a fault of time stamps. If the
+lag does not describe the joint (friction, backlash, …), ``rms`` is large and d has no meaning.
 
 Letters in shapes: T rows.
 """
@@ -20,14 +20,14 @@ from scipy.signal import lfilter
 from taccorl.errors import TaccorlError
 
 COMMAND_HZ = 150.0
-"""Below this rate rows are samples of a command that moved on in between, as in ``taccorl.sim.replay``."""
+"""Row rate below which the command is interpolated between rows, as in ``taccorl.sim.replay`` [Hz]."""
 TAU_S = (1e-3, 2.0)
-"""Time constants that are looked for."""
+"""Range of time constants that are searched [s]."""
 LEAST_ROWS = 20
 MOST_ROWS = 5000
-"""Of more rows than that, an even selection decides where the fit of all of them begins."""
+"""If there are more rows, an even selection of so many is used for the start of the fit."""
 DELAY_ROWS, DELAY_S = 8.0, 0.15
-"""Delays that are looked for: from so many rows too early to so many seconds late."""
+"""Range of delays that are searched: from so many rows too early to so many seconds late."""
 
 
 @dataclass(frozen=True)
@@ -37,23 +37,23 @@ class FirstOrder:
     time_constant_s: float
     delay_s: float
     delay_sd_s: float
-    """Standard deviation of the delay, with the residual's own correlation taken into account."""
+    """Standard deviation of the delay [s], with the autocorrelation of the residual taken into account."""
     gain: float
     rms: float
-    """What is left (rad, m)."""
+    """RMS of the residual of the fit [rad, m]."""
     row_rms: float
-    """How far the fitted answer goes in one row (RMS; rad, m): what an offset of one row would leave."""
+    """RMS change of the fitted response in one row [rad, m]: the residual that an offset of one row would cause."""
 
 
 def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -> FirstOrder:
-    """Least squares over τ and d; g and b follow.
+    """Fit τ, d, g and b by least squares.
 
     Args:
-        target: (T,) in force from row k on.
-        measured: (T,) at row k; rows with NaN are left out.
+        target: (T,) commands, in force from row k on.
+        measured: (T,) positions at row k; rows with NaN are left out.
 
     Raises:
-        TaccorlError: too few rows.
+        TaccorlError: there are too few rows.
     """
     rows = _rows(target, measured, period_s)
     answer = _Answer(target - target[0], period_s)
@@ -95,19 +95,19 @@ class Shift:
     delay_s: float
     delay_sd_s: float
     rms: float
-    """What neither a shift nor other gains explain (rad, m)."""
+    """RMS residual that neither a shift nor other gains explain [rad, m]."""
     row_rms: float
-    """What an offset of one row would leave."""
+    """RMS residual that an offset of one row would cause [rad, m]."""
 
 
 def delay_between(target: np.ndarray, measured: np.ndarray, other: np.ndarray, period_s: float) -> Shift:
-    """Delay of ``measured`` (T,) after ``other`` (T,), both answers to ``target``.
+    """Delay of ``measured`` (T,) relative to ``other`` (T,), both responses to ``target``.
 
-    measured − other = b + δg f + δτ ∂f/∂τ + δd ∂f/∂d, linear about the middle of both fits: what the lag describes in neither
-    falls out of the difference.
+    measured − other = b + δg f + δτ ∂f/∂τ + δd ∂f/∂d, linearised about the mean of both fits: a part of the response that the
+    lag describes in neither cancels in the difference.
 
     Raises:
-        TaccorlError: too few rows.
+        TaccorlError: there are too few rows.
     """
     fits = [fit_first_order(target, values, period_s) for values in (measured, other)]
     rows = _rows(target, measured, period_s)

@@ -7,8 +7,8 @@ position then deviates by that pulse through the joint's own response:
     e(t) ≈ Σ over events  w(t) * pulse(t),    w = A(q) G
 
 Each event is found by the squared residual that it explains (matching pursuit). A pulse always points backwards along the motion.
-Disturbances, friction and noise have no such preference, so the same search for pulses that point *forwards* estimates how many
-events chance and unmodelled physics produce.
+Disturbances, friction and noise have no preferred direction, so that the same search for pulses that point *forwards* estimates
+the number of false events.
 
 Letters in shapes: T rows, L rows of the response, M rows of a hold.
 """
@@ -24,22 +24,22 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 HOLDS = (1, 2, 3, 4, 6, 8, 12, 16)
-"""Lengths of a hold, in command periods."""
+"""Lengths of a hold that are searched [command periods]."""
 AR_ORDER = 6
-"""Of the whitening filter A(q)."""
+"""Order of the whitening filter A(q)."""
 PASSES = 4
-"""Fits of response and noise, each without the events found so far."""
+"""Number of fits of response and noise, each without the events found so far."""
 LEAD_ROWS = 4
 RESPONSE_S = 0.4
-"""Length of the response that is looked at."""
+"""Length of the response that is used [s]."""
 LEAST_GAIN = 12.0
-"""Reduction of ½ Σ e²/σ² that makes an event: noise alone gives one in about 10⁵ rows."""
+"""Least reduction of ½ Σ e²/σ² for an event: noise alone causes one in about 10⁵ rows."""
 LOCAL_S = 0.5
-"""σ is estimated within such a window, too: unmodelled physics comes in places."""
+"""Window in which a local σ is estimated, too [s]: unmodelled physics occurs in some places only."""
 OMEGA_RAD_PER_S, ZETA, DELAY_ROWS = (2.0, 400.0), (0.2, 20.0), (-2.0, 12.0)
-"""Ranges of the fitted response."""
+"""Ranges of the parameters of the fitted response: natural frequency, damping ratio, delay."""
 MOVES = 2e-3
-"""rad, m: a target that moves less cannot show a dropped command."""
+"""Least motion of a target that can show a dropped command [rad, m]."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class HeldCommand:
     """First row at which the previous target was still in force."""
     rows: int
     gain: float
-    """By how much ½ Σ e²/σ² fell."""
+    """Reduction of ½ Σ e²/σ² by the event."""
 
 
 @dataclass(frozen=True)
@@ -59,21 +59,21 @@ class HeldCommands:
 
     events: tuple[HeldCommand, ...]
     mirrored: tuple[HeldCommand, ...]
-    """Events of the opposite sign: what chance and unmodelled physics produce."""
+    """Events of the opposite sign: their number estimates that of false events."""
     updates: int
-    """Commands that differ from the one before."""
+    """Number of commands that differ from the one before."""
     visible: int
-    """Of those, commands whose loss would be seen by itself."""
+    """Number of these commands whose loss alone could be found."""
     period_rows: int
     """Rows between two updates of the command."""
 
 
 def find_held_commands(target: np.ndarray, measured: np.ndarray, period_s: float) -> HeldCommands | None:
-    """Find dropped commands of one signal of one recording; None if too little is measured or the target does not move.
+    """Find dropped commands of one signal of one recording; None if there are too few measured rows or the target does not move.
 
     Args:
-        target: (T,) as commanded, in force from row k on.
-        measured: (T,) at row k; NaN where nothing was measured.
+        target: (T,) commanded targets, in force from row k on.
+        measured: (T,) positions at row k; NaN where not measured.
     """
     changed = np.flatnonzero(np.diff(target) != 0) + 1
     if np.ptp(target) < MOVES or len(changed) < 50 or np.isfinite(measured).sum() < 200:

@@ -1,14 +1,14 @@
 """Distinguish a joint at a mechanical stop from one whose encoder's range ended, by the time at which the reading changes again.
 
-Both leave a reading without change while the command lies beyond it. A joint whose *reading* ended moved on unseen: the reading
-changes when the joint's free answer to the command comes back, about a lag τ (0.1 s on a PiPER) after the command did. A joint
-that stood at a *stop* was held there: it moves as soon as the command is back. With u = g q*(t − d) + b, everything mirrored for
-a lower end, and τ, d, g from ``first_order``, fitted to the rows of free motion:
+In both cases the reading is constant while the command is beyond it. If the *reading* ended, the joint moved on: the reading
+changes when the joint's free response comes back, about a lag τ (0.1 s on a PiPER) after the command. A joint that stood at a
+*stop* was held there: it moves as soon as the command is back. With u = g q*(t − d) + b, everything mirrored for a lower end,
+and τ, d, g from ``first_order``, fitted to the rows of free motion:
 
     free      f ← u + (f − u) e^(−h/τ)                   comes back below the reading q_held
     stopped   q ← min(q_held, u + (q − u) e^(−h/τ))      leaves q_held
 
-The time that is nearer to the measured one decides.
+The hypothesis whose time is nearer to the measured one is chosen.
 """
 
 import math
@@ -21,21 +21,22 @@ from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
 SETTLED_S = 0.3
-"""Time after a hold in which a stop still influences the motion (three time constants τ of 0.1 s): rows in it are not fitted."""
+"""Time after a hold in which a stop still influences the motion [s] (three time constants τ of 0.1 s): its rows are not
+fitted."""
 
 
 def stood_at_stop(
     target: np.ndarray, measured: np.ndarray, period_s: float, rows: tuple[int, int], sign: float, near: float
 ) -> bool:
-    """True if the hold ended as that of a joint at a stop; False if that is not clear.
+    """True if the end of the hold shows a joint at a stop; False if it does not, or is unclear.
 
     Args:
         target: (T,) commands.
         measured: (T,) readings.
         period_s: time between two rows.
-        rows: first row, and last row + 1, of readings without change.
+        rows: first row and last row + 1 of the constant readings.
         sign: +1 for an upper end of the range, −1 for a lower end.
-        near: readings within this of the held one may be at the same end, and say nothing of free motion.
+        near: readings within this distance of the held one may also be at the end, and are not used as free motion.
     """
     first, end = rows
     if end >= len(target):

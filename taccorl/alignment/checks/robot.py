@@ -1,4 +1,4 @@
-"""Do a recording and a robot file belong together? Limits of position and effort, inertia, columns that are missing."""
+"""Check that a recording and a robot file match: limits of position and effort, inertia, missing columns."""
 
 from collections.abc import Sequence
 
@@ -13,22 +13,22 @@ from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.data.finding import Finding, listed
 
 BEYOND = 0.02
-"""Share of a joint's range by which it may be measured beyond its limits."""
+"""Share of a joint's range by which a measured position may exceed its limits."""
 EFFORT_BEYOND = 1.5
-"""Times the effort limit: what a sensor reports beyond is in another unit."""
+"""Multiple of the effort limit above which a reported effort is probably in another unit."""
 INERTIA_OFF = 5.0
-"""Factor between the model's inertia and that in the recording from which they do not belong together."""
+"""Ratio of the model's inertia to that in the recording from which on they do not match."""
 INERTIA_SURE = 0.6
-"""Correlation of acceleration and effort, other torques taken off, from which the inertia in the recording is known."""
+"""Least correlation of acceleration and effort, without other torques, at which the inertia in the recording is known."""
 SMOOTH_S = 0.05
-"""Window of the quadratic whose second derivative is the acceleration."""
+"""Window of the quadratic whose second derivative is the acceleration [s]."""
 
 
 def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequence[str]) -> list[Finding]:
     """Findings of one recording.
 
     Args:
-        whole: ``m`` with all signals of the robot.
+        whole: the measurement ``m`` extended to all signals of the robot.
         moved: joints of the robot file that the recording moves.
     """
     found = _missing(robot, m)

@@ -1,4 +1,4 @@
-"""Is a measurement fit to blame the twin with? Checked before any effect is.
+"""Check that a measurement is good enough to judge a twin. This is done before any effect is considered.
 
     error    time_backwards, time_unit, not_finite, lost_samples, too_short, no_motion, dead_channel, frozen_channel,
              saturated_channel, unit, reversed, swapped_joints, swapped_arms, measured_before_command
@@ -6,9 +6,9 @@
              velocity_unit, no_baseline, dropped_commands, does_not_repeat, same_commands, sticking_joint, resampled
     note     late_answer, effort_limit, not_judged, same_motion
 
-An error that a user has looked into can be accepted by its name: it stays in the report as a warning. Every finding names joint,
-value and place, and what to record or change. The parts are here (values, motion, start), in ``time_stamps``, ``wiring``
-(which joint follows which command, units), ``clock`` (offsets in time) and ``unrepeated`` (recordings of one motion).
+An error that a user has examined can be accepted by its name; it stays in the report as a warning. Every finding names joint,
+value and place, and what to record or change. The checks are here (values, motion, start), in ``time_stamps``, ``wiring`` (which
+joint follows which command, units), ``clock`` (offsets in time) and ``unrepeated`` (recordings of one motion).
 """
 
 import dataclasses
@@ -34,32 +34,33 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 MOVED = {"rad": 0.02, "m": 0.002}
-"""A command that stays within this has not moved its joint,"""
+"""Least range of a command that counts as motion [rad; a tenth of it in m], …"""
 MOVED_STEPS = 100.0
-"""unless it is so many times what its encoder resolves: ± 1 mm on a stage. Of machines other than the PiPER."""
+"""… unless the range is at least so many encoder steps, for machines other than the PiPER (± 1 mm on a stage)."""
 TOO_SHORT_S, SHORT_S = 1.0, 3.0
-"""Of motion. The paper sweeps each joint for 10 s."""
+"""Duration of motion below which a recording is an error, and below which it is a warning [s]. The paper sweeps each joint for
+10 s."""
 DEAD_SHARE = 0.05
-"""A joint that goes less than this share of its command's way does not answer."""
+"""A joint does not answer if its range is below this share of its command's range."""
 FROZEN_S = 0.3
-"""Readings bit-identical for so long …"""
+"""Time of bit-identical readings …"""
 FROZEN_MOVE = 0.05
-"""… while the command goes so far (rad)."""
+"""… while the command moves by this [rad], for a frozen channel."""
 BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
-"""Standing at its furthest reading so long while it is commanded so much further."""
+"""Time at the furthest reading [s], and distance by which the command is beyond it [rad], for a blocked joint."""
 START_S, START_ROWS = 0.15, (8, 30)
-"""How fast a joint is at row 0 is read off so many seconds, within so many rows."""
+"""Time and number of rows from which the speed at row 0 is estimated."""
 START_SPEED = {"rad": 0.03, "m": 0.003}
-"""Per second: a twin that starts at rest is off by this times 0.1 s, 3 mrad."""
+"""Largest speed at row 0 [rad/s]: a twin that starts at rest then errs by 0.1 s times it, 3 mrad."""
 START_OFFSET_RAD = 0.1
-"""Further from its resting command the joint is not held by it. The paper's feed-forward torque moves it by
-11 mrad at most."""
+"""Largest distance of a joint from its resting command at the start [rad]. The paper's feed-forward torque causes 11 mrad at
+most."""
 AT_LIMIT_SHARE = 0.01
-"""Of the rows with exactly the largest effort: more than chance."""
+"""Share of the rows with exactly the largest effort from which on the effort counts as limited."""
 _ORDER = ("error", "warning", "note")
 STICK_STEPS = 4.0
-"""A joint that sticks moves on by no more than so many of its usual steps between rows, or of its encoder's; a driver that
-repeated old values jumps to where the joint has gone meanwhile."""
+"""Most steps (usual ones between rows, or the encoder's) by which a sticking joint moves on; a driver that repeated old values
+jumps to the joint's present position instead."""
 DIFFERENT = 3.0
 """Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""
 ERRORS = (
@@ -68,7 +69,7 @@ ERRORS = (
     "beyond_limits", "wrong_inertia", "reversed_effort", "effort_time",
     *CELL_ERRORS,
 )  # fmt: skip
-"""Checks that can end in an error, and so be accepted."""
+"""Checks that can end in an error, and so can be accepted with ``--accept``."""
 _NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")
 """With these nothing else can be judged."""
 
@@ -76,7 +77,7 @@ _NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")
 def check_names(accept: Sequence[str]) -> None:
     """
     Raises:
-        TaccorlError: a name that is no check's.
+        TaccorlError: there is no check of such a name.
     """
     for name in accept:
         if name not in ERRORS:
@@ -84,7 +85,7 @@ def check_names(accept: Sequence[str]) -> None:
 
 
 def accepted(findings: Sequence[Finding], accept: Sequence[str]) -> list[Finding]:
-    """``findings`` with errors of the checks ``accept`` turned into warnings that say so."""
+    """``findings`` in which errors of the checks ``accept`` are warnings that state the acceptance."""
     return [
         dataclasses.replace(f, severity="warning", text=f"{f.text}. An error, accepted by --accept={f.check}")
         if f.severity == "error" and f.check in accept
@@ -102,7 +103,7 @@ def check_measurement(
     """All findings on one measurement, worst first.
 
     Args:
-        joints: signals that are to be fitted; each must move.
+        joints: signals to be fitted; each must move.
         floor: signal → noise floor of positions (rad, m); estimated from this measurement alone by default.
         accept: names of checks whose errors are known and become warnings.
     """
@@ -124,7 +125,8 @@ def check_measurement(
 def check_measurements(
     measurements: Sequence[Measurement], joints: Sequence[str] = (), accept: Sequence[str] = ()
 ) -> dict[str, list[Finding]]:
-    """Name → findings, for several; joints need to move in one of them. Says where one repeats another untold."""
+    """Name → findings, for several measurements; each joint must move in one of them. Also finds measurements that repeat
+    another without stating it."""
     found = {m.name: check_measurement(m, accept=accept) for m in measurements}
     moved = {name for m in measurements for name, far in zip(m.signals, _moves(m), strict=True) if far}
     for m in measurements[:1]:
@@ -189,7 +191,7 @@ def _place(m: Measurement, first: int, end: int) -> str:
 
 
 def check_values(m: Measurement) -> list[Finding]:
-    """Numbers everywhere, and enough of them."""
+    """Check that there are enough values, and that all are finite."""
     findings = []
     for name, values in zip(m.signals, m.target.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
@@ -231,7 +233,7 @@ def _moves(m: Measurement) -> list[bool]:
 
 
 def least_motion(m: Measurement, name: str) -> float:
-    """rad, m: a signal that moves by less has not moved."""
+    """Least motion of a signal that counts as motion [rad, m]."""
     j = m.column(name)
     usual = MOVED[m.units[j]]
     if name in ROBOT.action_names:
@@ -260,7 +262,7 @@ def _no_motion(m: Measurement, name: str) -> Finding:
 
 
 def check_motion(m: Measurement, joints: Sequence[str] = ()) -> list[Finding]:
-    """Joints that do not move, do not answer, or stop answering."""
+    """Find joints that do not move, do not answer, or stop answering."""
     moves = _moves(m)
     if not any(moves):
         few, more = list(zip(m.signals, m.units, strict=True))[:2], " …" * (len(m.signals) > 2)
@@ -382,7 +384,7 @@ def _moves_on(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
 
 
 def check_start(m: Measurement) -> list[Finding]:
-    """The twin starts at rest where the robot was: was it at rest, and near its command?"""
+    """Check that the robot was at rest near its command at the start, as the twin is."""
     rows = min(max(START_ROWS[0], round(START_S / m.period_s)), START_ROWS[1])
     findings = []
     if m.num_rows <= rows:
@@ -425,7 +427,7 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
 
 
 def check_effort(m: Measurement) -> list[Finding]:
-    """Effort that says nothing, or stops at a limit."""
+    """Find efforts that carry no information, or stop at a limit."""
     findings = []
     recorded = m.has_effort()
     for j in np.flatnonzero(np.array(_moves(m)) & recorded):

@@ -6,11 +6,11 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding
 
 RATE_HZ = (5.0, 5000.0)
-"""Slower rows show no dynamics, faster ones nobody logs: the times are in another unit."""
+"""Range of plausible row rates [Hz]; outside it the times are probably in another unit."""
 GAP, JITTER = 1.5, 0.1
-"""In median periods: a longer step has lost rows; a twentieth of the steps may lie further off than the second."""
+"""Steps above the first [median periods] are lost rows; at most a twentieth of the steps may deviate by more than the second."""
 RATE_SHARE = 0.8
-"""Of the rate that the spec states."""
+"""Least rate, as a share of the rate that the spec states."""
 
 
 def check_time(m: Measurement) -> list[Finding]:

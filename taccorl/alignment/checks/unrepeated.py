@@ -1,10 +1,10 @@
 """Differences between repeats of one motion, per signal: size, time, and whether dropped commands explain them.
 
-    ratio       RMS of what repeats differ by, over the noise that rest, residue and rounding show
+    ratio       RMS difference of repeats, divided by the noise from rest, residue and rounding
     bursts      the smallest share of half-second blocks that holds 80 % of the squared difference
     dropped     pulses that point backwards along the motion, found by ``held_commands`` in every recording
 
-A ratio above 3 means that the floor from repeats would hide a missing effect of that size, whatever causes it. Dropped commands
+With a ratio above 3 the floor from repeats would hide a missing effect of that size, whatever its cause. Dropped commands
 are reported where pulses of the right sign clearly outnumber those of the opposite sign; a disturbance torque or dry friction
 produces both alike.
 
@@ -24,15 +24,15 @@ from taccorl.data.finding import Finding, not_judged
 from taccorl.errors import TaccorlError
 
 DISAGREE = 3.0
-"""Floor from repeats over the floor from rest, residue or rounding beyond which they disagree."""
+"""Ratio of the floor from repeats to the floor from rest, residue or rounding above which they disagree."""
 BLOCK_S = 0.5
 BURST_POWER, BURST_SHARE = 0.8, 0.25
-"""So much of the squared difference in less than such a share of the time: intermittent."""
+"""A difference is intermittent if the first share of its square lies in less than the second share of the time."""
 LEAST_EVENTS, MIRRORED = 6, 4
 """Dropped commands are reported from ``LEAST_EVENTS`` + ``MIRRORED`` × events of the opposite sign on: an effect
 that makes the joint lag (a torque limit) leaves up to four that are none."""
 MOST_TIMES = 5
-"""That a text lists."""
+"""Most times that a text lists."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +42,10 @@ class Burst:
     first: str
     second: str
     begin_s: float
-    """In the first recording."""
+    """Start of the burst in the first recording [s]."""
     end_s: float
     rms: float
-    """Of the difference / √2 (rad, m)."""
+    """RMS of the difference / √2 [rad, m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +57,10 @@ class Dropped:
     hold_rows: float
     """Mean length of a hold, in commands."""
     commands: int
-    """Changes of the command that were searched."""
+    """Number of changes of the command that were searched."""
     found: int
     mirrored: int
-    """Events of the opposite sign: how many chance and unmodelled physics produce."""
+    """Number of events of the opposite sign, which estimates that of false events."""
 
     @property
     def certain(self) -> bool:
@@ -68,7 +68,7 @@ class Dropped:
 
     @property
     def rate(self) -> float:
-        """Share of commands that were dropped and seen: a lower bound, slow motion does not show them."""
+        """Share of commands that were found dropped. It is a lower bound, because slow motion does not show them."""
         return self.found * self.hold_rows / max(self.commands, 1)
 
 
@@ -79,11 +79,11 @@ class Unrepeated:
     signal: str
     unit: str
     repeats: float | None
-    """RMS of what repeats differ by, / √2; None without repeats."""
+    """RMS difference of repeats / √2; None without repeats."""
     quiet: float
     """Noise from rest, residue and rounding."""
     burst_share: float | None
-    """Share of the time that holds ``BURST_POWER`` of the squared difference."""
+    """Share of the time that holds ``BURST_POWER`` of the squared difference; None without repeats."""
     bursts: tuple[Burst, ...]
     dropped: Dropped | None
 

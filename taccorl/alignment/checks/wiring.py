@@ -18,14 +18,14 @@ from taccorl.robots import ROBOT
 
 USUAL_LAG_S = 0.1
 FOLLOWS, FOLLOWS_NOT = 0.8, 0.5
-"""Correlation of a joint that follows a command; below the second it does not."""
+"""Correlation above which a joint follows a command, and below which it does not."""
 REVERSED = -0.6
 ALIKE = 0.02
-"""Correlations that differ by less do not choose between two joints."""
+"""Least difference of correlations for choosing between two joints."""
 GAIN = (0.2, 5.0)
-"""Beyond this no controller and no physics takes a joint."""
+"""Gain above which neither controller nor physics can explain the motion."""
 BEYOND = {"rad": 0.5, "m": 0.05}
-"""Beyond the robot's limits by more than this is not a place where it can be."""
+"""Distance beyond the robot's limits above which a position is impossible."""
 SMOOTH_S = 0.03
 KNOWN_FACTORS = {
     57.2958: "in degrees where it should be in rad",

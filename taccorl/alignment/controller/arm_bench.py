@@ -1,6 +1,6 @@
-"""One joint of the twin on its own: its arm with the other joints held, nothing to touch, no gripper that moves.
+"""MuJoCo model of one joint of the twin: its arm with the other joints held, without contacts and with a fixed gripper.
 
-``alignment.controller.joint_model`` reads inertia and weight from it, and runs it where an effect is one that only MuJoCo knows.
+``alignment.controller.joint_model`` reads inertia and weight from it, and simulates it for effects that only MuJoCo can compute.
 """
 
 import copy
@@ -28,7 +28,7 @@ def split_signal(signal: str) -> tuple[str, str]:
     """``left_joint5`` → ``left``, ``joint5``.
 
     Raises:
-        TaccorlError: no joint of the arms; grippers have no model of one joint.
+        TaccorlError: ``signal`` is not a joint of an arm; grippers have no one-joint model.
     """
     arm, _, joint = signal.partition("_")
     if arm in ROBOT.arms and joint == "gripper":
@@ -42,7 +42,7 @@ def split_signal(signal: str) -> tuple[str, str]:
 
 
 def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
-    """Those of ``effects`` that are there and act on one joint, and on it alone, in the order in which they act."""
+    """Those of ``effects`` that are not absent and act on this joint alone, in the order in which they act."""
     arm, joint = split_signal(signal)
     own: list[Effect] = []
     for effect in present(effects):
@@ -63,7 +63,7 @@ def arm_spec(
     payload_kg: float = 0.0,
     payload_at_m: Position = AT_TCP,
 ) -> mujoco.MjSpec:
-    """One arm, its joints ``free`` with their motors and encoders, the others and the gripper held at ``pose``.
+    """One arm whose joints ``free`` have motors and encoders, and whose other joints and gripper are held at ``pose``.
 
     ``pose`` holds the arm's joints [rad] and its opening [m].
 
@@ -110,7 +110,7 @@ def arm_spec(
 
 
 def held_payload(arm: str, mass_kg: float, at_m: Position = AT_TCP) -> Payload:
-    """A known mass in the gripper, at ``at_m`` in link 6's frame."""
+    """Add a known mass in the gripper, at ``at_m`` in link 6's frame."""
     x_m, y_m, z_m = at_m
     return Payload(arm=arm, mass_kg=mass_kg, x_link6_m=x_m, y_link6_m=y_m, z_link6_m=z_m)
 
@@ -123,7 +123,7 @@ def rigid(
     effects: Sequence[Effect],
     payload_at_m: Position = AT_TCP,
 ) -> Rigid:
-    """Inertia and weight of a joint with the others at ``pose``; of ``effects`` those that only change bodies."""
+    """Inertia and weight of a joint with the others held at ``pose``; of ``effects`` only those that change bodies are used."""
     arm, joint = split_signal(signal)
     spec = arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m)
     for effect in effects:
@@ -145,13 +145,14 @@ def run(
     effects: Sequence[Effect],
     payload_at_m: Position = AT_TCP,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The joint in MuJoCo, its effects as the twin builds them, from rest; what a gear lets hang hangs already.
+    """Simulate the joint in MuJoCo, with its effects as in the twin, from rest; a link that hangs in a gear's play or spring
+    starts in equilibrium.
 
     Args:
         sent: (S,) targets [rad], each held for ``hold`` physics steps.
         coupling_nm: (S hold,) torque that must be held against the other joints' motion.
         gains: K_p, K_d, T_ref.
-        effects: of this joint alone (``of_joint``).
+        effects: effects of this joint alone (``of_joint``).
 
     Returns:
         (S,) reported [rad] and motor torque [N·m] when each target is sent, before it acts.

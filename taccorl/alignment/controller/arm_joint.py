@@ -1,4 +1,4 @@
-"""One joint of the PiPER's twin, as the one-joint model sees it: its arm compiled with the other joints held.
+"""One joint of the PiPER's twin for the one-joint model: its arm compiled with the other joints held.
 
 Letters in shapes: T rows.
 """
@@ -29,16 +29,16 @@ from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.twin import TwinConfig
 
 BENCH_REST = np.concatenate([[*Bench.home_rad[arm], 0.0] for arm in ROBOT.arms])
-"""(14,) positions [rad, m] of joints and grippers that a table lacks."""
+"""(14,) positions [rad, m] of joints and grippers that a table does not contain."""
 
 
 class HasJoints(Protocol):
-    """A machine whose joints the one-joint model knows."""
+    """Interface of a machine with joints for the one-joint model."""
 
     def joint(self, signal: str) -> RigidJoint:
         """
         Raises:
-            TaccorlError: it has no such joint.
+            TaccorlError: the machine has no such joint.
         """
         ...
 
@@ -47,7 +47,7 @@ def joint_of(machine: TwinConfig | HasJoints, signal: str) -> RigidJoint:
     """One joint of the PiPER's twin, or of another machine.
 
     Raises:
-        TaccorlError: no such joint, or a gripper of the PiPER.
+        TaccorlError: there is no such joint, or it is a gripper of the PiPER.
     """
     return ArmJoint(machine, signal) if isinstance(machine, TwinConfig) else machine.joint(signal)
 
@@ -56,7 +56,7 @@ class ArmJoint(RigidJoint):
     """A joint of the twin ``config``; its own effects are those of the config that act on it.
 
     Raises:
-        TaccorlError: no such joint, or a gripper.
+        TaccorlError: there is no such joint, or it is a gripper.
     """
 
     def __init__(self, config: TwinConfig, signal: str) -> None:
@@ -142,7 +142,7 @@ class ArmJoint(RigidJoint):
 
 
 def selectors(cls: type[Effect], signal: str) -> dict[str, Any] | None:
-    """Arguments with which an effect acts on one joint of the PiPER alone; None for effects of something else."""
+    """Arguments with which an effect acts on one joint of the PiPER alone; None for effects that do not act on joints."""
     arm, joint = signal.split("_", 1)
     if issubclass(cls, JointEffect):
         return {"arm": arm, "joints": [joint]} if joint in cls.possible else None

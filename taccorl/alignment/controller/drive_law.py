@@ -40,12 +40,13 @@ NEEDED: Mapping[Law, tuple[str, ...]] = {
     "pwm": ("kp", *WINDING[:3]),
 }
 LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4
-"""Of the physics."""
+"""Range of the physics step [s]."""
 STEP_SHARE = 0.05
-"""Of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
+"""Physics step as a share of inertia / K_d. Steps are of second order: the error of a PWM servo's step of 0.8 rad is then 0.1
+mrad."""
 WINDING_WITHIN = 3.0
-"""Stall torque and back-EMF of law pwm are fitted from the file's value divided by this to that times this: data sheets are
-no better."""
+"""Factor within which stall torque and back-EMF of law pwm are fitted, relative to the file's values; data sheets are no
+better."""
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
 _KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque"}
 _OF_POSITION_LOOPS = ("integral_action", "error_deadband", "velocity_feedforward")
@@ -54,34 +55,35 @@ _OF_POSITION_LOOPS = ("integral_action", "error_deadband", "velocity_feedforward
 
 @dataclass(kw_only=True)
 class DriveLaw:
-    """Law and numbers of one drive. Units are those of a turning one; of a slide N for N·m, m for rad."""
+    """Control law and numbers of one drive. Units are for a hinge; for a sliding joint read N for N·m and m for rad."""
 
     law: Law = "impedance"
     kp: float | None = None
-    """In the unit that the law asks for, over ``kp_factor``."""
+    """Gain in the law's unit divided by ``kp_factor``; None for laws without it."""
     kd: float | None = None
     kp_factor: float = 1.0
-    """``kp`` times this is in the law's unit, here and in measurements.yaml: what one step of a gain's register is worth."""
+    """Factor from ``kp``, here and in measurements.yaml, to the law's unit: the value of one step of a gain's register."""
     kd_factor: float = 1.0
     torque_ff: float = 0.0
-    """N·m."""
+    """Constant torque of the controller [N·m]."""
     supply_v: float | None = None
-    """V: of law pwm."""
+    """Voltage of the motor's supply [V]; law pwm."""
     resistance_ohm: float | None = None
-    """Ω: of the winding, law pwm."""
+    """Resistance of the winding [Ω]; law pwm."""
     torque_nm_per_a: float | None = None
     """k_t at the axis or joint, gear included [N·m/A], law pwm."""
     emf_v_s_per_rad: float | None = None
-    """k_e at the axis or joint [V·s/rad], law pwm; k_t if not given, which it is in SI units."""
+    """k_e at the axis or joint [V·s/rad], law pwm; k_t if not given (both are equal in SI units)."""
     effort_limit: float | None = None
-    """N·m at which the drive's torque is clipped."""
+    """Torque at which the drive's output is clipped [N·m]; None: not clipped."""
     effort_after_target: bool = False
-    """Whether the logged effort of a row answers the row's own target already; else it was taken before that target acts."""
+    """True: the logged effort of a row already responds to the row's target. False: it was measured before that target acts."""
 
     def check_law(self, owner: str) -> None:
         """
         Raises:
-            TaccorlError: ``OWNER.KEY: …``, where a number is wrong, or is missing in the law, or the law has none.
+            TaccorlError: a number is wrong, is missing for the law, or is not used by the law; the message begins with
+                ``OWNER.KEY``.
         """
         check_numbers(owner, self, positive=("kp_factor", "kd_factor"), finite=("torque_ff",))
         stated = [name for name in ("kp", "kd", *WINDING, "effort_limit") if getattr(self, name) is not None]
@@ -98,12 +100,12 @@ class DriveLaw:
 
     @property
     def gain_names(self) -> tuple[str, ...]:
-        """Those of kp and kd that the law has."""
+        """Which of kp and kd the law has."""
         return tuple(name for name in ("kp", "kd") if getattr(self, name))
 
     @property
     def target_kind(self) -> TargetKind:
-        """What a target commands."""
+        """Quantity that a target of this law commands."""
         return _KINDS.get(self.law, "position")
 
     @property
@@ -119,7 +121,8 @@ class DriveLaw:
 
     @property
     def loop_gains(self) -> Gains:
-        """Of the position error and the velocity [N·m/rad, N·m·s/rad, N·m], whatever the law."""
+        """Gains of position error and velocity, and the constant torque [N·m/rad, N·m·s/rad, N·m], in the same form for every
+        law."""
         kp, kd = (self.kp or 0.0) * self.kp_factor, (self.kd or 0.0) * self.kd_factor
         if self.law == "cascade":
             return Gains(kp * kd, kd, self.torque_ff)
@@ -129,7 +132,7 @@ class DriveLaw:
 
     @property
     def facts(self) -> dict[str, float]:
-        """Numbers of ``joint_kernel.Drive`` that the law determines."""
+        """Fields of ``joint_kernel.Drive`` that the law determines."""
         found: dict[str, float] = {"command": _COMMANDS.get(self.law, POSITION), "midpoint": 1.0}
         found["effort_after"] = float(self.effort_after_target)
         if self.law == "pwm":
@@ -139,7 +142,7 @@ class DriveLaw:
         return found
 
     def timestep_s(self, rate_hz: float, inertia: float) -> float:
-        """Physics step for rows at ``rate_hz`` and an inertia [kg·m²]."""
+        """Physics step [s] for rows at ``rate_hz`` and an inertia [kg·m²]."""
         damping = self.loop_gains.kd + self.back_emf
         wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
@@ -149,7 +152,7 @@ class DriveLaw:
         return self.target_kind == "position" or effect not in _OF_POSITION_LOOPS
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:
-        """Fields of this class from fitted numbers: torque_ff; kp and kd as in ``loop_gains``; ``stall_nm`` and ``back_emf``."""
+        """Fields of this class from fitted values: torque_ff; kp and kd as in ``loop_gains``; ``stall_nm`` and ``back_emf``."""
         new = {"torque_ff": base["torque_ff"]} if "torque_ff" in base else {}
         if self.law == "pwm" and "stall_nm" in base:
             volts, ohms = self.supply_v or 1.0, self.resistance_ohm or 1.0
@@ -164,10 +167,10 @@ class DriveLaw:
         return new
 
     def gain_scales(self, signal: str, m: Measurement) -> tuple[float, float]:
-        """Loop gains of a recording over those of the file: of the position error, of the velocity.
+        """Ratios of a recording's loop gains to those of the file: for the position error, for the velocity.
 
         Raises:
-            TaccorlError: it states a gain that the file does not have.
+            TaccorlError: the recording states a gain that the file does not have.
         """
         scales = {}
         for name in ("kp", "kd"):
@@ -183,11 +186,11 @@ class DriveLaw:
         return scales["kp"] * product, scales["kd"]
 
     def supply(self, signal: str, m: Measurement) -> np.ndarray | None:
-        """(T,) voltage over that of the file; None if the recording has none. What the motor gets from a row on is what the next
-        row reads: the current that its target draws makes the supply sag.
+        """(T,) supply voltage divided by that of the file; None if the recording has none. The voltage from a row on is the one
+        measured at the next row, because the current that its target causes makes the supply sag.
 
         Raises:
-            TaccorlError: a voltage that the law has no use for.
+            TaccorlError: the recording has a voltage, which the law does not use.
         """
         volts = m.supply_v[:, m.column(signal)] if m.supply_v.size else np.full(m.num_rows, np.nan)
         if not np.isfinite(volts).any():

@@ -1,8 +1,8 @@
 """Controller identification (paper App. B.1): K_p, K_d and T_ref of one joint from its sweeps.
 
-The joints are damped far beyond critically, so positions show the time constant K_d / K_p and the offset T_ref / K_p, and nearly
-nothing of K_p itself (the correlation of log K_p and log K_d is 0.9999): whatever else is wrong ends up in K_p. So the ratios are
-reported with intervals of their own, commanded gains are believed, and recorded torques are fitted, too.
+The joints are strongly over-damped, so that positions determine the time constant K_d / K_p and the offset T_ref / K_p, but
+hardly K_p itself (the correlation of log K_p and log K_d is 0.9999): other errors of the model change K_p. So the ratios are
+reported with their own intervals, commanded gains are taken as true, and recorded torques are fitted, too.
 """
 
 import math
@@ -22,9 +22,9 @@ from taccorl.alignment.measurements.measurement import UNITS
 from taccorl.errors import TaccorlError
 
 PAPER_BOUNDS = {"kp": (10.0, 1e5), "kd": (1.0, 1e3), "torque_ff": (-8.0, 8.0)}
-"""N·m/rad, N·m·s/rad, N·m (App. B.1)."""
+"""Bounds of K_p, K_d and T_ref [N·m/rad, N·m·s/rad, N·m] (App. B.1)."""
 REFERENCE = Gains(500.0, 50.0, 0.0)
-"""The paper's reference simulator: where a search starts."""
+"""Gains of the paper's reference simulator, at which a search starts."""
 RATE_WEIGHT = 0.1  # of the finite differences in the paper's loss, eq. 9
 _NORMAL_95 = 1.96
 _AT_BOUND = 1e-3  # so near to a bound, as a share of the value or of the span, is at it
@@ -37,14 +37,14 @@ Method = Literal["least_squares", "spsa"]
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """One number with its 95 % interval."""
+    """Estimate of one number with its 95 % interval."""
 
     value: float
     low: float
     high: float
     unit: str
     fixed: bool = False
-    """Commanded and known, or not asked for."""
+    """True if the number was not fitted, because it was commanded and known, or not requested."""
     at_bound: bool = False
 
 
@@ -55,10 +55,10 @@ class MotionError:
     name: str
     use: Literal["fit", "validation"]
     loss_before: float
-    """Eq. 9 of the paper, rad."""
+    """Loss of eq. 9 of the paper before the fit [rad]."""
     loss_after: float
     rmse_before: float
-    """rad."""
+    """RMS error before the fit [rad]."""
     rmse_after: float
 
 
@@ -69,21 +69,21 @@ class ControllerFit:
     signal: str
     method: Method
     gains: Gains
-    """Those in force in the first recording."""
+    """Gains in force in the first recording."""
     estimates: dict[str, Estimate]
-    """``kp``, ``kd``, ``torque_ff``; ``lag`` = K_d / K_p and ``offset`` = T_ref / K_p, which positions do tell; ``late``, by how
-    much the rows of positions would be late if that were fitted as well."""
+    """``kp``, ``kd``, ``torque_ff``; ``lag`` = K_d / K_p and ``offset`` = T_ref / K_p, which positions
+    determine; ``late``: delay of the rows of positions, if it is fitted as well."""
     ridge: float
     """Correlation of log K_p and log K_d; 1 means that only their ratio is known. NaN if one is fixed."""
     errors: tuple[MotionError, ...]
     used_effort: bool
     effective_samples: float
-    """Rows that would tell as much if residuals were independent of each other."""
+    """Number of independent rows with the same information; residuals of neighbouring rows are correlated."""
     converged: bool
     remarks: tuple[str, ...]
-    """Why it did not converge, what cannot be known, what looks wrong."""
+    """Remarks: reasons why it did not converge, numbers that cannot be determined, suspicious values."""
     evaluations: int
-    """Simulations of one recording."""
+    """Number of simulations of one recording."""
     cpu_s: float
 
     def record(self) -> dict[str, Any]:
@@ -92,9 +92,8 @@ class ControllerFit:
 
 
 def paper_loss(reported: np.ndarray, measured: np.ndarray) -> float:
-    """Σ |e_sim − e_real| + 0.1 Σ |Δe_sim − Δe_real| [rad] (eq. 9) of (T,) angles; rows without a measurement are left out.
-
-    e = q − q*, and the targets cancel.
+    """The paper's loss (eq. 9) for (T,) angles: Σ |e_sim − e_real| + 0.1 Σ |Δe_sim − Δe_real| [rad]; rows without a measurement
+    are left out. e = q − q*, and the targets cancel.
     """
     difference = reported - measured
     return float(np.nansum(np.abs(difference)) + RATE_WEIGHT * np.nansum(np.abs(np.diff(difference))))
@@ -113,18 +112,20 @@ def identify_controller(
 ) -> ControllerFit:
     """Fit the gains of ``model`` to recordings of its joint.
 
-    Least squares of positions, and of torques where every recording has them: K_p and K_d are then worth what the driver's scale
-    of torques is worth. SPSA is the paper's search with its loss and constants, of positions only; it is slower and less exact.
+    The method ``least_squares`` uses positions, and torques if every recording has them: K_p and K_d are then as accurate as the
+    driver's scale of torques. SPSA is the paper's search with its loss and constants, for positions only; it is slower and less
+    exact.
 
     Args:
-        free: of ``kp``, ``kd``, ``torque_ff``; by default all but gains that every recording states as commanded. What is not
-            free is as commanded, or the twin's.
-        validation: recordings to which nothing is fitted; their errors are told.
-        start: where the search starts; least squares starts from the twin's gains as well.
-        seed: of SPSA's random signs.
+        free: of ``kp``, ``kd``, ``torque_ff``; by default all but gains that every recording states as commanded. The others
+            have the commanded values, or the twin's.
+        validation: recordings that are not used in the fit; their errors are reported.
+        start: gains at which the search starts; least squares also starts from the twin's.
+        seed: seed of SPSA's random signs.
 
     Raises:
-        TaccorlError: recordings that cannot tell these parameters (no motion, too short, not measured), unknown parameters.
+        TaccorlError: the recordings do not determine these parameters (no motion, too short, not measured), or a parameter is
+            unknown.
     """
     began = time.process_time()
     if not motions_fit:

@@ -23,10 +23,10 @@ _DIVERGED = 1e3
 
 
 class GainSearch:
-    """Residuals of recordings as a function of x: those of log K_p, log K_d / K_p and T_ref / K_p that are free.
-
-    Along these the valley is straight: positions know the ratios, and hardly K_p. What is beyond the bounds acts as what is at
-    them. Gains are those in force in the first recording; the others' are in proportion, where they were commanded so.
+    """Residuals of recordings as a function of x, the free ones of log K_p, log (K_d / K_p) and T_ref / K_p. In these
+    coordinates the valley of the loss is straight: positions determine the ratios, and hardly K_p. Values beyond the bounds are
+    clipped. Gains are those in force in the first recording; the other recordings' gains are in proportion, if they were
+    commanded so.
 
     Args:
         bounds: ``kp``, ``kd``, ``torque_ff`` → low, high.
@@ -45,14 +45,14 @@ class GainSearch:
         self.model, self.free, self.bounds = model, free, bounds
         own = model.gains
         self.given = Gains(own.kp * self._kp_scale, own.kd * self._kd_scale, own.torque_ff)
-        """Values of what is not free: what the first recording commanded, or the twin's own."""
+        """Values of the gains that are not free: commanded in the first recording, or the twin's own."""
         self.sigma_rad = 1e-4  # near to what an encoder has: keeps the solver's tolerances meaningful
         self.sigma_effort: float | None = None
-        """N·m; None: torques are not used."""
+        """Noise of the effort [N·m]; None: efforts are not used."""
         self.evaluations = 0
 
     def scaled(self, motion: JointMotion) -> JointMotion:
-        """``motion`` with its gains relative to the first recording's."""
+        """``motion`` with gain scales relative to those of the first recording."""
         return replace(motion, kp_scale=motion.kp_scale / self._kp_scale, kd_scale=motion.kd_scale / self._kd_scale)
 
     def gains(self, x: np.ndarray) -> Gains:
@@ -86,7 +86,7 @@ class GainSearch:
         return min(max(value, low), high)
 
     def simulate(self, motion: JointMotion, gains: Gains) -> tuple[np.ndarray, np.ndarray]:
-        """(T,) reported and effort; a simulation that has diverged is far off."""
+        """(T,) reported positions and (T,) efforts; after a divergence both are far from any measurement."""
         self.evaluations += 1
         done = self.model.simulate(motion, gains)
         return _finite(done.reported), _finite(done.effort)
@@ -95,7 +95,7 @@ class GainSearch:
         """Residuals of each recording and channel in units of the channel's noise, where something was measured.
 
         Args:
-            late_s: the rows' positions are taken to be of so long before their times.
+            late_s: the rows' positions are assumed to be older than their times by this.
         """
         parts = []
         for motion in self.motions:
@@ -136,7 +136,7 @@ class GainSearch:
         )
 
     def lateness(self, start: np.ndarray) -> tuple[float, float]:
-        """Delay [s] of the measured rows if it is fitted as well, and its standard error."""
+        """Fit a delay of the measured rows as well; returns the delay [s] and its standard error."""
 
         def residual(y: np.ndarray) -> np.ndarray:
             return self.residual(y[:-1], float(y[-1]))
@@ -155,7 +155,7 @@ class GainSearch:
         return late_s, math.sqrt(covariance(found.jac, found.fun, correlated)[-1, -1])
 
     def weigh(self, x: np.ndarray) -> None:
-        """Set the noise of both channels to the residuals at ``x``."""
+        """Set the noise of both channels to the RMS residuals at ``x``."""
         left = [(self.simulate(motion, self.gains(x)), motion) for motion in self.motions]
         positions = np.concatenate([reported - motion.measured for (reported, _), motion in left])
         efforts = np.concatenate([effort - motion.effort for (_, effort), motion in left])
@@ -177,7 +177,7 @@ def covariance(jacobian: np.ndarray, residual: np.ndarray, correlated: float) ->
 
 
 def correlation_time(parts: Sequence[np.ndarray]) -> float:
-    """Rows after which a residual is a new one, 1 + 2 Σ ρ_k up to the first ρ_k ≤ 0; the longest of all ``parts``."""
+    """Number of rows after which residuals are independent, 1 + 2 Σ ρ_k up to the first ρ_k ≤ 0; the largest over ``parts``."""
     longest = 1.0
     for part in parts:
         centred = part - part.mean()

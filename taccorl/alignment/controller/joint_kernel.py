@@ -36,17 +36,17 @@ _GEAR_INERTIA = 1e-5  # kg m²
 _BRISTLE_DAMPING_S = 0.001  # over their stiffness, effects/stribeck_friction.py
 _STOP_DAMPING_S = 0.005  # over its stiffness, effects/end_stop.py
 MOST_LOST = 0.9
-"""Share of the inertia that a delay of the speed may take; a loop with more than all of it is unstable."""
+"""Largest share of the inertia that a delay of the speed may subtract; a loop that loses all of it is unstable."""
 _mixed = numba.njit(dropped_commands.mixed)
 _STRIDE = dropped_commands.STRIDE
 
 
 POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
-"""What a command is."""
+"""Codes for the quantity that a command states (``Drive.command``)."""
 
 
 class Drive(NamedTuple):
-    """One joint with its drive: numbers in SI, N·m and rad (of a sliding axis N and m). The defaults do nothing."""
+    """One joint with its drive, in SI units, N·m and rad (for a sliding axis N and m). The default values have no effect."""
 
     # Controller: τ = K_p (q* − y) − K_d q̇ + T_ref.
     kp: float
@@ -54,26 +54,27 @@ class Drive(NamedTuple):
     torque_ff: float
     # Rigid body.
     inertia: float
-    """Of the link about the joint, and of the rotor."""
+    """Inertia about the joint: link and rotor."""
     rotor_inertia: float = 0.0
     """Share of ``inertia`` on the motor's side of the gear."""
     gravity_sin: float = 0.0
-    """Weight's torque S sin q + C cos q, which must be held."""
+    """Coefficient S of the weight's torque S sin q + C cos q, which the motor must hold; ``gravity_cos`` is C."""
     gravity_cos: float = 0.0
     compensation_sin: float = 0.0
-    """What the motor adds to carry the weight that it knows of."""
+    """Coefficients of the torque that the motor adds for gravity compensation, in the same form."""
     compensation_cos: float = 0.0
     gravity_carried: float = 1.0
-    """Times the compensation."""
+    """Factor on the gravity compensation."""
     # Bodies and friction.
     added_inertia: float = 0.0
     speed_delay: float = 0.0
-    """s: takes K_d times it from the inertia, at most ``MOST_LOST`` of it. The motor gives that torque: the effort holds it."""
+    """Delay of the velocity [s]: it subtracts K_d times it from the inertia, at most ``MOST_LOST`` of it. The motor gives that
+    torque, and the effort contains it."""
     viscous: float = 0.0
     quadratic_drag: float = 0.0
     coulomb: float = 0.0
     asymmetry: float = 0.0
-    """a in F (1 + a sign v), F is ``coulomb``: a constant torque − a F besides."""
+    """a in F (1 + a sign v), with F = ``coulomb``; a constant torque − a F is added."""
     stribeck_torque: float = 0.0
     stribeck_share: float = 1.0
     stribeck_speed: float = 0.05
@@ -81,56 +82,57 @@ class Drive(NamedTuple):
     load_friction: float = 0.0
     """μ in |τ| ≤ μ |τ_motor − τ_load|."""
     spot_friction: float = 0.0
-    """F₀ in F₀ exp(−((q − q₀) / w)²), besides ``coulomb``, at q₀ …"""
+    """F₀ in the friction F₀ exp(−((q − q₀) / w)²), added to ``coulomb``; q₀ is …"""
     spot_angle: float = 0.0
     spot_width: float = 0.1
-    """… and w."""
+    """Width w of the friction spot."""
     cogging_torque: float = 0.0
     cogging_periods: float = 1.0
-    """A turn."""
+    """Number of periods per turn."""
     cogging_phase: float = 0.0
     spring_stiffness: float = 0.0
     spring_rest: float = 0.0
     stop_stiffness: float = 0.0
-    """Of a stop that the joint meets at …"""
+    """Stiffness of a stop; the joint meets it at …"""
     stop_angle: float = 0.0
     # The command's way.
     command_delay: float = 0.0
     command_lag: float = 0.0
     drop_probability: float = 0.0
-    """Of each command to be lost; which ones follows from …"""
+    """Probability that a command is lost. The lost ones follow from …"""
     drop_seed: float = 0.0
     slew_rate: float = math.inf
     feedforward: float = 0.0
-    """Share of K_d q̇* that is added."""
+    """Factor α on the feed-forward K_d q̇*, which is added."""
     # The control loop.
     deadband: float = 0.0
-    """Of the position error: within ± it nothing is done."""
+    """Half width of the dead band of the position error, in which the controller does not act."""
     integral_rate: float = 0.0
-    """r in K_p r ∫ e dt, 1/s."""
+    """r in K_p r ∫ e dt [1/s]."""
     torque_lag: float = 0.0
     torque_max: float = math.inf
     stall_torque: float = math.inf
-    """|τ| ≤ stall torque × (1 − |v| / no-load speed) where the motor drives, ≤ stall torque where it brakes."""
+    """Stall torque. Limit of the torque: stall torque × (1 − |v| / no-load speed) where the motor drives, stall torque where it
+    brakes."""
     no_load_speed: float = math.inf
     torque_scale: float = 1.0
     fade_rate: float = 0.0
-    """1/s: torque × (1 − rate · t)."""
+    """Rate at which the torque fades: factor (1 − rate · t) [1/s]."""
     command: float = POSITION
-    """What a command is: a position, a velocity (τ = K_d (q̇* − q̇) + T_ref) or a torque (τ = τ* + T_ref)."""
+    """Quantity that a command states: a position, a velocity (τ = K_d (q̇* − q̇) + T_ref) or a torque (τ = τ* + T_ref)."""
     duty_torque: float = math.inf
-    """Torque of the whole supply voltage at rest, V k_t / R: what the controller asks for is clipped to it …"""
+    """Torque of the whole supply voltage at rest, V k_t / R, to which the controller's torque is clipped …"""
     back_emf: float = 0.0
-    """… before k_t k_e / R times the speed is lost."""
+    """… before k_t k_e / R times the speed is subtracted."""
     effort_after: float = 0.0
-    """1: the reported torque of a row answers the row's command, 0: it is the one until then."""
+    """1: the reported effort of a row responds to the row's command; 0: it is the effort before it."""
     effort_age: float = 0.0
-    """s by which the reported torque is older than the one that acts on average: a sampled loop holds it."""
+    """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
     midpoint: float = 0.0
-    """1: steps of second order, 0: those of MuJoCo."""
+    """1: second-order steps; 0: MuJoCo's."""
     # Gear.
     backlash: float = 0.0
-    """Whole play."""
+    """Width of the whole play."""
     compliance: float = 0.0
     compliance_damping: float = 0.0
     # Encoder: y = scale · (q' + wave · sin(q' + phase)) with q' = q + bias. The controller sees it at once, the report is late.
@@ -245,19 +247,20 @@ def simulate(
     parts: int,
     step_s: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The joint under targets, from rest in balance: friction, bristles, integrator and delays have been so for ever.
+    """Simulate the joint for given targets, from equilibrium: friction, bristles, integrator and delays are in their steady
+    state.
 
     Args:
         sent: (R · parts,) targets [rad], each held for ``hold`` physics steps.
         coupling: (R,) torque [N·m] that must be held against the other joints' motion, linear in between.
-        supply: (R · parts,) voltage that a position controller gets, over the one that its gains are for.
+        supply: (R · parts,) supply voltage divided by the one for which the gains are valid.
         on: (R · parts,) share of the time for which the motor is on.
         added: (R · parts,) torque [N·m] that the controller adds to its law.
         start: angle [rad] that the encoder reports at rest.
-        parts: targets a row.
+        parts: number of targets per row.
 
     Returns:
-        reported (R,) [rad] and the controller's torque (R,) [N·m] at each row's time, before the row's targets act.
+        reported (R,) [rad] and motor torque (R,) [N·m] at each row's time, before the row's targets act.
     """
     p, h, rows = drive, step_s, sent.size // parts
     reported, effort = np.empty(rows), np.empty(rows)

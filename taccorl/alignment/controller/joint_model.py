@@ -1,8 +1,9 @@
-"""One joint of a machine against one recording, in about a millisecond: what identification runs thousands of times.
+"""Simulate one joint of a machine with the targets of one recording, in about a millisecond: identification does it thousands of
+times.
 
-The other joints move as they were measured. Inertia and weight are those of the compiled model (``rigid_joint``), so what is
-identified on the PiPER holds in its twin; ``test_joint_model.py`` compares with MuJoCo, effect by effect, and
-with the whole twin.
+The other joints move as they were measured. Inertia and weight are those of the compiled model (``rigid_joint``), so that
+numbers identified on the PiPER are valid in its twin; ``test_joint_model.py`` compares with MuJoCo, effect by effect, and with
+the whole twin.
 
 Letters in shapes: T rows.
 """
@@ -24,7 +25,8 @@ from taccorl.sim.twin import TwinConfig
 
 GRAVITY_M_PER_S2 = 9.81
 SAME_RATE = 0.02
-"""Targets that are received faster than they are logged by less than this share come once a row: stamps are rounded."""
+"""Largest difference of the rates at which targets are received and logged, as a share, for which targets count as received once
+per row; stamps are rounded."""
 _ADDITIVE = {
     "added_inertia",
     "viscous",
@@ -39,12 +41,13 @@ _FACTORS = {"gravity_carried", "torque_scale", "encoder_scale"}
 
 
 class PayloadLever(NamedTuple):
-    """By how much a payload whose place no recording states is off the place where the twin has it: m g (s sin q + c cos q)."""
+    """Correction of the weight of a payload whose position no recording states: m g (s sin q + c cos q), relative to the
+    position in the twin."""
 
     sin_m: float = 0.0
-    """s."""
+    """Coefficient s [m]."""
     cos_m: float = 0.0
-    """c."""
+    """Coefficient c [m]."""
 
 
 AT_ITS_PLACE = PayloadLever()
@@ -61,19 +64,19 @@ class _Sent(NamedTuple):
 
 @dataclass(frozen=True)
 class JointResponse:
-    """What the joint did, row by row with the recording."""
+    """Response of the joint, in the rows of the recording."""
 
     reported: np.ndarray
-    """(T,) rad."""
+    """(T,) reported positions [rad]."""
     effort: np.ndarray
-    """(T,) N·m that the motor gives at the time of each row, before its command acts: ``Replay.effort`` of the row before."""
+    """(T,) torque of the motor at the time of each row, before its command acts [N·m]: ``Replay.effort`` of the row before."""
 
 
 class JointModel:
-    """A joint of a machine, the machine's own effects that act on it included.
+    """Model of one joint of a machine, with the machine's own effects on it.
 
     Raises:
-        TaccorlError: no such joint, or a gripper of the PiPER.
+        TaccorlError: there is no such joint, or it is a gripper of the PiPER.
     """
 
     def __init__(self, machine: TwinConfig | HasJoints, signal: str) -> None:
@@ -81,7 +84,7 @@ class JointModel:
 
     @classmethod
     def of(cls, joint: RigidJoint) -> "JointModel":
-        """The model of a joint that is known already."""
+        """The model of a given ``RigidJoint``."""
         model = cls.__new__(cls)
         model._set(joint)
         return model
@@ -96,9 +99,8 @@ class JointModel:
         unit: Literal["rad", "m"] = "rad",
         timestep_s: float = 1.0 / 1200.0,
     ) -> "JointModel":
-        """An axis by itself: an inertia [kg m²], or a mass [kg] on a slide with ``unit`` m, without weight.
-
-        Effects act on it by ``Effect.drive`` whatever joints they name; those without one are refused.
+        """Model of a single axis: an inertia [kg·m²], or a mass [kg] on a slide with ``unit`` m, without weight. Effects act on
+        it by ``Effect.drive``, whatever joints they name; effects without one are rejected.
         """
         return cls.of(AxisJoint(name, inertia, gains, unit, timestep_s))
 
@@ -115,17 +117,17 @@ class JointModel:
         age_s: float = 0.0,
         facts: Mapping[str, float] | None = None,
     ) -> JointResponse:
-        """Its answer to the recording's targets, from rest at ``motion.start``.
+        """Simulate the response to the recording's targets, from rest at ``motion.start``.
 
         Args:
-            gains: those of a recording with ``kp_scale`` = 1.
-            effects: besides the machine's; one of the same name takes the place of the machine's.
-            age_s: of the measured position when the drive's torque acts, besides the joint's own.
-            facts: numbers of the drive in place of the joint's own.
-            lever: left out where effects have no ``drive`` and MuJoCo runs.
+            gains: gains of a recording with ``kp_scale`` = 1.
+            effects: effects besides the machine's; one of the same name replaces the machine's.
+            age_s: additional age of the measured position when the drive's torque acts.
+            facts: fields of ``joint_kernel.Drive`` that replace the joint's own.
+            lever: correction of the payload's weight; ignored if an effect requires MuJoCo.
 
         Raises:
-            TaccorlError: rows that are no whole number of physics steps, or an effect that an axis cannot have.
+            TaccorlError: a row is no whole number of physics steps, or an axis cannot have one of the effects.
         """
         sent, parts, hold, step_s = self._sent(motion)
         present = self.joint.effects(effects)
@@ -158,22 +160,22 @@ class JointModel:
         return JointResponse(reported, effort)
 
     def carried_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
-        """(T,) what the motor gives besides its effort to carry the weight that it knows of, at ``angles`` (T,) rad."""
+        """(T,) torque of the motor for gravity compensation, which is not part of its effort, at ``angles`` (T,) [rad]."""
         body = self._body(motion, [])
         return body.compensation_sin * np.sin(angles) + body.compensation_cos * np.cos(angles)
 
     def inertia_kgm2(self, motion: JointMotion) -> float:
-        """Of the joint with all that it moves in the recording's pose, rotor and known payload included."""
+        """Inertia of the joint with all bodies that it moves, in the recording's pose, with rotor and known payload."""
         return self._body(motion, []).inertia
 
     def weight_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
-        """(T,) weight that the controller has to hold at ``angles`` (T,) rad: what is not carried for it."""
+        """(T,) torque of the weight that the controller must hold, without the compensated part, at ``angles`` (T,) [rad]."""
         body = self._body(motion, [])
         sine, cosine = body.gravity_sin - body.compensation_sin, body.gravity_cos - body.compensation_cos
         return sine * np.sin(angles) + cosine * np.cos(angles)
 
     def is_weighed(self, motion: JointMotion) -> bool:
-        """Whether weight acts about the joint: not about one whose axis is vertical."""
+        """Whether weight has a torque about the joint; it has none about a vertical axis."""
         return weighs(self._body(motion, []))
 
     def _body(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:

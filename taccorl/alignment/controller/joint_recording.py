@@ -1,4 +1,4 @@
-"""Take one joint's part from a recording: ``JointMotion``.
+"""Extract one joint's data from a recording: ``JointMotion``.
 
 Letters in shapes: T rows.
 """
@@ -16,19 +16,20 @@ _TARGET_COLUMNS = {"position": "q_target", "velocity": "qd_target", "torque": "t
 
 
 def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints | None, signal: str) -> JointMotion:
-    """A recording as one of its joints sees it.
+    """Data of one joint from a recording.
 
     Args:
-        machine: whose other joints couple with this one; None for an axis by itself.
+        machine: machine whose other joints are coupled with this one; None for a single axis.
 
     Raises:
-        TaccorlError: no such signal, gaps in its targets, nothing measured at the start, too short, uneven time.
+        TaccorlError: there is no such signal, its targets have gaps, nothing was measured at the start, the recording is too
+            short, or its time is uneven.
     """
     return motion_of(measurement, signal, None if machine is None else joint_of(machine, signal))
 
 
 def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -> JointMotion:
-    """``joint_motion`` of a joint that is known already."""
+    """Like ``joint_motion``, for a given ``RigidJoint``."""
     m, j = measurement, measurement.column(signal)
     target, measured = m.target[:, j].astype(float), m.measured[:, j].astype(float)
     if m.num_rows < 10:

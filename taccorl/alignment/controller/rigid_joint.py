@@ -1,7 +1,6 @@
-"""What the one-joint model knows of the body that a joint moves: inertia, weight, and what other joints' motion costs it.
-
-Each kind of machine has its own ``RigidJoint``: the PiPER's twin (``arm_joint``), any robot of an MJCF or URDF file
-(``robot_joint``), and an axis with nothing but an inertia (``AxisJoint``).
+"""Rigid-body properties of one joint for the one-joint model: inertia, weight, and torque from the motion of other joints. Each
+kind of machine has its own ``RigidJoint``: the PiPER's twin (``arm_joint``), any robot of an MJCF or URDF file
+(``robot_joint``), and a single axis with an inertia (``AxisJoint``).
 
 Letters in shapes: T rows, Q joints of the model, N numbers of a pose.
 """
@@ -22,24 +21,24 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.effects.effect import Effect
 
 NEED_ROTOR = ("backlash", "joint_compliance")
-"""Effects in a gear, which need the inertia on the motor's side of it."""
+"""Effects in a gear, which need the inertia on the motor's side."""
 _START_S = 0.1  # of a rest at the start is averaged
 STILL = 0.01
-"""rad, m: another joint that moves less counts as held."""
+"""Another joint counts as held if it moves by less than this [rad, m]."""
 _SMOOTH_HZ = 20.0
 """Of the other joints' measured motion. Seven clean robots of ``docs/robot_study.jsonl`` ended at up to 1.45 noise floors with
 10 Hz, which loses what steps do to other joints, at 1.16 with 20 Hz, and at 1.18 with 30 Hz, which lets in noise."""
 
 
 class Gains(NamedTuple):
-    """τ = K_p (q* − q) − K_d q̇ + T_ref. Of a sliding joint N/m, N·s/m, N."""
+    """Gains of τ = K_p (q* − q) − K_d q̇ + T_ref. For a sliding joint N/m, N·s/m, N."""
 
     kp: float
-    """N·m/rad."""
+    """K_p [N·m/rad]."""
     kd: float
-    """N·m·s/rad."""
+    """K_d [N·m·s/rad]."""
     torque_ff: float
-    """N·m."""
+    """T_ref [N·m]."""
 
 
 class Rigid(NamedTuple):
@@ -55,72 +54,76 @@ class Rigid(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
-    """What one recording says of the rest of the machine."""
+    """State of the rest of the machine in one recording."""
 
     coupling_nm: np.ndarray
-    """(T,) torque that the joint must hold against the measured motion of the others."""
+    """(T,) torque that the joint must hold against the measured motion of the other joints [N·m]."""
     torque_ff_nm: np.ndarray | None = None
     """(T,) known torque that the controller adds to its law; None: none."""
     supply: np.ndarray | None = None
-    """(T,) voltage of the motor over the one of its file; None: 1."""
+    """(T,) supply voltage of the motor divided by that of its file; None: 1."""
     on: np.ndarray | None = None
-    """(T,) 0 while the motor is off, else 1; None: 1."""
+    """(T,) 0 while the motor is off, else 1; None: always 1."""
     moment_kgm: float = 0.0
-    """Σ m l of what the recording mounts on an axis, with the arm that holds it;"""
+    """Σ m l of the masses that the recording mounts on an axis, with the arm that holds them [kg·m], …"""
     mounted_kgm2: float = 0.0
-    """Σ m l²; on a slide Σ m in kg."""
+    """… and Σ m l² [kg·m²]; on a slide Σ m [kg]."""
     pose: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """(N,) where the other joints are held, in the machine's own order."""
+    """(N,) positions at which the other joints are held, in the machine's own order."""
     payload_kg: float = 0.0
     payload_at_m: Position = AT_TCP
     payload_at_known: bool = False
 
 
 class RigidJoint(ABC):
-    """One joint of a machine, with all that it moves. The methods here are those of a joint with nothing around it."""
+    """One joint of a machine with all bodies that it moves. The methods of the base class are those of a joint without
+    surroundings."""
 
     signal: str
     unit: Literal["rad", "m"] = "rad"
     gains: Gains
-    """Of a recording that states none."""
+    """Gains for recordings that state none."""
     command_hz: float = 150.0
-    """Rate at which its drive receives targets: rows that are logged more slowly are joined by straight lines of such steps, at a
-    higher rate a target is held until the next row."""
+    """Rate at which its drive receives targets [Hz]. Rows at a lower rate are interpolated linearly at this rate; at a higher
+    rate a target is held until the next row."""
     effort_holds_weight: ClassVar[bool] = False
-    """Whether the reported effort holds the torque by which the controller carries the weight."""
+    """Whether the reported effort includes the torque of the gravity compensation."""
 
     target_kind: TargetKind = "position"
-    """What its controller takes as a target."""
+    """Quantity that its controller takes as target."""
     facts: Mapping[str, float] = {}
-    """Numbers of ``joint_kernel.Drive`` that are known of the drive; those of effects are added or take their place."""
+    """Known fields of ``joint_kernel.Drive``. Fields that effects set are added, or replace them."""
     position_age_s: float = 0.0
-    """How old the measured position is, on average, when the drive's torque acts; with ``speed_delay_s`` of a velocity."""
+    """Mean age of the measured position when the drive's torque acts [s]; ``speed_delay_s`` is that of the velocity."""
     speed_delay_s: float = 0.0
     exact_timing: ClassVar[bool] = False
-    """Whether the age of the position is fitted where gains are commanded: half a millisecond is 18 noise floors of 0.1 mrad at
-    3.7 rad/s."""
+    """Whether the age of the position is fitted if gains are commanded: at 3.7 rad/s half a millisecond makes 18 noise floors of
+    0.1 mrad."""
 
     follows_line: ClassVar[bool] = False
-    """Whether targets between the rows are those of the line at their own time; else those of the next time, as in a replay."""
+    """True: targets between rows are interpolated linearly at their own times. False: they have the next row's value, as in a
+    replay."""
     keeps_times: ClassVar[bool] = False
-    """Whether targets of rows that jittered act when they came; else with their rows."""
+    """True: targets of rows with jitter act at their own arrival times. False: at the times of their rows."""
     target_late_s: float = 0.0
-    """After that."""
+    """Time by which targets act later than that [s]."""
 
     gain_names: tuple[str, ...] = ("kp", "kd")
-    """Gains that a recording can state and a fit can find."""
+    """Gains that a recording can state and a fit can determine."""
 
     @property
     def winding(self) -> Mapping[str, float]:
-        """Stall torque [N·m] and back-EMF [N·m·s/rad] of a motor on a voltage, which a fit finds in place of gains."""
+        """Stall torque [N·m] and back-EMF [N·m·s/rad] of a motor with law pwm, which are fitted in place of gains; empty for
+        others."""
         return {}
 
     def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
-        """Gains, and numbers in place of ``facts``, from fitted values of those names."""
+        """Convert fitted values, by parameter name, into gains and into fields of ``joint_kernel.Drive`` that replace those in
+        ``facts``."""
         return self.gains._replace(**{name: values[name] for name in Gains._fields if name in values}), {}
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
-        """Gains of a recording over ``gains``: of the position error, of the velocity."""
+        """Ratios of a recording's gains to ``gains``: for the position error, for the velocity."""
         own = (self.gains.kp, max(self.gains.kd, 1e-9))
         factor = m.gain_scale.get(self.signal, 1.0)
         kp, kd = (
@@ -130,27 +133,27 @@ class RigidJoint(ABC):
         return kp, kd
 
     def timestep_s(self, rate_hz: float) -> float:
-        """Physics step for rows at ``rate_hz``."""
+        """Physics step [s] for rows at ``rate_hz``."""
         raise NotImplementedError
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
-        """Inertia and weight in the pose of a recording; of ``bodies`` those effects that only change bodies."""
+        """Inertia and weight in the pose of a recording; of ``bodies`` only the effects that change bodies are used."""
         raise NotImplementedError
 
     def surroundings(self, m: Measurement) -> Surroundings:
-        """What a recording says of the rest of the machine."""
+        """State of the rest of the machine in a recording."""
         return Surroundings(coupling_nm=np.zeros(m.num_rows))
 
     def whole(self, m: Measurement) -> Measurement:
-        """With all the machine's signals; those that the recording lacks rest and were not measured."""
+        """The recording extended to all signals of the machine; missing signals are at rest and count as not measured."""
         return m
 
     def effects(self, more: Sequence[Effect]) -> list[Effect]:
-        """The joint's own effects and ``more``, which take the place of own ones of the same name; absent ones left out."""
+        """The joint's own effects and ``more``, which replace own effects of the same name; absent effects are left out."""
         return [effect for effect in more if not effect.is_absent]
 
     def freed(self) -> tuple[list[Effect], "RigidJoint"]:
-        """Its own effects that a search fits, and the joint without them."""
+        """The joint's own effects that a search fits, and the joint without them."""
         return [], self
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
@@ -160,10 +163,11 @@ class RigidJoint(ABC):
     def in_mujoco(
         self, motion: JointMotion, gains: Gains, effects: Sequence[Effect], sent: np.ndarray, parts: int, hold: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Answer of the joint where ``joint_kernel`` lacks one of ``effects``: reported (T,) and effort (T,).
+        """Response of the joint, simulated in MuJoCo because ``joint_kernel`` lacks one of ``effects``: reported positions (T,)
+        and efforts (T,).
 
         Raises:
-            TaccorlError: the machine has no such simulation.
+            TaccorlError: the machine has no model in MuJoCo.
         """
         unknown = [effect.name for effect in effects if effect.drive() is None]
         raise TaccorlError(
@@ -174,7 +178,7 @@ class RigidJoint(ABC):
 
 @dataclass(frozen=True)
 class AxisJoint(RigidJoint):
-    """An inertia [kg m²], or a mass [kg] on a slide with ``unit`` m, without weight."""
+    """A single axis: an inertia [kg·m²], or a mass [kg] on a slide with ``unit`` m, without weight."""
 
     signal: str
     inertia: float
@@ -193,10 +197,10 @@ class AxisJoint(RigidJoint):
 
 
 def resting(m: Measurement, j: int) -> float:
-    """Mean of what was measured before the targets change, of a tenth of a second at most; one reading is noisy.
+    """Mean position measured before the targets change, over a tenth of a second at most, to reduce noise.
 
     Raises:
-        TaccorlError: measured later only.
+        TaccorlError: nothing was measured before the targets change.
     """
     changed = np.flatnonzero(m.target[:, j] != m.target[0, j])
     rest = min(changed[0] + 1 if len(changed) else m.num_rows, max(1, round(_START_S * m.rate_hz)))
@@ -211,7 +215,7 @@ def resting(m: Measurement, j: int) -> float:
 
 
 def smooth_motion(m: Measurement, signal: str) -> np.ndarray:
-    """(T,) measured positions, or targets where none were measured, without what is faster than the other joints."""
+    """(T,) measured positions, or targets if none were measured, low-pass filtered (``_SMOOTH_HZ``)."""
     j = m.column(signal)
     seen = m.measured[:, j]
     return _smooth(seen if np.isfinite(seen).any() else _planned(m, j), m.rate_hz)
@@ -232,10 +236,7 @@ def _planned(m: Measurement, j: int) -> np.ndarray:
 
 
 def moved_by_others(m: Measurement, signal: str, others: Sequence[str], still: float = STILL) -> dict[str, np.ndarray]:
-    """Smooth motion of ``signal`` and of those ``others`` that the recording has and that move by more than ``still``.
-
-    Only ``signal``'s own is in it where all the others stand still.
-    """
+    """Low-pass filtered motion of ``signal`` and of those ``others`` in the recording that move by more than ``still``."""
     found = {signal: _smooth(m.measured[:, m.column(signal)], m.rate_hz)}
     for other in others:
         if other != signal and other in m.signals:
@@ -259,8 +260,8 @@ def _smooth(angles: np.ndarray, rate_hz: float) -> np.ndarray:
 def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = None) -> Rigid:
     """Inertia and weight of a hinge with the other joints held at ``pose`` (nq,), qpos0 if not given.
 
-    The weight's torque of a hinge is S sin q + C cos q: two angles determine it. A slide's is constant and not in here
-    (``constant_weight``).
+    The weight's torque of a hinge is S sin q + C cos q: two angles determine it. The weight of a slide is constant and not
+    included (``constant_weight``).
     """
     data = mujoco.MjData(model)
     if pose is not None:
@@ -284,8 +285,8 @@ def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = Non
 def needed_nm(
     model: mujoco.MjModel, joint: str, positions: np.ndarray, velocities: np.ndarray, accelerations: np.ndarray
 ) -> np.ndarray:
-    """(T,) torque that a motion (T, nq) needs at one joint by inverse dynamics, without armature and without what
-    gravity compensation carries."""
+    """(T,) torque at one joint that a motion (T, nq) requires, by inverse dynamics, without armature and without the gravity
+    compensation."""
     data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
     torque, needed = np.empty(len(positions)), np.empty(model.nv)
     for row, (q, v, a) in enumerate(zip(positions, velocities, accelerations, strict=True)):
@@ -298,12 +299,12 @@ def needed_nm(
 
 
 def torque_along(model: mujoco.MjModel, joint: str, positions: np.ndarray, period_s: float) -> np.ndarray:
-    """(T,) ``needed_nm`` of smooth positions (T, nq) at rest at both ends, ``period_s`` apart."""
+    """(T,) ``needed_nm`` for smooth positions (T, nq) that are ``period_s`` apart and at rest at both ends."""
     accelerations = np.zeros_like(positions)
     accelerations[1:-1] = np.diff(positions, 2, axis=0) / period_s**2
     return needed_nm(model, joint, positions, np.gradient(positions, period_s, axis=0), accelerations)
 
 
 def weighs(rigid: Rigid) -> bool:
-    """Whether weight acts about the joint: not about one whose axis is vertical."""
+    """Whether weight has a torque about the joint; it has none about a vertical axis."""
     return math.hypot(rigid.gravity_sin, rigid.gravity_cos) > 1e-6

@@ -1,7 +1,8 @@
 """Simultaneous perturbation stochastic approximation (Spall 1992) with the constants of the paper's App. B.1.
 
-The two perturbed points of an iteration only estimate the gradient: at the first step they lie c = 0.08 from the iterate, so they
-say little about it. Loss, best point and stop rule therefore use the iterate x_k, which costs a third evaluation.
+The two perturbed points of an iteration are used for the gradient only: at the first step they are c = 0.08 away from the
+iterate, so that their loss differs from the iterate's. Loss, best point and stop rule therefore use the iterate x_k, which costs
+a third evaluation.
 """
 
 from collections.abc import Callable
@@ -18,20 +19,20 @@ MAX_ITERATIONS = 400  # not in the paper
 
 @dataclass(frozen=True)
 class Spsa:
-    """The best iterate."""
+    """Result of a search: the best iterate."""
 
     x: np.ndarray
     loss: float
     iterations: int
     out_of_patience: bool
-    """No iterate was better than the best for ``PATIENCE`` iterations, as opposed to out of iterations. That stops the search; it
-    is no proof of a minimum."""
+    """True: the search stopped because no iterate was better for ``PATIENCE`` iterations, which does not prove a minimum. False:
+    it reached the largest number of iterations."""
 
 
 def minimise(
     loss: Callable[[np.ndarray], float], start: np.ndarray, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
 ) -> Spsa:
-    """x_{k+1} = x_k − a_k g_k with a_k = a / (k + 1 + A)^α, from evaluations at x_k ± c_k Δ, Δ of random signs.
+    """Minimise by SPSA: x_{k+1} = x_k − a_k g_k with a_k = a / (k + 1 + A)^α, from evaluations at x_k ± c_k Δ, Δ of random signs.
 
     g_k = clip((L₊ − L₋) / (x₊ − x₋), ± 5) per coordinate, c_k = c / (k + 1)^γ. Without bounds x₊ − x₋ = 2 c_k Δ; where a bound
     clips an end it is shorter, and 0 in a coordinate means no gradient along it.

@@ -1,4 +1,4 @@
-"""An axis file: one driven axis by itself, such as a slide on a bench, a wheel, or a servo with a pendulum.
+"""An axis file: a single driven axis, such as a slide on a bench, a wheel, or a servo with a pendulum.
 
 ::
 
@@ -14,9 +14,8 @@
     effects:               # physics beyond that; taccorl add-effect writes them
     - {effect: coulomb_friction, torque_nm: 20.4}    # in N on a slide
 
-Laws, targets and what a recording may state of them are those of ``drive_law``. What a recording mounts on a turning axis is
-m l² of inertia and m g l sin(q − q₀) of weight: ``payload_kg`` at ``lever_m``, and an arm of ``arm_kg``, a uniform rod of that
-length.
+Laws and targets are those of ``drive_law``. A mass that a recording mounts on a turning axis adds the inertia m l² and the
+weight m g l sin(q − q₀): ``payload_kg`` at ``lever_m``, and an arm of ``arm_kg``, a uniform rod of that length.
 """
 
 import dataclasses
@@ -46,7 +45,7 @@ _HEADER = "# An axis: taccorl/alignment/machines/axis_file.py says what may stan
 
 @dataclass(frozen=True)
 class EffectEntry:
-    """An effect as the file has it, in the units of the axis."""
+    """An effect as in the file, in the units of the axis."""
 
     name: str
     values: Mapping[str, Any]
@@ -54,43 +53,45 @@ class EffectEntry:
 
 @dataclass(kw_only=True)
 class AxisConfig(DriveLaw):
-    """One driven axis. Gains are those that are commanded, unless a recording states others. Units are those of a turning one; of
-    a slide N for N·m, m for rad, kg for kg·m²."""
+    """One driven axis. Its gains apply unless a recording states others. Units are for a turning axis; for a slide read N for
+    N·m, m for rad, kg for kg·m²."""
 
     kind: Literal["axis"] = "axis"
     name: str
-    """Of its signal in the recordings."""
+    """Name of the axis's signal in the recordings."""
     unit: Literal["rad", "m"]
     inertia: float
-    """kg·m²."""
+    """Inertia about the axis [kg·m²], at which a fit starts."""
     rotor_inertia: float = 0.0
-    """Share of ``inertia`` on the motor's side of the gear [kg·m²]; without it neither play nor compliance is looked for."""
+    """Share of ``inertia`` on the motor's side of the gear [kg·m²]; without it the search does not consider play and
+    compliance."""
     weight_sin: float = 0.0
     """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
     weight_cos: float = 0.0
     """C [N·m]."""
     lever_m: float = 0.0
-    """Distance from the axis at which a recording's ``payload_kg`` is held, unless the recording states another one; a slide
-    has none."""
+    """Distance from the axis at which a recording's ``payload_kg`` is held, unless the recording states another one; not for
+    slides."""
     arm_kg: float = 0.0
-    """Of the arm that holds the payload, unless a recording states another one: a uniform rod as long as the lever."""
+    """Mass of the arm that holds the payload [kg], unless a recording states another one: a uniform rod as long as the lever."""
     hangs_at_rad: float = 0.0
     """Angle at which that payload hangs straight down."""
     loop_hz: float | None = None
-    """Rate of the drive's control loop, where it is known: its output is held for a period, its speed is a difference."""
+    """Rate of the drive's control loop [Hz], if known. The model then holds the loop's output for a period, and computes the
+    speed as a difference of samples."""
     command_hz: float | None = None
-    """Rate at which the drive receives targets, where they are logged more slowly: a replay joins the rows by straight
-    lines of such steps. If not given, a target is held until the next one comes."""
+    """Rate at which the drive receives targets [Hz], if they are logged at a lower rate: a replay then interpolates the rows
+    linearly at this rate. If not given, a target is held until the next one."""
     target_late_s: float = 0.0
-    """How long after the time of its row a target acts, transport and reading of the position included; ``diagnose`` fits up to
-    3 ms of it, more is an effect."""
+    """Delay from the time of a target's row until it acts [s], including transport and reading of the position. ``diagnose``
+    fits up to 3 ms of it; a longer delay is an effect."""
     limits: tuple[float, float] | None = None
     """Lowest and highest position [rad]."""
     force_unit_n: float | None = None
-    """N·m that are for this axis what 1 N·m is for a joint of a small arm: effects are searched for within bounds that grow with
-    it. A tenth of effort_limit if not given, else 1."""
+    """Torque of this axis [N·m] that corresponds to 1 N·m at a joint of a small arm; the bounds of effects are multiplied by it.
+    If not given: a tenth of effort_limit, or 1 without that."""
     length_unit_m: float | None = None
-    """The same for 1 rad; the stroke of a slide if not given, else 1."""
+    """Position range [rad] that corresponds to 1 rad at a joint of a small arm. If not given: the stroke of a slide, or 1."""
     effects: tuple[EffectEntry, ...] = ()
 
     def __post_init__(self) -> None:
@@ -122,10 +123,10 @@ class AxisConfig(DriveLaw):
         return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke)
 
     def effect_class(self, name: str) -> type[Effect] | None:
-        """The effect in the size and units of this axis; None if an axis cannot have it.
+        """Class of the effect with the size and units of this axis; None if an axis cannot have it.
 
         Raises:
-            TaccorlError: no such effect.
+            TaccorlError: there is no such effect.
         """
         cls = registry.get(name)
         if not issubclass(cls, JointEffect) or (self.unit == "m" and name in OF_A_TURN) or not self.takes(name):
@@ -135,7 +136,7 @@ class AxisConfig(DriveLaw):
         return own if own(**numbers).drive() and (self.rotor_inertia or name not in NEED_ROTOR) else None
 
     def made(self) -> list[Effect]:
-        """The effects of the file."""
+        """The effects of the file, as objects."""
         found = []
         for entry in self.effects:
             cls = self.effect_class(entry.name)
@@ -155,7 +156,7 @@ class AxisConfig(DriveLaw):
         return found
 
     def with_numbers(self, base: Mapping[str, float]) -> "AxisConfig":
-        """With fitted numbers, which are called as in ``AxisProblem``."""
+        """The axis with fitted numbers, named as in ``AxisProblem``."""
         same = ("inertia", "weight_sin", "weight_cos", "target_late_s")
         new = {name: base[name] for name in same if name in base}
         new |= self.law_numbers(base)
@@ -164,7 +165,7 @@ class AxisConfig(DriveLaw):
         return dataclasses.replace(self, **{name: float(value) for name, value in new.items()})
 
     def with_effects(self, found: Sequence[Effect]) -> "AxisConfig":
-        """With these effects; one of the same name is replaced."""
+        """The axis with these effects; one of the same name is replaced."""
         names = {e.name for e in found}
         entries = [e for e in self.effects if e.name not in names]
         entries += [EffectEntry(e.name, _values(e)) for e in found]
@@ -188,10 +189,10 @@ def _values(effect: Effect) -> dict[str, Any]:
 
 
 def load_axis(path: Path) -> AxisConfig:
-    """An axis's file.
+    """Load an axis file.
 
     Raises:
-        SpecError: a wrong key or value; with file and line.
+        SpecError: a key or value is wrong; the message names file and line.
     """
     return _AxisDocument(AxisConfig, path).value
 
@@ -232,7 +233,7 @@ class _AxisDocument(Document[AxisConfig]):
 
 
 def axis_text(config: AxisConfig) -> str:
-    """As a file has it: keys at their defaults are left out."""
+    """Text of an axis file; keys with default values are left out."""
     content: dict[str, Any] = {"kind": "axis"}
     law = {f.name for f in dataclasses.fields(DriveLaw)}
     for field in sorted(dataclasses.fields(config), key=lambda f: f.name in law):
@@ -251,7 +252,7 @@ def _plain(value: Any) -> Any:
 
 
 def axis_digest(config: AxisConfig) -> str:
-    """16 hexadecimal digits that two axes share only if they are the same."""
+    """Digest of an axis, 16 hexadecimal digits; only equal axes have equal digests."""
     return hashlib.sha256(axis_text(config).encode()).hexdigest()[:16]
 
 
@@ -260,7 +261,7 @@ def axis_digest(config: AxisConfig) -> str:
 
 @dataclass(frozen=True)
 class DrivenAxis(RigidJoint):
-    """The axis of a file as the one-joint model sees it."""
+    """The axis of a file for the one-joint model."""
 
     config: AxisConfig
     follows_line: ClassVar[bool] = True
@@ -300,7 +301,7 @@ class DrivenAxis(RigidJoint):
 
     @property
     def facts(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Numbers of ``joint_kernel.Drive`` that the file knows."""
+        """Fields of ``joint_kernel.Drive`` that the file determines."""
         # What a row shows before its target acts is half a period older than what acts on average.
         c = self.config
         return c.facts | ({"effort_age": 0.5 / c.loop_hz} if c.loop_hz and not c.effort_after_target else {})
@@ -318,10 +319,10 @@ class DrivenAxis(RigidJoint):
         return Rigid(c.inertia + motion.mounted_kgm2, c.rotor_inertia, c.weight_sin + sine, c.weight_cos + cosine)
 
     def surroundings(self, m: Measurement) -> Surroundings:
-        """The known external force, with the sign of what must be held against it, what is mounted, and the motor's supply.
+        """External force (positive if the axis must push against it), mounted masses, and the motor's supply in a recording.
 
         Raises:
-            TaccorlError: a payload without a lever, an arm on a slide, a supply voltage that the law has no use for.
+            TaccorlError: there is a payload without a lever, an arm on a slide, or a supply voltage that the law does not use.
         """
         c, name = self.config, self.signal
         payload, lever, arm = (

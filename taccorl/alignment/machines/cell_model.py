@@ -1,4 +1,4 @@
-"""What a sensor of cells reads under the load that was measured: load → effects → gain and offset → ends of the converter.
+"""Readings of a sensor of cells for a measured load: load → effects → gain and offset → ends of the converter.
 
 Letters in shapes: T rows, K cells, R × C the grid.
 """
@@ -18,13 +18,15 @@ from taccorl.sim.effects.taxel_temperature import NOMINAL_C, TaxelTemperature
 from taccorl.sim.effects.touch_memory import RememberingEffect
 
 MOST_ROWS_HZ = 200.0
-"""Recordings with more rows a second are brought to about that, by means of neighbouring rows."""
+"""Recordings with a higher row rate are reduced to about this rate by means of neighbouring rows [Hz]."""
 STEPS_OF_ROW = 4
-"""A time constant T comes out too long by Δt² / (12 T n²) with n held steps in a row of Δt: 0.03 ms at T = 20 ms and 100 Hz."""
+"""Steps into which a row is divided. With n held steps in a row of Δt a time constant T is overestimated by Δt² / (12 T n²):
+0.03 ms at T = 20 ms and 100 Hz."""
 
 
 class Calibration(NamedTuple):
-    """Gain and offset of each cell (K,): unit of the reading per 1 of the unit ``reading``, and unit of the reading."""
+    """Gain and offset of each cell, (K,): gain in the reading's unit per 1 of the unit ``reading``, offset in the reading's
+    unit."""
 
     gain: np.ndarray
     offset: np.ndarray
@@ -36,10 +38,10 @@ def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect]
     A row's load acts at the row's time; between rows it follows a straight line.
 
     Args:
-        effects: besides the config's; one of the same name takes the place of the config's.
+        effects: effects besides the config's; one of the same name replaces the config's.
 
     Raises:
-        TaccorlError: an effect stands there twice.
+        TaccorlError: an effect is given twice.
     """
     names = {effect.name for effect in effects}
     acting = present([*(e for e in config.effects if e.name not in names), *effects])
@@ -73,12 +75,12 @@ def _along_lines(effect: RememberingEffect, reading: np.ndarray, memory: Memory,
 
 
 def readings(config: CellsConfig, response: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """(T, K) in the unit of the reading: g r + o, cut to the ends of the converter."""
+    """(T, K) readings in the unit of the file: g r + o, limited to the ends of the converter."""
     return np.clip(calibration.gain * response + calibration.offset, config.low, config.high)
 
 
 def within_ends(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
-    """(T, K) bool: the converter is not at one of its ends (within half of its step)."""
+    """(T, K) bool: the converter is not at one of its ends (more than half a step away)."""
     half = 0.5 * np.maximum(m.quantum, 0.0) + 1e-9 * np.abs(m.measured)
     return (m.measured > config.low + half) & (m.measured < config.high - half)
 
@@ -86,9 +88,8 @@ def within_ends(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
 def calibrated(
     config: CellsConfig, pairs: Sequence[tuple[np.ndarray, np.ndarray]], before: Calibration | None = None
 ) -> Calibration:
-    """Gain and offset of every cell by least squares over (response, reading) pairs of (T, K), NaN where a row does not count.
-
-    Cells that were never loaded have the median gain of the others (``before`` if there is none).
+    """Fit gain and offset of every cell by least squares over pairs (response, reading), each (T, K), with NaN in rows that are
+    not used. Cells that were never loaded get the median gain of the others (``before`` if there is none).
     """
     response = np.concatenate([r for r, _ in pairs])
     reading = np.concatenate([y for _, y in pairs])
@@ -107,19 +108,19 @@ def calibrated(
 
 
 def of_file(config: CellsConfig) -> Calibration | None:
-    """Gain and offset as the cells file states them; None if it does not."""
+    """Gain and offset of the cells file; None if it states none."""
     if not config.gain:
         return None
     return Calibration(np.array(config.gain) * config.load_of_reading, np.array(config.offset))
 
 
 def file_numbers(config: CellsConfig, calibration: Calibration) -> dict[str, list[float]]:
-    """``gain`` and ``offset`` as the cells file has them."""
+    """Keys ``gain`` and ``offset`` of a cells file."""
     return {"gain": (calibration.gain / config.load_of_reading).tolist(), "offset": calibration.offset.tolist()}
 
 
 def thinned(m: CellMeasurement) -> CellMeasurement:
-    """At most about ``MOST_ROWS_HZ``: each row the mean of as many neighbours."""
+    """The measurement at about ``MOST_ROWS_HZ`` or less: each row is the mean of as many neighbours as needed."""
     size = int(m.rate_hz // MOST_ROWS_HZ)
     if size < 2:
         return m

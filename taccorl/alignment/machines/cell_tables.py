@@ -30,7 +30,8 @@ from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
 
 EVEN, LONGEST_GAP_S, LONGEST_GAP_ROWS = 0.1, 0.25, 5
-"""Steps within this share of the period are even; a gap longer than that, and than so many periods, is not bridged."""
+"""Steps within the first share of the period are even; a gap longer than the second [s] and the third [periods] is not
+bridged."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,23 +40,23 @@ class CellMeasurement(Measurement):
 
     known_units: ClassVar = tuple(READINGS)
     temperature_c: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(T,); empty if it was not recorded."""
+    """(T,) temperature [°C]; empty if it was not recorded."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TemperatureColumn:
-    """Where the temperature stands, in °C."""
+    """Column of the temperature [°C]."""
 
     column: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellColumns:
-    """Where one cell stands."""
+    """Columns of one cell."""
 
     reading: Column
     load: Column | None = None
-    """Of a cell with a load of its own."""
+    """Column of the load, if the cell has its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,19 +66,19 @@ class CellTableSpec:
     time: Column
     cells: dict[str, CellColumns]
     load: Column | None = None
-    """Of all cells."""
+    """Column of the load of all cells."""
     temperature: TemperatureColumn | None = None
     separator: str = "comma"
-    """Of CSV files: comma, semicolon or tab."""
+    """Separator of CSV files: comma, semicolon or tab."""
     origin: str = ""
-    """What made the file, e.g. "simulated …"."""
+    """Origin of the file, such as "simulated …"."""
 
 
 def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
-    """A columns file, checked against the cells file.
+    """Load a columns file, and check it against the cells file.
 
     Raises:
-        SpecError: with file, line, key and the way out.
+        SpecError: it is invalid; the message names file, line, key and remedy.
     """
     document = Document(CellTableSpec, Path(path))
     spec = document.value
@@ -116,10 +117,10 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
 
 
 def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> CellTableSpec:
-    """The columns of a table that has our own names.
+    """Columns of a table with taccorl's own names.
 
     Raises:
-        RecordingError: a column is missing or unknown; names file, column and the way out.
+        RecordingError: a column is missing or unknown; the message names file, column and remedy.
     """
     load = LOADS[config.load.unit][0]
     known = ["t", "temperature_c", *(f"{name}.reading" for name in config.names)]
@@ -153,11 +154,11 @@ def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> Cell
 
 
 def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None = None) -> CellMeasurement:
-    """A table as a measurement of the sensor, in the units of the cells file.
+    """Read a table as a measurement of the sensor, in the units of the cells file.
 
     Raises:
-        RecordingError: a column is missing, a cell of the table is empty or no number, time does not run forwards; names file,
-            line or row, and column.
+        RecordingError: a column is missing, a cell of the table is empty or no number, time does not increase; the message names
+            file, line or row, and column.
     """
     path = Path(path)
 

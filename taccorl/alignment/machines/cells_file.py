@@ -1,4 +1,4 @@
-"""A sensor of one or more cells that something of known size presses, and the file that describes it.
+"""The file of a sensor with one or more cells that known loads press.
 
 ::
 
@@ -13,8 +13,8 @@
     - {effect: taxel_creep, share: 0.2, time_constant_s: 1.1}
 
 The model is y = clip(g r + o, lowest … highest): the effects make r of the load, each cell has its gain g and offset o. In the
-unit ``reading``, in which effects have their numbers, 1 is a tenth of the rated load. What the converter cuts off at its ends
-is a fact of the file and no effect.
+unit ``reading``, in which effects have their numbers, 1 is a tenth of the rated load. Clipping at the converter's ends is
+described by the file, not by an effect.
 """
 
 import dataclasses
@@ -82,20 +82,20 @@ READINGS: dict[str, tuple[str, float]] = {
 }
 """Unit of a reading → the quantity's own unit and the factor to it."""
 READINGS_OF_RATED = 10.0
-"""The rated load in the unit ``reading``. Touch effects have their bounds for readings of this size."""
+"""Reading of the rated load in the unit ``reading``. Touch effects have bounds for readings of this size."""
 _HEADER = "# A sensor of cells. taccorl/alignment/machines/cells_file.py says what may stand here.\n"
 
 
 @dataclass(kw_only=True)
 class Load:
-    """What presses the cells."""
+    """Load that presses the cells."""
 
     unit: str
     """A key of ``LOADS``."""
     rated: float
-    """Greatest load that the sensor is made for, in ``unit``."""
+    """Greatest load for which the sensor is made, in ``unit``."""
     shared: bool = True
-    """All cells bear the load of one column; false: each cell has a column of its own."""
+    """True: all cells have the load of one column; false: each cell has its own column."""
 
 
 @dataclass(kw_only=True)
@@ -109,29 +109,29 @@ class Reading:
     highest: float | None = None
     """Upper end of the converter, in ``unit``; none if not given."""
     falls: bool = False
-    """Whether the reading falls under load, as a resistance does."""
+    """True if the reading decreases under load, like a resistance."""
 
 
 @dataclass(kw_only=True)
 class CellsConfig:
-    """A sensor of cells, as its file says."""
+    """Content of a cells file."""
 
     kind: Literal["cells"] = "cells"
     name: str = ""
-    """As tables and reports call it; the file's stem if not given."""
+    """Name of the sensor in tables and reports; the file's stem if not given."""
     cells: list[str] = field(default_factory=list)
-    """Names of cells that have no place in a grid."""
+    """Names of cells that are not in a grid."""
     rows: int | None = None
     columns: int | None = None
-    """Of a grid."""
+    """Number of columns of a grid."""
     load: Load
     reading: Reading
     rate_hz: float | None = None
-    """Rows a second of the recordings; not checked if not given."""
+    """Row rate of the recordings [Hz]; not checked if not given."""
     gain: list[float] = field(default_factory=list)
-    """Unit of the reading per unit of the load, cell by cell, row after row; fitted if not given."""
+    """Gain of each cell, row after row [unit of the reading per unit of the load]; fitted if not given."""
     offset: list[float] = field(default_factory=list)
-    """Reading without load, cell by cell."""
+    """Offset of each cell: reading without load."""
     effects: list[Effect] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -168,7 +168,7 @@ class CellsConfig:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns; cells with names are one row."""
+        """Numbers of rows and columns; cells with names are one row."""
         return (1, len(self.cells)) if self.cells else (self.rows or 0, self.columns or 0)
 
     @property
@@ -177,13 +177,14 @@ class CellsConfig:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the cells, row after row."""
+        """Names of the cells, row after row."""
         rows, columns = self.shape
         return tuple(self.cells) or tuple(f"r{i}c{j}" for i in range(rows) for j in range(columns))
 
     @property
     def gives(self) -> tuple[str, ...]:
-        """What its recordings may know of ``taccorl.sim.effects.effect.NEEDS``, but for the temperature."""
+        """Knowledge that its recordings can have, in words of ``taccorl.sim.effects.effect.NEEDS``, except for the
+        temperature."""
         return ("reading", "neighbours") if not self.cells and self.num_cells > 1 else ("reading",)
 
     @property
@@ -196,26 +197,27 @@ class CellsConfig:
 
     @property
     def sign(self) -> float:
-        """−1 where the reading falls under load."""
+        """−1 if the reading decreases under load, else 1."""
         return -1.0 if self.reading.falls else 1.0
 
     @property
     def load_of_reading(self) -> float:
-        """Load [``load.unit``] that is 1 in the unit ``reading``."""
+        """Load [``load.unit``] that corresponds to 1 in the unit ``reading``."""
         return self.load.rated / READINGS_OF_RATED
 
     def told(self, value: float, unit: str) -> tuple[float, str]:
-        """A number in a unit made of ``reading`` as a load: (0.4, "reading/min") → (0.8, "N/min") at 20 N rated."""
+        """Convert a number from a unit based on ``reading`` to one based on load: (0.4, "reading/min") → (0.8, "N/min") at 20 N
+        rated."""
         if "reading" not in unit:
             return value, unit
         return value * self.load_of_reading, unit.replace("reading", self.load.unit)
 
 
 def make_cells_effect(name: str, **values: Any) -> Effect:
-    """An effect of a sensor of cells.
+    """Make an effect of a sensor of cells.
 
     Raises:
-        TaccorlError: as ``make_effect``; or it does not act on cells.
+        TaccorlError: as ``make_effect``, or the effect does not act on cells.
     """
     return _of_cells(make_effect(name, **values))
 
@@ -229,10 +231,10 @@ def _of_cells(effect: Effect) -> Effect:
 
 
 def load_cells(path: Path) -> CellsConfig:
-    """A cells file.
+    """Load a cells file.
 
     Raises:
-        SpecError: with file, line and key.
+        SpecError: it is invalid; the message names file, line and key.
     """
     path = Path(path)
     document = EffectsDocument(CellsConfig, path)
@@ -246,7 +248,7 @@ def load_cells(path: Path) -> CellsConfig:
 
 
 def cells_text(config: CellsConfig) -> str:
-    """``config`` as its file has it."""
+    """Text of a cells file for ``config``."""
     plain = {
         f.name: value
         for f in dataclasses.fields(config)
@@ -265,12 +267,12 @@ def _short(note: Load | Reading) -> dict[str, Any]:
 
 
 def cells_digest(config: CellsConfig) -> str:
-    """16 hexadecimal digits that two sensors share only if they are the same."""
+    """Digest of a sensor, 16 hexadecimal digits; only equal sensors have equal digests."""
     return hashlib.sha256(cells_text(config).encode()).hexdigest()[:16]
 
 
 def save_cells(config: CellsConfig, path: Path) -> None:
-    """Write ``cells_text``; the file is replaced as a whole or not at all.
+    """Write ``cells_text`` to a file, which is replaced as a whole or not at all.
 
     Raises:
         TaccorlError: the folder cannot be written to.

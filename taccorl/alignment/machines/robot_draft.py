@@ -1,4 +1,4 @@
-"""A first robot file from an MJCF or URDF file: what the model says, and ``TODO`` where only the user knows."""
+"""Draft a robot file from an MJCF or URDF file: facts of the model, and ``TODO`` for facts that only the user knows."""
 
 import os
 from pathlib import Path
@@ -21,7 +21,7 @@ _HEADER = """\
 
 
 def robot_draft(model: Path, out: Path) -> tuple[str, RobotModel]:
-    """Text of a robot file at ``out``, and the model that it names.
+    """Text of a draft robot file for the path ``out``, and the model that it names.
 
     Raises:
         TaccorlError: the model cannot be used (``load_robot_model``).

@@ -1,4 +1,5 @@
-"""A robot file: any robot as a kinematic tree of an MJCF or URDF file, with what only its user knows of each joint's drive.
+"""A robot file: any robot as a kinematic tree of an MJCF or URDF file, with facts about each joint's drive that only its user
+knows.
 
 ::
 
@@ -18,7 +19,7 @@
         effects:                      # physics beyond rigid bodies and control; taccorl add-effect writes them
         - {effect: coulomb_friction, torque_nm: 0.41}
 
-``taccorl init-robot my_arm.xml`` writes such a file with all that the model says, and ``TODO`` where only the user knows.
+``taccorl init-robot my_arm.xml`` writes such a file with the facts of the model, and ``TODO`` for the others.
 """
 
 import dataclasses
@@ -64,22 +65,23 @@ _HEADER = "# A robot: taccorl/alignment/machines/robot_file.py says what may sta
 
 @dataclass(kw_only=True)
 class JointConfig(DriveLaw):
-    """The drive of one joint. Units are those of a hinge; of a sliding joint N for N·m, m for rad, kg for kg·m²."""
+    """Settings of the drive of one joint. Units are for a hinge; for a sliding joint read N for N·m, m for rad, kg for kg·m²."""
 
     gains: Literal["commanded", "fitted"] = "commanded"
-    """Whether kp and kd are what the controller runs, or only where a fit starts. Of law pwm they are the servo's own, and stall
-    torque and back-EMF are fitted."""
+    """commanded: kp and kd are those of the controller. fitted: they are only the start of a fit. With law pwm they are always
+    the servo's own, and stall torque and back-EMF are fitted."""
     rotor_inertia: float = 0.0
-    """kg·m² of the motor's rotor, on the motor's side of the gear."""
+    """Inertia of the motor's rotor on the motor's side of the gear [kg·m²]."""
     gear: float = 1.0
-    """Turns of the motor for one of the joint; of a sliding joint rad/m."""
+    """Turns of the motor per turn of the joint; for a sliding joint [rad/m]."""
     loop_hz: float | None = None
-    """Rate of the drive's control loop."""
+    """Rate of the drive's control loop [Hz]."""
     command_hz: float | None = None
-    """Rate at which the drive receives targets, where they are logged more slowly: a replay joins the rows by straight
-    lines of such steps. If not given, a target is held until the next row."""
+    """Rate at which the drive receives targets [Hz], if they are logged at a lower rate: a replay then interpolates the rows
+    linearly at this rate. If not given, a target is held until the next row."""
     position_age_s: float = 0.0
-    """How much older than the loop's timing says the measured position is when the torque acts; ``diagnose`` fits it."""
+    """Age of the measured position when the torque acts, beyond the age that follows from the loop's timing [s]; ``diagnose``
+    fits it."""
     effects: list[Effect] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -95,24 +97,24 @@ class JointConfig(DriveLaw):
 
     @property
     def is_uncertain(self) -> bool:
-        """Whether ``diagnose`` fits numbers of the law, because nobody knows them."""
+        """Whether ``diagnose`` fits numbers of the control law, because they are not known."""
         return self.law == "pwm" or self.gains == "fitted"
 
     @property
     def armature(self) -> float:
-        """kg·m²: the rotor's inertia as it acts at the joint."""
+        """Inertia of the rotor as it acts at the joint [kg·m²]."""
         return self.rotor_inertia * self.gear**2
 
 
 @dataclass(kw_only=True)
 class RobotConfig:
-    """A robot file."""
+    """Content of a robot file."""
 
     kind: Literal["robot"]
     model: str
-    """MJCF or URDF file, relative to this one."""
+    """Path of the MJCF or URDF file, relative to this file."""
     gravity_compensation: float = 0.0
-    """Share of the weight that the controller adds to its torque."""
+    """Share of the weight that the controller compensates, 0 … 1."""
     joints: dict[str, JointConfig]
 
     def __post_init__(self) -> None:
@@ -121,7 +123,7 @@ class RobotConfig:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot file with its model. ``joint`` returns what the one-joint model needs."""
+    """Machine described by a robot file and its model. ``joint`` returns the data for the one-joint model."""
 
     config: RobotConfig
     rigid: RobotModel
@@ -129,7 +131,8 @@ class Robot:
 
     @property
     def units(self) -> dict[str, str]:
-        """Joint of the model → rad or m; those that the file does not name can be recorded, too, and are then known to move."""
+        """Joint of the model → unit of its position, rad or m. Joints that the file does not name may also be recorded; their
+        motion is then known."""
         return {name: facts.unit for name, facts in self.rigid.joints.items()}
 
     def joint(self, signal: str) -> "RobotJoint":
@@ -138,12 +141,12 @@ class Robot:
         return RobotJoint(self, signal)
 
     def with_joint(self, signal: str, config: JointConfig) -> "Robot":
-        """With another drive at one joint."""
+        """The robot with another drive at one joint."""
         joints = {name: config if name == signal else own for name, own in self.config.joints.items()}
         return dataclasses.replace(self, config=dataclasses.replace(self.config, joints=joints))
 
     def text(self, path: Path) -> str:
-        """As a file at ``path`` has it: keys that are at their defaults are left out."""
+        """Text of the robot file for ``path``; keys with default values are left out."""
         model = self.rigid.path.resolve()
         folder = Path(path).resolve().parent
         content: dict[str, Any] = {"kind": "robot", "model": Path(os.path.relpath(model, folder)).as_posix()}
@@ -161,7 +164,7 @@ class Robot:
         )
 
     def digest(self) -> str:
-        """16 hexadecimal digits that two robots share only if file and model are the same."""
+        """Digest of a robot, 16 hexadecimal digits; equal only if file and model are equal."""
         model = self.rigid.path.read_bytes()
         return hashlib.sha256(self.text(self.path).encode() + model).hexdigest()[:16]
 
@@ -172,10 +175,11 @@ def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
 
 
 def load_robot(path: Path) -> Robot:
-    """A robot file and its model.
+    """Load a robot file and its model.
 
     Raises:
-        SpecError: the file holds ``TODO``, a wrong key or value, or a joint that the model lacks; with file and line.
+        SpecError: the file holds ``TODO``, a wrong key or value, or a joint that the model lacks; the message names file and
+            line.
         TaccorlError: the model cannot be used (``load_robot_model``).
     """
     path = Path(path)
@@ -233,10 +237,10 @@ def _refuse_todo(path: Path) -> None:
 
 
 def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool) -> bool:
-    """Whether an effect can act on one joint of a robot file: the one-joint model knows it by its numbers.
+    """Whether an effect can act on one joint of a robot file, so that the one-joint model can compute it.
 
     Args:
-        weight: the controller carries weight.
+        weight: the controller compensates gravity.
         rotor: the rotor's inertia is known.
     """
     if "joint" not in cls.kinds() or not cls.works_with((*_GIVES, *["weight"] * weight)):
@@ -248,7 +252,7 @@ def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool) -> bool:
 
 
 class RobotJoint(RigidJoint):
-    """One joint of a robot file. Positions of a pose are the model's ``qpos``."""
+    """One joint of a robot file. A pose holds the model's ``qpos``."""
 
     effort_holds_weight: ClassVar[bool] = True
     exact_timing: ClassVar[bool] = True
@@ -269,7 +273,7 @@ class RobotJoint(RigidJoint):
 
     @property
     def known(self) -> JointFacts:
-        """What the model says of the joint."""
+        """Limits, inertia, damping, friction and actuators of the joint as stated in the MJCF or URDF file."""
         return self._robot.rigid.joints[self.signal]
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
@@ -277,7 +281,7 @@ class RobotJoint(RigidJoint):
 
     @property
     def winding(self) -> dict[str, float]:
-        """Stall torque and back-EMF of law pwm; of others none."""
+        """Stall torque and back-EMF of law pwm; empty for other laws."""
         c = self._config
         return {"stall_nm": c.stall_nm, "back_emf": c.back_emf} if c.law == "pwm" else {}
 
@@ -315,10 +319,11 @@ class RobotJoint(RigidJoint):
         )
 
     def whole(self, m: Measurement) -> Measurement:
-        """With all joints of the model, and with the file's gains where they are commanded and the recording states none.
+        """The recording extended to all joints of the model, with the file's gains if they are commanded and the recording
+        states none.
 
         Raises:
-            TaccorlError: a signal that the model lacks, or has in another unit.
+            TaccorlError: the model lacks a signal, or has it in another unit.
         """
         names, units = tuple(self._robot.units), tuple(self._robot.units.values())
         for name, unit in zip(m.signals, m.units, strict=True):

@@ -1,13 +1,14 @@
-"""Any robot of an MJCF or URDF file as rigid bodies: the kinematic tree, masses and inertias, gravity, and what else it says of
-its joints.
+"""Any robot of an MJCF or URDF file as rigid bodies: the kinematic tree, masses, inertias, gravity, and further facts about its
+joints.
 
-Meshes are not needed: mesh, texture and material entries are removed before the model is compiled, and a file of them need not
-be there. So a moving link needs its inertia in the file (``<inertial>``), or, in MJCF, geoms that are primitives. A floating base
+Meshes are not needed: mesh, texture and material entries are removed before the model is compiled, and their files may be
+missing. So a moving link needs its inertia in the file (``<inertial>``), or, in MJCF, geoms that are primitives. A floating base
 is held fixed, and so are ball joints. Joints that a closed chain ties together are refused: inverse dynamics of a tree would be
 wrong for them.
 
-Passive forces of the file (damping, dry friction, springs) and its actuators are no part of the rigid bodies; ``joint_facts``
-returns them, and ``taccorl init-robot`` writes them into the robot file, where they can be seen, fitted and removed.
+Passive forces of the file (damping, dry friction, springs) and its actuators are not part of the rigid-body model;
+``joint_facts`` returns them, and ``taccorl init-robot`` writes them into the robot file, where they can be seen, fitted and
+removed.
 """
 
 import math
@@ -32,40 +33,40 @@ _REMOVED = ("sensors", "keys", "equalities", "tendons", "pairs", "excludes", "sk
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorFacts:
-    """One actuator of a joint, as MJCF has it: τ = gear · (gain · ctrl + bias0 + bias1 · gear q + bias2 · gear q̇)."""
+    """One actuator of a joint in MJCF: τ = gear · (gain · ctrl + bias0 + bias1 · gear q + bias2 · gear q̇)."""
 
     name: str
     kp: float
-    """N·m/rad or N/m at the joint; 0 for a motor."""
+    """Position gain at the joint [N·m/rad or N/m]; 0 for a motor."""
     kd: float
-    """N·m·s/rad or N·s/m at the joint."""
+    """Velocity gain at the joint [N·m·s/rad or N·s/m]."""
     effort_limit: float | None
-    """N·m or N at the joint."""
+    """Largest torque or force at the joint [N·m or N]; None if unlimited."""
     gear: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointFacts:
-    """What a model file says of one joint."""
+    """Facts about one joint in a model file."""
 
     name: str
     unit: Literal["rad", "m"]
     limits: tuple[float, float] | None
-    """rad or m; None where it has none."""
+    """Lowest and highest position [rad or m]; None if unlimited."""
     inertia: float
-    """kg·m² or kg of all that it moves, others at the model's zero pose; without armature."""
+    """Inertia of all bodies that the joint moves, with other joints at the model's zero pose [kg·m² or kg]; without armature."""
     armature: float
-    """kg·m² or kg: rotor inertia as it acts at the joint."""
+    """Rotor inertia at the joint [kg·m² or kg]."""
     effort_limit: float | None
-    """N·m or N."""
+    """Largest torque or force [N·m or N]; None if unlimited."""
     damping: float
-    """N·m·s/rad or N·s/m."""
+    """Damping coefficient [N·m·s/rad or N·s/m]."""
     friction: float
-    """N·m or N."""
+    """Dry friction [N·m or N]."""
     stiffness: float
-    """N·m/rad or N/m of a spring."""
+    """Stiffness of a spring at the joint [N·m/rad or N/m]."""
     spring_rest: float
-    """rad or m."""
+    """Position at which that spring is relaxed [rad or m]."""
     actuators: tuple[ActuatorFacts, ...]
 
 
@@ -78,18 +79,18 @@ class RobotModel:
     joints: dict[str, JointFacts]
     """Hinge and slide joints, in the order of the tree."""
     remarks: tuple[str, ...]
-    """What of the file was left out, and why that is no harm."""
+    """Parts of the file that were left out, and why that has no influence."""
 
 
 def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotModel:
     """Read an MJCF or URDF file.
 
     Args:
-        gravity_compensation: share of the weight that the controller carries.
+        gravity_compensation: share of the weight that the controller compensates.
 
     Raises:
-        TaccorlError: the file cannot be read; a moving link has no inertia, or one that needs a mesh; a closed chain; joints
-            without a name, or none at all.
+        TaccorlError: the file cannot be read; a moving link has no inertia, or one that requires a mesh; there is a closed
+            chain, a joint without a name, or no joint.
     """
     path = Path(path)
     spec, remarks = _spec(path)

@@ -1,1 +1,1 @@
-"""Measurements: what was commanded and what was measured, from recordings, datasets and tables; their noise floor."""
+"""Measurements: commands and measured positions from recordings, datasets and tables; their noise floor."""

@@ -1,4 +1,4 @@
-"""Measurements from datasets of this project: rows at the dataset's rate, one episode a measurement."""
+"""Measurements from datasets of this project: rows at the dataset's rate, one measurement per episode."""
 
 import math
 from pathlib import Path
@@ -16,10 +16,10 @@ from taccorl.robots import ROBOT
 
 
 def read_dataset(root: Path) -> list[Measurement]:
-    """Every episode of a dataset as a measurement at the dataset's rate.
+    """Read every episode of a dataset as a measurement at the dataset's rate.
 
     Raises:
-        TaccorlError: not a dataset, one whose numbers have no units, or one that does not state its action_time.
+        TaccorlError: it is not a dataset, its numbers have no units, or it does not state its action_time.
     """
     dataset = Dataset(root)
     try:
@@ -33,13 +33,13 @@ def read_dataset(root: Path) -> list[Measurement]:
 
 
 def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...], root: Path, k: int) -> Measurement:
-    """One episode of a dataset. Row k of the measurement is row k + 1 of the episode (T rows → T − 1).
+    """One episode of a dataset as a measurement. Row k of the measurement is row k + 1 of the episode (T rows → T − 1).
 
     The action of row t is reached, in a straight line, at row t + 1 (``DatasetSpec.action_time``): the command in force at
     row t is the action of row t − 1. Row 0 has none.
 
     Raises:
-        TaccorlError: too few rows, or the dataset does not state its action_time.
+        TaccorlError: there are too few rows, or the dataset does not state its action_time.
     """
     episode.spec.require_action_time(episode.name)
     state, action = episode.arrays[STATE].astype(float), episode.executed().astype(float)

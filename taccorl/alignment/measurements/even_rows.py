@@ -1,4 +1,4 @@
-"""A table with jitter or lost rows, brought to an even grid; what was not measured stays unmeasured.
+"""Resample a table with jitter or lost rows to an even grid; gaps in the measurement stay gaps.
 
 Row k of the grid is at t_0 + k / rate.
 
@@ -6,10 +6,10 @@ Row k of the grid is at t_0 + k / rate.
                 that changes with every row is on the straight line (the drive received what was streamed); any other is held.
     measured    on the cubic through the four rows around, or the straight line between two, that are at most 1.5 periods apart;
                 NaN in gaps. Nothing is interpolated across a gap.
-    command_s   when the row's target came: an axis is simulated with its targets at their own times.
+    command_s   arrival time of the row's target: an axis is simulated with targets at their own times.
 
 Jitter above ``MOST_JITTER`` of a period, a gap longer than ``LONGEST_GAP_S``, or more than ``MOST_LOST`` of the rows lost: the
-table stays as it is, the checks say why, and what needs even time refuses it.
+table is not changed, a check states the reason, and functions that need even time reject it.
 
 Letters in shapes: T rows, J signals, G rows of the grid.
 """
@@ -25,19 +25,19 @@ from taccorl.sim.twin import PhysicsConfig
 EVEN = 0.1
 """Steps within this share of the period are even enough for a replay."""
 GAP = 1.5
-"""Periods; a longer step has lost rows."""
+"""A step longer than this [periods] has lost rows."""
 MOST_JITTER = 0.5
-"""Periods; 95 % of the steps that are no gaps must lie nearer to it."""
+"""Largest jitter [periods] of 95 % of the steps that are no gaps."""
 LONGEST_GAP_S = 0.25
 MOST_LOST = 0.05
 RATE_TOLERANCE = 0.02
-"""A rate so near to a whole number of physics steps is that rate."""
+"""Largest relative difference from a rate with a whole number of physics steps at which the rate is set to it."""
 AT_ROW = 0.1
-"""Periods: a row so near to a grid row beside a gap is at it."""
+"""A row this near to a grid row beside a gap [periods] counts as being at it."""
 
 
 def even_rows(m: Measurement) -> Measurement:
-    """``m`` on an even grid with a finding that says so; ``m`` itself if it is even, or too uneven."""
+    """``m`` resampled to an even grid, with a finding that states it; ``m`` itself if it is even, or too uneven."""
     steps = np.diff(m.time_s)
     if m.num_rows < 3 or not np.isfinite(m.time_s).all() or (steps <= 0).any():
         return m

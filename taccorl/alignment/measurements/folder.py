@@ -1,6 +1,5 @@
-"""All measurements of a folder, and which of them are for fitting, for judging and for the final figures.
-
-A folder of recordings may hold a ``measurements.yaml`` that says what the files cannot::
+"""Read all measurements of a folder, divided into those for fitting, for validation and for test. A folder of recordings may
+hold a ``measurements.yaml`` with facts that the files do not state::
 
     spec: piper_flexitac_mcap         # how its recordings are read; not needed where only one shipped spec reads the format
     columns: columns.yaml             # names and units of its tables
@@ -16,7 +15,7 @@ A folder of recordings may hold a ``measurements.yaml`` that says what the files
       press_03.mcap: {pressed: {shape: rod, radius_m: 0.008, length_m: 0.04, arm: left, rpy_rad: [0, 1.5708, 0]}}
 
 ``payload_kg`` is a known mass in the gripper. Its centre of mass is ``payload_position_m`` [m] in link 6's frame: origin at the
-flange, z along the hand towards the fingers, y the direction in which they close. Not stated, it is the TCP, [0, 0, 0.168].
+flange, z along the hand towards the fingers, y the direction in which they close. By default it is the TCP, [0, 0, 0.168].
 ``pressed`` is a known object between the fingers of one arm; with it ``taccorl compare`` and ``diagnose`` look at the arm's pads.
 """
 
@@ -43,9 +42,9 @@ from taccorl.robots import ROBOT
 
 INDEX = "measurements.yaml"
 TableReader = Callable[[Path, Any], Measurement]
-"""Reads a table: its path, and its columns file if there is one."""
+"""Function that reads a table from its path and, if there is one, its columns file."""
 FARTHEST_PAYLOAD_M = 1.0
-"""Of a payload's centre of mass from the flange: the arm itself reaches 0.63 m (PiPER manual)."""
+"""Largest accepted distance of a payload's centre of mass from the flange [m]: the arm itself reaches 0.63 m (PiPER manual)."""
 Use = Literal["fit", "validation", "test"]
 if TYPE_CHECKING:
     ArmName = str
@@ -55,22 +54,23 @@ else:  # the names that a measurements.yaml may give: others are an error with i
 
 @dataclass(frozen=True, kw_only=True)
 class PressedNote:
-    """A known object between the fingers of one arm: what ``indenter`` takes."""
+    """A known object between the fingers of one arm: the arguments of ``indenter``."""
 
     shape: Literal["sphere", "rod"]
     radius_m: float
     arm: ArmName
     length_m: float | None = None
-    """Of a rod, which has flat ends; a sphere has none."""
+    """Length of a rod, which has flat ends [m]; not for a sphere."""
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Its middle: in the TCP's frame (middle between the pads, z = approach, fingers close along y), or in the world's."""
+    """Centre of the object [m]: in the TCP's frame (origin in the middle between the pads, z = approach, fingers close along y),
+    or in the world's, as ``frame`` says."""
     rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Fixed-axis roll, pitch, yaw; a rod lies along its own z, and [0, 1.5708, 0] lays it across the pads."""
     frame: Literal["tcp", "world"] = "tcp"
-    """tcp: it keeps its place in the hand; world: it is fixed to the bench."""
+    """tcp: the object is fixed relative to the hand; world: it is fixed to the bench."""
 
     def made(self) -> PressedObject:
-        """For ``touch_motion``."""
+        """The object as a ``PressedObject``, for ``touch_motion``."""
         size = {} if self.length_m is None else {"length_m": self.length_m}
         place = {"position_m": self.position_m, "rpy_rad": self.rpy_rad, "frame": self.frame}
         return indenter(self.shape, self.radius_m, self.arm, **size, **place)
@@ -78,62 +78,64 @@ class PressedNote:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingNote:
-    """What is known of one recording besides its file."""
+    """Facts about one recording that its file does not state."""
 
     use: Use | None = None
-    """fit: parameters are fitted to it; validation: choices are made on it; test: nothing is chosen on it."""
+    """Use of the recording. fit: parameters are fitted to it; validation: effects are chosen by its error; test: no choice
+    depends on it."""
     repeat_of: str | None = None
     kp: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded gain [N·m/rad, N/m]."""
+    """Signal → commanded K_p [N·m/rad, N/m]."""
     kd: dict[str, float] = field(default_factory=dict)
-    """Signal → [N·m·s/rad, N·s/m]."""
+    """Signal → commanded K_d [N·m·s/rad, N·s/m]."""
     gain_scale: dict[str, float] = field(default_factory=dict)
-    """Signal → factor of both gains over the other recordings', where no more than that is known."""
+    """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
-    """Arm, or an axis of its own file → mass held."""
+    """Arm, or name of an axis → mass of the payload [kg]."""
     lever_m: dict[str, float] = field(default_factory=dict)
-    """Axis of its own file → distance from the axis to the payload, where it is not that file's."""
+    """Name of an axis → distance from the axis to the payload [m], if it differs from that in the axis file."""
     arm_kg: dict[str, float] = field(default_factory=dict)
-    """Axis of its own file → mass of the arm that holds the payload, a uniform rod as long as the lever."""
+    """Name of an axis → mass of the arm that holds the payload [kg], a uniform rod as long as the lever."""
     supply_v: dict[str, float] = field(default_factory=dict)
-    """Axis of its own file → voltage of its motor's supply, where no column has it."""
+    """Name of an axis → voltage of its motor's supply [V], if no column has it."""
     payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Arm → centre of mass of what is held, in link 6's frame (flange, z along the hand); the TCP, [0, 0, 0.168], by default."""
+    """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
+    [0, 0, 0.168]."""
     effort_scale: dict[str, float] = field(default_factory=dict)
-    """Signal → factor to N·m, N: PiPER's firmware 1.5 to 1.8 reports joints 1 to 3 four times too large
-    (piper_sdk issue 73)."""
+    """Signal → factor from the recorded effort to N·m or N. PiPER's firmware 1.5 to 1.8 reports joints 1 to 3 four times too
+    large (piper_sdk issue 73)."""
     pressed: PressedNote | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementIndex:
-    """``measurements.yaml``."""
+    """Content of ``measurements.yaml``."""
 
     spec: str | None = None
     columns: str | None = None
     validation_every: int = 0
-    """0: only what is named."""
+    """Every k-th motion is for validation; 0: only recordings that are named."""
     recordings: dict[str, RecordingNote] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Several measurements and what each is for; the split is part of every result made from them."""
+    """Several measurements divided into fit, validation and test; the division is part of every result made from them."""
 
     fit: tuple[Measurement, ...]
     validation: tuple[Measurement, ...] = ()
     test: tuple[Measurement, ...] = ()
     rule: str = ""
-    """How they were divided, in words."""
+    """Description of the rule of the division."""
     skipped: tuple[str, ...] = ()
-    """What else lay in the folder and was not read, and why."""
+    """Other entries of the folder that were not read, with the reason."""
 
     @property
     def all(self) -> tuple[Measurement, ...]:
         return (*self.fit, *self.validation, *self.test)
 
     def record(self) -> dict[str, object]:
-        """The split for a report: rule and names."""
+        """The division for a report: rule and names."""
         names = {use: [m.name for m in getattr(self, use)] for use in ("fit", "validation", "test")}
         return {"rule": self.rule, **names, "skipped": list(self.skipped)}
 
@@ -149,19 +151,19 @@ def read_measurements(
     units: Mapping[str, str] | None = None,
     table: "TableReader | None" = None,
 ) -> Measurements:
-    """A recording, a table, a dataset, or a folder of those, divided.
+    """Read a recording, a table, a dataset, or a folder of those, and divide them into fit, validation and test.
 
     Args:
         spec: recording spec; else the index's, else the only shipped one that reads the format.
-        columns: columns file of the tables; else the index's, else our own names.
-        validation, test: names of measurements; with those the index's ``use`` is not looked at.
+        columns: columns file of the tables; else the index's, else taccorl's own names.
+        validation, test: names of measurements; with them the index's ``use`` is ignored.
         validation_every: every k-th motion that is not named is for validation; else the index's.
         units: signal of the machine → unit of its position, for tables without a columns file; the PiPER's if not given.
-        table: reads a table, by its path and that of the columns file, of a machine whose tables are not of joints; ``columns``
-            is then a path.
+        table: for machines whose tables hold no joints: function that reads a table from its path and that of the columns file;
+            ``columns`` is then a path.
 
     Raises:
-        TaccorlError: nothing to read, unknown names, or a motion and its repeat on both sides.
+        TaccorlError: there is nothing to read, a name is unknown, or a motion and its repeat have different uses.
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
@@ -194,12 +196,12 @@ def split(
     test: Sequence[str] = (),
     validation_every: int = 0,
 ) -> Measurements:
-    """Divide by name, and every k-th of the other motions to ``validation``. The same list gives the same split.
-
-    A motion and its repeats count as one and stay together: in validation, a repeat would measure the noise and not the model.
+    """Divide measurements by name, and assign every k-th of the other motions to ``validation``. The result depends on the list
+    only. A motion and its repeats count as one and stay together, because a repeat in validation would measure the noise and not
+    the model.
 
     Raises:
-        TaccorlError: a name that no measurement has, one named twice, a motion on both sides, or nothing left to fit.
+        TaccorlError: a name is unknown or given twice, a motion has different uses, or nothing remains for the fit.
     """
     measurements = list(measurements)
     names = [m.name for m in measurements]
@@ -238,10 +240,10 @@ def split(
 
 
 def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
-    """Name → name of the first recording of its motion, which need not be at hand.
+    """Name → name of the first recording of its motion, which may itself be missing.
 
     Raises:
-        TaccorlError: repeats in a circle.
+        TaccorlError: repeats refer to each other in a circle.
     """
     of = {m.name: m.repeat_of for m in measurements}
     roots = {}

@@ -1,8 +1,8 @@
-"""A measurement: what was commanded and what was measured, on one clock. The twin is compared with it row by row.
+"""A measurement: commands and measured positions on one clock. The twin is compared with it row by row.
 
 The rule of every row, and of every reader: **the target of row k is in force from time k on, and the position of row k is
-where the joint was at time k**, before that target could act. ``taccorl.sim.replay`` answers by the same rule. One row off (5 ms)
-turned K_p 151 into 690 in an identification (MuJoCo's sensordata after a step is the state before it).
+where the joint was at time k**, before that target could act. ``taccorl.sim.replay`` follows the same rule. An error of one row
+(5 ms) turned K_p 151 into 690 in an identification (MuJoCo's sensordata after a step is the state before it).
 
 Letters in shapes: T rows, J signals (of the robot: in the order of actions), N touch frames, K taxels.
 """
@@ -22,11 +22,11 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}
-"""Unit of a position → those of its velocity and effort."""
+"""Unit of a position → units of its velocity and effort."""
 
 
 def unit_of(name: str) -> str:
-    """Unit of one of the robot's signals."""
+    """Unit of one of the robot's signals, rad or m."""
     return "m" if name.endswith("gripper") else "rad"
 
 
@@ -36,11 +36,10 @@ ROBOT_UNITS = tuple(unit_of(name) for name in ROBOT.action_names)
 
 @dataclass(frozen=True, kw_only=True)
 class Touch:
-    """Frames of the pads at their own rate. Pads are scanned at different times, so each has its own."""
+    """Frames of the pads at their own rate. Pads are scanned at different times, so that each has its own times."""
 
     time_s: np.ndarray
-    """(N, 4) when each pad's frame had been scanned to its end, on the measurement's clock, in the order of
-    ``ROBOT.pads``."""
+    """(N, 4) times [s] of the ends of each pad's scans, on the measurement's clock, in the order of ``ROBOT.pads``."""
     counts: np.ndarray
     """(N, K) int16 counts above baseline, unclipped."""
     baseline: np.ndarray
@@ -52,72 +51,73 @@ class Measurement:
     """One recording on one clock, at the rate at which commands were sent.
 
     Raises:
-        TaccorlError: shapes that do not fit each other.
+        TaccorlError: the shapes do not fit together.
     """
 
     known_units: ClassVar[tuple[str, ...]] = tuple(UNITS)
     name: str
     time_s: np.ndarray
-    """(T,) since the first row. Even for recordings; a table keeps its own times, which the checks judge."""
+    """(T,) times since the first row [s]. They are even for recordings; a table keeps its own times, which are checked."""
     target: np.ndarray
-    """(T, J) rad, m: in force from ``time_s[k]`` on."""
+    """(T, J) targets [rad, m], in force from ``time_s[k]`` on."""
     measured: np.ndarray
-    """(T, J) rad, m: at ``time_s[k]``; NaN where nothing was measured for too long."""
+    """(T, J) positions [rad, m] at ``time_s[k]``; NaN in longer gaps of the measurement."""
     velocity: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(T, J) rad/s, m/s as the driver reports it; NaN where it does not."""
+    """(T, J) velocities [rad/s, m/s] as reported by the driver; NaN if it reports none."""
     effort: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(T, J) N·m, N as the driver reports it; NaN where it does not. PiPER firmware may report another scale."""
+    """(T, J) efforts [N·m, N] as reported by the driver; NaN if it reports none. PiPER firmware may report another scale."""
     load: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(T, J) N·m, N: external torque that is known to push the joint, positive where it drives it forwards; empty if none is."""
+    """(T, J) known external torques on the joints [N·m, N], positive if they drive the joint forwards; empty if there are
+    none."""
     torque_ff: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(T, J) N·m, N that the controller is known to have added to its law; part of ``effort``; empty if none is."""
+    """(T, J) torques that the controller is known to have added to its law [N·m, N], which are part of ``effort``; empty if
+    there are none."""
     supply_v: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(T, J) V that feeds the motor; NaN where it was not recorded; empty if it never was."""
+    """(T, J) supply voltages of the motors [V]; NaN where not recorded; empty if never recorded."""
     enabled: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) 0 while the motor is off, else 1; empty if it is never off."""
     command_s: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(T,) when each row's targets came, on the clock of ``time_s``; empty where they came with their rows."""
+    """(T,) arrival times of each row's targets, on the clock of ``time_s``; empty if they equal the rows' times."""
     signals: tuple[str, ...] = ROBOT.action_names
     units: tuple[str, ...] = ROBOT_UNITS
-    """Of positions, one per signal: rad or m."""
+    """Unit of each signal's position: rad or m."""
     target_kinds: tuple[TargetKind, ...] = ()
-    """What ``target`` commands, one per signal; positions if not given."""
+    """Quantity that ``target`` states for each signal; positions if not given."""
     quantum: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(J,) step between neighbouring encoder readings [rad, m], found before any interpolation; 0 where none shows."""
+    """(J,) step between neighbouring encoder readings [rad, m], found before any interpolation; 0 if none is visible."""
     touch: Touch | None = None
     source: Path = Path()
-    """File or dataset it was read from."""
+    """File or dataset from which it was read."""
     origin: str = ""
-    """What made it, e.g. "surrogate recording …"; empty where the file does not say."""
+    """Origin, such as "surrogate recording …"; empty if the file states none."""
     instruction: str = ""
     start_ns: int = 0
-    """The recording's clock at row 0 (ns)."""
+    """Time of row 0 on the recording's clock [ns]."""
     repeat_of: str | None = None
-    """Name of the measurement whose motion this one repeats, command for command."""
+    """Name of the measurement whose commands this one repeats; None if it is no repeat."""
     kp: dict[str, float] = field(default_factory=dict)
-    """Signal → gain that was commanded [N·m/rad, N/m], where somebody wrote it down."""
+    """Signal → commanded K_p [N·m/rad, N/m], if stated."""
     kd: dict[str, float] = field(default_factory=dict)
-    """Signal → [N·m·s/rad, N·s/m]."""
+    """Signal → commanded K_d [N·m·s/rad, N·s/m], if stated."""
     gain_scale: dict[str, float] = field(default_factory=dict)
-    """Signal → factor of both gains over the other recordings', where no more than that is known."""
+    """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
-    """Arm → known mass in its gripper."""
+    """Arm → known mass in its gripper [kg]."""
     lever_m: dict[str, float] = field(default_factory=dict)
-    """Axis → distance from it at which its payload is held, where it is not the one of the axis's file."""
+    """Axis → distance from it to its payload [m], if it differs from that in the axis file."""
     arm_kg: dict[str, float] = field(default_factory=dict)
-    """Axis → mass of the arm that holds the payload: a uniform rod from the axis to the lever's end."""
+    """Axis → mass of the arm that holds the payload [kg]: a uniform rod from the axis to the lever's end."""
     payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Arm → where the payload's centre of mass is, in link 6's frame (origin at the flange, z along the hand); the TCP,
-    (0, 0, 0.168) m, where it is not stated."""
+    """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
+    (0, 0, 0.168)."""
     pressed: PressedObject | None = None
-    """Known object between the fingers of one arm, where somebody wrote it down: what its pads are judged by."""
+    """Known object between the fingers of one arm, if stated; the arm's pads are compared with the twin's for it."""
     time_error_s: float = 0.0
-    """A row's position and target may be taken this much apart from its time (rows of a dataset show the last
-    sample)."""
+    """Largest time by which a row's position and target may differ from its time [s] (rows of a dataset show the last sample)."""
     timing: tuple[ChannelTiming, ...] = ()
-    """How each channel's own samples came; empty for tables."""
+    """Timing of each channel's samples; empty for tables."""
     findings: tuple[Finding, ...] = ()
-    """What reading it brought up."""
+    """Findings that were made while reading it."""
 
     def __post_init__(self) -> None:
         shape = (len(self.time_s), len(self.signals))
@@ -143,7 +143,7 @@ class Measurement:
 
     @property
     def extra_columns(self) -> list[str]:
-        """Of ``load``, ``torque_ff``, ``supply_v`` and ``enabled`` those that it has."""
+        """Those of ``load``, ``torque_ff``, ``supply_v`` and ``enabled`` that it has."""
         return [name for name in ("load", "torque_ff", "supply_v", "enabled") if getattr(self, name).size]
 
     @property
@@ -152,34 +152,34 @@ class Measurement:
 
     @property
     def period_s(self) -> float:
-        """Median time between rows."""
+        """Median time between rows [s]."""
         return float(np.median(np.diff(self.time_s))) if self.num_rows > 1 else float("nan")
 
     @property
     def rate_hz(self) -> float:
-        """Rows a second, rounded to a thousandth."""
+        """Row rate [Hz], rounded to a thousandth."""
         return round(1.0 / self.period_s, 3)
 
     def column(self, signal: str) -> int:
-        """Number of a signal.
+        """Index of a signal.
 
         Raises:
-            TaccorlError: there is none of that name.
+            TaccorlError: there is no signal of that name.
         """
         if signal not in self.signals:
             raise TaccorlError(f"{self.name} has no signal {signal!r}; {nearest(signal, self.signals)}")
         return self.signals.index(signal)
 
     def target_kind(self, signal: str) -> TargetKind:
-        """What the target of a signal commands."""
+        """Quantity that the target of a signal commands."""
         return self.target_kinds[self.column(signal)] if self.target_kinds else "position"
 
     def known_load(self, signal: str) -> np.ndarray:
-        """(T,) external torque on a signal; 0 where none is known."""
+        """(T,) known external torque on a signal; 0 if there is none."""
         return self.load[:, self.column(signal)] if self.load.size else np.zeros(self.num_rows)
 
     def twin_cannot_take(self, signal: str) -> str:
-        """What the recording has of a signal that the PiPER's twin cannot take, and what to do; empty if nothing."""
+        """Text: data of a signal that the PiPER's twin cannot use, and the remedy; empty if there are none."""
         j = self.column(signal)
         if self.known_load(signal).any():
             return "a known load; remove the column"
@@ -194,11 +194,11 @@ class Measurement:
         return stated and f"{stated}; remove it from measurements.yaml"
 
     def moved(self, signal: str) -> np.ndarray:
-        """(T,) positions by which it is judged whether a signal moves: commanded, or measured where targets are no positions."""
+        """(T,) positions by which motion of a signal is judged: commanded ones, or measured ones if targets are no positions."""
         return (self.target if self.target_kind(signal) == "position" else self.measured)[:, self.column(signal)]
 
     def only(self, signals: Sequence[str]) -> Self:
-        """With these signals alone."""
+        """The measurement with these signals only."""
         at = [self.column(signal) for signal in signals]
         names = ("target", "measured", "velocity", "effort", *self.extra_columns)
         return dataclasses.replace(
@@ -211,21 +211,22 @@ class Measurement:
         )
 
     def with_position_targets(self, positions: np.ndarray) -> Self:
-        """With ``positions`` (T, J) as targets of the signals whose targets are no positions."""
+        """The measurement with ``positions`` (T, J) as targets of those signals whose targets are no positions."""
         if not self.target_kinds:
             return self
         kept = np.array([kind == "position" for kind in self.target_kinds])
         return dataclasses.replace(self, target=np.where(kept, self.target, positions), target_kinds=())
 
     def has_effort(self) -> np.ndarray:
-        """(J,) bool: recorded, and not only zeros."""
+        """(J,) bool: the signal's effort was recorded, and is not always 0."""
         return np.isfinite(self.effort).any(axis=0) & (np.nan_to_num(self.effort) != 0).any(axis=0)
 
     def resampled(self, rate_hz: float) -> Self:
-        """The same at an even ``rate_hz``, in straight lines between rows: keeps the mean time of every command and position.
+        """The measurement resampled to an even ``rate_hz`` by linear interpolation, which keeps the mean time of every command
+        and position.
 
         Raises:
-            TaccorlError: less than two rows, or time that does not run forwards.
+            TaccorlError: there are less than two rows, or time does not increase.
         """
         if self.num_rows < 2 or (np.diff(self.time_s) <= 0).any():
             raise TaccorlError(f"{self.name}: its time does not run forwards; it cannot be brought to {rate_hz:g} Hz")
@@ -240,10 +241,11 @@ class Measurement:
         return dataclasses.replace(self, time_s=time_s, command_s=np.empty(0), **columns)
 
     def on_robot(self, rest: np.ndarray) -> "Measurement":
-        """All signals of the robot in the order of actions: those that it lacks stay at ``rest`` (J,) and were not measured.
+        """The measurement extended to all signals of the robot, in the order of actions: missing ones stay at ``rest`` (J,) and
+        count as not measured.
 
         Raises:
-            TaccorlError: a signal that the robot does not have, or has in another unit.
+            TaccorlError: the robot lacks a signal, or has it in another unit.
         """
         for name, unit in zip(self.signals, self.units, strict=True):
             if name not in ROBOT.action_names:
@@ -281,6 +283,6 @@ class Measurement:
 
 
 def other_arm(signal: str) -> str:
-    """``left_joint5`` → ``right_joint5``; a name without an arm stays."""
+    """Name of the other arm's signal: ``left_joint5`` → ``right_joint5``; a name without an arm is returned unchanged."""
     swap = {"left_": "right_", "right_": "left_"}
     return next((new + signal.removeprefix(old) for old, new in swap.items() if signal.startswith(old)), signal)

@@ -1,12 +1,12 @@
 """Library of motions to record for one joint: the paper's sweep and others that separate effects. 200 Hz, at rest at both ends.
 
     chirp            10 s as the paper's sweep (App. B.1), 0.1 to 2.5 Hz (a choice, the paper gives no frequencies)
-    wide triangle    there and back over a wide range in 14 s: friction, weight, what hangs on the angle
+    wide triangle    there and back over a wide range in 14 s: friction, weight, effects that depend on the angle
     steps            nine holds of a second: delays, slipping, integrators
     small chirp      0.02 rad up to 4 Hz: play, dead bands, stiction
-    chirp at 2× K_p and K_d; chirp with 0.3 kg in the hand: what gains and inertia hide
+    chirp at 2× K_p and K_d; chirp with 0.3 kg in the hand: effects that gains and inertia hide
 
-Validation (choices are made on it) and test (final figures) are other motions about other middles.
+Validation recordings (for choices) and test recordings (for final figures) hold other motions about other middle positions.
 
 Letters in shapes: T rows.
 """
@@ -23,26 +23,26 @@ from taccorl.robots import ROBOT
 
 RATE_HZ = 200
 SWEEP_S = 10.0
-"""Of the sweep with which joints are identified (paper App. B.1)."""
+"""Duration of the sweep with which joints are identified [s] (paper App. B.1)."""
 SWEEP_HZ = (0.1, 2.5)
-"""From, to. A choice: the paper gives no frequencies."""
+"""Frequencies of the sweep, from and to [Hz]. A choice: the paper gives none."""
 REST_S = 1.0
-"""Before and after each motion."""
+"""Rest before and after each motion [s]."""
 SPEED_RAD_PER_S = 3.0
-"""Of targets, at most; the arm's rating is 3.1 rad/s for the slowest joint (PiPER manual)."""
+"""Highest speed of targets [rad/s]; the arm's slowest joint is rated for 3.1 rad/s (PiPER manual)."""
 TORQUE_NM = (25.0, 25.0, 25.0, 10.0, 10.0, 10.0)
-"""Of each joint, weight and motion together: a choice, no rating is published."""
+"""Largest torque of each joint, weight and motion together [N·m]: a choice, no rating is published."""
 MARGIN_RAD = 0.05
-"""Kept from the joint's limits."""
+"""Distance that is kept from the joint's limits [rad]."""
 SWEEP_RAD = 0.35
-"""Amplitude of the chirp where speed and torque allow it."""
+"""Amplitude of the chirp, if speed and torque allow it [rad]."""
 SLOW_HZ, FAST_HZ = SWEEP_HZ
 KNOWN_KG = 0.3
-"""Weighed, and gripped for one recording."""
+"""Mass of the weighed payload that is gripped in one recording [kg]."""
 OPENING_M = 0.02
-"""The gripper's, all the time."""
+"""Opening of the gripper in all motions [m]."""
 REST_POSE = (0.0, 1.732, -0.883, 0.0, 0.2, 0.0)
-"""Joints of the arm that is not under test."""
+"""Joint angles of the arm that is not under test [rad]."""
 
 POSES = (
     (0.0, 1.34, -2.3, 0.0, -0.6, 0.3),
@@ -52,9 +52,10 @@ POSES = (
     (0.0, 1.2, -1.4, 0.1, 0.1, 0.4),
     (0.0, 0.8, -1.2, -0.4, 0.3, 0.0),
 )
-"""Where the arm stands while joint 1, 2, … is under test, in its middle: over the wide range nothing is touched."""
+"""Joint angles of the arm while joint 1, 2, … is under test, in the middle of its range [rad]: over the wide range nothing is
+touched."""
 WIDE_RAD = (1.1, 0.9, 0.9, 1.1, 0.95, 1.2)
-"""Half of the wide triangle's range."""
+"""Half of the range of the wide triangle [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +64,9 @@ class Motion:
 
     name: str
     target: Callable[["Room"], np.ndarray]
-    """(T,) rad."""
+    """Function that returns the targets (T,) [rad]."""
     gain: float = 1.0
-    """Times K_p and K_d."""
+    """Factor on K_p and K_d."""
     payload_kg: float = 0.0
     repeat_of: str | None = None
 
@@ -77,7 +78,7 @@ class Room:
     middle_rad: float
     wide_rad: float
     sweep_rad: float
-    """Amplitude of the chirp's slow part."""
+    """Amplitude of the slow part of the chirp [rad]."""
 
     @classmethod
     def of(cls, joint: int, middle_rad: float, inertia_kgm2: float, weight_nm: float) -> "Room":
@@ -90,7 +91,7 @@ class Room:
 
 
 def chirp(seconds: float, low_hz: float, high_hz: float, amplitude_rad: float) -> np.ndarray:
-    """Chirp (T,) [rad] from 0 to 0, with a smaller amplitude where it would be too fast."""
+    """Chirp (T,) [rad] that starts and ends at 0, with a smaller amplitude at frequencies at which it would be too fast."""
     time_s = _time(seconds)
     hz = low_hz + (high_hz - low_hz) * time_s / seconds
     angle = 2 * np.pi * (low_hz * time_s + (high_hz - low_hz) * time_s**2 / (2 * seconds))
@@ -99,13 +100,13 @@ def chirp(seconds: float, low_hz: float, high_hz: float, amplitude_rad: float) -
 
 
 def triangle(seconds: float, amplitude_rad: float, turns: int = 1) -> np.ndarray:
-    """Triangle (T,) [rad] from 0 up, down and back."""
+    """Triangle (T,) [rad]: from 0 up, down and back to 0."""
     time_s = _time(seconds)
     return amplitude_rad * np.interp(time_s * turns / seconds % 1.0, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0])
 
 
 def steps(levels_rad: np.ndarray, hold_s: float = 1.0) -> np.ndarray:
-    """Steps (T,) [rad] from one level to the next at the highest speed."""
+    """Steps (T,) [rad] between levels, with the highest speed."""
     most = SPEED_RAD_PER_S / RATE_HZ
     at, out = 0.0, []
     for level in levels_rad:
@@ -116,7 +117,7 @@ def steps(levels_rad: np.ndarray, hold_s: float = 1.0) -> np.ndarray:
 
 
 def multisine(seconds: float, amplitude_rad: float, seed: int) -> np.ndarray:
-    """Multisine (T,) [rad]: four sines with random phases, from 0 to 0."""
+    """Multisine (T,) [rad]: four sines with random phases, starting and ending at 0."""
     rng = np.random.default_rng(seed)
     time_s = _time(seconds)
     hz = np.array([0.15, 0.4, 0.9, 1.7])
@@ -164,7 +165,7 @@ PACK = (
     LOADED_CHIRP,
 )
 HELD_STEPS = Motion(name="held_steps", target=_steps((0.0, -0.6, 0.85, 0.9, -1.0, 0.6, 0.5, -0.3, 0.0), -0.2))
-"""Recorded twice, too: with dry friction a robot repeats its steps worse than its chirp."""
+"""Motion that is recorded twice as well: with dry friction a robot repeats its steps worse than its chirp."""
 VALIDATION = (
     Motion(
         name="held_chirp",
@@ -194,18 +195,18 @@ LIBRARY = (
         name="triangle_payload", target=lambda r: _rested(triangle(14.0, r.wide_rad), r.middle_rad), payload_kg=KNOWN_KG
     ),
 )
-"""What ``taccorl excite`` chooses from."""
+"""Motions from which ``taccorl excite`` chooses."""
 DESIGNS = {"chirp": (CHIRP, AGAIN), "pack": (CHIRP, AGAIN, *PACK)}
-"""What is recorded for fitting: the paper's sweep (twice, for the noise floor), or all."""
+"""Motions of the fit recordings by design: the paper's sweep (twice, for the noise floor), or all."""
 JUDGED_ON = {"chirp": (CHIRP,), "pack": (CHIRP, WIDE_TRIANGLE, STIFFER_CHIRP, LOADED_CHIRP)}
-"""On which of them the strength of what is hidden is measured."""
+"""Motion on which the strength of hidden effects is measured."""
 
 
 def joint_number(signal: str) -> int:
-    """``left_joint5`` → 5.
+    """Number of a joint: ``left_joint5`` → 5.
 
     Raises:
-        TaccorlError: no such joint.
+        TaccorlError: there is no such joint.
     """
     arm, _, joint = signal.partition("_")
     if arm not in ROBOT.arms or joint not in ROBOT.joints:

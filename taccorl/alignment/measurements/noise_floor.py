@@ -1,13 +1,13 @@
-"""How small the error of a perfect twin would be: the noise floor of every signal, from the recordings themselves.
+"""Noise floor of every signal, the error that a perfect twin would still have, estimated from the recordings.
 
-    repeats       RMS difference of two recordings of one motion / √2, after laying one over the other
-    rest          RMS about a straight line while nothing was commanded to move
-    residue       RMS about a Savitzky–Golay smooth that lets the motion through untouched, / √(1 − h₀)
+    repeats       RMS difference of two recordings of one motion / √2, after aligning them in time
+    rest          RMS about a straight line while no motion was commanded
+    residue       RMS about a Savitzky–Golay smooth that does not change the motion, / √(1 − h₀)
     quantisation  q / √12, q the encoder's step
 
-Repeats are used where there are any: only they see what the robot itself does not repeat. Where few blocks hold most of their
-difference (bursts), their median is taken, so that the floor does not contain the bursts. Without repeats the surer one of rest
-and residue (the other one if it lies clearly above), which is then a lower bound. The floor is never below the
+Repeats are used if there are any, because only they contain the robot's own variation. If few blocks hold most of their
+difference (bursts), their median is used, so that the floor does not contain the bursts. Without repeats the more certain one of
+rest and residue is used (the other one if it is clearly larger), which is a lower bound. The floor is never below the
 quantisation, and never 0. All estimates are reported.
 
 Letters in shapes: T rows, J signals, B blocks of rows, K taxels.
@@ -32,29 +32,30 @@ from taccorl.errors import TaccorlError
 Kind = Literal["position", "velocity", "effort"]
 Method = Literal["repeats", "rest", "residue", "quantisation", "number"]
 BLOCK_S = 0.25
-"""Estimates are made block by block; their scatter gives the interval."""
+"""Duration of a block [s]. Estimates are made per block, and their scatter gives the interval."""
 BLOCK_ROWS = 24
-"""Shortest block: at 30 rows a second 0.8 s."""
+"""Least number of rows in a block: 0.8 s at 30 rows per second."""
 SETTLE_S = 1.5
-"""After its last command a joint creeps on: time constants are about 0.1 s, exp(−15) of the way is left."""
+"""Time after the last command until a joint counts as at rest [s]: with time constants of about 0.1 s, exp(−15) of the motion
+remains."""
 REST_TARGET = 2e-5
-"""A command that stays within this (rad, m) rests: 0.001°, PiPER's resolution, may flicker."""
+"""Range within which a command counts as resting [rad, m]: 0.001°, PiPER's resolution."""
 WINDOW, ORDER = 9, 4
 """Of the smooth. It follows motion up to 0.61 of half the row rate (Schafer 2011, f_c = (ORDER + 1) / (3.2 M −
 4.6), M = 4)."""
 BANDWIDTH_FACTOR = 5.0
-"""The smooth must follow so many times the motion's highest frequency: at a fifth it misses 2 · 10⁻⁵ of the motion."""
+"""Least ratio of the smooth's bandwidth to the motion's highest frequency: with 5 the smooth misses 2 · 10⁻⁵ of the motion."""
 MOTION_POWER = 0.99
-"""Share of the motion's power below its highest frequency."""
+"""Share of the motion's power that defines its highest frequency."""
 OTHER_START = 5.0
-"""Two recordings of one motion that differ by so many times what they usually do began at different places."""
+"""Two recordings of one motion began at different positions if they differ by so many times their usual difference."""
 MOVING = 1e-3
-"""rad, m: a command that stays within this is no motion whose bandwidth could matter."""
+"""Range within which a command is no motion with a relevant bandwidth [rad, m]."""
 BURST_POWER, BURST_SHARE, BURST_RATIO = 0.8, 0.25, 3.0
-"""Repeats differ in bursts where less than such a share of the blocks holds so much of the squared difference, and the RMS of all
-is so many times that of the usual block."""
+"""Repeats differ in bursts if less than ``BURST_SHARE`` of the blocks hold ``BURST_POWER`` of the squared difference, and the
+RMS of all is ``BURST_RATIO`` times that of the typical block."""
 NUMBER = 2.0**-24
-"""Last bit of a 32-bit number of size 1: no floor is smaller than that of the numbers."""
+"""Last bit of a 32-bit number of size 1: no floor is smaller than this rounding."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +66,11 @@ class Estimate:
     value: float
     low: float
     high: float
-    """95 % interval."""
+    """Upper end of the 95 % interval; ``low`` is the lower end."""
     n: int
-    """Samples it rests on."""
+    """Number of samples in the estimate."""
     without_bursts: bool = False
-    """Of repeats: the median of the blocks, since few of them hold most of the difference."""
+    """True for repeats of which the median of the blocks was used, because few blocks hold most of the difference."""
 
 
 @dataclass(frozen=True)
@@ -81,17 +82,17 @@ class SignalFloor:
     unit: str
     used: Estimate
     estimates: tuple[Estimate, ...]
-    """All that could be made."""
+    """All estimates that could be made."""
     lower_bound: bool
-    """True without repeats: what the robot does not repeat is not in it."""
+    """True without repeats: the robot's own variation is then not included."""
 
     @property
     def value(self) -> float:
-        """Standard deviation; always above 0."""
+        """The floor, a standard deviation; always above 0."""
         return self.used.value
 
     def words(self) -> str:
-        """``0.204 mrad (0.198 … 0.211, from repeats, n = 4000)``"""
+        """Text such as ``0.204 mrad (0.198 … 0.211, from repeats, n = 4000)``."""
         factor, prefix = (1e3, "m") if self.kind != "effort" else (1.0, "")
         a, b, c = (f"{x * factor:.3g}" for x in (self.used.value, self.used.low, self.used.high))
         bound = "; a lower bound: record the motion twice" if self.lower_bound else ""
@@ -100,13 +101,13 @@ class SignalFloor:
 
 
 def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") -> dict[str, SignalFloor]:
-    """Signal → its floor. Signals that were never recorded (effort, velocity) have none.
+    """Estimate the noise floor of every signal. Signals that were never recorded (effort, velocity) have none.
 
     Args:
-        measurements: of one robot; each gives what it can. Those with ``repeat_of`` are laid over what they repeat.
+        measurements: measurements of one robot. Those with ``repeat_of`` are aligned with the recording that they repeat.
 
     Raises:
-        TaccorlError: none given, other signals, or a repeat that does not repeat.
+        TaccorlError: there is no measurement, signals differ, or a repeat has other commands.
     """
     measurements = list(measurements)
     if not measurements:
@@ -144,7 +145,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
 
 
 def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]:
-    """(first, repeat) for every further recording of a motion."""
+    """Pairs (first, repeat) for every further recording of a motion."""
     by_name = {m.name: m for m in measurements}
     firsts: dict[str, M] = {}
     pairs = []
@@ -157,8 +158,7 @@ def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]
 
 
 def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
-    """(K,) counts: noise of every taxel from the residue at the pads' own rate, at least 1 / √12; None without
-    touch."""
+    """(K,) noise of every taxel [counts] from the residue at the pads' own rate, at least 1 / √12; None without touch."""
     touched = [m.touch for m in measurements if m.touch is not None]
     frames = [(t.counts.astype(np.float32), 1.0 / float(np.median(np.diff(t.time_s[:, 0])))) for t in touched]
     values = residue_floor(frames) if frames else np.zeros(0)
@@ -166,9 +166,8 @@ def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
 
 
 def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
-    """(K,) noise of each column of (values (T, K), rate [Hz]) by the residue method; NaN where all are too short.
-
-    In the median over blocks: contact comes and goes in few of them. Blocks with NaN do not count.
+    """(K,) noise of each column of several (values (T, K), rate [Hz]) by the residue method; NaN if all are too short. The
+    median over blocks is used, because contact changes in few of them. Blocks with NaN are not used.
     """
     found = [b for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels) if len(b.mean_squares)]
     if not found:
@@ -240,7 +239,7 @@ def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:
 
 
 def rest_stretches(m: Measurement) -> list[tuple[int, int]]:
-    """[first, end) of every stretch in which all commands rest and the joints have had ``SETTLE_S`` to arrive."""
+    """[first, end) rows of every interval in which all commands rest, from ``SETTLE_S`` after the last motion on."""
     changed = np.flatnonzero(np.any(np.abs(np.diff(m.target, axis=0)) > REST_TARGET, axis=1)) + 1
     edges = [0, *changed.tolist(), m.num_rows]
     settle = round(SETTLE_S / m.period_s)
@@ -277,8 +276,7 @@ def _smooth_blocks(values: np.ndarray, rate_hz: float) -> _Blocks:
 
 
 def motion_hz(m: Measurement) -> np.ndarray:
-    """(J,) frequency below which ``MOTION_POWER`` of each joint's motion lies; 0 for those that are not commanded
-    to move."""
+    """(J,) frequency below which ``MOTION_POWER`` of each joint's motion lies [Hz]; 0 for joints without commanded motion."""
     found = np.zeros(len(m.signals))
     window = np.hanning(m.num_rows)
     frequency = np.fft.rfftfreq(m.num_rows, m.period_s)

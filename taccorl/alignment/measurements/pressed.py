@@ -19,10 +19,10 @@ class PressedObject:
     along y; finger a is on the side of +y."""
 
     solids: Sequence[Solid]
-    """In the object's own frame; those that do not touch are passed over."""
+    """Solids of the object in its own frame; ballast (``touches`` is false) is ignored."""
     arm: str
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """(4, 4) object's frame in the TCP's, or in the world [m]."""
+    """(4, 4) pose of the object in the TCP's frame, or in the world's [m]."""
     frame: Literal["tcp", "world"] = "tcp"
 
     def __post_init__(self) -> None:
@@ -47,14 +47,14 @@ def indenter(
     rpy_rad: Sequence[float] = (0.0, 0.0, 0.0),
     frame: Literal["tcp", "world"] = "tcp",
 ) -> PressedObject:
-    """A sphere, or a rod with flat ends along its own z, with its middle at ``position_m``.
+    """Make a sphere, or a rod with flat ends along its own z, centred at ``position_m`` [m].
 
     Args:
-        length_m: of a rod.
+        length_m: length of a rod.
         rpy_rad: fixed-axis roll, pitch, yaw; (0, π/2, 0) lays a rod across the pads.
 
     Raises:
-        TaccorlError: another shape, or a size that is not above 0.
+        TaccorlError: the shape is unknown, or a size is not above 0.
     """
     if shape not in ("sphere", "rod"):
         raise TaccorlError(f"indenter: no shape {shape!r}; {nearest(shape, ('sphere', 'rod'))}")

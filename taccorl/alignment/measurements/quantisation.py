@@ -1,18 +1,18 @@
-"""The step of an encoder, found in its readings: every reading is offset + n · q with whole n."""
+"""Find the step q of an encoder from its readings, which are offset + n · q with integers n."""
 
 import numpy as np
 
 SAME = 0.05
-"""A difference counts as a whole number of steps if it misses one by less than this share of a step. Readings stored as 32-bit
-numbers miss 0.001° by up to 1 %."""
+"""A difference counts as a whole number of steps if it deviates from one by less than this share of a step. Readings stored as
+32-bit numbers deviate by up to 1 % of 0.001°."""
 MANY = 8
-"""So many differences are whole multiples by chance once in 10⁸ (0.1⁸)."""
+"""Least number of differences that must be whole multiples; by chance it happens once in 10⁸ (0.1⁸)."""
 REPEATS = 10.0
-"""With fewer levels than that, each must have been read so often: noise without steps never reads the same twice."""
+"""If there are fewer levels than that, each must occur so often: noise without steps never gives the same reading twice."""
 
 
 def find_quantum(values: np.ndarray) -> float:
-    """Step q of (T,) readings in their unit; 0 where they show none (or only one level).
+    """Step q of (T,) readings in their unit; 0 if they show none (or have only one level).
 
     q is the smallest difference between two levels, refined over all of them: q = Σ d / Σ round(d / q).
     """

@@ -1,9 +1,9 @@
 """Measurements from recordings: MCAP, bags, HDF5.
 
-A recording is read at its own command rate, not at the dataset's 30 rows a second: one file, one measurement, whole, rests
-before and after the motion included. Its clock is an even grid laid through the command's stamps. Where a sample lies on the grid
-it is taken as it is; where it does not, the value is on the straight line between its neighbours, which keeps the mean time of
-commands and positions (the last sample instead would be half a period late). Nothing is drawn across longer gaps.
+A recording is read at its own command rate, not at the dataset's 30 rows per second. One file is one measurement, including the
+rests before and after the motion. Its clock is an even grid through the command's stamps. A sample on the grid is used
+unchanged; between samples the value is interpolated linearly, which keeps the mean time of commands and positions (holding the
+last sample would delay them by half a period). Longer gaps are not interpolated.
 """
 
 import dataclasses
@@ -28,19 +28,19 @@ from taccorl.errors import RecordingError
 
 TACTILE = "observation.tactile"
 RATE_TOLERANCE = 0.02
-"""A channel whose median rate is so near the spec's runs at the spec's rate; its clock merely drifts."""
+"""Largest relative difference of a channel's median rate from the spec's at which the spec's rate is used; the clock drifts."""
 LONGEST_LINE = 3.0
-"""Periods without a sample across which a straight line is drawn: a driver loses one or two samples now and then."""
+"""Longest gap [periods] across which values are interpolated: a driver occasionally loses one or two samples."""
 _EXTRA = {"effort": ("effort",), "velocity": ("qvel", "velocity")}
 """What lies beside a position: the message's field of that name, or (HDF5) a neighbouring array of one of these
 names."""
 
 
 def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
-    """Read one recording as a measurement. Episode markers are ignored; the instruction is the first one's.
+    """Read one recording as a measurement. Episode markers are ignored; the instruction is that of the first episode.
 
     Raises:
-        RecordingError: not readable, a topic of the spec is missing, or commands and states do not overlap.
+        RecordingError: the recording is not readable, a topic of the spec is missing, or commands and states do not overlap.
     """
     narrow, spans = _joint_channels(source, spec)
     with opened(source, narrow) as recording:
@@ -50,10 +50,10 @@ def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
 
 
 def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
-    """Our names of the elements of state and action: ``left_joint_5.pos`` is ``left_joint5``.
+    """taccorl's names for the elements of state and action: ``left_joint_5.pos`` is ``left_joint5``.
 
     Raises:
-        RecordingError: state and action differ, or hold something else than rad and m.
+        RecordingError: state and action differ, or hold units other than rad and m.
     """
     state, action = (spec.features.get(key) for key in (STATE, ACTION))
     if state is None or action is None or not state.names or state.names != action.names:

@@ -1,5 +1,4 @@
-"""Two recordings of one motion laid over each other by their commands: what differs then is noise, and what the robot does
-not repeat.
+"""Align two recordings of one motion by their commands. The remaining difference is noise and the robot's own variation.
 
 Letters in shapes: M common rows, J signals.
 """
@@ -12,41 +11,41 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import TaccorlError
 
 SAME_SHARE = 0.01
-"""Commands of one motion differ by less than this share of the motion once they lie over each other."""
+"""Largest difference of the commands, after alignment, as a share of the motion, for recordings of one motion."""
 SAME_QUANTA = 1e-4
-"""… or by less than this (rad, m): rounding on the way."""
+"""Difference of commands that is always accepted [rad, m]: rounding."""
 COMMON_SHARE = 0.5
-"""Of the shorter recording's motion: less in common measures nothing."""
+"""Least common part of the motion, as a share of the shorter recording's motion."""
 AFTER_S = 0.5
-"""The motion counts from its first command to so long after its last."""
+"""The motion lasts from its first command to so long after its last [s]."""
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """The second recording on the rows of the first."""
+    """The second recording aligned with the rows of the first."""
 
     shift_s: float
     """Time in the second recording − time in the first, at the same command."""
     difference: dict[str, np.ndarray]
-    """position, velocity, effort → (M, J) second − first while the motion lasts."""
+    """position, velocity, effort → (M, J) second − first, during the motion."""
     time_s: np.ndarray
     """(M,) time in the first recording."""
     target_rms: float
-    """What is left between the commands (rad, m)."""
+    """RMS difference of the aligned commands [rad, m]."""
     noise_gain: float
-    """Variance of ``difference`` for noise of variance 1 in both: 1 + Σ c², c the weights that shift by part of a
-    row."""
+    """Variance of ``difference`` for noise of variance 1 in both recordings: 1 + Σ c², with the weights c of the interpolation
+    between rows."""
 
 
 def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SHARE) -> Overlay:
-    """Lay ``second`` over ``first``: the shift is where their commands agree best, to a fraction of a row.
+    """Align ``second`` with ``first``: the time shift is that of the best agreement of their commands, to a fraction of a row.
 
     Args:
-        same_share: by which share of the motion commands may differ once they lie over each other; more for loads, which are
-            measured and not commanded.
+        same_share: largest difference of the aligned commands, as a share of the motion; larger for loads, which are measured
+            and not commanded.
 
     Raises:
-        TaccorlError: other signals, or other commands.
+        TaccorlError: the signals or the commands differ.
     """
     if first.signals != second.signals:
         raise TaccorlError(f"{second.name} and {first.name} hold different signals; one cannot repeat the other")
@@ -90,7 +89,7 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
 
 
 def repeats(first: Measurement, second: Measurement) -> bool:
-    """Whether both were given the same commands."""
+    """Whether both recordings have the same commands."""
     try:
         overlay(first, second)
     except TaccorlError:

@@ -1,8 +1,7 @@
-"""Measurements from CSV, parquet and MATLAB files: one row an instant, one column (of a .mat file: one variable) a quantity.
-
-Without a columns file the table speaks our own language: ``t`` [s], and for every signal ``left_joint5.q`` [rad, m],
-``left_joint5.q_target``, and where recorded ``left_joint5.qd`` [rad/s, m/s], ``left_joint5.tau`` [N·m, N] and
-``left_joint5.load`` [N·m, N], an external torque that is known to push the joint, positive forwards. An axis by itself may have
+"""Measurements from CSV, parquet and MATLAB files: each row is one instant, each column (in a .mat file: each variable) one
+quantity. Without a columns file the table must have taccorl's own names: ``t`` [s], and for every signal ``left_joint5.q`` [rad,
+m], ``left_joint5.q_target``, and, if recorded, ``left_joint5.qd`` [rad/s, m/s], ``left_joint5.tau`` [N·m, N] and
+``left_joint5.load`` [N·m, N], a known external torque on the joint, positive forwards. A single axis may also have
 ``servo.torque_ff`` [N·m, N], which its controller adds to the law, ``servo.supply`` [V] and ``servo.enabled``, 0 while its motor
 is off. Other names and units are written down in a columns file; no unit is ever guessed::
 
@@ -62,7 +61,7 @@ _CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFO
 _CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
 _CONVERSIONS |= {"torque_ff": EFFORT, "supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
 TARGETS = ("q_target", "qd_target", "tau_target")
-"""Exactly one of them commands a signal."""
+"""Columns of targets; a signal must have exactly one of them."""
 _KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
 
 
@@ -73,19 +72,19 @@ class Column:
     column: str
     unit: str
     factor: float = 1.0
-    """The column's numbers times this are in ``unit``: turns of a tick, N·m of a mA, −1 for a sign."""
+    """Factor from the column's numbers to ``unit``: turns per tick, N·m per mA, or −1 to reverse the sign."""
     if_missing: float | None = None
-    """The column's number throughout a file that lacks it; without it such a file is refused."""
+    """Value for files without the column; if not given, such a file is rejected."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SignalColumns:
-    """Where one signal stands."""
+    """Columns of one signal."""
 
     q: Column
     """Measured position."""
     q_target: Column | None = None
-    """Commanded position; or else one of:"""
+    """Commanded position; exactly one of the target columns is given."""
     qd_target: Column | None = None
     """Commanded velocity."""
     tau_target: Column | None = None
@@ -95,7 +94,7 @@ class SignalColumns:
     tau: Column | None = None
     """Effort of the motor."""
     load: Column | None = None
-    """Known external torque, positive where it drives the joint forwards."""
+    """Known external torque, positive if it drives the joint forwards."""
     torque_ff: Column | None = None
     """Torque that the controller adds to its law."""
     supply: Column | None = None
@@ -112,25 +111,25 @@ class TableSpec:
     signals: dict[str, SignalColumns]
     """Signal → its columns. The robot's signals are ``left_joint1`` … ``right_gripper``; others may have any name."""
     separator: str = "comma"
-    """Of CSV files: comma, semicolon or tab."""
+    """Separator of CSV files: comma, semicolon or tab."""
     target_rows_late: int = 0
-    """Rows by which the file shows a target too late: 1 where row k holds the target that was in force from row k − 1 on,
-    −1 where it holds the one of row k + 1."""
+    """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
+    −1 if it holds that of row k + 1."""
     origin: str = ""
-    """What made the file, e.g. "surrogate …"."""
+    """Origin of the file, such as "surrogate …"."""
     instruction: str = ""
 
 
 def is_table(m: Measurement) -> bool:
-    """Whether a measurement was read from a table, whose user has a columns file and no recording spec."""
+    """Whether a measurement was read from a table (with a columns file), not from a recording (with a recording spec)."""
     return m.source.suffix in SUFFIXES
 
 
 def load_table_spec(path: Path) -> TableSpec:
-    """A columns file, checked.
+    """Load and check a columns file.
 
     Raises:
-        SpecError: with file, line, key and the way out.
+        SpecError: it is invalid; the message names file, line, key and remedy.
     """
     document = Document(TableSpec, Path(path))
     spec = document.value
@@ -191,13 +190,13 @@ def robot_units() -> dict[str, str]:
 
 
 def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | None = None) -> TableSpec:
-    """The columns of a table that speaks our language.
+    """Columns of a table with taccorl's own names.
 
     Args:
         signal_units: signal of the machine → unit of its position, rad or m; the PiPER's if not given.
 
     Raises:
-        RecordingError: ``t`` or a position or a target is missing, or a column is unknown; names file and column.
+        RecordingError: ``t`` or a position or a target is missing, or a column is unknown; the message names file and column.
     """
     if "t" not in header:
         raise RecordingError(
@@ -259,14 +258,14 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
 
 
 def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[str, str] | None = None) -> Measurement:
-    """A CSV or parquet file as a measurement. Even rows stay as they are; others come to an even grid (``even_rows``).
+    """Read a CSV, parquet or MATLAB file as a measurement. Uneven rows are resampled to an even grid (``even_rows``).
 
     Args:
-        spec: names and units of its columns; our own names if not given.
+        spec: names and units of its columns; taccorl's own names if not given.
         signal_units: as ``own_spec``, for a table without a spec.
 
     Raises:
-        RecordingError: a column is missing, a cell is empty or no number; names file, line and column.
+        RecordingError: a column is missing, or a cell is empty or not a number; the message names file, line and column.
     """
     path = Path(path)
     header, columns = read_columns(
@@ -339,14 +338,15 @@ def _wanted(spec: TableSpec, header: list[str]) -> list[str]:
 def read_columns(
     path: Path, choose: Callable[[list[str]], list[str]], separator: str = "comma"
 ) -> tuple[list[str], dict[str, np.ndarray]]:
-    """Columns of a CSV or parquet file as numbers: the header, and name → (T,).
+    """Read columns of a CSV or parquet file as numbers. Returns the header, and name → (T,).
 
     Args:
-        choose: names of the columns to read, from the header; may raise.
+        choose: function that selects the columns to read from the header; it may raise.
         separator: a key of ``SEPARATORS``, for CSV.
 
     Raises:
-        RecordingError: a column is missing or there twice, a cell is empty or no number; names file, line and column.
+        RecordingError: a column is missing or occurs twice, or a cell is empty or not a number; the message names file, line and
+            column.
     """
     if path.suffix == ".mat":
         return _read_mat(path, choose)

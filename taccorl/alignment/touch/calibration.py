@@ -1,10 +1,10 @@
 """Tactile calibration, paper App. B.2: λ_noise from readings without contact, then (k_n, k_d) on matched contact replays.
 
-The fit is least squares on the counts of all taxels that the object comes near. The match is measured, on recordings that were
+The fit uses least squares on the counts of all taxels near the object. The match is measured, on recordings that were
 not used for the fit, by the quantities that the paper aligns: masks of active taxels, their number, centroids, histograms,
-temporal differences. Twin and measurement go through the same threshold.
+temporal differences. The same threshold is applied to twin and measurement.
 
-k_n and the sensor's gain (counts for a reading of 1) cannot be told apart by counts: the gain stays as configured.
+k_n and the sensor's gain (counts for a reading of 1) cannot be separated by counts, so that the gain is not fitted.
 
 Letters in shapes: T frames, P pads, R × C taxels.
 """
@@ -25,11 +25,11 @@ from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
 QUANTILE = 0.999
-"""Of the readings without contact, that many lie below λ_noise."""
+"""Share of the readings without contact that lie below λ_noise."""
 MIN_FRAMES = 50
-"""Without contact, for a noise level: half a second."""
+"""Least number of frames without contact for a noise level: half a second."""
 BLOCK_S = 0.5
-"""Residuals further apart than this count as independent in the intervals."""
+"""Time after which residuals count as independent in the intervals [s]."""
 _NEAR_M = 3e-4  # taxels that the object comes so near to take part in the fit
 _MIN_IN_CONTACT = 20  # frames
 _STIFFNESS_PER_M, _DAMPING_S_PER_M = (1.0, 1e6), (0.0, 1e4)
@@ -42,13 +42,13 @@ class NoiseLevel:
 
     pads: tuple[str, ...]
     mean_count: np.ndarray
-    """(P, R, C) counts above baseline."""
+    """(P, R, C) mean counts above baseline."""
     std_count: np.ndarray
-    """(P, R, C) of each taxel."""
+    """(P, R, C) standard deviation of each taxel's counts."""
     threshold_count: float
-    """λ_noise of all taxels together: the quantile 0.999 of their readings."""
+    """λ_noise common to all taxels [counts]: the 0.999 quantile of their readings."""
     num_frames: tuple[int, ...]
-    """Per pad."""
+    """Number of frames of each pad."""
 
     @property
     def pooled_std_count(self) -> float:
@@ -56,7 +56,7 @@ class NoiseLevel:
 
     @property
     def threshold_of_taxels_count(self) -> np.ndarray:
-        """(P, R, C) λ_noise of each by its own mean and standard deviation, as if normally distributed."""
+        """(P, R, C) λ_noise of each taxel from its own mean and standard deviation, for a normal distribution."""
         return self.mean_count + norm.ppf(QUANTILE) * self.std_count
 
 
@@ -75,19 +75,19 @@ class TouchMatch:
     """Agreement of measured and simulated touch over all frames of some recordings. Perfect is 0, for ``mask_iou`` 1."""
 
     rms_count: float
-    """Of counts, taxels that are ever active in either."""
+    """RMS difference of counts, over taxels that are ever active in either."""
     mask_iou: float
     """Masks of active taxels: intersection over union, all frames together."""
     active_count: float
-    """Mean difference of the number of active taxels of a pad, in frames with contact."""
+    """Mean difference of the number of active taxels of a pad, over frames with contact."""
     centroid_m: float
-    """Mean distance of the centroids of counts, in frames in which both have active taxels."""
+    """Mean distance of the centroids of counts [m], over frames in which both have active taxels."""
     histogram_count: float
-    """Wasserstein distance of the active taxels' counts."""
+    """Wasserstein distance between the distributions of the active taxels' counts [counts]."""
     temporal_count: float
-    """RMS difference of the change from frame to frame, taxels that are ever active in either."""
+    """RMS difference of the change between frames [counts], over taxels that are ever active in either."""
     num_frames: int
-    """Of single pads, in contact."""
+    """Number of frames of single pads in contact."""
 
 
 @dataclass(frozen=True)
@@ -96,18 +96,18 @@ class TouchCalibration:
 
     noise: NoiseLevel
     stiffness: Number
-    """k_n, reading per metre."""
+    """k_n [reading per metre]."""
     damping: Number
-    """k_d, reading per m/s."""
+    """k_d [reading per m/s]."""
     correlation: float
-    """Of the two estimates: near ±1 the recordings say only a combination; press at two speeds."""
+    """Correlation of the two estimates. Near ±1 the recordings determine only a combination; press at two speeds."""
     before: TouchMatch
-    """On the validation recordings, with the twin's own k_n and k_d."""
+    """Match on the validation recordings with the twin's own k_n and k_d."""
     after: TouchMatch
     fitted_to: tuple[str, ...]
     validation: tuple[str, ...]
     trouble: str
-    """Why it is not to be relied upon; empty if nothing speaks against it."""
+    """Reason why the result is not reliable; empty if there is none."""
 
     def mended(self, config: TwinConfig) -> TwinConfig:
         """``config`` with the fitted numbers."""
@@ -119,10 +119,10 @@ class TouchCalibration:
 
 
 def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
-    """λ_noise from the frames in which nothing is near a pad, nor was in the second before.
+    """Estimate λ_noise from the frames in which nothing is near a pad, nor was in the second before.
 
     Raises:
-        TaccorlError: less than half a second of such frames, or recordings of different pads.
+        TaccorlError: such frames last less than half a second, or the recordings are of different pads.
     """
     pads = _pads(motions)
     still = [
@@ -185,10 +185,10 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
 def calibrate_touch(
     fit: Sequence[TouchMotion], validation: Sequence[TouchMotion], config: TwinConfig
 ) -> TouchCalibration:
-    """λ_noise and (k_n, k_d) from matched contact replays; ``config``'s own effects act throughout.
+    """Fit λ_noise and (k_n, k_d) to matched contact replays; the effects of ``config`` are included.
 
     Raises:
-        TaccorlError: nothing for validation, too little contact or too little without any, or a sensor other than FlexiTac.
+        TaccorlError: there are no validation recordings, too few frames with or without contact, or the sensor is not FlexiTac.
     """
     if not fit or not validation:
         raise TaccorlError(

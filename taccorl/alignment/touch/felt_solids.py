@@ -1,4 +1,4 @@
-"""Solids of an object for the pads' depth queries, all in the object's frame instead of each in its own.
+"""Solids of an object for the pads' depth queries, all in the object's frame instead of one frame each.
 
 Letters in shapes: n pairs of pad and shape, G shapes.
 """

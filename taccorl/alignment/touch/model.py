@@ -1,8 +1,6 @@
-"""What the pads of the twin would have sent in a matched contact replay: depth → law → effects → counts.
-
-The same law (``normal_reading``) and the same ``reading`` hooks as in the simulation. What an effect does to a pad's place on
-its finger acts on the depth (``PadFrameEffect``); effects of the robot's and of the parts' mechanics do not show here, because
-nothing moves but what was measured.
+"""Readings of the twin's pads in a matched contact replay: depth → law → effects → counts. Law (``normal_reading``) and
+``reading`` hooks are those of the simulation. Effects that move a pad on its finger change the depth (``PadFrameEffect``);
+effects on the mechanics of robot and parts have no influence, because all motion is the measured one.
 
 Letters in shapes: T frames, P pads of the motion, B frames of a block, R × C taxels.
 """
@@ -30,10 +28,10 @@ class TouchModel:
     """The pads of a twin.
 
     Args:
-        config: its effects always act, those of ``simulate`` in addition.
+        config: configuration of the twin, whose effects always act; those of ``simulate`` act in addition.
 
     Raises:
-        TaccorlError: another sensor than FlexiTac.
+        TaccorlError: the sensor is not FlexiTac.
     """
 
     def __init__(self, config: TwinConfig) -> None:
@@ -51,13 +49,13 @@ class TouchModel:
         effects: Sequence[Effect] = (),
         start_s: float | None = None,
     ) -> np.ndarray:
-        """(T, P, R, C) float32 readings, one scan after the other from pads that nothing has touched.
+        """Simulate the readings (T, P, R, C) float32, scan by scan, from untouched pads.
 
         Args:
-            start_s: when the recording began, of a motion without its first frames; else it is at the first frame.
+            start_s: start of the recording, if the motion lacks its first frames; by default the first frame.
 
         Raises:
-            TaccorlError: two of the effects are the same one on the same pad, or one must have whole pads and the motion is cut.
+            TaccorlError: an effect is given twice for a pad, or an effect requires whole pads and the motion is cut.
         """
         acting = present([*self._own, *effects])
         depth, rate = motion.depth(_offsets(acting, motion.pads))
@@ -86,18 +84,18 @@ class TouchModel:
         return seen
 
     def windowed(self, effects: Sequence[Effect]) -> bool:
-        """Whether a ``TouchMotion.cut`` can be simulated with these effects beside the twin's own."""
+        """Whether a motion from ``TouchMotion.cut`` can be simulated with these effects in addition to the twin's own."""
         whole = (slice(None), slice(None))
         acting = [e for e in (*self._own, *effects) if _reads(e) and not e.is_absent]
         return all(isinstance(e, TouchEffect) and e.within(whole) is not None for e in acting)
 
     def remembers(self, effects: Sequence[Effect]) -> bool:
-        """Whether a frame's readings hang on the frames before it."""
+        """Whether a frame's readings depend on earlier frames."""
         shape = self.spec.rows, self.spec.columns
         return any(bool(e.memory(1, shape)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
 
     def counts(self, motion: TouchMotion, reading: np.ndarray) -> np.ndarray:
-        """(T, P, R, C) counts above baseline, without noise and rounding; the converter's ends are kept."""
+        """(T, P, R, C) counts above baseline, without noise and rounding, limited to the ends of the converter."""
         return np.clip(
             self.sensor.gain_count * reading, -motion.baseline, self.spec.max_count - motion.baseline, dtype=np.float32
         )
@@ -136,11 +134,11 @@ def _offsets(effects: Sequence[Effect], pads: Sequence[str]) -> tuple[tuple[floa
 
 
 def through(effect: Effect, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-    """Frames (B, P, R, C) of all pads as they come out of an effect; its memory goes on.
+    """Apply an effect to frames (B, P, R, C) of all pads, and advance its memory.
 
     Args:
-        memory: as after the frames before; {} for an effect without memory. Changed in place.
-        time_s, dt_s: (B,) since the first scan, and since the scan before.
+        memory: state after the frames before; {} for an effect without memory. Changed in place.
+        time_s, dt_s: (B,) time since the first scan, and since the scan before [s].
     """
     if not memory:
         return effect.reading(reading, memory, time_s, dt_s)

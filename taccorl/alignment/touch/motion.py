@@ -1,11 +1,12 @@
 """Depth of each taxel in a known object during a measurement, from geometry alone without dynamics (paper App. B.2).
 
-The fingers stand where their opening was measured, the object where it is known to be, so a taxel's depth δ and its rate δ̇
-follow, at the instants at which the board scanned it. Where the object is thicker than the opening, the difference is what the
-pads were pressed in by: a sprung pad of the twin yields by as much, so its taxels read the same depth (``taccorl.sim.pad``).
+The measured opening gives the poses of the fingers, and the pose of the object is known, so that a taxel's depth δ and its rate
+δ̇ follow at the instants at which the board scanned it. Where the object is thicker than the opening, the pads were pressed in
+by the difference: a sprung pad of the twin yields by the same amount, so that its taxels have the same depth
+(``taccorl.sim.pad``).
 
 An object is fixed to the hand (``tcp``: a jig on the gripper, or a part that stays in its grasp) or to the bench (``world``);
-then the arm's measured joints count as well, and 0.2 mrad of theirs are 0.1 mm here.
+then the arm's measured joints are used as well, and an error of 0.2 mrad makes 0.1 mm.
 
 Letters in shapes: T frames, P pads, R × C taxels, I instants of a scan, S rows of the measurement.
 """
@@ -32,7 +33,8 @@ from taccorl.sim.signed_distance import Shapes
 from taccorl.sim.twin import TwinConfig
 
 SMOOTH_S, SMOOTH_ORDER = 0.045, 3
-"""Savitzky–Golay window of openings and joints: 9 rows at 200 Hz. An opening's noise of 10 µm becomes 6 µm and 0.5 mm/s."""
+"""Savitzky–Golay window [s] and order for openings and joints: 9 rows at 200 Hz. It reduces an opening's noise of 10 µm to 6 µm
+and 0.5 mm/s."""
 _STEP_S = 5e-4  # of central differences of the pads' poses, along splines through the smoothed rows
 _KEPT = 4  # depths of a motion with its pads moved: what a fit asks for again and again
 _NEAR_M = 1e-3  # a pad that never comes so near to the object takes no part
@@ -44,28 +46,28 @@ class TouchMotion:
     ``touch_motion``."""
 
     measurement: Measurement = field(repr=False)
-    """That it was made from."""
+    """Measurement from which it was made."""
     pads: tuple[str, ...]
-    """Pads that the object came near, in the order of ``ROBOT.pads``."""
+    """Names of the pads that the object came near, in the order of ``ROBOT.pads``."""
     time_s: np.ndarray
-    """(T, P) stamps on the measurement's clock: ends of scans."""
+    """(T, P) time stamps on the measurement's clock: ends of scans [s]."""
     measured: np.ndarray
     """(T, P, R, C) int16 counts above baseline."""
     baseline: np.ndarray
-    """(P, R, C) counts at rest."""
+    """(P, R, C) resting counts."""
     object_from_pad: np.ndarray
-    """(T, P, I, 3, 4) at the instants at which the taxels of ``groups`` were read."""
+    """(T, P, I, 3, 4) pose of each pad in the object's frame at the instants at which the taxels of ``groups`` were read."""
     velocity: np.ndarray
-    """(T, P, I, 3, 4) its time derivative."""
+    """(T, P, I, 3, 4) time derivative of ``object_from_pad``."""
     groups: np.ndarray
-    """(I, G) flat numbers of the taxels that are read at one instant."""
+    """(I, G) flat indices of the taxels that are read at each instant."""
     shapes: tuple[Shapes, ...]
     clearance_m: np.ndarray
-    """(T, P, I) the object is at least so far out of the plane of the taxels; below 0 it may reach through."""
+    """(T, P, I) lower bound of the distance from the taxels' plane to the object [m]; below 0 they may overlap."""
     layout: PadLayout
-    """Taxels of a whole pad; ``window`` says which of them are simulated."""
+    """Arrangement of the taxels of a whole pad; ``window`` states which of them are simulated."""
     window: tuple[slice, slice] = (slice(None), slice(None))
-    """Rows and columns of the pads that R × C are: all but for a ``cut``."""
+    """Rows and columns of the pads that are simulated; all of them unless the motion is a ``cut``."""
 
     @property
     def name(self) -> str:
@@ -74,10 +76,10 @@ class TouchMotion:
     _known: dict[tuple, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
 
     def depth(self, offsets_m: tuple[tuple[float, float, float], ...] = ()) -> tuple[np.ndarray, np.ndarray]:
-        """δ [m] and δ̇ [m/s], each (T, P, R, C) float32 and 0 where nothing touches.
+        """Depth δ [m] and depth rate δ̇ [m/s], each (T, P, R, C) float32, 0 without contact.
 
         Args:
-            offsets_m: per pad, in its own frame, by how much its taxels lie elsewhere than on a nominal finger.
+            offsets_m: displacement of each pad's taxels from the nominal position, in the pad's own frame.
         """
         if not any(any(offset) for offset in offsets_m):
             offsets_m = ()
@@ -91,7 +93,7 @@ class TouchMotion:
         """Copy with some frames, rows and columns only, to make the repeated simulations of a fit cheaper.
 
         Args:
-            frames: (T,) bool.
+            frames: (T,) bool, frames to keep.
         """
         number = np.arange(self.layout.num_taxels).reshape(self.layout.shape)
         local = np.full(number.size, -1)
@@ -142,11 +144,11 @@ class TouchMotion:
         return depth_m, rate_mps
 
     def near(self, margin_m: float) -> np.ndarray:
-        """(T, P, R, C) bool: a taxel that lay ``margin_m`` further out would touch."""
+        """(T, P, R, C) bool: the taxel would touch if it were ``margin_m`` further out of the pad."""
         return self.depth(((0.0, 0.0, margin_m),) * len(self.pads))[0] > 0
 
     def undisturbed(self, margin_m: float = 3e-4, after_s: float = 1.0) -> np.ndarray:
-        """(T, P) bool: nothing is near the pad, and nothing touched it in the last ``after_s``."""
+        """(T, P) bool: nothing is near the pad, and nothing touched it during the last ``after_s`` [s]."""
         near = self.near(margin_m).any(axis=(2, 3))
         last = np.where(near, self.time_s, -np.inf)
         return self.time_s - np.maximum.accumulate(last, axis=0) > after_s
@@ -163,10 +165,10 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
     """Make the matched contact replay of a measurement, from its gripper openings and its pad frames.
 
     Args:
-        config: for the robot's mounts and the sensor's scan.
+        config: configuration of the twin, for the robot's mounts and the sensor's scan.
 
     Raises:
-        TaccorlError: no frames of the pads, no opening or joints measured, or the object never came near a pad.
+        TaccorlError: there are no frames of the pads, openings or joints were not measured, or the object never came near a pad.
     """
     if measurement.touch is None:
         raise TaccorlError(f"{measurement.name}: it holds no frames of the pads; record them, or leave this one out")
