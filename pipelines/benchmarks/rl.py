@@ -5,17 +5,16 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from statistics import median
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
 from pipelines.benchmarks.rows import Row, benchmark, spread
 from pipelines.benchmarks.sim import NUM_SIMS, REPEATS, holding
-from taccorl.rl.remote_shards import ProcessShard
-from taccorl.rl.twin_shard import Shard
+from taccorl.rl.shards import ProcessShard
+from taccorl.rl.twin_shard import make_shard
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
@@ -23,15 +22,14 @@ _ACTIONS = 16  # of a chunk
 
 
 def _process_shard(numbers: np.ndarray, num_threads: int) -> ProcessShard:
-    envs: dict[str, Any] = {
-        "task": "assembly_1",
-        "num_envs": len(numbers),
-        "twin": TwinConfig(),
-        "num_threads": num_threads,
-        "autoreset": AutoresetMode.DISABLED,
-    }
-    shard: dict[str, Any] = {"history": 10, "images": False, "privileged": True, "first": int(numbers[0])}
-    return ProcessShard(envs, shard, (0.0, 1))
+    envs = {"task": "assembly_1", "num_envs": len(numbers), "twin": TwinConfig(), "num_threads": num_threads}
+    return ProcessShard(partial(make_shard, envs, history=10, privileged=True, first=int(numbers[0])))
+
+
+def call(shard: ProcessShard, method: str, *args: Any) -> Any:
+    """Result of a method of a shard."""
+    shard.start(method, *args)
+    return shard.result()
 
 
 @benchmark("rollout_shards")
@@ -55,23 +53,25 @@ def rollout_shards() -> Iterator[Row]:
 
     def of_shards(num: int) -> tuple[Callable[[], float], Callable[[], None]]:
         parts = np.array_split(np.arange(NUM_SIMS), num)
-        shards: Sequence[Shard] = [_process_shard(part, cpus // num) for part in parts]
+        shards = [_process_shard(part, cpus // num) for part in parts]
         states = []
         for shard, part in zip(shards, parts, strict=True):
-            shard.restart(0)
+            call(shard, "restart", 0)
             snapshot = sim.snapshot(part)
             fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
-            states.append(shard.state_dict() | {"snapshot": fields})
-        pool = ThreadPoolExecutor(num)
+            states.append(call(shard, "state_dict") | {"snapshot": fields})
 
-        def work(shard: Shard, part: np.ndarray) -> None:
-            shard.act(chunks[part])
-            shard.observe()
+        def each(method: str, arguments: Sequence[tuple[Any, ...]]) -> None:
+            for shard, args in zip(shards, arguments, strict=True):
+                shard.start(method, *args)
+            for shard in shards:
+                shard.result()
 
         def measure() -> float:
-            list(pool.map(lambda shard, state: shard.load_state_dict(state), shards, states))
+            each("load_state_dict", [(state,) for state in states])
             before = time.perf_counter()
-            list(pool.map(work, shards, parts))
+            each("act", [(chunks[part],) for part in parts])
+            each("observe", [()] * num)
             return time.perf_counter() - before
 
         def close() -> None:

@@ -8,29 +8,14 @@ continues, of the last observation before the reset if time ran out, and 0 after
 Letters in shapes: T decisions of an environment, N environments.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 
-class Advantages(NamedTuple):
-    """Advantages and returns of a rollout, each (T, N)."""
-
-    advantage_TN: Tensor
-    return_TN: Tensor
-
-
 def estimate_advantages(
-    reward_TN: Tensor,
-    value_TN: Tensor,
-    next_value_TN: Tensor,
-    end_TN: Tensor,
-    *,
-    gamma: float,
-    gae_lambda: float,
-) -> Advantages:
-    """Compute advantages and returns of a rollout.
+    reward_TN: Tensor, value_TN: Tensor, next_value_TN: Tensor, end_TN: Tensor, *, gamma: float, gae_lambda: float
+) -> tuple[Tensor, Tensor]:
+    """Compute advantages and returns of a rollout, each (T, N).
 
     Args:
         next_value_TN: V'; 0 where the episode succeeded or failed.
@@ -40,7 +25,7 @@ def estimate_advantages(
     for t in reversed(range(len(reward_TN))):
         error_N = reward_TN[t] + gamma * next_value_TN[t] - value_TN[t]
         advantage_TN[t] = later_N = error_N + gamma * gae_lambda * torch.where(end_TN[t], 0.0, later_N)
-    return Advantages(advantage_TN, advantage_TN + value_TN)
+    return advantage_TN, advantage_TN + value_TN
 
 
 def normalise(advantage: Tensor) -> Tensor:

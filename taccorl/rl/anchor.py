@@ -5,7 +5,6 @@ do not count.
 """
 
 import logging
-from pathlib import Path
 from typing import Any, Protocol
 
 import torch
@@ -23,6 +22,7 @@ from taccorl.rl.settings import AnchorSettings
 from taccorl.training import reading
 from taccorl.training.cotrain import check_domains
 
+_FIXED_BATCHES = 4
 _log = logging.getLogger(__name__)
 
 
@@ -31,10 +31,6 @@ class Anchor(Protocol):
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
         """Add the gradient of β · ℓ for the rows of one optimiser step, and return the loss ℓ, without β."""
-        ...
-
-    def measure(self, generator: torch.Generator, num_rows: int) -> float:
-        """Loss ℓ of rows with fixed noise, which measures the drift from the real data."""
         ...
 
 
@@ -64,39 +60,45 @@ class RealAnchor:
         if missing := [key for key in policy.config.input_features or {} if key not in features]:
             raise TaccorlError(f"--anchor.dataset={root}: has no {', '.join(missing)}, inputs of the policy")
         if IS_SIM not in features and not settings.allow_simulated:
-            _refuse_simulated(root)
+            try:
+                check_domains([root], [])
+            except DatasetError as error:
+                way = "--anchor.allow_simulated=true takes it all the same"
+                raise TaccorlError(f"--anchor.dataset={root}: is not accepted as real data: {error}. {way}") from error
         reading.install()
         self._dataset: Any = factory.make_dataset(_Options(settings, policy.config))  # pyright: ignore[reportArgumentType]
-        meta = self._dataset.meta
-        policy.config.match_dataset(meta)
+        policy.config.match_dataset(self._dataset.meta)
         self.rows = torch.arange(len(self._dataset))
         if IS_SIM in features:
             is_sim = torch.as_tensor(self._dataset.hf_dataset.data.column(IS_SIM).to_numpy().astype("float32"))
             self.rows = torch.nonzero(is_sim.reshape(-1) < 0.5)[:, 0]
             if not len(self.rows):
                 raise TaccorlError(f"--anchor.dataset={root}: all of its rows are simulated ({IS_SIM})")
-        self._batch(self.rows[:1])  # frames that are missing are noticed now, not after hours of rollouts
-        _log.info("anchor: %d rows of %d episodes of %s", len(self.rows), meta.total_episodes, root)
+        fixed = self._draw(_FIXED_BATCHES * settings.batch_size, torch.Generator().manual_seed(0))
+        # Frames that are missing are noticed now, not after hours of rollouts.
+        self._fixed = [preprocessor(self._batch(part)) for part in fixed.split(settings.batch_size)]
+        _log.info("anchor: %d rows of %s", len(self.rows), root)
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
         rows = self._draw(self._settings.batch_size, generator)
         self._policy.train()
         loss = 0.0
         for part in rows.split(micro_batch):
-            share = self._loss(part) * (len(part) / len(rows))
+            share = self._policy.forward(self._preprocessor(self._batch(part)))[0] * (len(part) / len(rows))
             (self._settings.weight * share).backward()
             loss += float(share.detach())
         self._policy.eval()
         return loss
 
     @torch.no_grad()
-    def measure(self, generator: torch.Generator, num_rows: int) -> float:
-        rows = self._draw(num_rows, generator)
+    def drift(self) -> float:
+        """Flow loss ℓ, in evaluation mode, of 4 · B_real rows. Rows and noise are the same in each call and each run, so that the
+        values of a run show how far its policy moves away from the real data."""
         state = get_rng_state()
         torch.manual_seed(0)
-        parts = [float(self._loss(part)) * len(part) for part in rows.split(self._settings.batch_size)]
+        losses = [float(self._policy.forward(dict(batch))[0]) for batch in self._fixed]
         set_rng_state(state)
-        return sum(parts) / num_rows
+        return sum(losses) / len(losses)
 
     def _draw(self, num_rows: int, generator: torch.Generator) -> Tensor:
         return self.rows[torch.randint(len(self.rows), (num_rows,), generator=generator)]
@@ -108,19 +110,3 @@ class RealAnchor:
             if key in batch and batch[key].dtype == torch.uint8:
                 batch[key] = batch[key].to(torch.float32) / 255.0
         return batch
-
-    def _loss(self, rows: Tensor) -> Tensor:
-        return self._policy.forward(self._preprocessor(self._batch(rows)))[0]
-
-
-def _refuse_simulated(root: Path) -> None:
-    """
-    Raises:
-        TaccorlError: its episodes come from the twin.
-    """
-    try:
-        check_domains([root], [])
-    except DatasetError as error:
-        raise TaccorlError(
-            f"--anchor.dataset={root}: is not accepted as real data: {error}. --anchor.allow_simulated=true takes it all the same"
-        ) from error

@@ -18,7 +18,7 @@ from taccorl.errors import TaccorlError
 from taccorl.evaluation.policy_actor import Checkpoint
 
 LAST, BEST = "last", "best"
-_POLICY, _STATE = "pretrained_model", Path("training_state") / "state.pt"
+POLICY, _STATE = "pretrained_model", Path("training_state") / "state.pt"
 _TRAIN_CONFIG = "train_config.json"  # lerobot-train's; names the dataset that the policy was trained on
 
 
@@ -37,11 +37,11 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
     try:
         shutil.rmtree(unfinished, ignore_errors=True)
         (unfinished / _STATE).parent.mkdir(parents=True)
-        policy.save_pretrained(unfinished / _POLICY)
+        policy.save_pretrained(unfinished / POLICY)
         for processor in (opened.preprocessor, opened.postprocessor):
-            processor.save_pretrained(unfinished / _POLICY)
+            processor.save_pretrained(unfinished / POLICY)
         if (opened.path / _TRAIN_CONFIG).is_file():
-            shutil.copy(opened.path / _TRAIN_CONFIG, unfinished / _POLICY)
+            shutil.copy(opened.path / _TRAIN_CONFIG, unfinished / POLICY)
         torch.save(state, unfinished / _STATE)
     # torch and safetensors have errors of their own for a full disk
     except (OSError, RuntimeError, SafetensorError) as error:
@@ -75,7 +75,7 @@ def policy_folder(out: Path, name: str = LAST) -> Path:
         raise TaccorlError(
             f"--resume=true: {folder} holds no checkpoint of post-training; remove {out} and begin again"
         )
-    return folder / _POLICY
+    return folder / POLICY
 
 
 def load_state(policy_path: Path) -> dict[str, Any]:

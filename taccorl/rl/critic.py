@@ -5,8 +5,6 @@ The prefix is computed by the policy and detached: no gradient of the critic rea
 Letters in shapes: B decisions, F features, P privileged numbers.
 """
 
-from itertools import pairwise
-
 import torch
 from torch import Tensor, nn
 
@@ -24,11 +22,12 @@ class Critic(nn.Module):
 
     def __init__(self, num_features: int, num_privileged: int = 0, hidden: tuple[int, ...] = _HIDDEN) -> None:
         super().__init__()
-        widths = (num_features + num_privileged, *hidden)
         layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            layers += [nn.Linear(before, after), nn.ReLU()]
-        last = nn.Linear(widths[-1], 1)
+        width = num_features + num_privileged
+        for next_width in hidden:
+            layers += [nn.Linear(width, next_width), nn.ReLU()]
+            width = next_width
+        last = nn.Linear(width, 1)
         nn.init.normal_(last.weight, std=_LAST_STD)
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(*layers, last)

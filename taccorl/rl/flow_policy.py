@@ -9,7 +9,7 @@ Letters in shapes: B batch, T tokens of the prefix, H horizon, D padded action, 
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from lerobot.policies.pi05.modeling_pi05 import make_att_2d_masks, prepare_attention_masks_4d
@@ -44,6 +44,10 @@ class FlowPolicy(ABC):
     def trained_parameters(self) -> list[nn.Parameter]:
         """Parameters that the actor's optimiser changes."""
 
+    def draw(self, num_rows: int, sde: FlowSDE, generator: torch.Generator) -> Draws:
+        """Random numbers for ``sample``; ``generator`` is on the CPU."""
+        return sde.draw(num_rows, tuple(self.scored_HD.shape), generator, self.scored_HD.device)
+
     @torch.no_grad()
     def sample(self, batch: Batch, sde: FlowSDE, draws: Draws) -> tuple[Sampled, Tensor]:
         """Sample chunks with their log-probabilities, and return the (B, F) features."""
@@ -68,14 +72,6 @@ class FlowPolicy(ABC):
         return self.each(batch, compute)[0]
 
 
-class _Prefix(NamedTuple):
-    """Keys and values of the prefix, and its mean valid token."""
-
-    valid_BT: Tensor
-    cache: Any
-    mean_BF: Tensor
-
-
 class TactileFlowPolicy(FlowPolicy):
     """``TactilePI05Policy`` for PPO. It acts with the trained weights, not with their exponential mean, because PPO changes the
     former."""
@@ -83,24 +79,23 @@ class TactileFlowPolicy(FlowPolicy):
     def __init__(self, policy: TactilePI05Policy, settings: PolicySettings, num_steps: int) -> None:
         """
         Args:
-            policy: policy in evaluation mode; the weights with which it acts, possibly an exponential mean, become the trained
-                ones.
+            policy: is switched to evaluation mode; the weights with which it acts, possibly an exponential mean, become the
+                trained ones.
             num_steps: K_denoise, also stored in the checkpoints.
         """
         policy.eval()
-        policy.averaged, policy.config.average_decay = None, 0.0
-        # The pose head trained the cameras. The anchor is the loss of the flow alone.
-        policy.pose_head, policy.config.pose_loss = None, 0.0
-        policy.config.num_inference_steps = num_steps
+        config = policy.config
+        policy.averaged, config.average_decay = None, 0.0
+        policy.pose_head, config.pose_loss = (
+            None,
+            0.0,
+        )  # it trained the cameras; the anchor is the loss of the flow alone
+        config.num_inference_steps = num_steps
         self.policy, self.model = policy.float(), policy.model
         if settings.trained == "expert":
-            for parameter in self.model.paligemma_with_expert.paligemma.parameters():
-                parameter.requires_grad_(False)
-        config = policy.config
-        assert config.output_features is not None, "the policy has set them"
-        scored_HD = torch.zeros(config.chunk_size, config.max_action_dim, dtype=torch.bool, device=config.device)
-        scored_HD[: config.n_action_steps, : config.output_features["action"].shape[0]] = True
-        self.scored_HD = scored_HD
+            self.model.paligemma_with_expert.paligemma.requires_grad_(False)
+        self.scored_HD = torch.zeros(config.chunk_size, config.max_action_dim, dtype=torch.bool, device=config.device)
+        self.scored_HD[: config.n_action_steps, : (config.output_features or {})["action"].shape[0]] = True
 
     @property
     def num_features(self) -> int:
@@ -119,8 +114,8 @@ class TactileFlowPolicy(FlowPolicy):
         return self.policy._finished(chunk_BHD)[:, : self.policy.config.n_action_steps]
 
     def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
-        assert not self.policy.training, "sampling and scoring use the kernels of evaluation mode"
-        policy = self.policy
+        policy, config = self.policy, self.policy.config
+        assert not policy.training, "sampling and scoring use the kernels of evaluation mode"
         batch = {k: x.to(torch.float32) / 255 if x.dtype == torch.uint8 else x for k, x in batch.items()}
         images, image_masks = policy._preprocess_images(batch)
         images = policy._tokens(images)
@@ -129,14 +124,13 @@ class TactileFlowPolicy(FlowPolicy):
 
         def of_rows(rows: Any) -> Tensor:
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
-            prefix = self._prefix(*seen, *(x[rows] for x in prompt))
-            features_BF = prefix.mean_BF
-            if not policy.config.has_discrete_state:  # else the prompt has it
-                numbers = [OBS_STATE] + [PART_POSES] * policy.config.part_poses
+            valid_BT, cache, features_BF = self._prefix(*seen, *(x[rows] for x in prompt))
+            if not config.has_discrete_state:  # else the prompt has it
+                numbers = [OBS_STATE] + [PART_POSES] * config.part_poses
                 features_BF = torch.cat([features_BF, *(batch[key][rows].to(torch.float32) for key in numbers)], dim=1)
 
             def velocity(x_BHD: Tensor, t_B: Tensor) -> Tensor:
-                return self.model.denoise_step(prefix.valid_BT, prefix.cache, x_BHD, t_B)
+                return self.model.denoise_step(valid_BT, cache, x_BHD, t_B)
 
             results = compute(rows, velocity, features_BF)
             shapes[:] = [x.shape[1:] for x in results]
@@ -146,19 +140,20 @@ class TactileFlowPolicy(FlowPolicy):
         parts = packed.split([shape.numel() for shape in shapes], dim=1)
         return tuple(x.reshape(len(x), *shape) for x, shape in zip(parts, shapes, strict=True))
 
-    def _prefix(self, images: list[Tensor], masks: list[Tensor], tokens: Tensor, token_mask: Tensor) -> _Prefix:
-        """As LeRobot's ``sample_actions`` computes it."""
+    def _prefix(
+        self, images: list[Tensor], masks: list[Tensor], tokens: Tensor, token_mask: Tensor
+    ) -> tuple[Tensor, Any, Tensor]:
+        """Which tokens of the prefix are valid (B, T), its keys and values as LeRobot's ``sample_actions`` computes them, and its
+        mean valid token (B, F)."""
         backbone = self.model.paligemma_with_expert
         embedded_BTD, valid_BT, starts_block_BT = self.model.embed_prefix(images, masks, tokens, token_mask)
-        mask = prepare_attention_masks_4d(make_att_2d_masks(valid_BT, starts_block_BT))
         backbone.paligemma.model.language_model.config._attn_implementation = "eager"  # pyright: ignore
         (hidden_BTD, _), cache = backbone.forward(
-            attention_mask=mask,
+            attention_mask=prepare_attention_masks_4d(make_att_2d_masks(valid_BT, starts_block_BT)),
             position_ids=torch.cumsum(valid_BT, dim=1) - 1,
             past_key_values=None,
             inputs_embeds=[embedded_BTD, None],
             use_cache=True,
         )
         weight_BT = valid_BT.to(torch.float32) / valid_BT.sum(dim=1, keepdim=True)
-        mean_BF = (hidden_BTD.to(torch.float32) * weight_BT[:, :, None]).sum(dim=1)
-        return _Prefix(valid_BT, cache, mean_BF.detach())
+        return valid_BT, cache, (hidden_BTD.to(torch.float32) * weight_BT[:, :, None]).sum(dim=1).detach()

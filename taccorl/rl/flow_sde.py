@@ -9,15 +9,6 @@ LeRobot's flow runs from noise at t = 1 to the action at t = 0, in K Euler steps
 with t = 1 read as t_1 in the denominator, so s_0 = level for every K; K = 4, level 0.5: s = 0.500, 0.433, 0.250, 0.144. Both
 steps have the same marginals as K → ∞. A stochastic step is a Gaussian; its density is the policy's probability in PPO.
 
-The noise may be correlated along the chunk, with correlation matrix C_ij = ρ^|i − j| between actions i and j (an autoregressive
-process of order one). Then
-
-    stochastic   x ← x − d v − s_k² C ε̂ / (2 t) + s_k L z,      C = L Lᵀ, z = N(0, 1)
-
-has the same marginals, since the drift s² C · score / 2 balances diffusion with covariance s² C. A Gaussian with a correlated
-deviation explores offsets of a whole chunk, which contact depends on, where white noise averages out (Eberhard et al., "Pink
-noise is all you need", ICLR 2023, for noise from step to step).
-
 Noise is injected, and the density counted, in the scored numbers of a chunk only: executed steps, which are the first ones, and
 real dimensions. Everything else takes Euler steps. Without noise the result is that of the policy's own sampling, bit for bit.
 
@@ -64,10 +55,7 @@ class FlowSDE:
     """Flow-SDE sampler. One function, ``mean``, gives the transition for sampling and for scoring."""
 
     def __init__(self, settings: FlowSDESettings) -> None:
-        self.num_steps, self.level, self.correlation = settings.num_steps, settings.level, settings.correlation
-        last = self.num_steps - 1
-        self.choices = [last] if settings.stochastic_steps == "last" else list(range(self.num_steps))
-        """Indices of the steps that can be stochastic."""
+        self.num_steps, self.level = settings.num_steps, settings.level
         self.num_stochastic = settings.num_steps if settings.stochastic_steps == "all" else 1
         # Same operations, in the same order, as lerobot.policies.common.flow_matching.euler_integrate: results are bit-identical.
         self.dt = -1.0 / self.num_steps
@@ -79,14 +67,13 @@ class FlowSDE:
         rest = [1 - t if t < 1 else -self.dt for t in self.times]
         return [self.level * math.sqrt(-self.dt * t / r) for t, r in zip(self.times, rest, strict=True)]
 
-    def draw(self, num_rows: int, shape: tuple[int, int], generator: torch.Generator, device: Any = "cpu") -> Draws:
+    def draw(self, num_rows: int, shape: tuple[int, ...], generator: torch.Generator, device: Any = "cpu") -> Draws:
         """Draw the random numbers for ``num_rows`` samples of ``shape`` (H, D), on the CPU, so that they are the same for every
         device."""
         initial = torch.randn(num_rows, *shape, generator=generator)
         noise = torch.randn(num_rows, self.num_stochastic, *shape, generator=generator)
         if self.num_stochastic == 1:
-            chosen = torch.randint(len(self.choices), (num_rows, 1), generator=generator)
-            step = torch.tensor(self.choices)[chosen]
+            step = torch.randint(self.num_steps, (num_rows, 1), generator=generator)
         else:
             step = torch.arange(self.num_steps).expand(num_rows, -1)
         if self.level == 0:
@@ -103,32 +90,7 @@ class FlowSDE:
         std = torch.tensor(self.stds, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
         euler_BHD = x_BHD + self.dt * v_BHD
         noise_hat_BHD = x_BHD + (1 - t) * v_BHD
-        if self.correlation:
-            i = torch.arange(x_BHD.shape[1], dtype=x_BHD.dtype, device=x_BHD.device)
-            correlation_HH = self.correlation ** (i[:, None] - i).abs()
-            noise_hat_BHD = correlation_HH @ torch.where(noisy_BHD, noise_hat_BHD, 0.0)
         return torch.where(noisy_BHD, euler_BHD - std**2 / (2 * t) * noise_hat_BHD, euler_BHD), std
-
-    def coloured(self, z_BHD: Tensor) -> Tensor:
-        """Noise L z of standard deviation 1, correlated along the chunk, from independent normal numbers z."""
-        if not self.correlation:
-            return z_BHD
-        rho, rows = self.correlation, [z_BHD[:, 0]]
-        for i in range(1, z_BHD.shape[1]):
-            rows.append(rho * rows[-1] + math.sqrt(1 - rho**2) * z_BHD[:, i])
-        return torch.stack(rows, dim=1)
-
-    def _log_density(self, x_BHD: Tensor, mean_BHD: Tensor, std: Tensor, counted_BHD: Tensor) -> Tensor:
-        """(B,) sum of Gaussian log-densities of what is counted: the first rows of a chunk."""
-        std = std.clamp(min=torch.finfo(x_BHD.dtype).tiny)  # level 0: nothing is counted
-        z, log_std = (x_BHD - mean_BHD) / std, std.log()
-        if self.correlation:  # each row, given the one before
-            rho, rest = self.correlation, math.sqrt(1 - self.correlation**2)
-            z = torch.cat([z[:, :1], (z[:, 1:] - rho * z[:, :-1]) / rest], dim=1)
-            is_later_H1 = (torch.arange(z.shape[1], device=z.device) > 0)[:, None]
-            log_std = log_std + math.log(rest) * is_later_H1
-        densities = -0.5 * z * z - log_std - 0.5 * math.log(2 * math.pi)
-        return torch.where(counted_BHD, densities, 0.0).sum(dim=(1, 2))
 
     def sample(self, velocity: Velocity, draws: Draws, scored_HD: Tensor) -> Sampled:
         """Sample chunks: denoise ``draws.initial_BHD`` with the stochastic steps of ``draws``."""
@@ -137,14 +99,15 @@ class FlowSDE:
         log_prob_B = x.new_zeros(len(x))
         for k in range(self.num_steps):
             s = k if self.num_stochastic > 1 else 0
-            is_noisy_B = step_BS[:, s] == k
-            noisy_BHD = is_noisy_B[:, None, None] & scored_HD
-            k_B = torch.full((len(x),), k, device=x.device)
-            mean, std = self.mean(x, velocity(x, self._time(k_B, x)), k_B, noisy_BHD)
-            new = torch.where(noisy_BHD, mean + std * self.coloured(draws.noise_BSHD[:, s]), mean)
-            chosen = is_noisy_B[:, None, None]
-            before[:, s], after[:, s] = torch.where(chosen, x, before[:, s]), torch.where(chosen, new, after[:, s])
-            log_prob_B = log_prob_B + self._log_density(new, mean, std, noisy_BHD)
+            is_noisy_B11 = (step_BS[:, s] == k)[:, None, None]
+            noisy_BHD, k_B = is_noisy_B11 & scored_HD, torch.full((len(x),), k, device=x.device)
+            mean, std = self.mean(x, velocity(x, self._time(k_B)), k_B, noisy_BHD)
+            new = torch.where(noisy_BHD, mean + std * draws.noise_BSHD[:, s], mean)
+            before[:, s], after[:, s] = (
+                torch.where(is_noisy_B11, x, before[:, s]),
+                torch.where(is_noisy_B11, new, after[:, s]),
+            )
+            log_prob_B = log_prob_B + _log_density(new, mean, std, noisy_BHD)
             x = new
         return Sampled(x, before, after, log_prob_B)
 
@@ -156,9 +119,17 @@ class FlowSDE:
         for s in range(self.num_stochastic):
             x, k_B = before_BSHD[:, s], step_BS[:, s]
             noisy_BHD = (k_B >= 0)[:, None, None] & scored_HD
-            mean, std = self.mean(x, velocity(x, self._time(k_B, x)), k_B, noisy_BHD)
-            total_B = total_B + self._log_density(after_BSHD[:, s], mean, std, noisy_BHD)
+            mean, std = self.mean(x, velocity(x, self._time(k_B)), k_B, noisy_BHD)
+            total_B = total_B + _log_density(after_BSHD[:, s], mean, std, noisy_BHD)
         return total_B
 
-    def _time(self, k_B: Tensor, x: Tensor) -> Tensor:
-        return torch.tensor(self.times, dtype=torch.float32, device=x.device)[k_B]
+    def _time(self, k_B: Tensor) -> Tensor:
+        return torch.tensor(self.times, dtype=torch.float32, device=k_B.device)[k_B]
+
+
+def _log_density(x_BHD: Tensor, mean_BHD: Tensor, std: Tensor, counted_BHD: Tensor) -> Tensor:
+    """(B,) sum of Gaussian log-densities of what is counted."""
+    std = std.clamp(min=torch.finfo(x_BHD.dtype).tiny)  # level 0: nothing is counted
+    z = (x_BHD - mean_BHD) / std
+    densities = -0.5 * z * z - std.log() - 0.5 * math.log(2 * math.pi)
+    return torch.where(counted_BHD, densities, 0.0).sum(dim=(1, 2))

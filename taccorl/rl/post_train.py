@@ -6,22 +6,22 @@ KL divergence, undone steps, learning rate, gradient norms, explained variance, 
 
 import dataclasses
 import json
-import logging
 import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from torch import Tensor
 
 from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
+from taccorl.evaluation.episodes import SUCCESS
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
@@ -34,21 +34,18 @@ from taccorl.rl.exploration import measure_noise
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, RATIO_GUARD
-from taccorl.rl.remote_shards import ProcessShard, RayShard, start_ray
-from taccorl.rl.rollout import SUCCESS, Clock, Rollout, collect, first_episodes, stagger
+from taccorl.rl.rollout import Clock, Rollout, collect, first_episodes
 from taccorl.rl.settings import PostTrainSettings
-from taccorl.rl.start_states import StartStates
-from taccorl.rl.twin_shard import Shard, TwinShard
+from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard, start_ray
+from taccorl.rl.start_states import NUM_STATES
+from taccorl.rl.twin_shard import make_shard
 from taccorl.rl.twin_world import TwinWorld, needs_images
 from taccorl.rl.watched_episode import executed_again
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
-from taccorl.sim.vector_env import TaccorlVectorEnv
 
 PROGRESS, ROLLOUTS = "progress.jsonl", "rollouts"
 _CHECK_SEED = 1_000_000_007  # added to the run's: scenes of the noise check are not those of training
-_DRIFT_BATCHES = 4  # of the anchor's rows, for the drift in progress.jsonl
-_log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
 SaveEpisode = Callable[[Episode, Path], None]
@@ -89,32 +86,21 @@ class PostTraining:
         _check_folder(settings)
         twin = load_twin(settings.env.twin) if settings.env.twin else TwinConfig()
         self._opened = _open(settings, twin)
-        policy = self._load(self._opened)
+        policy: Any = self._opened.load(settings.seed).policy
+        torch.backends.cudnn.benchmark = False  # numbers of rows vary with the episodes that end; each would be tuned
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = settings.policy.tf32
         device = torch.device(str(policy.config.device))
         self._actor = TactileFlowPolicy(policy, settings.policy, settings.noise.num_steps)
         self._sde, self._clock = FlowSDE(settings.noise), Clock(device)
         self._generator = torch.Generator().manual_seed(settings.seed)
-        self.world = TwinWorld(
-            _shards(settings, twin, policy.config),
-            policy.config,
-            self._opened.preprocessor,
-            self._opened.postprocessor,
-            clock=self._clock,
-        )
+        processors = self._opened.preprocessor, self._opened.postprocessor
+        self.world = TwinWorld(_shards(settings, twin, policy.config), policy.config, *processors, clock=self._clock)
         self.world.restart(settings.seed)
-        seen = self.world.observe()
-        critic = Critic(self._actor.num_features, seen.privileged_NP.shape[1]).to(device)
-        self._anchor = (
-            RealAnchor(settings.anchor, policy, self._opened.preprocessor) if settings.anchor.dataset else None
-        )
-        self._ppo = PPO(
-            self._actor,
-            critic,
-            self._sde,
-            settings.ppo,
-            self._anchor if settings.anchor.weight > 0 else None,
-            ratio_guard=math.inf if settings.policy.tf32 else RATIO_GUARD,
-        )
+        critic = Critic(self._actor.num_features, self.world.observe().privileged_NP.shape[1]).to(device)
+        self._anchor = RealAnchor(settings.anchor, policy, processors[0]) if settings.anchor.dataset else None
+        trained_anchor = self._anchor if settings.anchor.weight > 0 else None
+        guard = math.inf if settings.policy.tf32 else RATIO_GUARD
+        self._ppo = PPO(self._actor, critic, self._sde, settings.ppo, trained_anchor, ratio_guard=guard)
         self._iteration, self._best = 0, 0.0
         self._recent: list[tuple[float, int]] = []
         """Success rate and number of episodes of recent iterations in which episodes ended."""
@@ -124,14 +110,6 @@ class PostTraining:
         else:
             self._begin(twin)
 
-    def _load(self, opened: Checkpoint) -> TactilePI05Policy:
-        policy: Any = opened.load(self.settings.seed).policy
-        torch.backends.cudnn.benchmark = (
-            False  # numbers of rows vary with the episodes that end, and each would be tuned
-        )
-        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = self.settings.policy.tf32
-        return policy
-
     def _begin(self, twin: TwinConfig) -> None:
         out = self.settings.out
         out.mkdir(parents=True, exist_ok=True)
@@ -139,22 +117,16 @@ class PostTraining:
         (out / PROGRESS).write_text("")
         num = sum(p.numel() for p in self._actor.trained_parameters())
         self._report(f"post-training {self.settings.policy.path}: {num / 1e6:.2f} million weights are trained")
+        if self._anchor is not None:
+            self._report(f"flow loss on fixed rows of {self.settings.anchor.dataset}: {self._anchor.drift():.4f}")
         if self._sde.level > 0:
             self._report_noise(twin)
             if self.settings.noise_check:
                 self._check_noise()
-        if self.settings.env.stagger:
-            stagger(self.world, self._actor, self._sde, self._generator, self._decisions_of_an_episode())
-            self._clock.restart()
-
-    def _decisions_of_an_episode(self) -> int:
-        """At the time limit."""
-        return math.ceil(self.world.limit_steps / self._actor.policy.config.n_action_steps)
 
     def _report_noise(self, twin: TwinConfig) -> None:
         batch, generator = self.world.observe().batch, torch.Generator().manual_seed(self.settings.seed)
-        found = measure_noise(self._actor, self._sde, batch, self._opened.postprocessor, twin.robot, generator)
-        for one in found:
+        for one in measure_noise(self._actor, self._sde, batch, self._opened.postprocessor, twin.robot, generator):
             self._report(
                 f"noise of level {self._sde.level:g} in {'all steps' if one.step < 0 else f'step {one.step}'}: "
                 f"joints {1e3 * one.joints_rad:.2f} mrad, hand {one.hand_mm:.2f} mm and {one.offset_mm:.2f} mm in the mean of a "
@@ -164,10 +136,11 @@ class PostTraining:
     def _check_noise(self) -> None:
         """Warn if noise costs the policy more than half of its successes."""
         settings, rates = self.settings, []
+        decisions = math.ceil(self.world.limit_steps / self._actor.policy.config.n_action_steps)
         for sde in (FlowSDE(dataclasses.replace(settings.noise, level=0.0)), self._sde):
             self.world.restart(settings.seed + _CHECK_SEED)
             generator = torch.Generator().manual_seed(settings.seed)
-            found = first_episodes(self.world, self._actor, sde, generator, self._decisions_of_an_episode())
+            found = first_episodes(self.world, self._actor, sde, generator, decisions)
             rates.append(found.count(SUCCESS) / len(found))
         self.world.restart(settings.seed)
         self._clock.restart()
@@ -181,44 +154,39 @@ class PostTraining:
             )
 
     def _resume(self, state: dict[str, Any]) -> None:
+        settings = self.settings
         self._ppo.load_state_dict(state["ppo"])
         self.world.load_state_dict(state["world"])
         self._generator.set_state(state["generator"])
         self._iteration, self._best, self._recent = state["iteration"], state["best"], list(state["recent"])
-        if self._iteration > self.settings.iterations:
+        if self._iteration > settings.iterations:
             raise TaccorlError(
-                f"--iterations={self.settings.iterations}: the run in {self.settings.out} has done {self._iteration} already"
+                f"--iterations={settings.iterations}: the run in {settings.out} has done {self._iteration} already"
             )
-        progress = self.settings.out / PROGRESS
+        progress = settings.out / PROGRESS
         lines = progress.read_text(encoding="utf-8").splitlines() if progress.is_file() else []
         progress.write_text("".join(f"{line}\n" for line in lines[: self._iteration]), encoding="utf-8")
-        run_settings.write(self.settings)  # with other iterations, perhaps
-        self._report(f"resumed at iteration {self._iteration} of {self.settings.iterations}")
+        run_settings.write(settings)  # with other iterations, perhaps
+        self._report(f"resumed at iteration {self._iteration} of {settings.iterations}")
         set_rng_state(state["random"])
 
     def run(self) -> None:
         """Run the remaining iterations."""
-        settings = self.settings
+        settings, ppo = self.settings, self._ppo
+        longest = max(settings.save_freq, settings.collapse_iterations)
         while self._iteration < settings.iterations:
+            decisions = settings.env.decisions
             rollout = collect(
-                self.world,
-                self._actor,
-                self._ppo.critic,
-                self._sde,
-                settings.env.decisions,
-                settings.ppo,
-                self._generator,
-                self._clock,
+                self.world, self._actor, ppo.critic, self._sde, decisions, ppo.settings, self._generator, self._clock,
                 self._note_value,
-            )
+            )  # fmt: skip
             with self._clock.part("update"):
-                facts = self._ppo.update(rollout.decisions, self._generator)
+                facts = ppo.update(rollout.decisions, self._generator)
+            if self._anchor is not None:
+                with self._clock.part("drift"):
+                    facts["drift"] = self._anchor.drift()
             self._iteration += 1
             row = self._row(rollout, facts)
-            is_due = self._iteration % settings.save_freq == 0 or self._iteration == settings.iterations
-            if is_due and self._anchor is not None:
-                rows = _DRIFT_BATCHES * settings.anchor.batch_size
-                row["drift"] = self._anchor.measure(torch.Generator().manual_seed(settings.seed), rows)
             with (settings.out / PROGRESS).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             self._report(_line(row))
@@ -228,11 +196,10 @@ class PostTraining:
                     f"{settings.ppo.kl_stop:g} and was undone: it does not learn. Lower it, or begin with --ppo.adapt_lr=true"
                 )
             if row["episodes"]:
-                longest = max(settings.save_freq, settings.collapse_iterations)
                 self._recent = [*self._recent, (row["success"], row["episodes"])][-longest:]
             self._guard_collapse()
             self._write_rerun()
-            if is_due:
+            if self._iteration % settings.save_freq == 0 or self._iteration == settings.iterations:
                 self._save()
 
     def _note_value(self, value_N: Tensor) -> None:
@@ -242,18 +209,13 @@ class PostTraining:
         """The first episode of environment 0 that ended after a checkpoint, or after the start."""
         if (watched := self.world.watch.take()) is None or not self._wants_rerun or self._save_episode is None:
             return
-        settings, env = self.settings, self.settings.env
-        rrd = settings.out / ROLLOUTS / f"iteration_{self._iteration:04d}.rrd"
+        out, env = self.settings.out, self.settings.env
+        rrd = out / ROLLOUTS / f"iteration_{self._iteration:04d}.rrd"
         scenes = Scenes(
-            tasks=(str(env.task),),
-            episodes=1,
-            seed=watched.seed,
-            difficulty=env.difficulty,
-            twin=env.twin,
-            randomization=env.randomization,
-            episode_length=env.episode_length,
-        )
-        name = f"{settings.out.name}, iteration {self._iteration}, with noise"
+            tasks=(str(env.task),), episodes=1, seed=watched.seed, difficulty=env.difficulty, twin=env.twin,
+            randomization=env.randomization, episode_length=env.episode_length,
+        )  # fmt: skip
+        name = f"{out.name}, iteration {self._iteration}, with noise"
         try:
             with self._clock.part("rerun"):
                 rrd.parent.mkdir(exist_ok=True)
@@ -279,8 +241,7 @@ class PostTraining:
         self._wants_rerun = True
         recent = self._recent[-self.settings.save_freq :]
         score = sum(success * num for success, num in recent) / max(1, sum(num for _, num in recent))
-        is_best = score > self._best
-        self._best = max(score, self._best)
+        is_best, self._best = score > self._best, max(score, self._best)
         state = {
             "ppo": self._ppo.state_dict(),
             "world": self.world.state_dict(),
@@ -302,15 +263,14 @@ class PostTraining:
         last = self._recent[-count:]
         if not count or len(last) < count or self._best == 0 or max(success for success, _ in last) >= 0.5 * self._best:
             return
-        folder = checkpoint.policy_folder(self.settings.out, checkpoint.BEST)
+        folder = self.settings.out / "checkpoints" / checkpoint.BEST / checkpoint.POLICY
         if not folder.is_dir():  # killed after the checkpoint was written and before it was linked
             return
         best = TactilePI05Policy.from_pretrained(folder, config=self._actor.policy.config)
         self._actor.policy.load_state_dict(best.state_dict())
         lr = 0.5 * self._ppo.actor_lr
         self._ppo.load_state_dict({**checkpoint.load_state(folder)["ppo"], "num_updates": self._ppo.num_updates})
-        self._ppo.actor_lr = lr
-        self._recent = []
+        self._ppo.actor_lr, self._recent = lr, []
         self._report(
             f"warning: success was below half of the best ({self._best:.1%}) for {count} iterations: back to "
             f"{folder.parent.resolve().name}, actor's learning rate now {lr:.2g}"
@@ -336,43 +296,41 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
 
 def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[Shard]:
     """As equal in size as can be."""
-    env, images = settings.env, needs_images(config)
+    env = settings.env
     if env.task is None:
         raise TaccorlError("missing --env.task=…, such as assembly_2")
     ray = start_ray() if env.ray else None
-    starts = env.start_share, max(1, env.start_states // env.shards)
     num_threads = env.threads or max(1, len(os.sched_getaffinity(0)) // env.shards)
 
-    def make(numbers: np.ndarray) -> Shard:
-        arguments: dict[str, Any] = {
+    def shard(numbers: np.ndarray) -> Shard:
+        envs: dict[str, Any] = {
             "task": env.task,
             "num_envs": len(numbers),
             "difficulty": env.difficulty,
             "twin": twin,
-            "images": "on_request" if images else "never",
             "randomization": env.randomization,
             "num_threads": min(len(numbers), num_threads),
-            "autoreset": AutoresetMode.DISABLED,
             "max_episode_steps": env.episode_length,
             "part_poses": config.part_poses,
         }
-        shard: dict[str, Any] = {
+        options: dict[str, Any] = {
             "history": config.tactile_history,
-            "images": images,
+            "images": needs_images(config),
             "privileged": settings.ppo.privileged_critic,
             "first": int(numbers[0]),
+            "start_share": env.start_share,
+            "start_states": max(1, NUM_STATES // env.shards),
         }
+        make = partial(make_shard, envs, **options)
         if ray is not None:
-            return RayShard(ray, arguments, shard, starts)
-        if env.shards > 1:
-            return ProcessShard(arguments, shard, starts)
-        return TwinShard(TaccorlVectorEnv(**arguments), **shard, starts=StartStates(*starts))
+            return RayShard(ray, make, envs["num_threads"])
+        return ProcessShard(make) if env.shards > 1 else LocalShard(make)
 
     parts = np.array_split(np.arange(env.num_envs), env.shards)
     if ray is None and env.shards == 1:
-        return [make(parts[0])]
+        return [shard(parts[0])]  # in this thread, that of its OpenGL context
     with ThreadPoolExecutor(env.shards) as pool:  # each compiles the twin for itself
-        return list(pool.map(make, parts))
+        return list(pool.map(shard, parts))
 
 
 def _check_folder(settings: PostTrainSettings) -> None:
@@ -380,33 +338,30 @@ def _check_folder(settings: PostTrainSettings) -> None:
     Raises:
         TaccorlError: ``out`` is in use, or what is to be resumed had other settings, or an anchor has no dataset.
     """
-    out = settings.out
-    if not settings.resume:
-        if settings.anchor.weight > 0 and settings.anchor.dataset is None:
-            raise TaccorlError(
-                "missing --anchor.dataset=…, a dataset of real demonstrations; without one: --anchor.weight=0"
-            )
-        if not is_free(out):
-            raise TaccorlError(
-                f"--out={out}: holds files already; nothing was touched: give another folder, or --resume=true to go on there"
-            )
-        return
-    run_settings.refuse_changes(settings)
+    if settings.resume:
+        run_settings.refuse_changes(settings)
+    elif settings.anchor.weight > 0 and settings.anchor.dataset is None:
+        raise TaccorlError(
+            "missing --anchor.dataset=…, a dataset of real demonstrations; without one: --anchor.weight=0"
+        )
+    elif not is_free(settings.out):
+        raise TaccorlError(
+            f"--out={settings.out}: holds files already, nothing was touched: give another folder, or --resume=true to go on"
+        )
 
 
 def _line(row: dict[str, Any]) -> str:
-    seconds = ", ".join(f"{name} {s:.1f}" for name, s in row["seconds"].items())
-    anchor = f", anchor {row['anchor_loss']:.4f}" if "anchor_loss" in row else ""
-    actor = f", KL {row['last_kl']:.4f}, clipped {row['clip_fraction']:.1%}" if "kl" in row else ""
-    actor += (
-        f", {row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}" if row["undone_steps"] else ""
-    )
-    success = "no episode from a reset ended" if row["success"] is None else f"success {row['success']:.1%}"
+    parts = ["no episode from a reset ended"]
     if row["episodes"]:
-        success += f" of {row['episodes']} episodes"
+        parts = [f"success {row['success']:.1%} of {row['episodes']} episodes"]
     if "later_episodes" in row:
-        success += f" ({row['later_success']:.1%} of {row['later_episodes']:.0f} begun in earlier states)"
-    return (
-        f"iteration {row['iteration']}: {success}, explained variance "
-        f"{row['explained_variance']:.2f}{actor}{anchor}; seconds: {seconds}"
-    )
+        parts[0] += f" ({row['later_success']:.1%} of {row['later_episodes']:.0f} begun in earlier states)"
+    parts.append(f"explained variance {row['explained_variance']:.2f}")
+    if "kl" in row:
+        parts += [f"KL {row['last_kl']:.4f}", f"clipped {row['clip_fraction']:.1%}"]
+    if row["undone_steps"]:
+        parts.append(f"{row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}")
+    names = {"anchor_loss": "anchor", "drift": "flow loss on fixed real rows"}
+    parts += [f"{text} {row[name]:.4f}" for name, text in names.items() if name in row]
+    seconds = ", ".join(f"{name} {s:.1f}" for name, s in row["seconds"].items())
+    return f"iteration {row['iteration']}: {', '.join(parts)}; seconds: {seconds}"

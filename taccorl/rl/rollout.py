@@ -1,4 +1,4 @@
-"""Rollouts of a flow policy with Flow-SDE noise: N environments in one process, T decisions of each.
+"""Rollouts of a flow policy with Flow-SDE noise: N environments at once, T decisions of each.
 
 A decision is one chunk of actions. Episodes that end are reset at the end of the chunk; running episodes continue in the next
 iteration.
@@ -16,14 +16,13 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from taccorl.evaluation.episodes import SUCCESS
 from taccorl.rl.advantages import estimate_advantages, explained_variance
 from taccorl.rl.critic import Critic
 from taccorl.rl.flow_policy import Batch, FlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import Decisions
 from taccorl.rl.settings import PPOSettings
-
-SUCCESS = "success"
 
 
 class Clock:
@@ -81,21 +80,15 @@ class Acted:
 class World(Protocol):
     """Interface of the N environments in which a rollout acts."""
 
-    @property
-    def num_envs(self) -> int:
-        """N: number of environments."""
-        ...
+    num_envs: int
+    """N: number of environments."""
 
     def observe(self) -> Seen:
         """Present inputs of all environments."""
         ...
 
-    def act(self, actions_NHA: Tensor) -> Acted:
-        """Execute chunks (N, n, A) in the policy's units; reset environments whose episode ended."""
-        ...
-
-    def reset(self, rows_N: Tensor) -> None:
-        """Begin the next episode in the environments where ``rows_N`` (bool) is true."""
+    def act(self, actions_NnA: Tensor) -> Acted:
+        """Execute chunks in the policy's units; reset environments whose episode ended."""
         ...
 
 
@@ -105,7 +98,7 @@ class Rollout:
 
     decisions: Decisions
     outcomes: Counter[str]
-    facts: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, float]
 
 
 def collect(
@@ -117,7 +110,7 @@ def collect(
     settings: PPOSettings,
     generator: torch.Generator,
     clock: Clock,
-    on_values: Callable[[Tensor], None] | None = None,
+    on_values: Callable[[Tensor], None] = lambda value_N: None,
 ) -> Rollout:
     """Make T decisions in every environment, and compute their advantages.
 
@@ -127,22 +120,27 @@ def collect(
     """
     kept: list[dict[str, Tensor]] = []
     batches: list[Batch] = []
-    outcomes: Counter[str] = Counter()
-    later: Counter[str] = Counter()
-    won_by_step = torch.zeros(2, sde.num_steps)  # successes, ends
-    shape: tuple[int, int] = tuple(actor.scored_HD.shape)  # pyright: ignore[reportAssignmentType]
+    outcomes, later, won_by_step = Counter[str](), Counter[str](), dict[int, list[bool]]()
+
+    def values(features_NF: Tensor, seen: Seen) -> Tensor:
+        with torch.no_grad():
+            return critic(features_NF, seen.privileged_NP)
+
     for _ in range(num_decisions):
         seen = world.observe()
         if seen.privileged_NP.shape[-1]:
             critic.observe(seen.privileged_NP)
         with clock.part("policy"):
-            draws = sde.draw(world.num_envs, shape, generator, actor.scored_HD.device)
+            draws = actor.draw(world.num_envs, sde, generator)
             sampled, features_NF = actor.sample(seen.batch, sde, draws)
-            value_N = _values(critic, features_NF, seen.privileged_NP)
-            actions_NHA = actor.actions(sampled.chunk_BHD)
-        if on_values is not None:
-            on_values(value_N)
-        acted = world.act(actions_NHA)
+            value_N = values(features_NF, seen)
+            actions_NnA = actor.actions(sampled.chunk_BHD)
+        on_values(value_N)
+        acted = world.act(actions_NnA)
+        last_N = torch.zeros_like(value_N)  # value of the last observation where time ran out
+        if acted.last is not None:
+            with clock.part("policy"):
+                last_N[acted.truncated_N.to(last_N.device)] = values(actor.features(acted.last.batch), acted.last)
         kept.append(
             {
                 "before_MSHD": sampled.before_BSHD,
@@ -154,29 +152,23 @@ def collect(
                 "value": value_N,
                 "reward": acted.reward_N.to(value_N),
                 "end": (acted.terminated_N | acted.truncated_N).to(value_N.device),
-                "last_value": _last_values(actor, critic, acted, value_N, clock),
+                "last_value": last_N,
             }
         )
         batches.append(seen.batch)
-        ended = [name for name in acted.outcomes if name is not None]
-        outcomes.update(ended)
+        outcomes.update(name for name in acted.outcomes if name is not None)
         later.update(name for name in acted.later_outcomes if name is not None)
         for name, k in zip(acted.outcomes, draws.step_BS[:, 0].tolist(), strict=True):
-            if name is not None and k >= 0:
-                won_by_step[:, k] += torch.tensor([float(name == SUCCESS), 1.0])
+            if name is not None and sde.num_stochastic == 1 and k >= 0:
+                won_by_step.setdefault(k, []).append(name == SUCCESS)
     seen = world.observe()
     with clock.part("policy"):
-        next_N = _values(critic, actor.features(seen.batch), seen.privileged_NP)
+        next_N = values(actor.features(seen.batch), seen)
     columns = {name: torch.stack([row[name] for row in kept]) for name in kept[0]}
     value_TN, end_TN = columns.pop("value"), columns.pop("end")
-    following_TN = torch.cat([value_TN[1:], next_N[None]])
+    following_TN = torch.where(end_TN, columns.pop("last_value"), torch.cat([value_TN[1:], next_N[None]]))
     advantage_TN, return_TN = estimate_advantages(
-        columns.pop("reward"),
-        value_TN,
-        torch.where(end_TN, columns.pop("last_value"), following_TN),
-        end_TN,
-        gamma=settings.gamma,
-        gae_lambda=settings.gae_lambda,
+        columns.pop("reward"), value_TN, following_TN, end_TN, gamma=settings.gamma, gae_lambda=settings.gae_lambda
     )
     decisions = Decisions(
         batch={key: torch.cat([batch[key] for batch in batches]) for key in batches[0]},
@@ -191,25 +183,8 @@ def collect(
     }
     if later:
         facts |= {"later_episodes": float(later.total()), "later_success": later[SUCCESS] / later.total()}
-    for k in range(sde.num_steps):
-        if sde.num_stochastic == 1 and won_by_step[1, k]:
-            facts[f"success_step_{k}"] = float(won_by_step[0, k] / won_by_step[1, k])
+    facts |= {f"success_step_{k}": sum(won) / len(won) for k, won in sorted(won_by_step.items())}
     return Rollout(decisions, outcomes, facts)
-
-
-@torch.no_grad()
-def _values(critic: Critic, features_NF: Tensor, privileged_NP: Tensor) -> Tensor:
-    return critic(features_NF, privileged_NP)
-
-
-def _last_values(actor: FlowPolicy, critic: Critic, acted: Acted, like_N: Tensor, clock: Clock) -> Tensor:
-    """(N,) value of the last observation where time ran out, 0 elsewhere."""
-    last_N = torch.zeros_like(like_N)
-    if acted.last is not None:
-        with clock.part("policy"):
-            features_NF = actor.features(acted.last.batch)
-            last_N[acted.truncated_N.to(last_N.device)] = _values(critic, features_NF, acted.last.privileged_NP)
-    return last_N
 
 
 def first_episodes(
@@ -218,26 +193,10 @@ def first_episodes(
     """Outcome of the first episode of each environment in a world that was just restarted; None: it has not ended."""
     found: list[str | None] = [None] * world.num_envs
     for _ in range(max_decisions):
-        acted = _decide(world, actor, sde, generator)
+        draws = actor.draw(world.num_envs, sde, generator)
+        sampled, _ = actor.sample(world.observe().batch, sde, draws)
+        acted = world.act(actor.actions(sampled.chunk_BHD))
         found = [one or new for one, new in zip(found, acted.outcomes, strict=True)]
         if all(found):
             break
     return found
-
-
-def stagger(world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator, num_decisions: int) -> None:
-    """Act for the number of decisions of an episode, and reset each environment once, at a random decision. Otherwise all
-    environments would be in the same phase of the task in every iteration.
-    """
-    begin_N = torch.randint(num_decisions, (world.num_envs,), generator=generator)
-    for k in range(num_decisions):
-        if (begin_N == k).any():
-            world.reset(begin_N == k)
-        _decide(world, actor, sde, generator)
-
-
-def _decide(world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator) -> Acted:
-    shape: tuple[int, int] = tuple(actor.scored_HD.shape)  # pyright: ignore[reportAssignmentType]
-    draws = sde.draw(world.num_envs, shape, generator, actor.scored_HD.device)
-    sampled, _ = actor.sample(world.observe().batch, sde, draws)
-    return world.act(actor.actions(sampled.chunk_BHD))

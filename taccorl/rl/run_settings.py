@@ -15,6 +15,8 @@ SETTINGS = "settings.json"
 _NOT_STORED = ("out", "resume", "policy.device")
 _MAY_CHANGE = ("iterations", "save_freq", "keep_checkpoints", "rerun", "noise_check")
 _TWIN_DIGEST = "env.twin_sha256"
+_REMOVED = {"noise.correlation": (0.0,), "env.stagger": (True, False), "env.start_states": (256,)}
+"""Settings of older versions, and the values with which a run goes on as it did; they no longer exist since 23 November 2026."""
 
 
 def write(settings: PostTrainSettings) -> None:
@@ -57,6 +59,12 @@ def refuse_changes(settings: PostTrainSettings) -> None:
         TaccorlError: there is no run in ``settings.out``, it has other settings, or its twin has changed.
     """
     before, now = _to_json(PostTrainSettings()) | _read(settings.out), _to_json(settings)
+    gone = [f"--{name}={before[name]}" for name, same in _REMOVED.items() if before.get(name, same[0]) not in same]
+    if gone:
+        raise TaccorlError(
+            f"--resume=true: {settings.out} was begun with {', '.join(gone)}, which this version does not have: begin anew from "
+            "its policy, --policy.path=…/checkpoints/last/pretrained_model"
+        )
     fixed = [name for name in now if name not in _MAY_CHANGE]
     if changed := [f"--{name} {before[name]} there, {now[name]} here" for name in fixed if before[name] != now[name]]:
         raise TaccorlError(

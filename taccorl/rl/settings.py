@@ -3,12 +3,11 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from taccorl.errors import TaccorlError, nearest
 
-_STOCHASTIC_STEPS = ("one", "last", "all")
-_TRAINED = ("expert", "all")
-_MOST_CORRELATION = 0.99
+_STOCHASTIC_STEPS, _TRAINED = ("one", "all"), ("expert", "all")
 
 
 @dataclass(kw_only=True)
@@ -25,10 +24,6 @@ class PolicySettings:
     """On a GPU, multiply float32 matrices with 10-bit mantissas: faster, but ratios before the first update differ from 1."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: ``trained`` is not one of its values.
-        """
         if self.trained not in _TRAINED:
             raise TaccorlError(f"--policy.trained={self.trained}: {nearest(self.trained, _TRAINED)}")
 
@@ -60,21 +55,11 @@ class EnvSettings:
     """Control steps after which an episode ends; the task's own limit if not given."""
     start_share: float = 0.0
     """Share of episodes, 0 or more and below 1, that begin in a stored state of one of the policy's earlier episodes instead of a
-    reset. States are stored after each arm has grasped its part. progress.jsonl counts these episodes apart (later_success)."""
-    start_states: int = 256
-    """Number of states that are stored for start_share. New states replace the oldest. Each shard stores at least one."""
-    stagger: bool = True
-    """Before the first iteration, act for an episode's length and begin episodes at random times in it, so that environments are
-    in different phases of the task."""
+    reset. The newest 256 states after each arm has grasped its part are stored. progress.jsonl counts these episodes apart
+    (later_success)."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a number is out of its range.
-        """
-        _at_least("env", 1, num_envs=self.num_envs, decisions=self.decisions, start_states=self.start_states)
-        if self.threads is not None:
-            _at_least("env", 1, threads=self.threads)
+        _at_least("env.", self, num_envs=1, decisions=1, threads=1)
         if not 1 <= self.shards <= self.num_envs:
             raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
         if not 0 <= self.start_share < 1:
@@ -93,26 +78,16 @@ class FlowSDESettings:
     level: float = 0.5
     """σ_SDE: standard deviation of the first stochastic step, in normalised actions. 0: no noise."""
     stochastic_steps: str = "one"
-    """Steps of a decision that are stochastic; the others are Euler steps. one: a randomly drawn step (paper); last: the last
-    step, whose noise no later step reduces; all: every step."""
-    correlation: float = 0.0
-    """ρ: correlation of the noise at neighbouring actions of a chunk, ρ^|i − j| between actions i and j. 0: white (paper). White
-    noise of 16 actions moves their mean by a quarter of its deviation; with ρ = 0.9 by three quarters."""
+    """Steps of a decision that are stochastic; the others are Euler steps. one: a randomly drawn one (paper); all: every step."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a setting is out of its range.
-        """
-        _at_least("noise", 1, num_steps=self.num_steps)
-        _at_least("noise", 0, level=self.level, correlation=self.correlation)
-        if not self.correlation <= _MOST_CORRELATION:  # beyond it float32 densities round coarsely
-            raise TaccorlError(f"--noise.correlation={self.correlation:g}: must be 0 to {_MOST_CORRELATION:g}")
+        _at_least("noise.", self, num_steps=1, level=0)
         if not math.isfinite(self.level):
             raise TaccorlError(f"--noise.level={self.level:g}: is not finite")
         if self.stochastic_steps not in _STOCHASTIC_STEPS:
-            known = nearest(self.stochastic_steps, _STOCHASTIC_STEPS)
-            raise TaccorlError(f"--noise.stochastic_steps={self.stochastic_steps}: {known}")
+            raise TaccorlError(
+                f"--noise.stochastic_steps={self.stochastic_steps}: {nearest(self.stochastic_steps, _STOCHASTIC_STEPS)}"
+            )
 
 
 @dataclass(kw_only=True)
@@ -133,12 +108,7 @@ class AnchorSettings:
     """Folder of the cache of decoded pictures."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a number is out of its range.
-        """
-        _at_least("anchor", 0, weight=self.weight)
-        _at_least("anchor", 1, batch_size=self.batch_size)
+        _at_least("anchor.", self, weight=0, batch_size=1)
 
 
 @dataclass(kw_only=True)
@@ -179,14 +149,8 @@ class PPOSettings:
     """True: the simulator's state is an input of the critic, which is discarded after training."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a number is out of its range.
-        """
-        _at_least("ppo", 1, epochs=self.epochs, batch_size=self.batch_size, micro_batch=self.micro_batch)
-        _at_least("ppo", 0, actor_lr=self.actor_lr, critic_lr=self.critic_lr)
-        _at_least("ppo", 1, critic_epochs=self.critic_epochs)
-        _at_least("ppo", 0, critic_warmup=self.critic_warmup, kl_stop=self.kl_stop, clip=self.clip)
+        _at_least("ppo.", self, epochs=1, batch_size=1, micro_batch=1, critic_epochs=1)
+        _at_least("ppo.", self, actor_lr=0, critic_lr=0, critic_warmup=0, kl_stop=0, clip=0)
 
 
 @dataclass(kw_only=True)
@@ -224,16 +188,15 @@ class PostTrainSettings:
     with half the learning rate. 0: never."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a number is out of its range.
-        """
-        for name, least in (("iterations", 1), ("seed", 0), ("save_freq", 1), ("keep_checkpoints", 0)):
-            if getattr(self, name) < least:
-                raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
+        _at_least("", self, iterations=1, seed=0, save_freq=1, keep_checkpoints=0)
 
 
-def _at_least(group: str, least: int, **values: float) -> None:
-    for name, value in values.items():
-        if not value >= least:
-            raise TaccorlError(f"--{group}.{name}={value:g}: at least {least}")
+def _at_least(prefix: str, settings: Any, **least: float) -> None:
+    """
+    Raises:
+        TaccorlError: a setting that is smaller, or no number.
+    """
+    for name, smallest in least.items():
+        value = getattr(settings, name)
+        if value is not None and not value >= smallest:
+            raise TaccorlError(f"--{prefix}{name}={value:g}: at least {smallest}")

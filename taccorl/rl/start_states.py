@@ -12,6 +12,8 @@ import numpy as np
 
 from taccorl.sim.simulation import Simulation, Snapshot
 
+NUM_STATES = 256
+"""States that all shards of a run keep together."""
 _KEPT = 0.1
 """Share of such states that is kept, one a decision."""
 _TIME_LEFT = 1 / 3
@@ -19,8 +21,7 @@ _TIME_LEFT = 1 / 3
 
 
 class StartStates:
-    """Ring buffer of states of single environments with their windows of touch, and the choice of environments that start in
-    one."""
+    """Ring buffer of states of single environments with their windows of touch, and the choice of who starts in one."""
 
     def __init__(self, share: float, size: int) -> None:
         """
@@ -48,11 +49,7 @@ class StartStates:
         in_time_N = sim.judge.steps <= (1 - _TIME_LEFT) * sim.judge.limit_steps
         held_N = ((subtask >= 1) & (subtask < counts)).all(axis=1) & (sim.judge.held == 0) & in_time_N & ~over_N
         for i in np.flatnonzero(held_N & (self._rng.random(len(held_N)) < _KEPT)):
-            state = sim.snapshot(np.array([i])), window_NLK[i].copy()
-            if len(self._kept) < self._size:
-                self._kept.append(state)
-            else:
-                self._kept[self._next] = state
+            self._kept[self._next : self._next + 1] = [(sim.snapshot(np.array([i])), window_NLK[i].copy())]
             self._next = (self._next + 1) % self._size
 
     def draw(self, over_N: np.ndarray) -> tuple[np.ndarray, list[int]]:
@@ -64,8 +61,8 @@ class StartStates:
 
     def states(self, numbers: list[int]) -> tuple[Snapshot, np.ndarray]:
         """Snapshot of these states, and their windows (n, L, K)."""
-        chosen = [self._kept[k] for k in numbers]
-        return _joined([snapshot for snapshot, _ in chosen]), np.stack([window for _, window in chosen])
+        snapshots, windows = zip(*(self._kept[k] for k in numbers), strict=True)
+        return _joined(snapshots), np.stack(windows)
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit."""
@@ -79,11 +76,11 @@ class StartStates:
         self._rng.bit_generator.state = state["generator"]
 
 
-def _joined(snapshots: list[Snapshot]) -> Snapshot:
-    def join(name: str) -> Any:
-        values = [getattr(snapshot, name) for snapshot in snapshots]
+def _joined(snapshots: tuple[Snapshot, ...]) -> Snapshot:
+    def join(values: list[Any]) -> Any:
         if isinstance(values[0], dict):
             return {key: np.concatenate([value[key] for value in values]) for key in values[0]}
         return np.concatenate(values)
 
-    return Snapshot(**{f.name: join(f.name) for f in dataclasses.fields(Snapshot)})
+    fields = dataclasses.fields(Snapshot)
+    return Snapshot(**{f.name: join([getattr(snapshot, f.name) for snapshot in snapshots]) for f in fields})

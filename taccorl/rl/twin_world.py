@@ -1,13 +1,10 @@
 """The twin's environments for rollouts: the policy's own processors, its window of touch, pictures only when they are used.
 
-Several groups of environments (shards) compute at the same time. One thread for each of them waits for its results.
-
 Letters in shapes: N environments, n executed actions of a chunk, A action, L history, K taxels, P privileged numbers.
 """
 
 import copy
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,13 +18,13 @@ from taccorl.evaluation.policy_actor import Processor, policy_batch, require_sam
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
-from taccorl.rl.remote_shards import RemoteShard
 from taccorl.rl.rollout import Acted, Clock, Seen
-from taccorl.rl.twin_shard import Shard, ShardActed, ShardSeen
+from taccorl.rl.shards import Shard
+from taccorl.rl.twin_shard import PRIVILEGED, ShardActed
 from taccorl.rl.watched_episode import EpisodeWatch
 from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY
-from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY
+from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
 
 
 def needs_images(config: Any) -> bool:
@@ -36,16 +33,10 @@ def needs_images(config: Any) -> bool:
 
 
 class TwinWorld:
-    """``World`` of one task in the twin."""
+    """``World`` of one task in the twin, of shards that compute at the same time."""
 
     def __init__(
-        self,
-        shards: Sequence[Shard],
-        config: Any,
-        preprocessor: Processor,
-        postprocessor: Processor,
-        *,
-        clock: Clock,
+        self, shards: Sequence[Shard], config: Any, preprocessor: Processor, postprocessor: Processor, *, clock: Clock
     ) -> None:
         """
         Args:
@@ -61,101 +52,75 @@ class TwinWorld:
             raise TaccorlError(
                 "post-training: --policy.normalization_mapping normalises pictures (VISUAL); only IDENTITY is known"
             )
-        self.shards, self._config, self._clock = list(shards), config, clock
+        self.shards, self._clock = list(shards), clock
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
+        facts = self.shards[0].facts
         if config.part_poses:
-            require_same_parts(config, self.shards[0].task, self.shards[0].part_names)
-        self._device = torch.device(config.device)
+            require_same_parts(config, facts.task, facts.part_names)
+        self.limit_steps, self._instruction, self._device = facts.limit_steps, facts.instruction, config.device
         inputs = config.input_features
         self._cameras = [IMAGE_KEYS[name] for name in ROBOT.cameras if IMAGE_KEYS[name] in inputs]
         self.needs_images = needs_images(config)
         self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK}
         self._kept |= {HAND_POSES} if config.knows_hands else set()
         self._kept |= {PART_POSES} if config.part_poses else set()
-        firsts = np.cumsum([0, *(shard.num_envs for shard in self.shards)])
-        self._bounds = list(zip(firsts[:-1].tolist(), firsts[1:].tolist(), strict=True))
-        self._threads = [ThreadPoolExecutor(1) for _ in self.shards] if len(self.shards) > 1 else []
+        ends = np.cumsum([shard.facts.num_envs for shard in self.shards])
+        self.num_envs, self._ends = int(ends[-1]), ends[:-1]
         self.watch = EpisodeWatch()
 
-    @property
-    def limit_steps(self) -> int:
-        """Control steps after which an episode ends."""
-        return self.shards[0].limit_steps
-
-    @property
-    def num_envs(self) -> int:
-        return self._bounds[-1][1]
-
-    def _each(self, work: Callable[[Shard, int, int], Any]) -> list[Any]:
-        """``work(shard, first, end)`` of all shards, side by side."""
-        if not self._threads:
-            return [work(self.shards[0], *self._bounds[0])]
-        calls = zip(self._threads, self.shards, self._bounds, strict=True)
-        waiting = [thread.submit(work, shard, *bounds) for thread, shard, bounds in calls]
-        return [each.result() for each in waiting]
+    def _each(self, method: str, *arguments: Sequence[Any]) -> list[Any]:
+        """``method`` of all shards at the same time; ``arguments`` have an entry for each."""
+        for k, shard in enumerate(self.shards):
+            shard.start(method, *(argument[k] for argument in arguments))
+        return [shard.result() for shard in self.shards]
 
     def restart(self, seed: int) -> None:
         """Start new episodes with the seed sequence of ``seed``."""
-        self._each(lambda shard, *_: shard.restart(seed))
+        self._each("restart", [seed] * len(self.shards))
         self.watch.reset()
 
     def observe(self) -> Seen:
         with self._clock.part("pictures"):
-            seen = self._each(lambda shard, *_: shard.observe())
-        return self._seen(seen)
+            observations = self._each("observe")
+        return self._seen(observations)
 
-    def act(self, actions_NHA: Tensor) -> Acted:
+    def act(self, actions_NnA: Tensor) -> Acted:
         with self._clock.part("policy"):
-            actions = self._postprocessor(actions_NHA).to("cpu").numpy().astype(np.float32)
+            actions = self._postprocessor(actions_NnA).to("cpu").numpy().astype(np.float32)
         with self._clock.part("physics"):
-            acted = self._each(lambda shard, first, end: shard.act(actions[first:end]))
-        last = [each.last for each in acted if each.last is not None]
-        self._watch(actions, acted[0])
-
-        def joined(name: str) -> Tensor:
-            return torch.from_numpy(np.concatenate([getattr(each, name) for each in acted]))
-
+            acted: list[ShardActed] = self._each("act", np.split(actions, self._ends))
+        joined = {
+            name: np.concatenate([getattr(a, name) for a in acted]) for name in ShardActed._fields if name != "last"
+        }
+        last = [a.last for a in acted if a.last is not None]
+        outcomes, later = joined["outcome_N"].tolist(), joined["began_later_N"].tolist()
+        self.watch.stepped(actions[0, : joined["num_steps_N"][0]])
+        if outcomes[0]:
+            # Episodes that began in a state of an earlier one cannot be executed again from their seed.
+            self.watch.end(int(joined["seed_N"][0]), None if later[0] else outcomes[0], int(joined["partial_N"][0]))
         return Acted(
-            reward_N=joined("reward_N").float(),
-            terminated_N=joined("terminated_N"),
-            truncated_N=joined("truncated_N"),
+            reward_N=torch.from_numpy(joined["reward_N"]).float(),
+            terminated_N=torch.from_numpy(joined["terminated_N"]),
+            truncated_N=torch.from_numpy(joined["truncated_N"]),
             last=self._seen(last) if last else None,
-            outcomes=[o for each in acted for o in each.outcomes],
-            later_outcomes=[o for each in acted for o in each.later_outcomes],
+            outcomes=[None if is_later else outcome for outcome, is_later in zip(outcomes, later, strict=True)],
+            later_outcomes=[outcome if is_later else None for outcome, is_later in zip(outcomes, later, strict=True)],
         )
 
-    def _watch(self, actions_NHA: np.ndarray, acted: ShardActed) -> None:
-        """Environment 0. Episodes that began in a state of an earlier one cannot be executed again from their seed."""
-        self.watch.stepped(actions_NHA[0, : acted.num_steps_N[0]])
-        if outcome := acted.outcomes[0]:
-            self.watch.end(int(acted.seed_N[0]), outcome, int(acted.partial_N[0]))
-        if outcome or acted.later_outcomes[0]:
-            self.watch.reset()
-
-    def reset(self, rows_N: Tensor) -> None:
-        rows = rows_N.numpy()
-        if rows[0]:
-            self.watch.reset()
-        self._each(lambda shard, first, end: shard.reset(rows[first:end]) if rows[first:end].any() else None)
-
-    def _seen(self, parts: Sequence[ShardSeen]) -> Seen:
-        observation = {key: np.concatenate([p.observation[key] for p in parts]) for key in parts[0].observation}
-        window_NLK = np.concatenate([p.window_NLK for p in parts])
+    def _seen(self, parts: Sequence[Observation]) -> Seen:
+        observation = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        privileged_NP = torch.from_numpy(observation[PRIVILEGED]).float().to(self._device)
         with self._clock.part("policy"):
-            numbers = {STATE_KEY: observation[STATE_KEY], TACTILE_KEY: window_NLK}
-            if PARTS_KEY in observation:
-                numbers[PARTS_KEY] = observation[PARTS_KEY]
-            instructions = [self.shards[0].instruction] * len(window_NLK)
-            found = policy_batch(self._preprocessor, numbers, instructions)
+            numbers = {key: observation[key] for key in (STATE_KEY, TACTILE_KEY, PARTS_KEY) if key in observation}
+            found = policy_batch(self._preprocessor, numbers, [self._instruction] * len(privileged_NP))
             batch: Batch = {k: x.to(self._device) for k, x in found.items() if k in self._kept}
             for key in self._cameras:  # (N, 3, rows, columns) uint8, a quarter of float32
                 batch[key] = torch.from_numpy(observation[key]).to(self._device).permute(0, 3, 1, 2).contiguous()
-        privileged_NP = np.concatenate([p.privileged_NP for p in parts])
-        return Seen(batch, torch.from_numpy(privileged_NP).float().to(self._device))
+        return Seen(batch, privileged_NP)
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit; no episode may end between two calls of ``act``."""
-        return {"shards": self._each(lambda shard, *_: shard.state_dict()), "watch": copy.deepcopy(vars(self.watch))}
+        return {"shards": self._each("state_dict"), "watch": copy.deepcopy(vars(self.watch))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from ``state_dict``.
@@ -168,25 +133,13 @@ class TwinWorld:
                 "--resume=true: the checkpoint was written by a taccorl of before 22 November 2026, which kept environments in "
                 "another form: begin anew from its policy, --policy.path=…/checkpoints/last/pretrained_model"
             )
-        states = state["shards"]
-        if len(states) != len(self.shards):
-            raise TaccorlError(
-                f"--env.shards={len(self.shards)}: the run was stopped with {len(states)}; resume with the same"
-            )
-        own = dict(zip((first for first, _ in self._bounds), states, strict=True))
-        self._each(lambda shard, first, _: shard.load_state_dict(own[first]))
+        there, here = len(state["shards"]), len(self.shards)
+        if there != here:
+            raise TaccorlError(f"--env.shards={here}: the run was stopped with {there}; resume with the same")
+        self._each("load_state_dict", state["shards"])
         self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
 
     def close(self) -> None:
-        """Close all environments.
-
-        Environments of this process are closed in the thread that rendered their pictures, because an OpenGL context works in
-        one thread only.
-        """
-        if all(isinstance(shard, RemoteShard) for shard in self.shards):  # also while a thread waits for one of them
-            for shard in self.shards:
-                shard.close()
-        else:
-            self._each(lambda shard, *_: shard.close())
-        for thread in self._threads:
-            thread.shutdown()
+        """Close all environments, also while one of them computes."""
+        for shard in self.shards:
+            shard.close()

@@ -35,7 +35,7 @@ class WatchedEpisode:
     """Number of goals in place at the end."""
     actions_TA: np.ndarray
     values_T: np.ndarray
-    """Value V of the decision that each control step belongs to; NaN if no rollout was collected (``env.stagger``)."""
+    """Value V of the decision that each control step belongs to; NaN if no rollout was collected."""
 
 
 @dataclass
@@ -45,6 +45,7 @@ class EpisodeWatch:
     chunks: list[np.ndarray] = field(default_factory=list)
     values: list[np.ndarray] = field(default_factory=list)
     value: float = math.nan
+    """Of the next decision."""
     ended: WatchedEpisode | None = None
 
     def reset(self) -> None:
@@ -57,11 +58,12 @@ class EpisodeWatch:
         self.values.append(np.full(len(actions_nA), self.value, dtype=np.float32))
         self.value = math.nan
 
-    def end(self, seed: int, outcome: str, partial: int) -> None:
-        """End the present episode."""
-        if self.ended is None and self.chunks:
+    def end(self, seed: int, outcome: str | None, partial: int) -> None:
+        """End the present episode; ``outcome`` None: it is not kept."""
+        if self.ended is None and outcome is not None:
             actions_TA, values_T = np.concatenate(self.chunks), np.concatenate(self.values)
             self.ended = WatchedEpisode(seed, outcome, partial, actions_TA, values_T)
+        self.reset()
 
     def take(self) -> WatchedEpisode | None:
         """The first episode that ended since the last call."""
@@ -80,22 +82,13 @@ def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, imag
     Raises:
         TaccorlError: the repeated episode has another outcome.
     """
+    steps = len(watched.actions_TA)
     row = EpisodeRow(
-        policy=policy,
-        task=scenes.tasks[0],
-        seed=watched.seed,
-        outcome=watched.outcome,
-        partial=watched.partial,
-        max_partial=0,
-        steps=len(watched.actions_TA),
-        time_s=len(watched.actions_TA) / CONTROL_HZ,
-        subtask_end_s={},
-        clipped_steps=0,
-    )
-    again = execute_again(
-        scenes, Rollout(row, watched.actions_TA, np.zeros((0, len(ROBOT.action_names)))), images=images
-    )
+        policy=policy, task=scenes.tasks[0], seed=watched.seed, outcome=watched.outcome, partial=watched.partial,
+        max_partial=0, steps=steps, time_s=steps / CONTROL_HZ, subtask_end_s={}, clipped_steps=0,
+    )  # fmt: skip
+    rollout = Rollout(row, watched.actions_TA, np.zeros((0, len(ROBOT.action_names))))
+    episode = execute_again(scenes, rollout, images=images).episode
     value = FeatureSpec(dtype="float32", shape=(1,), unit="1", frame="critic", rate_hz=CONTROL_HZ, range=(-1e12, 1e12))
-    spec = dataclasses.replace(again.episode.spec, features=again.episode.spec.features | {VALUE: value})
-    arrays = again.episode.arrays | {VALUE: watched.values_T[:, None]}
-    return dataclasses.replace(again.episode, spec=spec, arrays=arrays)
+    spec = dataclasses.replace(episode.spec, features=episode.spec.features | {VALUE: value})
+    return dataclasses.replace(episode, spec=spec, arrays=episode.arrays | {VALUE: watched.values_T[:, None]})

@@ -200,64 +200,7 @@ def test_settings_out_of_range_are_named() -> None:
         FlowSDESettings(level=-1)
 
 
-def correlated(rho: float, level: float = 0.5, steps: str = "last", num_steps: int = 4) -> FlowSDE:
-    settings = FlowSDESettings(num_steps=num_steps, level=level, stochastic_steps=steps, correlation=rho)
-    return FlowSDE(settings)
-
-
-def test_noise_of_neighbouring_actions_is_correlated_as_asked() -> None:
-    """Covariance 0.8^|i − j| between actions and 0 between dimensions; 20000 rows: standard error below 0.011."""
-    z = torch.randn(20000, H, D, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    noise = correlated(0.8).coloured(z)
-    covariance = torch.einsum("bid,bje->idje", noise, noise) / 20000
-    i = torch.arange(H)
-    expected = 0.8 ** (i[:, None] - i).abs().to(torch.float64)
-    for d in range(D):
-        for e in range(D):
-            torch.testing.assert_close(covariance[:, d, :, e], expected * (d == e), atol=0.045, rtol=0)
-
-
-@pytest.mark.parametrize("steps", ["one", "last", "all"])
-def test_density_of_correlated_noise_is_the_multivariate_normal(steps: str) -> None:
-    """Against PyTorch's own distribution, over the scored part: the first three of four actions, two of three dimensions."""
-    sampler, given = correlated(0.9, steps=steps), draws(correlated(0.9, steps=steps), 40)
-    scored = torch.zeros(H, D, dtype=torch.bool)
-    scored[:3, :2] = True
-    sampled = sampler.sample(smooth, given, scored)
-    i = torch.arange(3)
-    correlation = 0.9 ** (i[:, None] - i).abs().float()
-    total = torch.zeros(40)
-    for s in range(given.step_BS.shape[1]):
-        k, x = given.step_BS[:, s], sampled.before_BSHD[:, s]
-        time = torch.tensor(sampler.times)[k]
-        mean, std = sampler.mean(x, smooth(x, time), k, scored.expand(40, H, D))
-        covariance = (std**2) * correlation  # (B, 3, 3)
-        for d in range(2):
-            normal = torch.distributions.MultivariateNormal(mean[:, :3, d], covariance)
-            total += normal.log_prob(sampled.after_BSHD[:, s, :3, d])
-    torch.testing.assert_close(sampled.log_prob_B, total, atol=2e-4, rtol=1e-5)
-    again = sampler.log_prob(smooth, sampled.before_BSHD, sampled.after_BSHD, given.step_BS, scored)
-    torch.testing.assert_close(again, sampled.log_prob_B, atol=1e-4, rtol=0)
-
-
-def test_correlated_noise_keeps_the_marginals() -> None:
-    """Independent data N(0.7, 0.2²) in all numbers: after 64 stochastic steps the deviation is that of white noise, 0.2 but for
-    the error of the steps, and neighbouring actions stay uncorrelated although the noise was not."""
-    sampler = correlated(0.9, steps="all", num_steps=64)
-    chunks = sampler.sample(to_gaussian(0.7, 0.2), draws(sampler, 8000), ALL).chunk_BHD
-    x = (chunks - chunks.mean()).double()
-    covariance = torch.einsum("bid,bjd->ij", x, x) / (8000 * D)
-    white = propagated(0.7, 0.2, 64, 0.5)[1] ** 2
-    off = covariance - white * torch.eye(H)
-    assert off.abs().max() < 0.1 * white  # without C in the drift: neighbours correlated by a third or more
-
-
-def test_last_step_alone_is_stochastic() -> None:
-    given = draws(correlated(0.0), 50)
-    assert given.step_BS.tolist() == [[3]] * 50
-
-
-@pytest.mark.parametrize("settings", [{"correlation": 1.0}, {"correlation": 0.999999}, {"level": math.inf}])
-def test_noise_without_a_density_is_refused(settings: dict[str, float]) -> None:
-    with pytest.raises(TaccorlError, match=f"--noise.{next(iter(settings))}="):
-        FlowSDESettings(**settings)  # pyright: ignore[reportArgumentType]
+@pytest.mark.parametrize("level", [math.inf, math.nan])
+def test_noise_without_a_density_is_refused(level: float) -> None:
+    with pytest.raises(TaccorlError, match=r"--noise\.level="):
+        FlowSDESettings(level=level)

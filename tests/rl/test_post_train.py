@@ -39,7 +39,6 @@ def options(start: Path, real: Path, out: Path, **changes: Any) -> list[str]:
         "env.num_envs": 2,
         "env.decisions": 2,
         "env.episode_length": 12,
-        "env.stagger": False,
         "anchor.dataset": real,
         "anchor.batch_size": 2,
         "ppo.actor_lr": 1e-5,
@@ -67,7 +66,8 @@ def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path
     assert "mrad" in printed and "mm" in printed
     (row,) = progress(out)
     assert row["decisions"] == 4 and row["first_ratio_error"] < 1e-5 and row["anchor_loss"] > 0 and row["drift"] > 0
-    assert set(row["seconds"]) == {"pictures", "policy", "physics", "update"}
+    assert printed.count(f"{row['drift']:.4f}") == 1
+    assert set(row["seconds"]) == {"pictures", "policy", "physics", "update", "drift"}
     before, after = open_checkpoint(start, "cpu").load(0).policy.state_dict(), weights(out)
     moved = [name for name, value in before.items() if not torch.equal(value, after[name])]
     assert moved and not any("paligemma.model" in name for name in moved)
@@ -154,10 +154,9 @@ def run(start: Path, out: Path, lines: list[str], save: Any = None, **changes: A
 
     settings = PostTrainSettings(
         policy=PolicySettings(path=start),
-        env=EnvSettings(task="assembly_2", num_envs=2, decisions=2, episode_length=12, stagger=False),
-        anchor=AnchorSettings(weight=0),
+        env=EnvSettings(task="assembly_2", num_envs=2, decisions=2, episode_length=12),
         out=out,
-        **changes,
+        **{"anchor": AnchorSettings(weight=0), **changes},
     )
     return PostTraining(settings, lines.append, save)
 
@@ -184,19 +183,25 @@ def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path
     made.world.close()
 
 
-def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(start: Path, tmp_path: Path) -> None:
-    from taccorl.rl.settings import PPOSettings
+def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(
+    start: Path, real: Path, tmp_path: Path
+) -> None:
+    """With β = 0 the loss on the dataset is logged all the same, and is that of before, too."""
+    from taccorl.rl.settings import AnchorSettings, PPOSettings
+
+    anchor = AnchorSettings(dataset=real, weight=0, batch_size=2)
 
     lines: list[str] = []
     for adapt_lr in (True, False):
         out = tmp_path / str(adapt_lr)
-        made = run(
-            start, out, lines, noise_check=False, iterations=1, ppo=PPOSettings(actor_lr=1e-2, adapt_lr=adapt_lr)
-        )
+        ppo = PPOSettings(actor_lr=1e-2, adapt_lr=adapt_lr)
+        made = run(start, out, lines, noise_check=False, iterations=1, ppo=ppo, anchor=anchor)
+        drift = made._anchor.drift()
         before = {name: value.clone() for name, value in made._actor.policy.state_dict().items()}
         made.run()
         assert all(torch.equal(value, before[name]) for name, value in made._actor.policy.state_dict().items())
         (row,) = progress(out)
+        assert row["drift"] == drift > 0 and "anchor_loss" not in row
         assert row["undone_steps"] == 1 and row["actor_lr"] == 1e-2 and row["last_kl"] < 1e-6
         assert made._ppo.actor_lr == (5e-3 if adapt_lr else 1e-2)
         assert ("--ppo.adapt_lr=true" in lines[-1]) is not adapt_lr and "1 step undone" in "".join(lines)

@@ -10,7 +10,7 @@ from taccorl.errors import TaccorlError
 from taccorl.rl.critic import Critic
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, Decisions, policy_loss
-from taccorl.rl.rollout import SUCCESS, Clock, collect, first_episodes, stagger
+from taccorl.rl.rollout import SUCCESS, Clock, collect, first_episodes
 from taccorl.rl.settings import FlowSDESettings, PPOSettings
 
 SETTINGS = PPOSettings(actor_lr=3e-4, critic_lr=1e-3, batch_size=64)
@@ -269,18 +269,6 @@ def test_running_normalisation_of_privileged_numbers() -> None:
     torch.testing.assert_close(critic.square_P / 100, x.var(0, correction=0), atol=1e-4, rtol=1e-4)
 
 
-def test_staggered_environments_are_in_different_phases() -> None:
-    """A policy that stands still never succeeds: without staggering all ages are equal. Reset at a random one of 8 decisions,
-    ages at the end are 1 … 8, where a full episode's 8 has begun anew: 0 … 7."""
-    policy, world = LinePolicy(), LineWorld(200)
-    policy.actions = lambda chunk_BHD: 0 * chunk_BHD  # pyright: ignore
-    world.distance[:] = 1.0
-    sde = FlowSDE(FlowSDESettings())
-    stagger(world, policy, sde, torch.Generator().manual_seed(0), 8)
-    counts = world.age[world.distance.abs() > 0.05].bincount(minlength=8)
-    assert len(counts) == 8 and counts.min() > 10
-
-
 def train(iterations: int, beta: float | None = None) -> tuple[float, float, float]:
     """Success without noise before and after, and the flow loss on the demonstrations after."""
     policy = imitated()
@@ -295,7 +283,7 @@ def train(iterations: int, beta: float | None = None) -> tuple[float, float, flo
     for _ in range(iterations):
         found = collect(world, policy, learner.critic, learner.sde, 16, learner.settings, generator, Clock())
         learner.update(found.decisions, generator)
-    return before, success(), DemoAnchor(policy, 1.0).measure(torch.Generator().manual_seed(3), 2000)
+    return before, success(), DemoAnchor(policy, 1.0).drift(2000)
 
 
 def test_ppo_learns_to_reach() -> None:

@@ -1,6 +1,7 @@
 """``--resume=true``: which settings are read from the run's settings.json, and which changed ones are refused."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,19 @@ def test_settings_that_a_run_of_an_older_version_lacks_have_their_defaults(out: 
     found = resumed(f"--out={out}")
     run_settings.refuse_changes(found)
     assert found.iterations == 100 and not found.ppo.adapt_lr
+
+
+@pytest.mark.parametrize(("name", "same", "other"), [("noise.correlation", 0.0, 0.9), ("env.start_states", 256, 64)])
+def test_a_run_with_a_setting_that_was_removed_goes_on_only_where_it_was_as_now(
+    out: Path, name: str, same: float, other: float
+) -> None:
+    file = out / "settings.json"
+    before = json.loads(file.read_text())
+    file.write_text(json.dumps(before | {name: same, "env.stagger": False}))
+    run_settings.refuse_changes(resumed(f"--out={out}"))
+    file.write_text(json.dumps(before | {name: other}))
+    with pytest.raises(TaccorlError, match=rf"{name}={other}"):
+        run_settings.refuse_changes(resumed(f"--out={out}"))
 
 
 def test_a_changed_twin_is_refused(tmp_path: Path) -> None:

@@ -123,8 +123,7 @@ def test_lerobots_algorithm_is_ppos_own_update(tmp_path: Path) -> None:
     from lerobot.rl.algorithms.configs import RLAlgorithmConfig
     from lerobot.rl.algorithms.factory import make_algorithm_config
 
-    from taccorl.rl.flow_ppo import FlowPPO
-    from taccorl.rl.flow_ppo_config import FlowPPOConfig
+    from taccorl.rl.flow_ppo import FlowPPO, FlowPPOConfig
 
     settings: dict[str, Any] = {"actor_lr": 1e-5, "critic_lr": 1e-3, "batch_size": 2}
     config: Any = make_algorithm_config("flow_ppo", seed=3, **settings)
@@ -234,6 +233,20 @@ def test_real_anchor_is_a_step_of_co_training(real: Path) -> None:
     policy.policy.eval()
     expected = torch.cat([p.grad.flatten() for p in policy.trained_parameters() if p.grad is not None])
     assert torch.equal(found, expected)
+
+
+def test_drift_is_of_the_same_rows_and_noise_and_changes_no_random_number(real: Path) -> None:
+    """It depends on the weights alone: not on β, nor on what was drawn before."""
+    policy = actor(discrete_state_input=None)
+    torch.manual_seed(1)
+    given, state = anchor(policy, real, batch_size=3), torch.get_rng_state()
+    first = given.drift()
+    assert torch.equal(torch.get_rng_state(), state) and not policy.policy.training
+    given.backward(torch.Generator().manual_seed(0), 16)
+    assert given.drift() == first == anchor(policy, real, batch_size=3, weight=0.0).drift()
+    with torch.no_grad():
+        policy.model.action_out_proj.bias.add_(0.1)
+    assert given.drift() != first
 
 
 def test_only_real_rows_of_a_merged_dataset_are_used(tmp_path: Path) -> None:

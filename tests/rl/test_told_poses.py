@@ -1,11 +1,11 @@
 """A policy that is told the poses of the parts and sees no pictures: rollouts, evaluation, and the task it belongs to."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from gymnasium.vector import AutoresetMode
 from tiny_checkpoint import write_checkpoint
 
 from taccorl.errors import TaccorlError
@@ -16,12 +16,12 @@ from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.rollout import Clock
 from taccorl.rl.settings import PolicySettings
-from taccorl.rl.twin_shard import TwinShard
+from taccorl.rl.shards import LocalShard
+from taccorl.rl.twin_shard import make_shard
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
-from taccorl.sim.vector_env import TaccorlVectorEnv
 
 TOUCH = "observation.tactile"
 
@@ -34,10 +34,8 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def world_of(opened: Any, task: str = "assembly_2") -> TwinWorld:
-    envs = TaccorlVectorEnv(
-        task, 2, autoreset=AutoresetMode.DISABLED, max_episode_steps=7, num_threads=1, part_poses=True
-    )
-    shard = TwinShard(envs, history=opened.config.tactile_history, images=False, privileged=False)
+    envs = {"task": task, "num_envs": 2, "max_episode_steps": 7, "num_threads": 1, "part_poses": True}
+    shard = LocalShard(partial(make_shard, envs, history=opened.config.tactile_history))
     return TwinWorld([shard], opened.config, opened.preprocessor, opened.postprocessor, clock=Clock())
 
 
@@ -48,10 +46,10 @@ def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -
     seen = world.observe().batch
     assert {PART_POSES, PARTS_KEY, "observation.state", TOUCH} <= set(seen) and not any("images" in key for key in seen)
     (shard,) = world.shards
-    assert isinstance(shard, TwinShard)
-    observation = shard.envs.observe()
+    assert isinstance(shard, LocalShard)
+    observation = shard.twins.envs.observe()
     observation[TOUCH] = np.repeat(observation[TOUCH][:, None], 10, axis=1)
-    expected = policy_batch(opened.preprocessor, observation, [shard.instruction] * 2)
+    expected = policy_batch(opened.preprocessor, observation, [shard.facts.instruction] * 2)
     assert torch.equal(seen[PART_POSES], expected[PART_POSES])  # pyright: ignore
     for _ in range(2):
         acted = world.act(seen["observation.state"][:, None].expand(-1, 5, -1))

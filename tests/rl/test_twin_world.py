@@ -1,6 +1,7 @@
 """Rollouts beside evaluation: the same input, the same actions without noise, the same touch; and exact resuming."""
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.rollout import Clock
 from taccorl.rl.settings import EnvSettings, FlowSDESettings, PolicySettings
-from taccorl.rl.start_states import StartStates
+from taccorl.rl.shards import LocalShard
 from taccorl.rl.twin_shard import TwinShard
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.episode_seeds import episode_seed
@@ -57,12 +58,19 @@ def world_of(
 ) -> TwinWorld:
     history, first, shards = opened.config.tactile_history, 0, []
     for envs in all_envs:
-        starts = StartStates(share, size)
-        shards.append(TwinShard(envs, history=history, images=True, privileged=privileged, starts=starts, first=first))
+        options = {"history": history, "privileged": privileged, "start_share": share, "start_states": size}
+        shards.append(LocalShard(partial(TwinShard, envs, images=True, first=first, **options)))
         first += envs.num_envs
     made = TwinWorld(shards, opened.config, opened.preprocessor, opened.postprocessor, clock=Clock())
     made.restart(seed)
     return made
+
+
+def twins(world: TwinWorld) -> TwinShard:
+    """Those of the first shard."""
+    (shard, *_) = world.shards
+    assert isinstance(shard, LocalShard)
+    return shard.twins
 
 
 def home(world: TwinWorld, n: int = 5) -> torch.Tensor:
@@ -165,7 +173,7 @@ def test_a_reset_is_of_its_rows_only(envs: TaccorlVectorEnv, opened: Any) -> Non
     world = make_world(envs, opened)
     world.act(home(world))
     before = world.observe()
-    world.reset(torch.tensor([False, True]))
+    twins(world).reset(np.array([False, True]))
     after = world.observe()
     assert envs.facts()["steps"].tolist() == [5, 0]
     assert envs.facts()["seed"].tolist() == [episode_seed(5, 0, 0), episode_seed(5, 1, 1)]
@@ -209,11 +217,11 @@ def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_count
     envs.sim.judge.subtask[0] = 2  # environment 0 is done, says the judge, environment 1 holds its parts
     envs.sim.judge.subtask[1] = 1
     world.act(home(world) + 0.1)
-    assert len(world.shards[0].starts) == 1
+    assert len(twins(world).starts) == 1
     kept = envs.sim.snapshot(np.array([1]))
     felt = world.observe().batch[TOUCH][1]
     world.act(home(world))
-    assert len(world.shards[0].starts) == 1, "too late"
+    assert len(twins(world).starts) == 1, "too late"
     acted = world.act(home(world))
     assert acted.outcomes == ["timeout", "timeout"] and acted.later_outcomes == [None, None]
     for i in range(N):
@@ -241,7 +249,7 @@ def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(
         return found
 
     steps(8)
-    assert len(world.shards[0].starts) == 2, "the ring is full"
+    assert len(twins(world).starts) == 2, "the ring is full"
     state = world.state_dict()
     expected = steps(9)
     world = later_world(envs, opened, share=0.5, size=2)
@@ -258,7 +266,7 @@ def test_a_share_beyond_one_is_refused() -> None:
 
 
 def test_shards_give_what_one_gives(opened: Any) -> None:
-    """Three environments at once, and as two and one in threads of their own: scenes, touch, outcomes, last observations."""
+    """Three environments at once, and as two and one: scenes, touch, outcomes, last observations."""
 
     def made(*sizes: int) -> TwinWorld:
         envs = [
@@ -276,8 +284,8 @@ def test_shards_give_what_one_gives(opened: Any) -> None:
 
     one, two = made(3), made(2, 1)
     assert one.num_envs == two.num_envs == 3
-    one.reset(torch.tensor([False, True, False]))
-    two.reset(torch.tensor([False, True, False]))
+    twins(one).reset(np.array([False, True, False]))
+    twins(two).reset(np.array([False, True]))
     shift = 0.05 * torch.arange(3)[:, None, None]
     resumed = None
     for step in range(4):

@@ -6,32 +6,37 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 
 from taccorl.errors import TaccorlError
-from taccorl.rl import remote_shards
-from taccorl.rl.remote_shards import ProcessShard, RayShard, RemoteShard, start_ray
-from taccorl.rl.start_states import StartStates
-from taccorl.rl.twin_shard import ShardSeen, TwinShard
+from taccorl.rl import shards
+from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard, start_ray
+from taccorl.rl.twin_shard import PRIVILEGED, make_shard
 from taccorl.sim.twin import TwinConfig
-from taccorl.sim.vector_env import TaccorlVectorEnv
 
 ENVS: dict[str, Any] = {
     "task": "assembly_2",
     "num_envs": 2,
     "twin": TwinConfig(),
-    "images": "never",
     "num_threads": 1,
-    "autoreset": AutoresetMode.DISABLED,
     "max_episode_steps": 8,
     "part_poses": True,
 }
-SHARD: dict[str, Any] = {"history": 3, "images": False, "privileged": True, "first": 4}
+OPTIONS: dict[str, Any] = {"history": 3, "privileged": True, "first": 4, "start_share": 0.5, "start_states": 4}
+
+
+def maker(**changes: Any) -> Any:
+    return partial(make_shard, ENVS | changes, **OPTIONS)
+
+
+def call(shard: Shard, method: str, *args: Any) -> Any:
+    shard.start(method, *args)
+    return shard.result()
 
 
 def test_without_ray_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,52 +45,48 @@ def test_without_ray_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> N
         start_ray()
 
 
-def agree(there: RemoteShard) -> None:
+def agree(there: Shard) -> None:
     """Three chunks over a time limit, and a state that goes from there to here."""
-    here = TwinShard(TaccorlVectorEnv(**ENVS), **SHARD, starts=StartStates(0.5, 4))
-    names = ("num_envs", "task", "instruction", "part_names", "limit_steps")
-    assert [getattr(there, name) for name in names] == [getattr(here, name) for name in names]
+    here = LocalShard(maker())
+    assert there.facts == here.facts and here.facts.num_envs == 2
 
-    def check(one: ShardSeen, other: ShardSeen) -> None:
-        assert one.observation.keys() == other.observation.keys()
-        for key, value in one.observation.items():
-            np.testing.assert_array_equal(value, other.observation[key], err_msg=key)
-        np.testing.assert_array_equal(one.window_NLK, other.window_NLK)
-        np.testing.assert_array_equal(one.privileged_NP, other.privileged_NP)
+    def check(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+        assert one.keys() == other.keys() >= {PRIVILEGED, "observation.tactile"}
+        for key, value in one.items():
+            np.testing.assert_array_equal(value, other[key], err_msg=key)
 
     for shard in (here, there):
-        shard.restart(3)
+        call(shard, "restart", 3)
     for step in range(3):
-        seen = here.observe()
-        check(seen, there.observe())
-        actions = np.repeat(seen.observation["observation.state"][:, None].astype(np.float32), 5, axis=1) + 0.02
-        one, other = here.act(actions), there.act(actions)
-        for name in ("reward_N", "terminated_N", "truncated_N", "num_steps_N", "seed_N", "partial_N"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-        assert (one.outcomes, one.later_outcomes) == (other.outcomes, other.later_outcomes)
+        seen = call(here, "observe")
+        check(seen, call(there, "observe"))
+        actions = np.repeat(seen["observation.state"][:, None].astype(np.float32), 5, axis=1) + 0.02
+        one, other = call(here, "act", actions), call(there, "act", actions)
+        for name, value in one._asdict().items():
+            if name != "last":
+                np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
         assert (one.last is None) == (other.last is None) == (step != 1)
-        if one.last is not None and other.last is not None:
+        if one.last is not None:
             check(one.last, other.last)
-    state = there.state_dict()
-    here.load_state_dict(state)
-    check(here.observe(), there.observe())
+    call(here, "load_state_dict", call(there, "state_dict"))
+    check(call(here, "observe"), call(there, "observe"))
     there.close()
     here.close()
 
 
 def test_a_process_gives_the_numbers_of_this_one() -> None:
-    agree(ProcessShard(ENVS, SHARD, (0.5, 4)))
+    agree(ProcessShard(maker()))
 
 
 def test_an_error_in_a_process_says_where_it_arose() -> None:
     with pytest.raises(TypeError, match="foo") as caught:
-        ProcessShard(ENVS | {"foo": 1}, SHARD, (0.0, 1))
-    assert any("_Worker" in note or "__init__" in note for note in caught.value.__notes__)
+        ProcessShard(maker(foo=1))
+    assert any("make_shard" in note for note in caught.value.__notes__)
 
 
 def test_a_process_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_shards, "_PATIENCE_S", 0.5)
-    shard = ProcessShard(ENVS, SHARD, (0.0, 1))
+    monkeypatch.setattr(shards, "_PATIENCE_S", 0.5)
+    shard = ProcessShard(maker())
     assert shard._process.pid is not None
     os.kill(shard._process.pid, signal.SIGSTOP)
     shard.close()
@@ -94,15 +95,15 @@ def test_a_process_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_environments_refuse_in_a_process_is_said_here() -> None:
     with pytest.raises(TaccorlError, match="assembly_22"):
-        ProcessShard(ENVS | {"task": "assembly_22"}, SHARD, (0.0, 1))
+        ProcessShard(maker(task="assembly_22"))
 
 
 def test_a_process_that_was_killed_is_named() -> None:
-    shard = ProcessShard(ENVS, SHARD, (0.0, 1))
-    shard.restart(0)
+    shard = ProcessShard(maker())
+    call(shard, "restart", 0)
     shard._process.kill()
     with pytest.raises(TaccorlError, match=r"--env\.shards.*--resume=true"):
-        shard.observe()
+        call(shard, "observe")
     shard.close()
 
 
@@ -110,7 +111,7 @@ def test_a_process_that_was_killed_is_named() -> None:
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="extra ray is not installed")
 def test_an_actor_gives_the_numbers_of_this_process() -> None:
     ray = start_ray()
-    agree(RayShard(ray, ENVS, SHARD, (0.5, 4)))
+    agree(RayShard(ray, maker(), 1))
     ray.shutdown()
 
 
@@ -119,11 +120,11 @@ def test_environments_end_with_the_process_that_was_killed(tmp_path: Path) -> No
     script = tmp_path / "make.py"
     script.write_text(
         "import time\n"
-        "from gymnasium.vector import AutoresetMode\n"
-        "from taccorl.rl.remote_shards import ProcessShard\n"
+        "from functools import partial\n"
+        "from taccorl.rl.shards import ProcessShard\n"
+        "from taccorl.rl.twin_shard import make_shard\n"
         "if __name__ == '__main__':\n"
-        "    envs = {'task': 'assembly_2', 'autoreset': AutoresetMode.DISABLED}\n"
-        "    shard = ProcessShard(envs, {'history': 3, 'images': False, 'privileged': False}, (0.0, 1))\n"
+        "    shard = ProcessShard(partial(make_shard, {'task': 'assembly_2'}, history=3))\n"
         "    print(shard._process.pid, flush=True)\n"
         "    time.sleep(60)\n"
     )

@@ -1,0 +1,163 @@
+"""Where environments run: in this process, in worker processes of this machine, or in Ray actors of a cluster (extra ``ray``).
+
+Python runs in one thread of a process at a time, so that one process feeds about ten cores with environments. Each shard makes
+its own environments, and receives and returns arrays; the policy stays in the main process, so that no weights are transferred.
+Results do not depend on the place.
+"""
+
+import contextlib
+import importlib
+import logging
+import multiprocessing
+import pickle
+import traceback
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+from taccorl.errors import TaccorlError
+from taccorl.rl.twin_shard import ShardFacts, TwinShard
+
+_PATIENCE_S = 5.0
+"""How long ``close`` waits after SIGTERM before it sends SIGKILL [s]."""
+
+
+class Shard(ABC):
+    """A ``TwinShard`` and the place where it runs. ``start`` calls one of its methods, ``result`` waits for what it returns."""
+
+    facts: ShardFacts
+
+    @abstractmethod
+    def start(self, method: str, *args: Any) -> None: ...
+
+    @abstractmethod
+    def result(self) -> Any: ...
+
+    def close(self) -> None:
+        """Close the environments and end their process."""
+        self.start("close")
+        self.result()
+
+
+class LocalShard(Shard):
+    """In this process."""
+
+    def __init__(self, make: Callable[[], TwinShard]) -> None:
+        self.twins = make()
+        self.facts = self.twins.facts()
+
+    def start(self, method: str, *args: Any) -> None:
+        self._result = getattr(self.twins, method)(*args)
+
+    def result(self) -> Any:
+        return self._result
+
+
+class ProcessShard(Shard):
+    """In another process of this machine.
+
+    A script that makes one must do so below ``if __name__ == "__main__":``, because multiprocessing imports the script again.
+    """
+
+    def __init__(self, make: Callable[[], TwinShard]) -> None:
+        """
+        Args:
+            make: is pickled, and called there.
+
+        Raises:
+            TaccorlError: as the environments raise.
+        """
+        context = multiprocessing.get_context("forkserver")  # imports once, and forks before there are threads
+        context.set_forkserver_preload([__name__])
+        self._pipe, there = context.Pipe()
+        self._process = context.Process(target=_serve, args=(there, make), daemon=True)
+        self._process.start()
+        there.close()  # so that the end of either process ends the other's waiting
+        self.facts = self.result()
+
+    def start(self, method: str, *args: Any) -> None:
+        with contextlib.suppress(BrokenPipeError):  # what it sent last says why
+            self._pipe.send((method, args))
+
+    def result(self) -> Any:
+        try:
+            result, error = self._pipe.recv()
+        except (EOFError, OSError) as end:
+            raise TaccorlError(
+                "--env.shards: a process of environments ended by itself. If it said nothing above, the machine may be out of "
+                "memory: --resume=true goes on from the last checkpoint with the same numbers; with lower --env.num_envs or "
+                "--env.shards begin in another --out from --policy.path=…/checkpoints/last/pretrained_model. (In a script of "
+                'your own, environments are made below if __name__ == "__main__":)'
+            ) from end
+        if error is not None:
+            raise error
+        return result
+
+    def close(self) -> None:
+        self._process.terminate()  # it holds nothing that must be saved
+        self._process.join(_PATIENCE_S)
+        self._process.kill()
+        self._process.join()
+        self._pipe.close()
+
+
+def _serve(pipe: Connection, make: Callable[[], TwinShard]) -> None:
+    """Body of the other process: answer calls from the pipe until its other end is closed."""
+    try:
+        twins = make()
+        pipe.send((twins.facts(), None))
+        while True:
+            method, args = pipe.recv()
+            pipe.send((getattr(twins, method)(*args), None))
+    except (EOFError, BrokenPipeError, KeyboardInterrupt):
+        return
+    except Exception as error:
+        error.add_note(f"In a process of environments:\n{traceback.format_exc()}")
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # it cannot travel
+            error = RuntimeError(traceback.format_exc())
+        pipe.send((None, error))
+
+
+class RayShard(Shard):
+    """In a Ray actor."""
+
+    def __init__(self, ray: Any, make: Callable[[], TwinShard], num_cpus: int) -> None:
+        """
+        Args:
+            ray: module from ``start_ray``.
+            make: is pickled, and called there.
+            num_cpus: that the actor takes.
+        """
+        self._ray = ray
+        self._actor = ray.remote(LocalShard).options(num_cpus=num_cpus).remote(make)
+        self.start("facts")
+        self.facts = self.result()
+
+    def start(self, method: str, *args: Any) -> None:
+        self._actor.start.remote(method, *args)
+        self._waiting = self._actor.result.remote()
+
+    def result(self) -> Any:
+        return self._ray.get(self._waiting)
+
+    def close(self) -> None:
+        super().close()
+        self._ray.kill(self._actor)
+
+
+def start_ray() -> Any:
+    """Start Ray and return its module: connected to the cluster of RAY_ADDRESS, else to one on this machine.
+
+    Raises:
+        TaccorlError: Ray is not installed.
+    """
+    try:
+        ray: Any = importlib.import_module("ray")
+    except ModuleNotFoundError as error:
+        raise TaccorlError("--env.ray=true: Ray is not installed: pip install 'taccorl[ray]'") from error
+    if not ray.is_initialized():
+        ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING)
+    return ray
