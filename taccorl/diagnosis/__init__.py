@@ -1,1 +1,1 @@
-"""Diagnosis: where the twin fails, which effect it lacks, and what to record next."""
+"""Diagnosis: where a twin deviates from measurements, which effect it lacks, and what to record next."""

@@ -1,4 +1,5 @@
-"""The arm's rigid bodies, computed apart from MuJoCo: torques by Newton–Euler recursion, inertia by composite bodies.
+"""Rigid-body dynamics of the arm, computed independently of MuJoCo: torques by Newton–Euler recursion, inertia by composite
+bodies.
 
     M(q) q̈ + c(q, q̇) + g(q) = τ
 
@@ -26,22 +27,22 @@ class Bodies(NamedTuple):
     """Links 1 to 6 as arrays; hand, fingers, pads and payload are part of link 6."""
 
     turn: np.ndarray
-    """(6, 3, 3) parent-from-link at joint angle 0."""
+    """(6, 3, 3) rotation parent-from-link at joint angle 0."""
     origin: np.ndarray
-    """(6, 3) m, of each link in its parent."""
+    """(6, 3) origin of each link in its parent's frame [m]."""
     mass: np.ndarray
-    """(6,) kg."""
+    """(6,) masses [kg]."""
     moment: np.ndarray
-    """(6, 3) kg·m: mass times centre of mass, in the link's frame."""
+    """(6, 3) first moment: mass times centre of mass, in the link's frame [kg·m]."""
     inertia: np.ndarray
-    """(6, 3, 3) kg·m² about the link's origin."""
+    """(6, 3, 3) inertia about the link's origin [kg·m²]."""
 
 
 def bodies(config: RobotConfig, opening_m: float, balls: tuple[tuple[float, float, float, float], ...] = ()) -> Bodies:
-    """The arm of ``config`` with its gripper open by ``opening_m``.
+    """Rigid bodies of the arm of ``config`` with its gripper open by ``opening_m``.
 
     Args:
-        balls: masses fixed to link 6: kg, x, y, z [m].
+        balls: point masses fixed to link 6: mass [kg], x, y, z [m].
     """
     inertias = INERTIAS[config.inertias]
     mass = np.array([body.mass_kg for body in inertias])
@@ -90,7 +91,8 @@ def _link_turn(turn, angle, out):
 
 @numba.njit(cache=True)
 def torques(b: Bodies, q, v, a, gravity):
-    """(6,) N·m that the links need to move with ``a`` at ``q``, ``v`` under ``gravity`` (m/s²): recursive Newton–Euler."""
+    """(6,) joint torques [N·m] for acceleration ``a`` at angles ``q`` and velocities ``v`` under ``gravity`` [m/s²]: recursive
+    Newton–Euler."""
     rot = np.empty((NUM_JOINTS, 3, 3))
     force, couple = np.empty((NUM_JOINTS, 3)), np.empty((NUM_JOINTS, 3))
     w = np.zeros(3)
@@ -159,7 +161,7 @@ def _to_parent(r, p, force, couple, force_parent, couple_parent):
 
 @numba.njit(cache=True)
 def mass_matrix(b: Bodies, q):
-    """(6, 6) kg·m²: composite rigid bodies. Rotors are not in it."""
+    """(6, 6) mass matrix [kg·m²] by composite rigid bodies, without rotors."""
     rot = np.empty((NUM_JOINTS, 3, 3))
     mass, moment, inertia = b.mass.copy(), b.moment.copy(), b.inertia.copy()
     half, turned = np.empty((3, 3)), np.empty(3)
@@ -203,7 +205,7 @@ def mass_matrix(b: Bodies, q):
 
 @numba.njit(cache=True)
 def factor(a):
-    """Cholesky factor of (6, 6), in place in its lower half."""
+    """Cholesky factorisation of (6, 6), in place in the lower half."""
     for j in range(NUM_JOINTS):
         for k in range(j):
             a[j, j] -= a[j, k] * a[j, k]
@@ -216,7 +218,7 @@ def factor(a):
 
 @numba.njit(cache=True, inline="always")
 def solve(a, x):
-    """x (6,) becomes A⁻¹ x."""
+    """Replace x (6,) by A⁻¹ x."""
     for i in range(NUM_JOINTS):
         for k in range(i):
             x[i] -= a[i, k] * x[k]

@@ -1,7 +1,6 @@
-"""A surrogate robot drawn at random: which joint, which drive, what is hidden in it, and the twin that its user starts from.
-
-How strong a hidden effect is, is said by what it leaves on the recordings after the gains have been refitted: 1 to 30 noise
-floors. Its severity is searched for that, within what a robot could have.
+"""A surrogate robot drawn at random: joint, drive, hidden effects, and the twin with which its user starts. The strength of a
+hidden effect is the error in the recordings that remains after a refit of the gains: 1 to 30 noise floors. Its parameters are
+chosen for that strength, within realistic bounds.
 
 Letters in shapes: T rows, J signals.
 """
@@ -44,16 +43,17 @@ from taccorl.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop,
 
 SEVERITY_FLOORS = (1.0, 30.0)
 SEARCHES, CLOSE_ENOUGH = 6, 0.15
-"""Tries for a severity; log of the ratio to what was wanted."""
+"""Most steps of the search for a severity, and accepted error of the result (logarithm of the ratio)."""
 OMEGA_RAD_PER_S, ZETA = (11.0, 24.0), (0.7, 1.5)
-"""Natural frequency and damping of soft drives (MIT mode)."""
+"""Ranges of natural frequency and damping ratio of soft drives (MIT mode)."""
 LOOP_FLOORS = 0.5
-"""What a sampled loop may leave by itself, gains refitted: a slower one is an effect of its own (``slow_velocity_filter``)."""
+"""Largest error that the sampling of a loop alone may leave, with refitted gains [floors]; a slower loop is an effect of its own
+(``slow_velocity_filter``)."""
 LOOP_DRAWS, GAIN_DRAWS, SLOWEST_S = 8, 5, PERIODS_STEPS[-1] * STEP_S + FILTER_S[1]
 PAYLOAD_KG = (0.1, 0.5)
-"""Of a weighed mass that is held in every recording."""
+"""Range of the mass that is held in every recording [kg]."""
 COLOUR_S = (0.01, 0.1)
-"""Time constants of coloured encoder noise."""
+"""Range of the time constants of coloured encoder noise [s]."""
 _RUNAWAY_RAD = 3.0
 _GEARED = ("backlash", "joint_compliance")
 
@@ -64,39 +64,39 @@ class Case:
 
     seed: int
     signal: str
-    """``left_joint5``: the joint under test."""
+    """Joint under test, such as ``left_joint5``."""
     gains: tuple[float, float, float]
-    """True K_p, K_d, T_ref of its drive, as a continuous controller's (``sampled_loop``)."""
+    """True K_p, K_d, T_ref of its drive, converted to those of a continuous controller (``sampled_loop``)."""
     hidden: tuple[Hidden, ...]
     twin: TwinConfig
-    """What the user starts from: without the hidden effects, and with wrong gains where those are unknown."""
+    """Twin with which the user starts: without the hidden effects, and with wrong gains if they are unknown."""
     gains_known: bool
-    """K_p and K_d were commanded, and the drive keeps them."""
+    """True: K_p and K_d are stated in the recordings, and the drive really has them."""
     room: Room
     pose: tuple[float, ...]
-    """(6,) rad of the arm under test, its joint in the middle."""
+    """(6,) pose of the arm under test [rad], with its joint in the middle."""
     floor_rad: float
-    """Noise floor as expected: sensor, and disturbance through the drive."""
+    """Expected noise floor [rad]: from the sensor, and from disturbances through the drive."""
     left_floors: float = 0.0
-    """What the hidden effects leave of an error once K_p, K_d, T_ref have been refitted, in floors."""
+    """Error that the hidden effects cause after a refit of K_p, K_d and T_ref [floors]."""
     design: str = "pack"
     loop: SampledLoop | None = None
-    """None: the velocity loop is continuous."""
+    """Timing of the sampled loop; None: the velocity loop is continuous."""
     loop_floors: float = 0.0
-    """What the loop's sampling alone leaves once the gains have been refitted."""
+    """Error that the loop's sampling alone causes after a refit of the gains [floors]."""
     payload_kg: float = 0.0
-    """Known mass that is held in every recording; a design may have recordings with one besides."""
+    """Known mass that is held in every recording [kg]; a design may have further recordings with a payload."""
     payload_m: tuple[float, float, float] = PAYLOAD_LINK6_M
-    """Where masses are really held, in link 6."""
+    """True position of held masses in link 6's frame [m]."""
     colour_s: float = 0.0
-    """Time constant of the encoder's noise; 0 is white."""
+    """Time constant of the encoder's noise [s]; 0: white noise."""
 
     @property
     def name(self) -> str:
         return f"{'+'.join(h.name for h in self.hidden) or 'none'} on {self.signal}, seed {self.seed}"
 
     def truth(self) -> dict[str, object]:
-        """For the sealed file."""
+        """The true values, for the sealed file."""
         return {
             "seed": self.seed,
             "signal": self.signal,
@@ -116,19 +116,19 @@ class Case:
         }
 
     def values(self) -> dict[str, float]:
-        """``kp``, ``kd``, ``coulomb_friction.torque_nm`` → the true number. K_d as it is set in the drive:
-        more than a continuous controller's, by what the loop's timing takes of it."""
+        """Name of a number, such as ``kp``, ``kd``, ``coulomb_friction.torque_nm`` → its true value. K_d is that of the drive,
+        which is larger than the equivalent continuous controller's because of the loop's timing."""
         numbers = {"kp": self.gains[0], "kd": self.robot.drive.kd, "torque_ff": self.gains[2]}
         return numbers | {f"{h.name}.{name}": value for h in self.hidden for name, value in h.values.items()}
 
     def ratios(self) -> dict[str, float]:
-        """True values of what angles alone identify: torques, stiffnesses, dampings, inertias and masses over K_p; others
-        unchanged."""
+        """True values of the numbers that angles alone identify: torques, stiffnesses, dampings, inertias and masses divided by
+        K_p; others unchanged."""
         own = {n: v for n, v in self.values().items() if n != "kp"}
         return {f"{n}/kp" if _is_torque(n) else n: v / self.gains[0] if _is_torque(n) else v for n, v in own.items()}
 
     def motion(self, motion: Motion) -> Motion:
-        """``motion`` with what this robot holds."""
+        """``motion`` with the payload of this robot added."""
         return dataclasses.replace(motion, payload_kg=motion.payload_kg + self.payload_kg)
 
     @cached_property
@@ -156,20 +156,20 @@ def draw_case(
     loaded: bool = False,
     coloured: bool = False,
 ) -> Case:
-    """A robot in which these effects are hidden; none of them is a robot as the twin has it.
+    """Draw a robot with these hidden effects; without any, the robot equals the twin.
 
     Args:
-        effect_names: of ``hidden.KINDS``.
+        effect_names: names in ``hidden.KINDS``.
         signal: joint under test; drawn among those on which the effects can be seen.
-        strength: noise floors that each of them leaves after a refit of the gains; drawn from 1 to 30.
-        gains_known: the twin has the true K_p and K_d, and recordings say so.
-        design: which recordings will be made, and strength is measured on: ``chirp`` or ``pack``.
+        strength: error that each of them causes after a refit of the gains [floors]; drawn from 1 to 30 if not given.
+        gains_known: the twin has the true K_p and K_d, and recordings state them.
+        design: design of the recordings, on which strength is measured: ``chirp`` or ``pack``.
         sampled: the drive's whole loop is sampled, at 0.5 to 4 kHz with a low-pass of the velocity.
         loaded: a weighed mass is held in every recording.
         coloured: the encoder's noise is correlated over time.
 
     Raises:
-        TaccorlError: nothing of that name can be hidden, a joint on which it cannot be seen, or no such joint.
+        TaccorlError: there is no hidden effect of that name, the joint cannot show it, or there is no such joint.
     """
     if design not in JUDGED_ON:
         raise TaccorlError(f"surrogate: no design {design!r}; {nearest(design, JUDGED_ON)}")
@@ -365,7 +365,7 @@ def _as_strong_as(wanted: float, refit: _Refit, name: str, k: Kind, scale: Scale
 
 
 def find_severity(wanted: float, ends: tuple[float, float], left: Callable[[float], float]) -> float:
-    """Severity within ``ends`` at which ``left`` (what it leaves, in floors) is ``wanted``, or nearest to it."""
+    """Severity within ``ends`` at which the error ``left`` [floors] is ``wanted``, or nearest to it."""
     low, high = np.log(ends)
     found: list[tuple[float, float]] = []  # log severity, log of what is left over what is wanted
     at = 0.5 * (low + high)
@@ -383,7 +383,8 @@ def find_severity(wanted: float, ends: tuple[float, float], left: Callable[[floa
 
 
 def draw_secret(seed: int) -> tuple[str, ...]:
-    """Names of what a robot of this seed hides: mostly one effect of the registry, or two, none, one from outside of it."""
+    """Names of the effects that the robot of this seed hides: usually one of the registry, or two, none, or one from outside of
+    it."""
     rng = np.random.default_rng([seed, zlib.crc32(b"secret")])
     fate = rng.random()
     if fate < 0.1:

@@ -1,9 +1,9 @@
-"""A simulated sensor of force cells that is pressed, held and released; hidden effects act at 1 kHz by equations of their own.
+"""A simulated sensor of force cells that is pressed, held and released; hidden effects act at 1 kHz, by independent equations.
 
     f → material → wires → gain, offset → temperature, drift → noise → converter (0 … 1023 counts)
 
-The load that is recorded has noise of its own, stamps jitter by 1 ms, and half of the sensors have noise that is coloured. All
-files say that they are simulated.
+The recorded load has its own noise, time stamps jitter by 1 ms, and half of the sensors have coloured noise. All files state
+that they are simulated.
 
 Letters in shapes: M milliseconds, T rows, K cells, R × C the grid.
 """
@@ -31,7 +31,7 @@ RATE_HZ = 100.0
 RATED_N = 20.0
 HIGHEST_COUNT = 1023
 LOAD_NOISE = 5e-4
-"""Share of the rated load: the noise of the load cell."""
+"""Noise of the load cell, as a share of the rated load."""
 HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
     "taxel_saturation": lambda rng: {"limit": _between(rng, 8, 60)},
     "taxel_power_law": lambda rng: {"exponent": float(_between(rng, 1.1, 1.6) ** rng.choice([-1.0, 1.0]))},
@@ -52,10 +52,11 @@ HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
     "taxel_crosstalk": lambda rng: {"share": _between(rng, 0.05, 0.4)},
     "taxel_ghosting": lambda rng: {"share": _between(rng, 0.005, 0.05)},
 }
-"""Name → its numbers, in the units of the registry; a reading of 10 is the rated load."""
+"""Name of a hidden effect → function that draws its parameters, in the units of the registry; a reading of 10 is the rated
+load."""
 OF_GRIDS = ("taxel_crosstalk", "taxel_ghosting")
 Knots = tuple[tuple[float, float], ...]
-"""(s, share of the rated load), straight lines between."""
+"""(time [s], share of the rated load), connected by straight lines."""
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -85,21 +86,21 @@ RECORDINGS: dict[str, tuple[str, Knots]] = {
     "long_hold": ("validation", _presses((0.5, 3.0, 15), (0.9, 0.2, 2))),
     "last_presses": ("test", _presses((0.45, 0.2, 4), (0.9, 0.6, 6), (0.15, 0.5, 2))),
 }
-"""Name → use and load; presses_again repeats presses."""
+"""Name of a recording → use and load; presses_again repeats presses."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellsCase:
-    """One simulated sensor with what is hidden in it."""
+    """One simulated sensor with its hidden effect."""
 
     seed: int
     shape: tuple[int, int] = (1, 1)
     hidden: str = ""
-    """A key of ``HIDDEN``; empty for a sensor that the nominal model describes."""
+    """Name of the hidden effect, a key of ``HIDDEN``; empty for a sensor without one."""
     values: Values = field(default_factory=dict)
 
     def config(self) -> CellsConfig:
-        """The sensor as its user knows it."""
+        """The sensor as known to its user: without the hidden effect."""
         rows, columns = self.shape
         grid: dict[str, Any] = {"cells": ["thumb"]} if self.shape == (1, 1) else {"rows": rows, "columns": columns}
         return CellsConfig(
@@ -112,10 +113,10 @@ class CellsCase:
 
 
 def draw_cells(hidden: str, seed: int) -> CellsCase:
-    """A sensor with ``hidden`` in it (empty: with nothing); a grid of 3 × 4 cells where only neighbours show it.
+    """Draw a sensor with the effect ``hidden`` (empty: none). It has 3 × 4 cells if only neighbours can show the effect.
 
     Raises:
-        TaccorlError: nothing of that name can be hidden.
+        TaccorlError: there is no hidden effect of that name.
     """
     if hidden and hidden not in HIDDEN:
         raise TaccorlError(f"simulated cells: no hidden effect {hidden!r}; {nearest(hidden, HIDDEN)}")
@@ -125,7 +126,7 @@ def draw_cells(hidden: str, seed: int) -> CellsCase:
 
 
 def simulated(case: CellsCase) -> Measurements:
-    """Its recordings (``RECORDINGS``)."""
+    """Simulated recordings of the sensor (``RECORDINGS``)."""
     sides: dict[str, list[CellMeasurement]] = {"fit": [], "validation": [], "test": []}
     for name, (use, _) in RECORDINGS.items():
         sides[use].append(record(case, name))
@@ -133,7 +134,7 @@ def simulated(case: CellsCase) -> Measurements:
 
 
 def record(case: CellsCase, name: str) -> CellMeasurement:
-    """One recording: 100 rows a second, the load as a load cell gives it, readings in counts."""
+    """Simulate one recording: 100 rows per second, the load as measured by a load cell, readings in counts."""
     board = np.random.default_rng([case.seed, 1])
     cells = math.prod(case.shape)
     gain = board.uniform(45, 85) * np.exp(0.15 * board.standard_normal(cells))  # counts for 1/10 of the rated load
@@ -179,16 +180,16 @@ def record(case: CellsCase, name: str) -> CellMeasurement:
 
 
 def write_cells(case: CellsCase, folder: Path) -> int:
-    """Write a sensor as files, and what is hidden sealed beside them, as ``taccorl.surrogate.writing`` does robots.
+    """Write the files of a sensor, and the hidden effect in a sealed file, as ``taccorl.surrogate.writing`` does for robots.
 
     FOLDER/presses/*.csv, measurements.yaml, columns.yaml    for ``taccorl compare`` and ``diagnose``
-    FOLDER/taxel.yaml                                        the sensor as its user knows it
+    FOLDER/taxel.yaml                                        the sensor as known to its user
 
     Returns:
-        How many recordings there are.
+        Number of recordings.
 
     Raises:
-        FileExistsError: the folder is there already.
+        FileExistsError: the folder exists.
     """
     config = case.config()
     presses = folder / PRESSES

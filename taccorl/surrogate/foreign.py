@@ -1,9 +1,8 @@
-"""Simulated robots of other makes: an arm of seven joints, a leg whose joints move at once, a SCARA of two joints.
-
-They show what ``taccorl diagnose`` does on a robot file. What is recorded is computed apart from the one-joint model: MuJoCo
-moves the whole robot with steps of 0.25 ms and ``implicitfast``; every joint has a drive of its own that samples a quantised
-encoder at 1 kHz, differentiates it, filters the velocity and holds its torque. Hidden effects are written out here, not taken
-from ``taccorl.sim.effects``. **Simulated: no recording here is of a real robot.**
+"""Simulated robots of other makes, for tests of ``taccorl diagnose`` with robot files: an arm of seven joints, a leg whose
+joints move at the same time, a SCARA of two joints. Recordings are computed independently of the one-joint model: MuJoCo moves
+the whole robot with steps of 0.25 ms and ``implicitfast``; every joint has a drive of its own that samples a quantised encoder
+at 1 kHz, differentiates it, filters the velocity and holds its torque. Hidden effects are written out here, not taken from
+``taccorl.sim.effects``. **Simulated: no recording here is of a real robot.**
 
 Letters in shapes: T rows at 200 Hz, J joints.
 """
@@ -25,13 +24,13 @@ from taccorl.errors import TaccorlError
 ORIGIN = "simulated robot (taccorl.surrogate.foreign)"
 RATE_HZ, LOOP_HZ, STEP_S = 200, 1000, 0.25e-3
 FILTER_S = 1e-3
-"""Low-pass of each drive's velocity."""
+"""Time constant of the low-pass filter of each drive's velocity [s]."""
 QUANTUM_RAD = 2 * math.pi / 2**17
-"""Of the encoders."""
+"""Step of the encoders [rad]."""
 NOISE_RAD, NOISE_SHARE = 1e-4, 2e-3
-"""Of what is logged: angles; efforts, as a share of the largest."""
+"""Noise of logged angles [rad], and of logged efforts as a share of the largest one."""
 DISTURBANCE_SHARE = 1e-3
-"""Of the torque for 0.1 rad: a coloured disturbance (50 ms) at every joint."""
+"""Standard deviation of a coloured disturbance (50 ms) at every joint, as a share of the torque for 0.1 rad."""
 KINDS = {
     "coulomb_friction": (0.01, 0.06),
     "viscous_friction": (0.1, 0.5),
@@ -53,7 +52,7 @@ KINDS = {
     "joint_compliance": (0.05, 0.2),
     "encoder_scale": (0.02, 0.06),
 }
-"""Hidden effect → range of its strength (``Case.strength``)."""
+"""Name of a hidden effect → range of its strength (``Case.strength``)."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ _SCARA2 = (
 )
 ROBOTS: Mapping[str, tuple[Link, ...]] = {"arm of 7 joints": _ARM7, "leg": _LEG3, "SCARA": _SCARA2}
 EXAMPLE = "arm of 6 joints"
-"""Of docs/your_robot.md."""
+"""Robot of the example in docs/your_robot.md."""
 _ARM6 = (
     Link("shoulder_pan", (0, 0, 1), (0, 0, 0.12), 2.5, 0.10, 0.3),
     Link("shoulder_lift", (0, 1, 0), (0.30, 0, 0.02), 2.8, 0.10, -0.5),
@@ -107,7 +106,7 @@ CARRIES_WEIGHT = ("arm of 7 joints", EXAMPLE)
 
 
 def mjcf(links: Sequence[Link], gear: Mapping[str, str] = {}) -> str:
-    """A robot's model file. Passive forces are none; ``armature`` is the rotor's.
+    """Text of a robot's MJCF file, without passive forces; ``armature`` is the rotor's inertia.
 
     Args:
         gear: joint → attributes of a second hinge between its motor and its link.
@@ -145,10 +144,11 @@ class Case:
     hidden: str
     """Name of the effect; empty: none."""
     strength: float
-    """Torques as a share of K_p · 0.35 rad, dampings of K_d, inertias of J, springs and 1 / compliance of K_p …: ``_numbers``."""
+    """Strength of the hidden effect as a share of a reference value: K_p · 0.35 rad for torques, K_d for dampings, J for
+    inertias, K_p for springs and 1 / compliance … (``_numbers``)."""
     seed: int
     effort: bool
-    """Efforts are logged."""
+    """True: efforts are logged."""
 
     @property
     def links(self) -> tuple[Link, ...]:
@@ -160,7 +160,7 @@ class Case:
 
 
 def draw(seed: int, hidden: str) -> Case:
-    """A case: robot, joint and strength follow from the seed."""
+    """Draw a case: robot, joint and strength follow from the seed."""
     rng = np.random.default_rng([seed, 77])
     robot = list(ROBOTS)[seed % len(ROBOTS)]
     links = ROBOTS[robot]
@@ -172,7 +172,7 @@ def draw(seed: int, hidden: str) -> Case:
 
 @dataclass
 class Plant:
-    """The robot of a case as it really is."""
+    """The real robot of a case, with its hidden effect."""
 
     case: Case
     kp: np.ndarray = field(init=False)
@@ -192,7 +192,7 @@ class Plant:
         self.carries = float(self.case.robot in CARRIES_WEIGHT)
 
     def robot_file(self, folder: Path) -> Path:
-        """The user's model and robot file: nothing hidden, gains as commanded."""
+        """The user's model and robot file: without the hidden effect, with the commanded gains."""
         (folder / "robot.xml").write_text(mjcf(self.case.links), encoding="utf-8")
         lines = ["kind: robot", "model: robot.xml", f"gravity_compensation: {self.carries}", "joints:"]
         for link, kp, kd in zip(self.case.links, self.kp, self.kd, strict=True):
@@ -204,7 +204,7 @@ class Plant:
         return path
 
     def record(self, name: str, target: np.ndarray, seed: int, repeat_of: str | None = None) -> Measurement:
-        """A recording of ``target`` (T, J)."""
+        """Simulate a recording of the targets ``target`` (T, J)."""
         measured, effort = _simulate(self, target, np.random.default_rng([self.case.seed, seed]))
         return Measurement(
             name=name,
@@ -220,7 +220,7 @@ class Plant:
 
 
 def recordings(plant: Plant) -> Measurements:
-    """A chirp twice and a triangle for fitting, another chirp and steps for validation."""
+    """Simulate all recordings: a chirp (twice) and a triangle for the fit, another chirp and steps for validation."""
     chirp = _targets(plant, _chirp(9.0, 0.1, 2.5, 0.3))
     return Measurements(
         fit=(
@@ -237,7 +237,7 @@ def recordings(plant: Plant) -> Measurements:
 
 
 def with_robot(case: Case, folder: Path) -> tuple[Robot, Measurements]:
-    """The user's robot file in ``folder``, and recordings of the case's robot."""
+    """Write the user's robot file into ``folder``; returns it with the recordings of the case's robot."""
     plant = Plant(case)
     return load_robot(plant.robot_file(folder)), recordings(plant)
 
@@ -406,10 +406,11 @@ def _weight(model: mujoco.MjModel, data: mujoco.MjData, angles: np.ndarray) -> n
 
 
 def write_example(folder: Path) -> Plant:
-    """An arm of six joints as its user has it: ``arm.xml``, and ``sweeps/`` of its elbow as tables. Dry friction is hidden.
+    """Write the files that the user of an arm with six joints has: ``arm.xml``, and ``sweeps/`` of its elbow as tables. The
+    hidden effect is dry friction.
 
     Raises:
-        TaccorlError: the folder is there already.
+        TaccorlError: the folder exists.
     """
     case = Case(robot=EXAMPLE, joint="elbow", hidden="coulomb_friction", strength=0.02, seed=6, effort=True)
     plant = Plant(case)
@@ -441,7 +442,7 @@ def write_example(folder: Path) -> Plant:
 
 
 def main(argv: Sequence[str]) -> int:
-    """``python -m taccorl.surrogate.foreign my_arm``: writes the example, and prints the gains of its drives."""
+    """Command line ``python -m taccorl.surrogate.foreign my_arm``: write the example, and print the gains of its drives."""
     plant = write_example(Path(argv[0]))
     print(f"wrote {argv[0]}: arm.xml and sweeps/ of its elbow; simulated, no robot was near. Its drives run:")
     for link, kp, kd in zip(plant.case.links, plant.kp, plant.kd, strict=True):

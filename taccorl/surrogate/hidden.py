@@ -1,8 +1,8 @@
 """Effects that can be hidden in the surrogate robot: those of the registry by name and parameters, and some outside of it.
 
-Each kind says how large it may be (``severity``, from subtle to absurd), what numbers a severity stands for in the registry's
-terms, and what they are in the surrogate's own plant. The registry's classes (``taccorl.sim.effects``) define what the names
-mean; nothing of their code computes anything here.
+Each kind states its range of strength (``severity``), the parameters in the registry's terms for a severity, and the
+corresponding numbers of the surrogate's own plant. The registry's classes (``taccorl.sim.effects``) define the meaning of the
+names; their code is not used.
 """
 
 import math
@@ -28,17 +28,17 @@ class Scale:
     kp: float
     kd: float
     inertia: float
-    """kg·m², rotor included."""
+    """Inertia, rotor included [kg·m²]."""
     torque: float
-    """N·m: the most that the drive gives on the recordings, weight included."""
+    """Largest torque of the drive in the recordings, weight included [N·m]."""
     speed: float
-    """rad/s: of the chirp's target, at most."""
+    """Highest speed of the chirp's target [rad/s]."""
     centre: float
-    """rad: about which it is moved."""
+    """Angle about which the joint is moved [rad]."""
     sweep: float = 0.35
-    """rad: amplitude of the chirp."""
+    """Amplitude of the chirp [rad]."""
     reach: float = 0.35
-    """rad: as far as it is moved from there on the recordings."""
+    """Largest distance from that angle in the recordings [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,14 +46,15 @@ class Change:
     """Change of the plant by a hidden effect."""
 
     drive: Values = field(default_factory=dict)
-    """Fields of ``Drive``. Torques, inertias, delays add up, ``torque_scale`` multiplies, the others replace."""
+    """Changes of fields of ``Drive``. Torques, inertias and delays are added, ``torque_scale`` is multiplied, others are
+    replaced."""
     carried: float = 1.0
-    """Times the share of the weight that the controller carries."""
+    """Factor on the share of the weight that the controller compensates."""
     ball: tuple[float, float, float, float] | None = None
-    """Mass fixed to link 6: kg, x, y, z [m]."""
+    """Point mass fixed to link 6: mass [kg], x, y, z [m]; None: none."""
     report_delay_s: float = 0.0
     dropped: float = 0.0
-    """Share of commands that never arrive, in each recording others."""
+    """Share of commands that never arrive; other ones in each recording."""
 
 
 _ADD = frozenset(
@@ -62,7 +63,7 @@ _ADD = frozenset(
 
 
 def changed(drive: Drive, changes: list[Change]) -> Drive:
-    """``drive`` with all that is hidden in it."""
+    """``drive`` with all hidden effects."""
     for change in changes:
         for name, value in change.drive.items():
             before = getattr(drive, name)
@@ -79,12 +80,13 @@ class Kind:
     """One kind of hidden effect."""
 
     severity: Callable[[Scale], tuple[float, float]]
-    """From hardly there to the most that a robot could have; the error grows with it."""
+    """Function that returns the range of severities, from hardly visible to the largest realistic one; the error grows with the
+    severity."""
     values: Callable[[float, Scale, Values], Values]
-    """Severity and shape → numbers, by the registry's parameter names where it has the effect."""
+    """Function (severity, scale, shape) → parameters, with the registry's names if it has the effect."""
     plant: Callable[[Values], Change]
     shape: Callable[[np.random.Generator, Scale], Values] = lambda rng, scale: {}
-    """Numbers that say what it is like and not how strong it is."""
+    """Function that draws parameters which determine the effect's form, not its strength."""
     joints: tuple[int, ...] = tuple(range(1, ROBOT.num_joints + 1))
     """Joints on which it can be seen."""
     stiff: bool = True

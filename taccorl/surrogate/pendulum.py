@@ -24,22 +24,21 @@ from taccorl.errors import TaccorlError
 
 ORIGIN = "simulated servo (taccorl.surrogate.pendulum)"
 STEP_S, LOOP_STEPS = 5e-5, 20
-"""Of the physics; so many make a cycle of the servo's loop (1 ms)."""
+"""Physics step [s], and number of steps per cycle of the servo's loop (1 ms)."""
 TICK_RAD, MIDDLE_TICK = 2 * math.pi / 4096, 2048
 DUTY_STEPS = 885
 KP_FACTOR = 4096 / (2 * math.pi) / (128 * DUTY_STEPS)
-"""Duty per rad of one step of the gain's register: a register of 128 is one step of duty a tick."""
+"""Duty per rad for one step of the gain's register: a register of 128 is one step of duty per tick."""
 SUPPLY_V, SOURCE_OHM = 7.4, 0.25
 LOADS = ((0.05, 0.10), (0.10, 0.10), (0.10, 0.15), (0.22, 0.10), (0.20, 0.15))
-"""kg, m of each load, from light to heavy: 0.05 to 0.29 N·m."""
+"""Mass [kg] and lever [m] of each load, from light to heavy: 0.05 to 0.29 N·m."""
 GAINS = (200, 400, 800)
-"""Of the register."""
+"""Values of the gain's register."""
 USES = ("fit", "validation", "fit", "test", "fit")
-"""Of the loads' recordings."""
+"""Uses of the loads' recordings."""
 GRAVITY = 9.81
 DISTURBANCE_SHARE = 2e-3
-"""RMS of a random torque (correlated over 50 ms), as a share of the torque that the gear passes on. No model of the search has
-it."""
+"""RMS of a random torque (correlated over 50 ms), as a share of the torque through the gear. It is in no model of the search."""
 KINDS: Mapping[str, tuple[float, float]] = {
     "load_friction": (0.05, 0.2),
     "coulomb_friction": (0.01, 0.05),
@@ -47,29 +46,29 @@ KINDS: Mapping[str, tuple[float, float]] = {
     "backlash": (0.015, 0.05),
     "motor": (1.3, 1.8),
 }
-"""What is hidden → range of its strength. load_friction: share of the load; coulomb_friction [N·m]; stribeck_friction: N·m while
-moving, twice that at rest; backlash: play [rad]; motor: factor by which the servo file's k_t and k_e are too large or too small.
-The last is no effect: every fit adjusts these numbers."""
+"""Name of a hidden fault → range of its strength. load_friction: share of the load; coulomb_friction [N·m]; stribeck_friction:
+N·m while moving, twice that at rest; backlash: play [rad]; motor: factor by which the servo file's k_t and k_e are too large or
+too small. The last is not an effect, because every fit adjusts these numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Servo:
-    """The servo of a case as it really is."""
+    """The real servo of a case."""
 
     seed: int
     hidden: str
-    """Key of ``KINDS``; empty: nothing."""
+    """Key of ``KINDS``; empty: nothing is hidden."""
     strength: float = field(init=False)
     inertia: float = field(init=False)
-    """kg·m² of rotor and gear at the output shaft."""
+    """Inertia of rotor and gear at the output shaft [kg·m²]."""
     resistance_ohm: float = field(init=False)
     torque_nm_per_a: float = field(init=False)
     emf_v_s_per_rad: float = field(init=False)
     dry_nm: float = field(init=False)
-    """Dry friction that the servo's file states, too. Servos with another kind of friction hidden have none."""
+    """Dry friction that the servo's file also states [N·m]; 0 for servos with another hidden friction."""
     arm_kg_per_m: float = field(init=False)
     rate_hz: int = field(init=False)
-    """At which the script would like to run."""
+    """Rate at which the script is meant to run [Hz]."""
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng([self.seed, 91])
@@ -89,7 +88,7 @@ class Servo:
             object.__setattr__(self, name, value)
 
     def numbers(self) -> dict[str, float]:
-        """Of the hidden effect, in its own units."""
+        """Parameters of the hidden fault in its own units."""
         return {
             "load_friction": {"share": self.strength},
             "coulomb_friction": {"coulomb": self.strength},
@@ -98,7 +97,7 @@ class Servo:
         }.get(self.hidden, {})
 
     def sheet(self) -> dict[str, float]:
-        """What the data sheet says of the motor: 10 % off, and far off where that is what is hidden."""
+        """Values in the data sheet of the motor: 10 % wrong, and far more if they are the hidden fault."""
         rng = np.random.default_rng([self.seed, 92])
         wrong = self.strength if self.hidden == "motor" else 1.0
         factors = wrong ** rng.choice([-1.0, 1.0], 2) * rng.uniform(0.9, 1.1, 2)
@@ -112,10 +111,10 @@ class Servo:
 
 
 def write(servo: Servo, folder: Path) -> None:
-    """What its user has: ``servo.yaml`` and ``swings/`` with tables, ``columns.yaml`` and ``measurements.yaml``.
+    """Write the files of its user: ``servo.yaml`` and ``swings/`` with tables, ``columns.yaml`` and ``measurements.yaml``.
 
     Raises:
-        TaccorlError: the folder is there already.
+        TaccorlError: the folder exists.
     """
     if (folder / "swings").exists():
         raise TaccorlError(f"{folder}/swings: is there already; name a new folder")
@@ -157,7 +156,7 @@ signals:
 
 
 def servo_file(servo: Servo) -> str:
-    """The axis file that its user writes from the data sheet."""
+    """Text of the axis file that the user of the servo would write from the motor's data sheet."""
     sheet = servo.sheet()
     return f"""\
 kind: axis
@@ -211,7 +210,7 @@ def _steps(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 MOTIONS = {"chirp": _chirp, "up_and_down": _up_and_down, "lift_and_drop": _lift_and_drop, "steps": _steps}
-"""Goal [rad] and whether the torque is enabled, at times [s]; 0 hangs."""
+"""Motions: goal [rad] and whether the torque is enabled, at times [s]; at angle 0 the load hangs down."""
 DURATION_S = 5.5
 
 
@@ -302,7 +301,7 @@ def _swing(
 
 
 def main(argv: Sequence[str]) -> int:
-    """Write the example: load-dependent friction is hidden in it."""
+    """Command line: write the example, whose hidden fault is load-dependent friction."""
     servo = Servo(seed=3, hidden="load_friction")
     write(servo, Path(argv[0]))
     print(

@@ -1,11 +1,12 @@
-"""The surrogate robot's arm: rigid bodies, a drive with friction, gear and sampled controller, computed apart from the twin.
+"""The surrogate robot's arm: rigid bodies, a drive with friction, gear and sampled controller, computed independently of the
+twin.
 
     M(q) q̈ + c(q, q̇) + g(q) = τ                      six joints, M by composite bodies, c and g by Newton–Euler recursion
-    τ_j = τ_drive − LuGre friction − …                the joint that has hidden effects; the others keep the paper's gains
+    τ_j = τ_drive − LuGre friction − …                equation of the joint with hidden effects; the others have the paper's gains
 
-What differs from the twin on purpose: no MuJoCo anywhere; 0.125 ms steps (the twin: 0.83 ms), M, c and g renewed each
-millisecond half a millisecond ahead, the drive's damping implicit; friction of bristles (Canudas de Wit et al. 1995) instead of
-a constraint; weight carried by a model that the controller evaluates at the encoders' angles; a gear with contact stiffness;
+Intended differences from the twin: no MuJoCo anywhere; 0.125 ms steps (the twin: 0.83 ms), M, c and g computed every millisecond
+for half a millisecond later, implicit damping of the drive; bristle friction (Canudas de Wit et al. 1995) instead of a
+constraint; gravity compensation by a model that the controller evaluates at the encoders' angles; a gear with contact stiffness;
 coloured disturbance torques on every joint. The controller of the joint under test is one of two:
 
     continuous   positions are sampled at 1 kHz with jitter, the drive's velocity loop is continuous
@@ -25,14 +26,14 @@ import numpy as np
 from taccorl.surrogate.arm import GRAVITY, NUM_JOINTS, Bodies, factor, mass_matrix, solve, torques
 
 SUBSTEPS = 8
-"""Integration steps in a millisecond."""
+"""Number of integration steps per millisecond."""
 STEP_S = 1e-3 / SUBSTEPS
 COMMAND_MS = 5
-"""Commands come at 200 Hz and are held."""
+"""Period of commands [ms]: they come at 200 Hz and are held."""
 
 
 class Drive(NamedTuple):
-    """Parameters of drive, gear and friction of the joint under test. Absent values by default; rad, N·m, s."""
+    """Parameters of drive, gear and friction of the joint under test, in rad, N·m, s. By default effects are absent."""
 
     kp: float
     kd: float
@@ -43,21 +44,21 @@ class Drive(NamedTuple):
     coulomb: float = 0.0
     asymmetry: float = 0.0
     stribeck: float = 0.0
-    """Torque that stiction adds to ``coulomb``."""
+    """Torque that stiction adds to ``coulomb`` [N·m]."""
     stribeck_speed: float = 0.05
     presliding: float = 3e-5
-    """Bend of the bristles at the break-away torque."""
+    """Deflection of the bristles at the break-away torque [rad]."""
     load_share: float = 0.0
     angle_share: float = 0.0
-    """Outside the registry: friction torque grows and falls with the angle by this share, twice a turn."""
+    """Relative variation of the friction torque with the angle, with two periods per turn (not in the registry)."""
     angle_phase: float = 0.0
     spot: float = 0.0
-    """Friction torque that a tight spot adds in its middle."""
+    """Friction torque that a tight spot adds in its middle [N·m]."""
     spot_angle: float = 0.0
     spot_width: float = 0.1
     # torques that hang on the angle
     stop: float = 0.0
-    """N·m/rad of an end stop, on the far side of ``stop_angle`` from where the joint starts."""
+    """Stiffness of an end stop [N·m/rad], on the far side of ``stop_angle`` from the start."""
     stop_angle: float = 0.0
     cogging: float = 0.0
     cogging_periods: float = 12.0
@@ -65,15 +66,15 @@ class Drive(NamedTuple):
     spring: float = 0.0
     spring_rest: float = 0.0
     hysteresis: float = 0.0
-    """Outside the registry: magnetic hysteresis, a Bouc–Wen torque with this most …"""
+    """Largest torque of a magnetic hysteresis (Bouc–Wen) [N·m] (not in the registry)."""
     hysteresis_width: float = 0.05
-    """… reached after so many rad of travel."""
+    """Travel after which the hysteresis torque is reached [rad]."""
     hung_inertia: float = 0.0
-    """Outside the registry: kg·m² that hang on the link by a spring …"""
+    """Inertia that is coupled to the link by a spring [kg·m²] (not in the registry)."""
     hung_rad_per_s: float = 30.0
-    """… of this natural frequency …"""
+    """Natural frequency of that inertia on its spring [rad/s]."""
     hung_damping: float = 0.05
-    """… and damping ratio."""
+    """Damping ratio of that inertia on its spring."""
     # setpoint
     delay: float = 0.0
     lag: float = 0.0
@@ -84,27 +85,27 @@ class Drive(NamedTuple):
     integral: float = 0.0
     gravity_carried: float = 1.0
     loop_steps: int = 0
-    """Of a sampled loop: integration steps between two samples. 0: the velocity loop is continuous."""
+    """Number of integration steps between two samples of a sampled loop; 0: the velocity loop is continuous."""
     velocity_filter: float = 0.0
-    """Time constant of a sampled loop's low-pass of the velocity."""
+    """Time constant of the low-pass of the velocity in a sampled loop [s]."""
     loop_delay: float = 0.0
-    """Outside the registry: from the encoder to the torque, velocity included."""
+    """Delay from the encoder to the torque, for position and velocity [s] (not in the registry)."""
     torque_lag: float = 0.0
     torque_max: float = math.inf
     stall: float = math.inf
-    """Torque that the motor has at rest; driving, it falls in proportion to the speed …"""
+    """Torque of the motor at rest [N·m]; when it drives, the torque falls linearly with the speed to 0 at ``no_load``."""
     no_load: float = math.inf
-    """… and is 0 here."""
+    """Speed at which a driving motor has no torque [rad/s]."""
     torque_scale: float = 1.0
     one_way: float = 0.0
-    """Outside the registry: torques upwards are larger by this share, downwards smaller."""
+    """Share by which torques upwards are larger, and downwards smaller (not in the registry)."""
     sag: float = 0.0
-    """Outside the registry: torques are divided by 1 + this times the motor's power (1/W): the supply's voltage sags …"""
+    """Sag of the supply voltage: torques are divided by 1 + this times the motor's power [1/W] (not in the registry)."""
     sag_time: float = 0.05
-    """… after so long."""
+    """Time constant of the sag [s]."""
     fade: float = 0.0
     warm_up: float = 0.0
-    """Outside the registry: friction torque falls by this share a second, as grease warms up."""
+    """Rate at which the friction torque falls as grease warms up [1/s] (not in the registry)."""
     # gear
     motor_inertia: float = 0.01
     play: float = 0.0
@@ -115,39 +116,39 @@ class Drive(NamedTuple):
     encoder_bias: float = 0.0
     encoder_wave: float = 0.0
     encoder_waves: float = 1.0
-    """Periods a turn; 1 is a disc off its axis, others lie outside the registry."""
+    """Periods of the encoder's error per turn: 1 for an eccentric disc, other values are not in the registry."""
     encoder_phase: float = 0.0
 
 
 class Arm(NamedTuple):
-    """The arm and its six drives; those of the joint under test are in its ``Drive``."""
+    """The arm and its six drives; that of the joint under test is described by its ``Drive``."""
 
     bodies: Bodies
     believed: Bodies
-    """With which the controller carries the weight."""
+    """Rigid bodies with which the controller computes the gravity compensation."""
     carried: float
-    """Share of the believed weight that it carries."""
+    """Share of that weight that it compensates."""
     armature: np.ndarray
-    """(6,) kg·m²."""
+    """(6,) rotor inertias [kg·m²]."""
     kp: np.ndarray
     kd: np.ndarray
     torque_ff: np.ndarray
 
 
 class Run(NamedTuple):
-    """Every millisecond, before the controller of that millisecond acts."""
+    """State of the arm at every millisecond, before the controller acts."""
 
     angle: np.ndarray
-    """(M, 6) rad of the motors, behind the gear: true, not as encoders report."""
+    """(M, 6) true angles of the motors, on the motor's side of the gear [rad]."""
     velocity: np.ndarray
-    """(M, 6) rad/s."""
+    """(M, 6) velocities of the motors [rad/s]."""
     effort: np.ndarray
-    """(M, 6) N·m of the motors, less the weight that they were sent to carry; half a millisecond old."""
+    """(M, 6) motor torques without gravity compensation, half a millisecond old [N·m]."""
 
 
 @numba.njit(cache=True)
 def encoder(d: Drive, angle):
-    """Reading of the encoder of the joint under test."""
+    """Reading of the joint under test's encoder."""
     return d.encoder_scale * angle + d.encoder_bias + d.encoder_wave * np.sin(d.encoder_waves * angle + d.encoder_phase)
 
 
@@ -164,13 +165,14 @@ def _arrived(target, joint, ms, delay_ms, window_ms):
 
 @numba.njit(cache=True)
 def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter, lead_ms: int) -> Run:
-    """The arm under ``target`` (T, 6) rad at 200 Hz, after ``lead_ms`` in which it comes to rest at the first of them.
+    """Simulate the arm with targets ``target`` (T, 6) [rad] at 200 Hz, after ``lead_ms`` in which it comes to rest at the first
+    target.
 
     Args:
-        joint: of the six, counted from 0, that ``d`` belongs to.
-        start: (6,) rad where the lead begins, at rest.
-        disturbance: (lead_ms + 5 T, 6) N·m.
-        jitter: (lead_ms + 5 T) of the controller's milliseconds, in steps of 0.125 ms; 0 with a sampled loop, whose timer is the
+        joint: index of the joint to which ``d`` belongs, 0 to 5.
+        start: (6,) angles at rest at the beginning [rad].
+        disturbance: (lead_ms + 5 T, 6) disturbance torques [N·m].
+        jitter: (lead_ms + 5 T) jitter of the controller's cycles, in steps of 0.125 ms; 0 with a sampled loop, whose timer is the
             drive's own.
     """
     h = STEP_S

@@ -1,4 +1,4 @@
-"""Recordings of a surrogate robot, in memory: what the drivers would have logged, with noise, quantisation and metadata.
+"""Recordings of a surrogate robot in memory: the data that drivers would log, with noise, quantisation and metadata.
 
 Letters in shapes: T rows, J signals.
 """
@@ -22,19 +22,20 @@ from taccorl.surrogate.robot import NOISE_RAD, QUANTUM_RAD
 ORIGIN = "surrogate robot, simulated; not a robot"
 SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
 EFFORT_NOISE_SHARE, EFFORT_NOISE_NM, EFFORT_QUANTUM_NM = 0.01, 0.005, 1e-3
-"""Noise of efforts, a choice: share of the largest in the recording, and at least. PiPER reports steps of 1 mN·m."""
+"""Noise of efforts: share of the largest effort in the recording, and least value [N·m], both choices; step in which PiPER
+reports them."""
 OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
 
 
 def recordings(case: Case, design: str | None = None) -> Measurements:
-    """All recordings of one robot: those of the design for fitting, and others for validation and for the test.
+    """Simulate all recordings of one robot: those of the design for the fit, and others for validation and test.
 
     Args:
         design: ``chirp`` (the paper's 10 s sweep, twice) or ``pack`` (with triangle, steps, small chirp, 2× gain, payload);
             the case's by default.
 
     Raises:
-        TaccorlError: no such design.
+        TaccorlError: there is no such design.
     """
     design = case.design if design is None else design
     if design not in DESIGNS:
@@ -45,7 +46,7 @@ def recordings(case: Case, design: str | None = None) -> Measurements:
 
 
 def record(case: Case, motion: Motion) -> Measurement:
-    """One recording. The same case and motion give the same numbers, bit for bit."""
+    """Simulate one recording. The same case and motion give the same numbers, bit for bit."""
     rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(motion.name.encode())])
     robot, motion = case.robot, case.motion(motion)
     run = robot.run(motion, case.room, rng)

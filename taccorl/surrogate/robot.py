@@ -19,40 +19,42 @@ from taccorl.surrogate.plant import COMMAND_MS, SUBSTEPS, Arm, Drive, Run, encod
 from taccorl.surrogate.sampled_loop import SampledLoop
 
 LEAD_MS = 1500
-"""Before a recording begins the arm comes to rest at its first target …"""
+"""Time in which the arm comes to rest at the first target before a recording [ms]."""
 APPROACH_RAD = 0.01
-"""… from so far off, on either side: with friction it rests beside it."""
+"""Distance from which it approaches that target, from either side [rad]: with friction it then rests beside the target."""
 NOISE_RAD = 2e-4
-"""Of an encoder's reading."""
+"""Standard deviation of an encoder's noise [rad]."""
 QUANTUM_RAD = math.radians(0.001)
-"""PiPER's step of angles."""
+"""Step of PiPER's reported angles [rad]."""
 SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
 EFFORT_NOISE_SHARE, EFFORT_QUANTUM_NM = 0.01, 1e-3
-"""Noise of efforts over the joint's largest on the chirp: a choice. PiPER reports N·m in steps of a thousandth."""
+"""Noise of efforts as a share of the joint's largest on the chirp (a choice), and the step in which PiPER reports them [N·m]."""
 JITTER_S = 2e-4
-"""Of each of the controller's milliseconds."""
+"""Standard deviation of the jitter of the controller's cycles [s]."""
 TWIN_LATE_S = 0.5 * PhysicsConfig().timestep_s
 LATE_S = 0.5e-3 + TWIN_LATE_S
-"""Gains are stated as the twin would need them. A controller that samples positions a millisecond apart acts half of one late,
-which takes K_p · 0.5 ms of damping (a sampled loop: half of its period); the twin's implicit steps add half a step of K_p."""
+"""Delay that is included in the stated gains [s], so that they are valid for the twin. A controller that samples positions every
+millisecond acts half a millisecond late, which reduces the damping by K_p · 0.5 ms (a sampled loop: half of its period); the
+twin's implicit steps add half a step of K_p."""
 PAYLOAD_LINK6_M = (0.0, 0.0, ROBOT.tcp_from_hand_m)
-"""Where a known mass is held: its centre in the middle between the pads …"""
+"""Nominal centre of a held mass in link 6's frame [m]: the middle between the pads."""
 PAYLOAD_OFF_M = 0.002
-"""… but for so much (standard deviation along each axis, of one robot to the next): nobody grips a weight in its very middle."""
+"""Standard deviation, along each axis and between robots, of the true centre from the nominal one [m]: no weight is gripped
+exactly in its middle."""
 LOST_RUN = (0.8, 0.15, 0.05)
-"""Shares of one, two, three commands lost in a row."""
+"""Probabilities that one, two or three consecutive commands are lost together."""
 DISTURBANCE_SHARE = 0.01
-"""Torque that nobody accounts for, over the one that weight and a swing at 1.5 Hz take."""
+"""Unmodelled disturbance torque, as a share of the torque for weight and a motion at 1.5 Hz."""
 DISTURBANCE_HZ = 5.0
 
 
 class Robot:
-    """The plant with its sensors: commands in, reports out.
+    """The plant with its sensors: simulates reports for commands.
 
     Args:
-        gains: K_p, K_d, T_ref as a continuous controller's.
-        loop: of the joint under test; None is the drive whose velocity loop is continuous.
-        payload_m: (3,) where known masses are held, in link 6.
+        gains: K_p, K_d, T_ref of the equivalent continuous controller.
+        loop: timing of the loop of the joint under test; None: its velocity loop is continuous.
+        payload_m: (3,) true position of known masses in link 6's frame.
     """
 
     def __init__(
@@ -80,10 +82,10 @@ class Robot:
         self._believed = bodies(config, OPENING_M)
 
     def run(self, motion: Motion, room: Room, rng: np.random.Generator | None = None, **drive: float) -> Run:
-        """The true motion; without ``rng`` nothing disturbs it.
+        """Simulate the true motion; without ``rng`` there are no disturbances.
 
         Args:
-            drive: fields of ``Drive`` that are changed for this run.
+            drive: changed fields of ``Drive`` for this run.
         """
         own = motion.target(room)
         target = np.tile(self.pose, (len(own), 1))
@@ -133,7 +135,7 @@ class Robot:
         return DISTURBANCE_SHARE * weight
 
     def carried_nm(self, run: Run) -> np.ndarray:
-        """(M,) weight of the joint under test that its motor carries."""
+        """(M,) torque of the gravity compensation at the joint under test [N·m]."""
         angle, zero = self.pose.copy(), np.zeros(ROBOT.num_joints)
         coarse = np.linspace(run.angle[:, self.joint].min(), run.angle[:, self.joint].max(), 50)
         weight = []
@@ -142,7 +144,7 @@ class Robot:
         return np.interp(run.angle[:, self.joint], coarse, weight)
 
     def reported(self, run: Run) -> np.ndarray:
-        """(T, 6) rad reported by the encoders at each row, without noise."""
+        """(T, 6) angles reported by the encoders at each row, without noise [rad]."""
         late_ms = 1e3 * sum(c.report_delay_s for c in self._changes)
         ms = np.arange(len(run.angle), dtype=float)
         rows = ms[::COMMAND_MS] - late_ms
@@ -165,7 +167,7 @@ class Robot:
 
 
 def inertia_and_weight(pose: np.ndarray, joint: int, payload_kg: float = 0.0) -> tuple[float, float]:
-    """kg·m² with rotor, and N·m, of joint 1 to 6 at ``pose`` (6,) while the others stand still."""
+    """Inertia with rotor [kg·m²] and weight [N·m] of joint 1 to 6 at ``pose`` (6,), with the other joints held."""
     config = RobotConfig()
     arm = bodies(config, OPENING_M, ((payload_kg, *PAYLOAD_LINK6_M),))
     inertia = mass_matrix(arm, pose)[joint - 1, joint - 1] + config.armature_kgm2
@@ -174,7 +176,8 @@ def inertia_and_weight(pose: np.ndarray, joint: int, payload_kg: float = 0.0) ->
 
 
 def free_inertia(pose: np.ndarray, joint: int) -> float:
-    """kg·m² of joint 1 to 6 at ``pose`` while the others give way: what a fast loop moves; 1 / (M⁻¹)_jj."""
+    """Inertia of joint 1 to 6 at ``pose`` with the other joints free [kg·m²], 1 / (M⁻¹)_jj: the one that matters to a fast
+    loop."""
     config = RobotConfig()
     moved = mass_matrix(bodies(config, OPENING_M), pose) + config.armature_kgm2 * np.eye(ROBOT.num_joints)
     return float(1.0 / np.linalg.inv(moved)[joint - 1, joint - 1])

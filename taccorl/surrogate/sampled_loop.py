@@ -1,10 +1,10 @@
-"""A controller that is sampled as real drives are: finite difference of the encoder, low-pass, torque held between samples.
+"""A sampled controller, as in real drives: finite difference of the encoder, low-pass, torque held between samples.
 
     w_k = w_{k−1} + a ((q_k − q_{k−1}) / T − w_{k−1}),   a = 1 − exp(−T / τ)
     u_k = K_p (q*_k − q_k) − K_d w_k + T_ref             held until k + 1
 
-To first order in T and τ this is the continuous controller with K_d − K_p T / 2, on a joint of inertia J − K_d (T + τ): from
-angles and a known J all torques come out larger by J / (J − K_d (T + τ)), and only their ratios to K_p are right.
+To first order in T and τ this is the continuous controller with K_d − K_p T / 2, on a joint of inertia J − K_d (T + τ): with
+angles and a known J, all torques are overestimated by J / (J − K_d (T + τ)), and only their ratios to K_p are correct.
 """
 
 import math
@@ -16,11 +16,11 @@ import numpy as np
 from taccorl.surrogate.plant import STEP_S
 
 PERIODS_STEPS = (2, 4, 5, 8, 10, 16)
-"""Integration steps between two samples: 4, 2, 1.6, 1, 0.8 and 0.5 kHz."""
+"""Numbers of integration steps between two samples: 4, 2, 1.6, 1, 0.8 and 0.5 kHz."""
 FILTER_S = (3e-4, 3e-3)
-"""Range of τ: 530 to 53 Hz."""
+"""Range of the low-pass's time constant τ [s]: 530 to 53 Hz."""
 MARGIN = 3.2
-"""Times K_p and K_d the loop must still be stable: recordings at twice the gains, and 1.6 for what is hidden."""
+"""Factor on K_p and K_d at which the loop must still be stable: recordings at twice the gains, and 1.6 for hidden effects."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +28,9 @@ class SampledLoop:
     """Timing of one drive's loop."""
 
     steps: int
-    """Of ``STEP_S`` between two samples."""
+    """Number of integration steps (``STEP_S``) between two samples."""
     filter_s: float
-    """τ."""
+    """Time constant τ of the low-pass [s]."""
 
     @property
     def period_s(self) -> float:
@@ -38,12 +38,12 @@ class SampledLoop:
 
     @property
     def late_s(self) -> float:
-        """What K_d feels of both, relative to K_d / J: period and low-pass."""
+        """Delay of the velocity due to period and low-pass [s], T + τ."""
         return self.period_s + self.filter_s
 
 
 def draw_loop(rng: np.random.Generator, most_late_s: float = math.inf) -> SampledLoop:
-    """Any rate and any low-pass that together are no later than that; whether a drive is stable with it is another question."""
+    """Draw a loop with any rate and low-pass whose total delay is at most this. Stability with a drive is not checked."""
     periods = [steps for steps in PERIODS_STEPS if steps * STEP_S + FILTER_S[0] <= most_late_s] or [PERIODS_STEPS[0]]
     steps = int(rng.choice(periods))
     longest_s = max(FILTER_S[0], min(FILTER_S[1], most_late_s - steps * STEP_S))
@@ -67,6 +67,7 @@ def spectral_radius(loop: SampledLoop, kp: float, kd: float, inertia_kgm2: float
 
 
 def is_stable(loop: SampledLoop, kp: float, kd: float, inertias_kgm2: Sequence[float]) -> bool:
-    """At every gain up to ``MARGIN`` times these, for each inertia (in the play of a gear the motor moves itself alone)."""
+    """Whether the loop is stable at every gain up to ``MARGIN`` times these, for each inertia (in the play of a gear the motor
+    moves alone)."""
     gains = (1.0, 2.0, MARGIN)
     return all(spectral_radius(loop, f * kp, f * kd, inertia) < 1.0 for f in gains for inertia in inertias_kgm2)

@@ -1,8 +1,8 @@
-"""Surrogate pads: a known indenter between the fingers, pressed, held, released; what is hidden acts at 1 kHz.
+"""Surrogate pads: a known object between the fingers is pressed, held and released; hidden effects act at 1 kHz.
 
     f = [k_n δ + k_d δ̇]₊ where δ > 0 → material → scan → wires → gains → counts, noise, converter
 
-Depths come from the indenter's geometry in closed form, with an error of the true opening of some 8 µm that no reader knows.
+Depths come from the indenter's geometry in closed form, with an unreported error of the opening of some 8 µm.
 The protocol is a press–hold–release pack: three depths at two speeds with 10 s of nothing before and after, a slow ramp with
 inner loops and a hold of 4 s, a rod across the pads, on several places. Nothing slides: in the hand a known object keeps its
 place, and on the bench 0.2 mrad of the joints would be 0.1 mm.
@@ -35,10 +35,10 @@ RADIUS_M = {"sphere": 0.012, "rod": 0.008}
 FRAME_S = 0.01
 NOISE_COUNT, MAX_COUNT, RESTING_COUNT = 1.3, 255, (10, 40)
 ROOM_ERROR_M, ROOM_ERROR_S = 8e-6, 0.5
-"""Of the true depth against what the opening says, and how long it takes to change."""
+"""Standard deviation of the true depth from that of the reported opening [m], and the time constant of its change [s]."""
 OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
 K_N_PER_M, K_D_S = (600.0, 2000.0), (0.002, 0.02)
-"""Ranges of k_n, and of k_d over it."""
+"""Range of k_n [reading per m], and of k_d / k_n [s]."""
 SEVERITY_FLOORS = (1.5, 15.0)
 FRAMES_A_ROW = 5  # of the problem that judges: its floor is counted in means over so many
 AWAY_M = -1e-3
@@ -47,15 +47,15 @@ _NEAR_M = 1.2e-3  # taxels that stay further off take no part
 
 @dataclass(frozen=True, kw_only=True)
 class Press:
-    """One recording to be made: a shape at a place, and a depth over time."""
+    """One recording to be made: an object at a position, and a depth over time."""
 
     name: str
     knots: tuple[tuple[float, float], ...]
-    """(s, m) of penetration, straight lines between."""
+    """(time [s], penetration [m]), connected by straight lines."""
     shape: str = "sphere"
     x_m: float = 0.0
     z_m: float = 0.0
-    """Place of the indenter's middle in the TCP's frame; the rod lies across, along x."""
+    """Position of the object's centre along z of the TCP's frame [m]; the rod lies across the pads, along x."""
     wiggle_m: float = 0.0
     repeat_of: str | None = None
 
@@ -105,7 +105,7 @@ TEST = (Press(name="test_task", knots=(*_TASK, *_TASK_END), x_m=0.0015, z_m=0.00
 
 @dataclass(frozen=True)
 class TouchCase:
-    """Surrogate pads of one arm."""
+    """Surrogate pads of one arm with their hidden effects."""
 
     seed: int
     arm: str
@@ -113,9 +113,9 @@ class TouchCase:
     k_d: float
     hidden: tuple[Hidden, ...]
     twin: TwinConfig
-    """With wrong k_n and k_d."""
+    """Twin of the user, with wrong k_n and k_d."""
     left_floors: float = 0.0
-    """What is left on press and ramp after a refit of k_n, k_d and zero, in floors of a 50 ms row."""
+    """Error on press and ramp after a refit of k_n, k_d and zero, in floors of a 50 ms row."""
 
     @property
     def name(self) -> str:
@@ -126,7 +126,7 @@ class TouchCase:
         return [f"{self.arm}_{finger}" for finger in ROBOT.fingers]
 
     def truth(self) -> dict[str, object]:
-        """For the sealed file."""
+        """The true values, for the sealed file."""
         return {
             "seed": self.seed,
             "arm": self.arm,
@@ -138,23 +138,23 @@ class TouchCase:
 
     @cached_property
     def resting(self) -> np.ndarray:
-        """(4, R, C) counts."""
+        """(4, R, C) resting counts."""
         low, high = RESTING_COUNT
         return np.random.default_rng([self.seed, 77]).uniform(low, high, (len(ROBOT.pads), *ROBOT.pad.shape))
 
 
 @dataclass(frozen=True)
 class TouchRecordings:
-    """Recordings with what was pressed in each."""
+    """Recordings with the object that was pressed in each."""
 
     fit: tuple[Measurement, ...]
     validation: tuple[Measurement, ...]
     test: tuple[Measurement, ...]
     pressed: dict[str, PressedObject]
-    """Name of a recording → object."""
+    """Name of a recording → pressed object."""
 
     def motions(self, config: TwinConfig) -> dict[str, list[TouchMotion]]:
-        """fit, validation, test → matched contact replays, as ``TouchProblem`` takes them."""
+        """fit, validation, test → matched contact replays, in the form for ``TouchProblem``."""
         return {
             use: [touch_motion(m, config, self.pressed[m.name]) for m in getattr(self, use)]
             for use in ("fit", "validation", "test")
@@ -164,14 +164,14 @@ class TouchRecordings:
 def draw_touch_case(
     effect_names: tuple[str, ...] | list[str], seed: int, *, arm: str | None = None, strength: float | None = None
 ) -> TouchCase:
-    """Pads in which these effects are hidden.
+    """Draw pads with these hidden effects.
 
     Args:
-        effect_names: of ``touch_hidden.TOUCH_KINDS``.
-        strength: floors that each leaves on the press; drawn from 1.5 to 15.
+        effect_names: names in ``touch_hidden.TOUCH_KINDS``.
+        strength: error that each causes on the press [floors]; drawn from 1.5 to 15 if not given.
 
     Raises:
-        TaccorlError: nothing of that name can be hidden.
+        TaccorlError: there is no hidden effect of that name.
     """
     kinds = [touch_kind(name) for name in effect_names]
     rng = np.random.default_rng([seed, zlib.crc32("+".join(effect_names).encode()), 3])
@@ -204,7 +204,7 @@ def draw_touch_case(
 
 
 def touch_recordings(case: TouchCase) -> TouchRecordings:
-    """All recordings of these pads. The same case gives the same numbers, bit for bit."""
+    """Simulate all recordings of these pads. The same case gives the same numbers, bit for bit."""
     made = {use: tuple(record_touch(case, press) for press in presses) for use, presses in _USES.items()}
     pressed = {press.name: pressed_object(case, press) for presses in _USES.values() for press in presses}
     return TouchRecordings(**made, pressed=pressed)
@@ -221,7 +221,7 @@ def pressed_object(case: TouchCase, press: Press) -> PressedObject:
 
 
 def record_touch(case: TouchCase, press: Press) -> Measurement:
-    """One recording."""
+    """Simulate one recording."""
     rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(press.name.encode())])
     time_s, depth_m = _penetration(press)
     error_m = _slow_error(rng, time_s)

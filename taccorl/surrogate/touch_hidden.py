@@ -20,17 +20,19 @@ class TouchKind:
     """One kind of hidden effect."""
 
     severity: tuple[float, float]
-    """From hardly there to the most that a pad could have."""
+    """Range of the severity, from hardly visible to the largest realistic one."""
     values: Callable[[float, np.random.Generator], Values]
-    """Severity and a board's dice → the registry's numbers. The same dice give the same shape."""
+    """Function (severity, a board's random generator) → parameters with the registry's names. The same generator state gives the
+    same form."""
     stage: str
-    """place (depths are taken elsewhere), material (each taxel at 1 kHz), spread (whole frames), board (gains), baseline."""
+    """Stage at which it acts: place (depths at other positions), material (each taxel at 1 kHz), spread (whole frames), board
+    (gains), baseline."""
     registered: bool = True
 
 
 def touch_kind(name: str) -> TouchKind:
     """Raises:
-    TaccorlError: nothing of that name can be hidden.
+    TaccorlError: there is no hidden effect of that name.
     """
     if name not in TOUCH_KINDS:
         raise TaccorlError(f"surrogate pads: no hidden effect {name!r}; {nearest(name, TOUCH_KINDS)}")
@@ -84,7 +86,7 @@ OUTSIDE_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if not k.registere
 
 
 def material(name: str, values: Values, reading: np.ndarray, rate_mps: np.ndarray) -> np.ndarray:
-    """Readings (M, K), one taxel after the other, as the pad's material and its driver make them; times are milliseconds."""
+    """Readings (M, K) after the effects of the pad's material and driver, taxel by taxel; rows are milliseconds."""
     match name:
         case "taxel_power_law":
             return np.exp(values["exponent"] * np.log(np.maximum(reading, 1e-12))) * (reading > 0)
@@ -166,7 +168,7 @@ def _follow(reading, rate):
 
 
 def spread(name: str, values: Values, frames: np.ndarray) -> np.ndarray:
-    """Frames (T, R, C) of one pad after what the wires and the cover share out."""
+    """Frames (T, R, C) of one pad after crosstalk in wires and cover."""
     match name:
         case "taxel_crosstalk":  # along rows, then along columns: corners get a little as well
             for axis in (1, 2):

@@ -1,7 +1,7 @@
 """A surrogate of the robot for co-training: the twin with effects that the user's twin lacks, other cameras and another gain.
 
-It is simulated, and data collected in it is labelled so (``ORIGIN``). For finding missing effects there is a surrogate of its
-own physics, ``taccorl surrogate``; it has no scene to demonstrate in.
+It is simulated, and data collected in it is labelled so (``ORIGIN``). The surrogate of ``taccorl surrogate``, for finding
+missing effects, has its own physics and no scenes for demonstrations.
 """
 
 import dataclasses

@@ -1,10 +1,10 @@
-"""A surrogate robot as files: MCAP as the drivers write it, the twin that its user starts from, and the sealed truth.
+"""Write a surrogate robot as files: MCAP in the drivers' format, the twin with which its user starts, and the sealed truth.
 
 FOLDER/sweeps/*.mcap, measurements.yaml    for ``taccorl compare`` and ``diagnose``
 FOLDER/twin.yaml                           without the hidden effects
-FOLDER/sealed_truth.json                   beside the measurements and not among them: nothing that reads them reads it
+FOLDER/sealed_truth.json                   outside the folder of measurements, so that no command reads it
 
-Surrogate pads are written in the same way; what was pressed stands in their measurements.yaml.
+Surrogate pads are written in the same way; their measurements.yaml states the pressed objects.
 """
 
 import base64
@@ -40,7 +40,7 @@ from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 
 SWEEPS, TWIN, TRUTH = "sweeps", "twin.yaml", "sealed_truth.json"
 FINGERS_LAG_S = 0.03
-"""Time constant with which surrogate fingers follow their command. A choice."""
+"""Time constant with which surrogate fingers follow their command [s]. A choice."""
 _NOTE = "What is hidden in this surrogate robot. Compare and diagnose do not read it; `taccorl surrogate --reveal` prints it."
 
 
@@ -120,7 +120,7 @@ class _Sweep(Streams):
 
 
 def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: str | None) -> None:
-    """One recording as the robot's drivers write it; replaces the file if there is one."""
+    """Write one recording in the format of the robot's drivers; an existing file is replaced."""
     story = _Rows(measurement)
     config = StandInConfig(
         duration_s=story.duration_s, seed=seed, instruction=measurement.instruction, pad_gain_spread=0.0
@@ -131,10 +131,10 @@ def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: 
 
 
 def write_recordings(case: Case, folder: Path) -> Measurements:
-    """The whole robot as files, and what was written.
+    """Write the whole robot as files; returns what was written.
 
     Raises:
-        TaccorlError: the folder holds something that is no surrogate's.
+        TaccorlError: the folder holds other files.
     """
     made = recordings(case)
     uses = [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
@@ -143,10 +143,10 @@ def write_recordings(case: Case, folder: Path) -> Measurements:
 
 
 def write_touch_recordings(case: TouchCase, folder: Path) -> TouchRecordings:
-    """Surrogate pads as files: as ``write_recordings``, and what was pressed in each recording.
+    """Write surrogate pads as files: as ``write_recordings``, with the pressed object of each recording.
 
     Raises:
-        TaccorlError: the folder holds something that is no surrogate's.
+        TaccorlError: the folder holds other files.
     """
     made = touch_recordings(case)
     uses = [(use, _commanded(m, case.arm)) for use in ("fit", "validation", "test") for m in getattr(made, use)]
@@ -229,7 +229,7 @@ def _pressed(of: PressedObject) -> dict[str, Any]:
 
 
 def draw_touch_secret(seed: int) -> tuple[str, ...]:
-    """Names of what pads of this seed hide: mostly one effect of the registry, or none, or one from outside of it."""
+    """Names of the effects that the pads of this seed hide: usually one of the registry, or none, or one from outside of it."""
     rng = np.random.default_rng([seed, zlib.crc32(b"secret pads")])
     fate = rng.random()
     if fate < 0.1:
@@ -244,7 +244,7 @@ def _check_is_surrogate(folder: Path) -> None:
 
 
 def seal(folder: Path, truth: dict[str, object]) -> None:
-    """Write the truth into its file in encoded form, so that nobody reads it by mistake."""
+    """Write the true values into a file in encoded form, so that nobody reads them by mistake."""
     text = base64.b64encode(json.dumps(truth, ensure_ascii=False).encode()).decode()
     (folder / TRUTH).write_text(json.dumps({"note": _NOTE, "sealed": text}, indent=1), encoding="utf-8")
 

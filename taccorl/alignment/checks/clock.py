@@ -31,10 +31,11 @@ LATE_ROWS = 1.2
 """Least delay that is reported [rows]. A second pole (inertia over K_d) counts as delay, up to 5.7 ms at the twin's joints 2 and
 3, so that less is expected."""
 FITTING = 3.0
-"""A first-order lag describes a joint if its residual is below so many noise floors …"""
+"""A first-order lag describes a joint if its residual is below so many noise floors, or below
+``FITTING_ROWS``."""
 FITTING_ROWS = 0.05
-"""… or below this share of the residual that an offset of one row would cause; the delay is then wrong by a sixth of a row at
-most."""
+"""A first-order lag also describes a joint if its residual is below this share of that of an offset of one row; the delay is
+then wrong by a sixth of a row at most."""
 STEP_FLOORS = 8.0
 """Least motion in the first row after a step for judging it [noise floors]."""
 REST_S = 0.25
@@ -43,7 +44,8 @@ EXCHANGED = 0.7
 """Columns of target and position are exchanged if the residual of a lag fitted from position to target is below this share of
 that from target to position."""
 ROUGHER = 3.0
-"""… or, if neither fit decides, if the noise of the column given as the target is this many times the other's."""
+"""Columns of target and position are also exchanged if neither fit decides, and the noise of the column given as the target is
+this many times the other's."""
 USUAL_TAU_S = 0.12
 """Slowest time constant of a joint in the paper (Fig. "Per-joint controller SysID"): a step moves a joint in its first row by at
 least step · period / τ."""

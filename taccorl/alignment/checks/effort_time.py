@@ -16,10 +16,10 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding
 
 NEAR = 0.3
-"""Largest distance of r from 0 or 1 for a decision, …"""
+"""Largest distance of r from 0 or 1 for a decision."""
 SURE = 0.1
-"""… and largest standard error of r; otherwise there is no finding. A drive that receives targets faster than they are logged
-lies in between."""
+"""Largest standard error of r for a decision; otherwise there is no finding. A drive that receives targets faster than they
+are logged lies in between."""
 CLIPPED = 0.98
 """Rows with an effort above this share of the effort limit are not used."""
 SMOOTH_S = 0.05

@@ -34,18 +34,18 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 MOVED = {"rad": 0.02, "m": 0.002}
-"""Least range of a command that counts as motion [rad; a tenth of it in m], …"""
+"""Least range of a command that counts as motion [rad; a tenth of it in m]."""
 MOVED_STEPS = 100.0
-"""… unless the range is at least so many encoder steps, for machines other than the PiPER (± 1 mm on a stage)."""
+"""A command of a machine other than the PiPER also counts as motion if its range is so many encoder steps (± 1 mm on a stage)."""
 TOO_SHORT_S, SHORT_S = 1.0, 3.0
 """Duration of motion below which a recording is an error, and below which it is a warning [s]. The paper sweeps each joint for
 10 s."""
 DEAD_SHARE = 0.05
 """A joint does not answer if its range is below this share of its command's range."""
 FROZEN_S = 0.3
-"""Time of bit-identical readings …"""
+"""Least time of bit-identical readings of a frozen channel [s]."""
 FROZEN_MOVE = 0.05
-"""… while the command moves by this [rad], for a frozen channel."""
+"""Least motion of the command in that time [rad]."""
 BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
 """Time at the furthest reading [s], and distance by which the command is beyond it [rad], for a blocked joint."""
 START_S, START_ROWS = 0.15, (8, 30)

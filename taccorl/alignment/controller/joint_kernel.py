@@ -82,7 +82,7 @@ class Drive(NamedTuple):
     load_friction: float = 0.0
     """μ in |τ| ≤ μ |τ_motor − τ_load|."""
     spot_friction: float = 0.0
-    """F₀ in the friction F₀ exp(−((q − q₀) / w)²), added to ``coulomb``; q₀ is …"""
+    """F₀ in the friction F₀ exp(−((q − q₀) / w)²), added to ``coulomb``; q₀ is ``spot_angle``."""
     spot_angle: float = 0.0
     spot_width: float = 0.1
     """Width w of the friction spot."""
@@ -93,13 +93,13 @@ class Drive(NamedTuple):
     spring_stiffness: float = 0.0
     spring_rest: float = 0.0
     stop_stiffness: float = 0.0
-    """Stiffness of a stop; the joint meets it at …"""
+    """Stiffness of a stop; the joint meets it at ``stop_angle``."""
     stop_angle: float = 0.0
     # The command's way.
     command_delay: float = 0.0
     command_lag: float = 0.0
     drop_probability: float = 0.0
-    """Probability that a command is lost. The lost ones follow from …"""
+    """Probability that a command is lost. The lost ones follow from ``drop_seed``."""
     drop_seed: float = 0.0
     slew_rate: float = math.inf
     feedforward: float = 0.0
@@ -121,9 +121,10 @@ class Drive(NamedTuple):
     command: float = POSITION
     """Quantity that a command states: a position, a velocity (τ = K_d (q̇* − q̇) + T_ref) or a torque (τ = τ* + T_ref)."""
     duty_torque: float = math.inf
-    """Torque of the whole supply voltage at rest, V k_t / R, to which the controller's torque is clipped …"""
+    """Torque of the whole supply voltage at rest, V k_t / R, to which the controller's torque is clipped
+    before the back-EMF is subtracted."""
     back_emf: float = 0.0
-    """… before k_t k_e / R times the speed is subtracted."""
+    """Torque per speed that the back-EMF takes, k_t k_e / R."""
     effort_after: float = 0.0
     """1: the reported effort of a row responds to the row's command; 0: it is the effort before it."""
     effort_age: float = 0.0

@@ -53,9 +53,9 @@ class JointMotion:
     on: np.ndarray | None = None
     """(T,) 0 while the motor is off, else 1; None: always 1."""
     moment_kgm: float = 0.0
-    """Σ m l of the masses that the recording mounts on an axis [kg·m], …"""
+    """Σ m l of the masses that the recording mounts on an axis [kg·m]."""
     mounted_kgm2: float = 0.0
-    """… and Σ m l² [kg·m²]; on a slide Σ m [kg]."""
+    """Σ m l² of the masses that the recording mounts on an axis [kg·m²]; on a slide Σ m [kg]."""
     payload_at_m: Position = AT_TCP
     """Centre of mass of the payload in link 6's frame [m]."""
     payload_at_known: bool = False

@@ -65,9 +65,9 @@ class Surroundings:
     on: np.ndarray | None = None
     """(T,) 0 while the motor is off, else 1; None: always 1."""
     moment_kgm: float = 0.0
-    """Σ m l of the masses that the recording mounts on an axis, with the arm that holds them [kg·m], …"""
+    """Σ m l of the masses that the recording mounts on an axis, with the arm that holds them [kg·m]."""
     mounted_kgm2: float = 0.0
-    """… and Σ m l² [kg·m²]; on a slide Σ m [kg]."""
+    """Σ m l² of these masses [kg·m²]; on a slide Σ m [kg]."""
     pose: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(N,) positions at which the other joints are held, in the machine's own order."""
     payload_kg: float = 0.0

@@ -1,6 +1,6 @@
 """Residual as a function of the variables on which physical effects depend, with a band that includes the correlation of rows.
 
-A curve that leaves zero says along what the twin is off; it does not say why.
+A curve that leaves zero shows on which variable the error depends; it does not show the cause.
 
 Letters in shapes: T rows, B blocks, V bins of a variable.
 """
@@ -17,9 +17,10 @@ from taccorl.diagnosis.comparison.result import BLOCK_S, Comparison, Kind, drawn
 
 BINS = 14
 STANDS = 1e-6
-"""A variable that spans less (rad, rad/s, N·m, s) does not vary: what is left is rounding."""
+"""Range below which a variable counts as constant [rad, rad/s, N·m, s]."""
 Measure = Literal["mean", "RMS"]
-"""Of the residual along a variable: along time and speed its sign changes with the direction, its size tells."""
+"""Statistic of the residual along a variable. Along time and speed the RMS is used, because the residual's sign changes with the
+direction."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Variable:
 
     name: str
     words: str
-    """Effects that would show along it, so that a reader knows why it is drawn. No more than that."""
+    """Examples of effects that would depend on the variable, to explain why it is shown."""
     measure: Measure
     values: Callable[[Motion], np.ndarray]
 
@@ -46,7 +47,7 @@ VARIABLES: tuple[Variable, ...] = (
 
 
 def variable_unit(variable: str, position_unit: str) -> str:
-    """Unit of the variable's axis, for a signal whose position is in ``position_unit``."""
+    """Unit of the variable, for a signal whose position is in ``position_unit``."""
     speed, effort = UNITS[position_unit]
     units = {"velocity": speed, "position": position_unit, "commanded acceleration": f"{speed}²", "time": "s"}
     return units.get(variable, effort if variable == "modelled torque" else speed)
@@ -61,17 +62,17 @@ class Curve:
     variable: str
     measure: Measure
     at: np.ndarray
-    """(V,) mean of the variable in each bin; bins of equal width, those with hardly a row left out."""
+    """(V,) mean of the variable in each bin; bins have equal width, and those with too few rows are left out."""
     middle: np.ndarray
     """(V,) mean or RMS of the residual."""
     low: np.ndarray
-    """(V,) 95 % band, from blocks of ``BLOCK_S``: neighbouring rows are alike."""
+    """(V,) lower end of the 95 % band, from blocks of ``BLOCK_S``, because neighbouring rows are correlated."""
     high: np.ndarray
     explained: float
-    """Share of the residual's variance (along time and speed: of its square's) that lies in the bins' means."""
+    """Share of the residual's variance that the means of the bins explain (along time and speed: share of the mean square)."""
     by_chance: float
-    """What of it 95 % of residuals of the same shape would reach that have nothing to do with the variable (shifted round in
-    time)."""
+    """The 95 % quantile of ``explained`` for residuals of the same shape that do not depend on the variable (cyclically shifted
+    in time)."""
 
     @property
     def beyond_chance(self) -> bool:
@@ -79,7 +80,7 @@ class Curve:
 
 
 def curves(comparison: Comparison, signal: str, kind: Kind = "position") -> list[Curve]:
-    """Curves along every variable that varies, from all recordings of the signal together."""
+    """Curves along every variable that is not constant, from all recordings of the signal together."""
     motions = motions_of(comparison.of(signal, kind))
     found = [_curve(motions, signal, kind, variable) for variable in VARIABLES]
     return [c for c in found if c is not None]

@@ -1,9 +1,8 @@
-"""Every recording's commands through the twin, and what is left: residual = measurement − replay.
-
-Two ways, one rule. **joint**: wherever nothing is touched and no gripper is commanded to move, each joint that is commanded
-runs alone in the one-joint model, and the others move as they were measured: what one joint does wrong stays with
-that joint. **twin**: everywhere else (contact, grippers), the whole twin follows the commands. Touch is a matched contact replay
-(``taccorl.alignment.touch.model``): the pads where they were measured, in an object whose place is known.
+"""Simulate the commands of every recording in the twin, and compute the residual = measurement − replay. There are two ways.
+**joint**: without contact and without a gripper command, each commanded joint is simulated alone in the one-joint model, while
+the others move as measured, so that the error of one joint does not affect others. **twin**: otherwise (contact, grippers), the
+whole twin follows the commands. Touch is a matched contact replay (``taccorl.alignment.touch.model``): the pads at their
+measured poses, in an object whose pose is known.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,17 +41,16 @@ def compare(
     pressed: PressedObject | None = None,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> Comparison:
-    """Replay all recordings and keep what is left.
+    """Replay all recordings and compute their residuals.
 
     Args:
-        name: of the twin, for titles.
-        pressed: what the fingers press in recordings with pads that do not say it themselves, and where it is. Only then touch
-            is compared: a reading means nothing to a twin that does not know what was touched.
-        progress: told (recording, recordings done, recordings in all).
+        name: name of the twin, for titles.
+        pressed: object between the fingers, and its pose, for recordings with pads that do not state one. Touch is compared only
+            if the object is known.
+        progress: function that is called with (recording, number of recordings done, number in all).
 
     Raises:
-        TaccorlError: a signal that the robot does not have, recordings with nothing to compare, or one that says what was
-            pressed and whose pads say otherwise.
+        TaccorlError: the robot lacks a signal, a recording has nothing to compare, or the pads contradict the stated object.
     """
     uses: list[tuple[Use, Measurement]] = [
         (use, m.on_robot(BENCH_REST)) for use in USES for m in getattr(measurements, use)
@@ -94,7 +92,7 @@ def compare(
 def replay_all(
     config: TwinConfig, measurements: Sequence[Measurement], progress: Callable[[str, int, int], None]
 ) -> list[Response]:
-    """What the twin does in each of them, by the rule above; nothing where no signal can be compared."""
+    """Replays of the measurements by the module's rule; None for one without a signal to compare."""
     found = []
     for k, m in enumerate(measurements):
         progress(m.name, k, len(measurements))
@@ -110,25 +108,25 @@ def replay_all(
 
 
 def moving(m: Measurement) -> list[str]:
-    """Signals whose command moves."""
+    """Signals whose commands move."""
     spans = np.ptp(m.target, axis=0)
     return [s for s, unit, span in zip(m.signals, m.units, spans, strict=True) if span > MOVED[unit]]
 
 
 def compared(m: Measurement) -> list[str]:
-    """Signals that move (where none does, all), but for grippers that something holds up."""
+    """Signals that move (all, if none does), without grippers that an object holds open."""
     return [s for s in moving(m) or m.signals if s not in held_up(m)]
 
 
 def held_up(m: Measurement) -> list[str]:
-    """Grippers of arms that press something, as the recording or its pads say: the twin's would close further."""
+    """Grippers of arms that press an object, as stated by the recording or shown by its pads: the twin's would close further."""
     touched = np.asarray(in_contact(m).any(axis=0))
     stated = [m.pressed is not None and m.pressed.arm == arm for arm in ROBOT.arms]
     return [signal for signal, held, said in zip(GRIPPERS, touched, stated, strict=True) if held or said]
 
 
 def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
-    """One for each signal that is compared and was measured, and one for its effort where that was recorded."""
+    """Traces of each signal that is compared and was measured, and of its effort if that was recorded."""
     touched = in_contact(response.measurement)
     found = []
     even = response.measurement

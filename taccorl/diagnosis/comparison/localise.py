@@ -1,7 +1,7 @@
 """Localise the error of a twin by regime, a part of the motion such as slow, fast or after a reversal.
 
-This says WHERE, never WHY: a delay, a payload, a wrong gain scale and missing inertia all light up "high speed" and "high load"
-(measured on surrogates). ``taccorl diagnose`` tells causes apart, by simulating each.
+This shows where the error is, not its cause: a delay, a payload, a wrong gain scale and missing inertia all cause errors at
+"high speed" and "high load" (measured on surrogates). ``taccorl diagnose`` separates causes by simulating each.
 
 Letters in shapes: T rows.
 """
@@ -16,27 +16,28 @@ from scipy.signal import savgol_filter
 from taccorl.diagnosis.comparison.result import Comparison, Kind, Trace
 
 SMOOTH_S = 0.1
-"""Velocities are slopes of straight lines over so many seconds: cubics would overshoot at a sudden stop, and show a reversal."""
+"""Window of the straight lines whose slopes are the velocities [s]; cubics would overshoot at a sudden stop and show a
+reversal."""
 SLOW, FAST = 0.05, 0.7
-"""Of the peak speed (99th percentile): below the first is near zero, above the second is high."""
+"""Shares of the peak speed (99th percentile): a speed below the first is near zero, one above the second is high."""
 REVERSAL_S = 0.15
-"""After the velocity has changed its sign: friction and backlash take about as long to be crossed."""
+"""Time after a change of the velocity's sign that belongs to the reversal [s]: friction and backlash take about as long."""
 HIGH_LOAD = 0.75
 """Quantile of |torque| above which the load is high."""
 LEAST_SHARE = 0.01
-"""Of the rows: a regime with less says nothing."""
+"""Least share of the rows for a regime to be evaluated."""
 
 
 @dataclass(frozen=True)
 class Regime:
-    """A regime: a condition that selects rows of a motion."""
+    """A condition that selects rows of a motion."""
 
     name: str
     group: str
-    """Regimes of one group exclude each other."""
+    """Name of the group; regimes of one group exclude each other."""
     words: str
     rows: Callable[["Motion"], np.ndarray]
-    """(T,) bool."""
+    """Function of a ``Motion`` that returns (T,) bool."""
 
 
 @dataclass(frozen=True)
@@ -45,21 +46,21 @@ class Motion:
 
     trace: Trace
     velocity: np.ndarray
-    """(T,)."""
+    """(T,) measured velocity."""
     acceleration: np.ndarray
-    """(T,) commanded: of the target, smoothed."""
+    """(T,) commanded acceleration, from the smoothed target."""
     target_speed: np.ndarray
-    """(T,) of the target, smoothed."""
+    """(T,) speed of the smoothed target."""
     peak_speed: float
-    """99th percentile over all recordings of the signal."""
+    """99th percentile of the speed over all recordings of the signal."""
     span: tuple[float, float]
-    """Of the measured positions of all recordings of the signal."""
+    """Lowest and highest measured position over all recordings of the signal."""
     high_torque: float
     """|torque| above which the load is high, over all recordings of the signal."""
 
     @property
     def after_reversal(self) -> np.ndarray:
-        """(T,) bool. A reversal counts when the joint has gone faster than near zero on both sides."""
+        """(T,) bool: rows after a reversal. A reversal counts if the joint was faster than near zero on both sides of it."""
         sign = np.where(np.abs(self.velocity) > SLOW * self.peak_speed, np.sign(self.velocity), 0.0)
         moving = np.flatnonzero(sign)
         after = np.zeros(len(sign), dtype=bool)
@@ -72,7 +73,7 @@ class Motion:
 
 
 def motions_of(traces: Sequence[Trace]) -> list[Motion]:
-    """Motions of all traces of one signal, with common scales."""
+    """Motions of all traces of one signal, with common limits for speed, range and load."""
     velocities = [_slope(bridged(t.position), t.period_s) for t in traces]
     peak = float(np.quantile(np.abs(np.concatenate(velocities)), 0.99))
     positions = np.concatenate([t.position for t in traces])
@@ -173,7 +174,7 @@ class Cell:
     ratio: float
     """RMSE / noise floor."""
     share_of_error: float
-    """Of the signal's summed squared residual."""
+    """Share of the regime in the signal's sum of squared residuals."""
     share_of_time: float
     n: int
 
@@ -184,7 +185,7 @@ class Cell:
 
 
 def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
-    """Every signal in every regime that it was in for ``LEAST_SHARE`` of the time; all recordings together."""
+    """Errors of every signal in every regime with at least ``LEAST_SHARE`` of the rows; all recordings together."""
     cells = []
     for signal in [s for s, k in comparison.signals if k == kind]:
         motions = motions_of(comparison.of(signal, kind))
@@ -214,6 +215,6 @@ def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
 
 
 def worst_regime(cells: Sequence[Cell], signal: str, kind: str = "position") -> Cell | None:
-    """Regime with the highest RMSE, among those that cover only a part of the time."""
+    """Regime with the highest RMSE, among those with only a part of the rows."""
     own = [c for c in cells if c.signal == signal and c.kind == kind and c.share_of_time < 0.9]
     return max(own, key=lambda c: c.ratio, default=None)

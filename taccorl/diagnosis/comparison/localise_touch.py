@@ -1,6 +1,5 @@
-"""Where the pads of a twin are off: in contact or not, in which phase of a touch, on which third of the pad.
-
-As in ``localise``: this says where, never why. Creep, hysteresis and a late sensor all show while a pad is unloaded.
+"""Localise the error of a twin's pads: in contact or not, by phase of a touch, by third of the pad. As in ``localise``, this
+shows where the error is, not its cause: creep, hysteresis and a late sensor all cause errors during unloading.
 
 Letters in shapes: N touch frames, R × C taxels.
 """
@@ -23,16 +22,16 @@ PHASES = {
     "untouched": "the rest",
 }
 EVERYWHERE = ("in contact", "no contact", *PHASES)
-"""Regimes of all cells; those of parts of the rows follow (``TouchTrace.thirds``)."""
+"""Regimes of all cells; regimes for parts of the rows follow (``TouchTrace.thirds``)."""
 RELEASED_S = 1.0
 CHANGE_PER_S = 0.25
-"""Of the touch's strongest sum: faster is loading or unloading, slower is a hold."""
+"""Rate of the summed touch, relative to its largest value [1/s]: faster is loading or unloading, slower is a hold."""
 SMOOTH_S = 0.05
 
 
 def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
-    """Phase → (N,) bool; each frame is in exactly one. Loading is read off the measured counts, and contact where it is not known
-    by geometry."""
+    """Phase → (N,) bool; each frame is in exactly one phase. Loading is determined from the measured counts, and so is contact
+    if geometry does not determine it."""
     counts = trace.measured[:, pad].reshape(len(trace.measured), -1).astype(float)
     period_s = trace.period_s
     total = gaussian_filter1d(counts.sum(axis=1), SMOOTH_S / period_s)
@@ -51,7 +50,7 @@ def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
 
 
 def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Regime → its frames (N,) and its taxels (R, C), bool."""
+    """Regime → its frames (N,) bool and its taxels (R, C) bool."""
     rows, columns = trace.measured.shape[2:]
     everywhere = np.ones((rows, columns), dtype=bool)
     always = np.ones(len(trace.measured), dtype=bool)
@@ -67,7 +66,7 @@ def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarr
 
 
 def touch_heat_map(traces: Sequence[TouchTrace]) -> list[Cell]:
-    """Every pad in every regime, over the taxels that feel something at some time."""
+    """Errors of every pad in every regime, over taxels that are above the noise at some time."""
     cells = []
     for pad in dict.fromkeys(pad for t in traces for pad in t.pads):
         own_traces = [t for t in traces if pad in t.pads]

@@ -1,6 +1,6 @@
 """Errors by recording and regime, and differences in coverage between fit and validation recordings.
 
-One pooled number hides a recording, a speed, a direction or a part of the range in which the twin is off.
+A single error over all rows can hide a large error in one recording, at one speed, in one direction or in a part of the range.
 
 Letters in shapes: T rows.
 """
@@ -18,27 +18,27 @@ from taccorl.diagnosis.search.result import SearchConfig
 
 ALL = "all rows"
 GROUPS = ("speed", "direction", "pose")
-"""Of ``localise.REGIMES``."""
+"""Groups of ``localise.REGIMES`` that are evaluated."""
 AT_FLOOR = SearchConfig().stop_at
-"""Noise floors up to which an error is at the floor, as for the search."""
+"""An error up to so many noise floors counts as at the floor, as in the search."""
 DISAGREE = 1.3
-"""Ratio of two errors that is remarkable."""
+"""Ratio of two errors from which on a remark is made."""
 COVERED = 0.75
-"""Share of a range that the other use must cover; less is remarkable."""
+"""Least share of a range that recordings of the other use must cover; below it a remark is made."""
 INNER = (0.005, 0.995)
-"""Quantiles that count as the ends of a range: single rows of noise are outside."""
+"""Quantiles that count as the ends of a range, so that single noisy rows are ignored."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegimeError:
-    """One recording, or all recordings of one use, in one regime."""
+    """Error of one recording, or of all recordings of one use, in one regime."""
 
     recording: str
-    """Empty: all of this use."""
+    """Name of the recording; empty for all recordings of the use."""
     use: Use
     regime: str
     error: float
-    """RMS residual in noise floors."""
+    """RMS residual [noise floors]."""
     n: int
 
 
@@ -59,17 +59,17 @@ class RegimeErrors:
     rows: tuple[RegimeError, ...]
     coverage: tuple[Coverage, ...]
     remarks: tuple[str, ...]
-    """Where fit and validation disagree or cover different ranges; a sentence each, the most important first."""
+    """Sentences on regimes in which fit and validation disagree, or ranges that differ; the most important first."""
 
     @property
     def worst(self) -> RegimeError | None:
-        """The recording and regime with the greatest error; None where nothing was measured."""
+        """Entry with the greatest error among recordings and regimes; None if nothing was measured."""
         own = [r for r in self.rows if r.recording and r.regime != ALL]
         return max(own, key=lambda r: r.error, default=None)
 
 
 def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
-    """Errors of all recordings of one signal, replayed by the fitted twin."""
+    """Errors of all recordings of one signal, replayed with the fitted twin."""
     motions = motions_of(traces)
     regimes: list[tuple[str, Callable[[Motion], np.ndarray]]] = [(ALL, _every)]
     regimes += [(r.name, r.rows) for r in REGIMES if r.group in GROUPS]

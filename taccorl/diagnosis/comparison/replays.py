@@ -1,5 +1,5 @@
-"""A measurement's commands through the twin: joint by joint, or the whole of it; and its pads in what they pressed. Row k is the
-twin at the time of row k.
+"""Replay a measurement's commands in the twin: joint by joint, or with the whole twin; and its pads in the pressed object. Row k
+is the state of the twin at the time of row k.
 
 Letters in shapes: T rows.
 """
@@ -28,28 +28,30 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 
 CONTACT_COUNTS = 30.0
-"""A taxel beyond this is contact: λ_f = 0.4 (paper Table 3) at the data spec's 75 counts for 1."""
+"""Counts of a taxel above which it is in contact: λ_f = 0.4 (paper Table 3) at the data spec's 75 counts per reading of 1."""
 DEEP_M, FELT_COUNTS = 2e-4, 1.0
-"""Taxels so deep in an object read at least so much on average, whatever the pad."""
+"""Taxels at least this deep in an object [m] must read at least so many counts on average."""
 START_S = 0.1
-"""Where the joints were at the start is the mean of so long a rest: one reading's noise would be a swing of the twin."""
+"""Duration of rest over which the start position of the joints is averaged [s], because the noise of one reading would excite
+the twin."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """What the twin did."""
+    """Response of the twin in a replay."""
 
     measurement: Measurement
-    """The recording as it was replayed: all signals, resampled at a rate whose period is a whole number of physics steps."""
+    """The replayed recording: all signals, resampled at a rate whose period is a whole number of physics steps."""
     way: Literal["joint", "twin"]
     reported: np.ndarray
-    """(T, J) rad, m, J signals of the machine; NaN for those that were not replayed."""
+    """(T, J) reported positions [rad, m] of the machine's J signals; NaN for those that were not replayed."""
     effort: np.ndarray
-    """(T, J) N·m, N that the motors give at the time of each row; NaN where not known."""
+    """(T, J) motor efforts at the time of each row [N·m, N]; NaN where not known."""
 
 
 def replay_joints(machine: TwinConfig | HasJoints, m: Measurement, signals: Sequence[str]) -> Response:
-    """Each of ``signals`` alone, the others as they were measured; gains and payloads as the recording knows them."""
+    """Replay each of ``signals`` alone, while the others move as measured; with the gains and payloads that the recording
+    states."""
     m = evened(m, machine) if isinstance(machine, TwinConfig) else m
     reported, effort = np.full((2, m.num_rows, len(m.signals)), np.nan)
     for signal in signals:
@@ -60,7 +62,7 @@ def replay_joints(machine: TwinConfig | HasJoints, m: Measurement, signals: Sequ
 
 
 def replay_whole(config: TwinConfig, m: Measurement) -> Response:
-    """The whole twin on the empty bench, from where the robot stood.
+    """Replay with the whole twin on the empty bench, from the robot's measured start.
 
     Raises:
         TaccorlError: the twin diverged.
@@ -95,10 +97,10 @@ def _as_recorded(config: TwinConfig, m: Measurement) -> TwinConfig:
 
 
 def evened(m: Measurement, config: TwinConfig) -> Measurement:
-    """At the nearest even rate that is a whole number of physics steps: 200 Hz for 199.97 Hz.
+    """The measurement at the nearest even rate whose period is a whole number of physics steps: 200 Hz for 199.97 Hz.
 
     Raises:
-        TaccorlError: faster than the physics.
+        TaccorlError: its rate is higher than that of the physics.
     """
     physics_hz = 1.0 / config.physics.timestep_s
     if m.rate_hz > 1.25 * physics_hz:
@@ -131,10 +133,10 @@ def in_contact(m: Measurement) -> np.ndarray:
 
 
 def matched_contact(m: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
-    """Where the taxels were in the object; what was said of the object must fit what the pads say.
+    """Matched contact replay for the stated object, which must agree with the readings of the pads.
 
     Raises:
-        TaccorlError: as ``touch_motion``; the object touches no pad, or a pad does not feel it.
+        TaccorlError: as ``touch_motion``; the object touches no pad, or a pad in contact reads nothing.
     """
     motion = touch_motion(m, config, pressed)
     depth, _ = motion.depth()

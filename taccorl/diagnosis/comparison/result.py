@@ -1,7 +1,7 @@
-"""A comparison: every signal of every recording beside its replay, and how far off it is.
+"""A comparison: every signal of every recording with its replay, and the errors.
 
-Errors are given three times: RMSE in the signal's unit, NRMSE as a share of the standard deviation of what was measured (1: as
-bad as a constant), and RMSE over the noise floor (1: as good as any twin can be).
+Errors are given three times: RMSE in the signal's unit, NRMSE relative to the standard deviation of the measurement (1: no
+better than a constant), and RMSE relative to the noise floor (1: the best possible).
 
 Letters in shapes: T rows, N touch frames, P pads, R × C taxels of a pad, B blocks.
 """
@@ -24,17 +24,18 @@ Kind = Literal["position", "effort"]
 Way = Literal["joint", "twin"]
 USES: tuple[Use, ...] = ("fit", "validation", "test")
 BLOCK_S = 0.5
-"""Residuals of neighbouring rows are alike: intervals come from whole blocks (block bootstrap, Carlstein 1986)."""
+"""Duration of a block [s]. Residuals of neighbouring rows are correlated, so that intervals are computed from whole blocks
+(block bootstrap, Carlstein 1986)."""
 FELT_FLOORS = 4.0
-"""A taxel feels something beyond so many of its noise floors."""
+"""A taxel is touched if it reads more than so many of its noise floors."""
 NOT_STATED = "origin not stated by the recordings"
 DRAWS = 400
-"""Of the bootstrap: the ends of a 95 % interval then scatter by a tenth of its width."""
+"""Number of bootstrap draws: the ends of a 95 % interval then scatter by a tenth of its width."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """One signal of one recording beside its replay."""
+    """One signal of one recording with its replay."""
 
     recording: str
     use: Use
@@ -43,17 +44,17 @@ class Trace:
     unit: str
     way: Way
     time_s: np.ndarray
-    """(T,)."""
+    """(T,) times [s]."""
     target: np.ndarray
-    """(T,) the position that is commanded, in its own unit."""
+    """(T,) commanded position, in the position's unit."""
     position: np.ndarray
-    """(T,) as measured, for efforts, too."""
+    """(T,) measured position, also for traces of efforts."""
     measured: np.ndarray
-    """(T,) in ``unit``; NaN where nothing was measured."""
+    """(T,) measured values in ``unit``; NaN where not measured."""
     replayed: np.ndarray
-    """(T,) in ``unit``."""
+    """(T,) replayed values in ``unit``."""
     torque: np.ndarray
-    """(T,) N·m, N: what the twin's motor gives in the replay."""
+    """(T,) torque of the twin's motor in the replay [N·m, N]."""
     touched: np.ndarray
     """(T,) bool: a pad of this arm is in contact; all False without pads."""
     floor: SignalFloor
@@ -61,7 +62,7 @@ class Trace:
 
     @property
     def residual(self) -> np.ndarray:
-        """(T,) measurement − replay; NaN where nothing was measured."""
+        """(T,) residual, measurement − replay; NaN where not measured."""
         return self.measured - self.replayed
 
     @property
@@ -71,36 +72,36 @@ class Trace:
 
 @dataclass(frozen=True, kw_only=True)
 class TouchTrace:
-    """The pads of one recording beside their matched contact replay; counts above baseline."""
+    """The pads of one recording with their matched contact replay, in counts above baseline."""
 
     recording: str
     use: Use
     pads: tuple[str, ...]
-    """Those that came near the object."""
+    """Names of the pads that came near the object."""
     time_s: np.ndarray
-    """(N, P)."""
+    """(N, P) times of the frames [s]."""
     measured: np.ndarray
-    """(N, P, R, C)."""
+    """(N, P, R, C) measured readings."""
     replayed: np.ndarray
-    """(N, P, R, C)."""
+    """(N, P, R, C) replayed readings."""
     floor: np.ndarray
-    """(P, R, C)."""
+    """(P, R, C) noise floor of each taxel."""
     origin: str
     touched: np.ndarray | None = None
-    """(N, P) bool: what is pressed is in the pad, by where both are; None where that is not known."""
+    """(N, P) bool: the object is in contact with the pad, by their poses; None if that is not known."""
     unit: str = "counts"
-    """Of the readings."""
+    """Unit of the readings."""
     thirds: tuple[str, ...] = ("palm third", "middle third", "tip third")
-    """Names of parts of the rows with about as many rows each; () where the rows are too few."""
+    """Names of parts of the rows with about equally many rows each; empty if there are too few rows."""
     load: np.ndarray | None = None
-    """(N, P, R, C) what pressed each cell, in ``load_unit``; None where only its shape and place are known."""
+    """(N, P, R, C) load on each cell, in ``load_unit``; None if only the object's shape and pose are known."""
     load_unit: str = ""
     repeated: bool = False
-    """``floor`` holds what repeats of a press do not repeat; else it is the noise of each cell, a lower bound."""
+    """True: ``floor`` includes the variation between repeats of a press. False: it is the noise of each cell, a lower bound."""
 
     @property
     def residual(self) -> np.ndarray:
-        """(N, P, R, C)."""
+        """(N, P, R, C) residual, measurement − replay."""
         return self.measured.astype(float) - self.replayed
 
     @property
@@ -108,14 +109,14 @@ class TouchTrace:
         return float(np.median(np.diff(self.time_s[:, 0])))
 
     def felt(self, pad: int) -> np.ndarray:
-        """(R, C) bool: taxels of a pad that feel something at some time, in the measurement or in the replay."""
+        """(R, C) bool: taxels of a pad above the noise at some time, in the measurement or in the replay."""
         level = FELT_FLOORS * self.floor[pad]
         return (np.abs(self.measured[:, pad]) > level).any(axis=0) | (np.abs(self.replayed[:, pad]) > level).any(axis=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """How far off one signal is, over all recordings of one use."""
+    """Error of one signal over all recordings of one use."""
 
     signal: str
     kind: Literal["position", "effort", "touch"]
@@ -123,15 +124,15 @@ class Score:
     unit: str
     rmse: float
     interval: tuple[float, float]
-    """95 % of the RMSE, from blocks of ``BLOCK_S``."""
+    """95 % interval of the RMSE, from blocks of ``BLOCK_S``."""
     nrmse: float
-    """RMSE / standard deviation of what was measured."""
+    """RMSE / standard deviation of the measurement."""
     floor: float
     floor_words: str
     lower_bound: bool
-    """The floor is one: no motion was recorded twice."""
+    """True if the floor is a lower bound, because no motion was recorded twice."""
     n: int
-    """Rows (taxel readings for touch)."""
+    """Number of rows (for touch: of taxel readings)."""
     recordings: int
 
     @property
@@ -142,55 +143,55 @@ class Score:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """A twin beside measurements."""
+    """Replays of measurements by one twin, with their errors."""
 
     twin: str
-    """Its name, for titles."""
+    """Name of the twin, for titles."""
     effects: tuple[str, ...]
-    """That the twin has."""
+    """Names of the twin's effects."""
     traces: tuple[Trace, ...]
     touches: tuple[TouchTrace, ...] = ()
     split: dict[str, object]
-    """Which recordings are fit, validation, test, and by what rule."""
+    """The recordings for fit, validation and test, and the rule of the division."""
     clock: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
     """Recording → what its replay says about its clock."""
     left_out: tuple[str, ...] = ()
-    """What was not compared, and why."""
+    """Data that were not compared, with the reason."""
 
     @property
     def origins(self) -> tuple[str, ...]:
-        """What made the recordings, each once."""
+        """Origins of the recordings, each once."""
         return tuple(dict.fromkeys(t.origin for t in (*self.traces, *self.touches) if t.origin))
 
     @property
     def uses(self) -> tuple[Use, ...]:
-        """Those that there are recordings for."""
+        """The uses (fit, validation, test) for which there are recordings."""
         return tuple(use for use in USES if any(t.use == use for t in (*self.traces, *self.touches)))
 
     @property
     def signals(self) -> tuple[tuple[str, Kind], ...]:
-        """(signal, kind), positions first, in the order of the PiPER's actions, or else as they come."""
+        """(signal, kind), positions first, in the order of the PiPER's actions, or else in the order of the recordings."""
         found: dict[tuple[str, Kind], None] = dict.fromkeys((t.signal, t.kind) for t in self.traces)
         return tuple(sorted(found, key=lambda s: (s[1] != "position", _order(s[0]))))
 
     def of(self, signal: str, kind: Kind = "position", use: Use | None = None) -> tuple[Trace, ...]:
-        """Traces of one signal, of one use or of all."""
+        """Traces of one signal, for one use or for all."""
         return tuple(t for t in self.traces if t.signal == signal and t.kind == kind and (use is None or t.use == use))
 
     def score(self, signal: str, kind: Kind, use: Use) -> Score | None:
-        """None: no such recording."""
+        """Error of one signal for one use; None without such a recording."""
         traces = self.of(signal, kind, use)
         return _score(traces) if traces else None
 
     def scores(self) -> list[Score]:
-        """Every signal and use, and all pads together where there are several."""
+        """Errors of every signal and use, and of all pads together if there are several."""
         found = [self.score(signal, kind, use) for signal, kind in self.signals for use in self.uses]
         if len({pad for t in self.touches for pad in t.pads}) > 1:
             found += [_touch_score([t for t in self.touches if t.use == use]) for use in self.uses]
         return [s for s in found if s is not None]
 
     def pad_scores(self) -> list[Score]:
-        """Every pad and use."""
+        """Errors of every pad and use."""
         there = dict.fromkeys(pad for t in self.touches for pad in t.pads)
         pads = sorted(there, key=lambda pad: ROBOT.pads.index(pad) if pad in ROBOT.pads else len(ROBOT.pads))
         found = [_touch_score([t for t in self.touches if t.use == use], pad) for pad in pads for use in self.uses]
@@ -267,7 +268,7 @@ def _touch_score(traces: Sequence[TouchTrace], pad: str | None = None) -> Score 
 
 
 def block_sums(values: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """((B,) sums, (B,) numbers) of the finite ones in blocks of ``rows``; the last block may be shorter."""
+    """(B,) sums and (B,) numbers of the finite values in blocks of ``rows``; the last block may be shorter."""
     starts = np.arange(0, len(values), max(rows, 1))
     finite = np.isfinite(values)
     return np.add.reduceat(np.where(finite, values, 0.0), starts), np.add.reduceat(finite.astype(float), starts)
@@ -283,22 +284,22 @@ def _rms_interval(sums: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
 
 
 def drawn_blocks(num_blocks: int) -> np.ndarray:
-    """(DRAWS, B) how often each block is drawn; the same for the same number of blocks."""
+    """(DRAWS, B) number of times that each block is drawn; it depends on the number of blocks only."""
     return np.random.default_rng(0).multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), DRAWS).astype(float)
 
 
 def origin_words(origins: Sequence[str]) -> str:
-    """``data: surrogate …``"""
+    """Text of the data's origin, such as ``data: surrogate …``."""
     return "data: " + (", ".join(dict.fromkeys(origins)) or NOT_STATED)
 
 
 def shown_unit(unit: str) -> tuple[float, str]:
-    """Factor and unit in which errors are read: 1 mrad, and not 0.001 rad."""
+    """Factor and unit for the display of errors, such as mrad for rad."""
     return {"rad": (1e3, "mrad"), "m": (1e3, "mm")}.get(unit, (1.0, unit))
 
 
 def shown(value: float, unit: str) -> str:
-    """``2.01 mrad``"""
+    """Text of an error in a readable unit, such as ``2.01 mrad``."""
     factor, name = shown_unit(unit)
     return f"{value * factor:.3g} {name}"
 
@@ -308,10 +309,10 @@ def _order(signal: str) -> int:
 
 
 def only(comparison: Comparison, signals: Iterable[str]) -> Comparison:
-    """The same with some of its signals.
+    """The comparison restricted to some of its signals.
 
     Raises:
-        TaccorlError: one that was not compared.
+        TaccorlError: a signal was not compared.
     """
     known = [s for s, _ in comparison.signals]
     wanted = list(signals)

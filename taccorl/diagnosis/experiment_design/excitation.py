@@ -1,9 +1,9 @@
-"""Choose the motion to record next: the one that separates rival explanations most after a refit (T-optimal design).
-Joints here; presses of the pads, by the same measure, in ``presses``.
+"""Choose the motion to record next: the one that best separates rival explanations after a refit (T-optimal design). This module
+is for joints; ``presses`` uses the same measure for presses of the pads.
 
-T-optimal design (Atkinson and Fedorov 1975): for rivals A and B and a motion, A predicts what would be measured; B with all its
-numbers is fitted to that; what it cannot follow, in noise floors, is the discrimination, in the worse of both directions. Below
-about one floor the recording would not tell them apart. Recordings that are there already are part of both fits.
+T-optimal design (Atkinson and Fedorov 1975): for rivals A and B and a motion, a measurement is simulated with A, and B with all
+its numbers is fitted to it; the residual in noise floors is the discrimination, the smaller one of both directions. Below about
+one floor the recording would not separate the rivals. Existing recordings are part of both fits.
 """
 
 import dataclasses
@@ -39,19 +39,19 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
 
 TELLS = 1.25
-"""Discrimination in floors from which a recording tells two rivals apart: √(1 + 1.25²) = 1.6 times the floor."""
+"""Discrimination [noise floors] from which on a recording separates two rivals: √(1 + 1.25²) = 1.6."""
 SAME = 0.25
-"""Below this many floors on every motion two effects are one."""
+"""Two effects count as the same if they differ by less than so many floors on every motion."""
 STEPS = 12
-"""Of a refit."""
+"""Most steps of the solver in a refit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """A recording that could be made, with its discrimination of rivals."""
+    """A recording that could be made, with its discrimination between rivals."""
 
     ways: dict[str, tuple[float, float]]
-    """"a | b" → floors that stay between the two after a refit of b to a's truth, and of a to b's."""
+    """"a | b" → residual [floors] after a refit of b to data simulated with a, and of a to data simulated with b."""
 
     @property
     def discrimination(self) -> dict[str, float]:
@@ -70,38 +70,38 @@ class Planned:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedMotion(Planned):
-    """A motion of a joint."""
+    """A motion of a joint that could be recorded."""
 
     motion: Motion
     target: np.ndarray
-    """(T,) rad at 200 Hz."""
+    """(T,) targets at 200 Hz [rad]."""
     peak_torque_nm: float
-    """That the motor would need, carried weight included, as the twin says."""
+    """Largest torque of the motor in the twin, gravity compensation included [N·m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan[PlannedT: Planned]:
-    """Recordings that could be made of one part, best first."""
+    """Recordings that could be made for one part, best first."""
 
     part: str
-    """``left_joint5``, ``left pads``."""
+    """Name of the part: ``left_joint5``, ``left pads``."""
     rivals: tuple[str, ...]
     floor: float
-    """Of noise: rad of a joint, counts of a row of a pad's taxel."""
+    """Noise floor: of a joint's angle [rad], or of a taxel's row [counts]."""
     planned: tuple[PlannedT, ...]
     refused: dict[str, str]
-    """Motion or press → why it must not be recorded."""
+    """Motion or press → reason why it must not be recorded."""
     pose: dict[str, float] = field(default_factory=dict)
-    """Other joints and gripper of the arm → where they stand meanwhile [rad, m]; empty for presses."""
+    """Positions of the arm's other joints and gripper during the motion [rad, m]; empty for presses."""
 
     @property
     def hopeless(self) -> tuple[str, ...]:
-        """Pairs of rivals that none of these recordings separates reliably."""
+        """Pairs of rivals that no recording of the plan separates reliably."""
         pairs = [f"{a} | {b}" for a, b in itertools.combinations(self.rivals, 2)]
         return tuple(pair for pair in pairs if self.best(pair) < TELLS)
 
     def best(self, pair: str) -> float:
-        """Floors between the two on what keeps them furthest apart; 0 where nothing may be recorded."""
+        """Discrimination of a pair on the recording that separates it best [floors]; 0 if nothing may be recorded."""
         return max((p.discrimination[pair] for p in self.planned), default=0.0)
 
 
@@ -120,14 +120,14 @@ def plan(
     """Score every motion of the library.
 
     Args:
-        rivals: two effects or more.
-        pose: (7,) rad, m: where the arm stands, the joint in the middle of its motions.
-        floor_rad: noise floor of the angle.
-        measurements: recordings that are there already.
-        fitted: effect → all numbers of the twin with it, where it has been fitted; else it is typical of its kind.
+        rivals: effects to separate, two or more.
+        pose: (7,) pose of the arm [rad, m], with the joint in the middle of its motions.
+        floor_rad: noise floor of the angle [rad].
+        measurements: existing recordings.
+        fitted: effect → all numbers of the twin with it, if it was fitted; otherwise typical values are used.
 
     Raises:
-        TaccorlError: less than two rivals, or the joint has no room to move about its pose.
+        TaccorlError: there are fewer than two rivals, or the joint cannot move about its pose.
     """
     check_rivals(rivals)
     room = room_of(config, signal, pose)
@@ -160,7 +160,7 @@ def plan(
 
 
 def other_joints(signal: str, pose: np.ndarray) -> dict[str, float]:
-    """``pose`` (7,) by name, without the joint under test."""
+    """The pose (7,) as joint name → position, without the joint under test."""
     arm = signal.split("_", 1)[0]
     names = [f"{arm}_{joint}" for joint in (*ROBOT.joints, "gripper")]
     return {name: round(float(value), 4) for name, value in zip(names, pose, strict=True) if name != signal}
@@ -169,7 +169,7 @@ def other_joints(signal: str, pose: np.ndarray) -> dict[str, float]:
 def check_rivals(rivals: Sequence[str]) -> None:
     """
     Raises:
-        TaccorlError: less than two.
+        TaccorlError: there are fewer than two.
     """
     if len(set(rivals)) < 2:
         raise TaccorlError(
@@ -191,7 +191,7 @@ def room_of(config: TwinConfig, signal: str, pose: np.ndarray) -> Room:
 
 
 def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
-    """Pose (7,) of the arm while this joint is swept: as in the recordings that sweep it, else as in ``motions.POSES``."""
+    """Pose (7,) of the arm while this joint is moved: that of recordings that move it, else that of ``motions.POSES``."""
     arm, number = signal.split("_", 1)[0], joint_number(signal)
     swept = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
     pose = np.array([*POSES[number - 1], OPENING_M])
@@ -204,7 +204,7 @@ def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
 def imagined(
     config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray, floor_rad: float
 ) -> Measurement:
-    """Simulated measurement of a motion by the twin, with noise, in place of a recording that is not made yet."""
+    """Simulated measurement of a motion with the twin, with noise, in place of a recording that does not exist yet."""
     j = ROBOT.action_names.index(signal)
     arm = signal.split("_", 1)[0]
     targets = np.zeros((len(target), len(ROBOT.action_names)))
@@ -231,7 +231,7 @@ def imagined(
 
 
 def peak_torque_nm(config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray) -> float:
-    """Largest torque of the motor on a motion, including gravity compensation."""
+    """Largest torque of the motor during a motion, including gravity compensation [N·m]."""
     m = imagined(config, signal, pose, motion, target, 0.0)
     model, seen = JointModel(config, signal), joint_motion(m, config, signal)
     answer = model.simulate(seen, model.gains)
@@ -267,7 +267,7 @@ def _apart(
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """A hypothesis: one effect with all fitted numbers of the part."""
+    """An explanation of the recordings: one effect with all fitted numbers of the part."""
 
     values: Values
     effect: Effect
@@ -276,13 +276,13 @@ class Explanation:
 def explanations(
     problem: Problem, rivals: Sequence[str], start: Mapping[str, float], fitted: Mapping[str, Values]
 ) -> dict[str, Explanation]:
-    """Rivals with the numbers that were ``fitted`` with each; without, typical of their kind.
+    """Explanations for the rivals, with the numbers that were ``fitted`` with each, or typical values.
 
     Args:
         start: numbers of the part without a rival.
 
     Raises:
-        TaccorlError: a rival that is no candidate of the problem.
+        TaccorlError: a rival is not a candidate of the problem.
     """
     found = {}
     for c in chosen(problem, rivals):
@@ -299,8 +299,8 @@ def floors_between(
     and vice versa.
 
     Args:
-        present: effects that the twin has in any case; their numbers are fitted, too.
-        recordings: those that are there already, then the one that could be made.
+        present: effects of the twin in both explanations; their numbers are fitted, too.
+        recordings: existing recordings, followed by the one that could be made.
     """
 
     def left(truth: Explanation, other: Explanation) -> float:

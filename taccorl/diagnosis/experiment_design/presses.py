@@ -1,16 +1,16 @@
 """Choose the press to record next: a library of presses of an arm's pads, scored by how well each separates rivals.
 
     press_hold_release   a ball to three depths at two speeds: k_n, k_d, the law
-    deep_presses         to 1.6 mm: what saturates or bends
+    deep_presses         to 1.6 mm: saturation, nonlinear law
     slow_ramp            up and down with inner loops: hysteresis
     long_hold            8 s, and 5 s of nothing after its release: creep
     quick_taps           a dozen of 0.06 s: delay, lag
-    light_touches        0.05 to 0.3 mm: thresholds, where the pad begins
+    light_touches        0.05 to 0.3 mm: thresholds, position of the pad's surface
     rod_across           a line over all columns: gains, crosstalk, a shifted pad
     rests                10 s of nothing before and after one press: a drifting zero
 
-A ball or a rod of known size in the hand, its place known. What the fingers do is an opening over time; commands lie below it by
-as much as the twin's gripper yields to the pads' springs. Limits: the gripper's range, the fingers' speed, the pads' travel.
+The object is a ball or a rod of known size at a known pose in the hand. A press is an opening over time; the commanded opening
+is smaller, because the gripper yields to the pads' springs. Limits: the gripper's range, the fingers' speed, the pads' travel.
 
 Letters in shapes: T rows or frames, P pads, R × C taxels.
 """
@@ -53,34 +53,35 @@ from taccorl.sim.twin import TwinConfig
 RADIUS_M = {"sphere": 0.012, "rod": 0.008}
 ROD_LENGTH_M = 0.04
 FINGER_SPEED_M_PER_S = 0.05
-"""Of each, at most: a choice, no rating is published."""
+"""Highest speed of each finger [m/s]: a choice, no rating is published."""
 AWAY_M = -1e-3
-"""Penetration while nothing is pressed: a millimetre of air at each pad."""
+"""Penetration while nothing is pressed [m]: a distance of a millimetre at each pad."""
 REST_S = 2.5
-"""Before and after."""
+"""Rest before and after each press [s]."""
 FRAME_S = 0.01
 SMOOTH_ROWS = 13
-"""Corners are rounded over 65 ms: fingers have some inertia."""
+"""Number of rows over which corners are rounded (65 ms), because fingers have inertia."""
 GAIN_SPREAD = 0.1
-"""Of the taxels of a gain map that is not known: a choice."""
+"""Standard deviation of the taxels' gains for a gain map that is not known: a choice."""
 
 Knots = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Press:
-    """One press to be recorded: object, place, and depth over time."""
+    """A press that could be recorded: object, position, and depth over time."""
 
     name: str
     knots: Knots
-    """(s, m) of penetration into each pad, straight lines between; below 0 is air."""
+    """(time [s], penetration into each pad [m]), connected by straight lines; negative is a distance to the pad."""
     shape: str = "sphere"
     x_m: float = 0.001
     z_m: float = 0.003
-    """Place of the object's middle in the TCP's frame, on no taxel's own middle; a rod lies across the pads, along x."""
+    """Position of the object's centre along z of the TCP's frame [m], not at the centre of a taxel; a rod lies across the pads,
+    along x."""
 
     def pressed(self, arm: str) -> PressedNote:
-        """Entry ``pressed`` of measurements.yaml."""
+        """Entry ``pressed`` of measurements.yaml for the press."""
         place = {"arm": arm, "radius_m": RADIUS_M[self.shape], "position_m": (self.x_m, 0.0, self.z_m)}
         if self.shape == "sphere":
             return PressedNote(shape="sphere", **place)
@@ -93,7 +94,7 @@ class Press:
         return np.convolve(np.interp(rows, time_s, depth_m), np.ones(SMOOTH_ROWS) / SMOOTH_ROWS, mode="valid")
 
     def opening_m(self) -> np.ndarray:
-        """(T,) between the fingers at 200 Hz."""
+        """(T,) opening between the fingers at 200 Hz [m]."""
         return 2 * (RADIUS_M[self.shape] - self.penetration_m())
 
 
@@ -126,20 +127,20 @@ LIBRARY = (
     Press(name="rod_across", knots=_presses((3e-4, 7e-4), (0.15, 0.6), 0.6), shape="rod", x_m=0.0, z_m=0.012),
     Press(name="rests", knots=_presses((6e-4,), (0.3,), 0.8, before_s=10.0, after_s=10.0)),
 )
-"""What ``taccorl excite --pads`` chooses from."""
+"""Presses from which ``taccorl excite --pads`` chooses."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedPress(Planned):
-    """A press of one arm's pads."""
+    """A press of one arm's pads that could be recorded."""
 
     press: Press
     opening_m: np.ndarray
-    """(T,) at 200 Hz: where the fingers shall be."""
+    """(T,) requested opening at 200 Hz [m]."""
     target_m: np.ndarray
-    """(T,) what to command, as the twin's gripper yields."""
+    """(T,) opening to command, which accounts for the compliance of the gripper in the twin [m]."""
     peak_force_n: float
-    """On each pad, as its spring in the twin says; 0 of rigid pads, which say nothing."""
+    """Largest force on each pad, from its spring in the twin [N]; 0 for rigid pads, for which it is not known."""
 
 
 def plan_presses(
@@ -154,14 +155,14 @@ def plan_presses(
     """Score every press of the library.
 
     Args:
-        rivals: two effects or more.
-        measurements: recordings that are there already; those that say what these pads pressed count, and their noise is the
-            floor. The twin's own sensor noise is without any.
-        fitted: effect → all numbers of the twin with it, where it has been fitted; else it is typical of its kind.
+        rivals: effects to separate, two or more.
+        measurements: existing recordings; those that state what these pads pressed are used, and their noise is the floor.
+            Without any, the floor is the twin's own sensor noise.
+        fitted: effect → all numbers of the twin with it, if it was fitted; otherwise typical values are used.
 
     Raises:
-        TaccorlError: less than two rivals, or one that pads do not show or have already; no such arm; recordings of which none
-            says what these pads pressed; another sensor than FlexiTac.
+        TaccorlError: there are fewer than two rivals, pads do not show one of them or already have it, there is no such arm, no
+            recording states what these pads pressed, or the sensor is not FlexiTac.
     """
     if arm not in ROBOT.arms:
         raise TaccorlError(f"excite: no pads of an arm {arm!r}; {nearest(arm, ROBOT.arms)}")
@@ -196,7 +197,7 @@ def plan_presses(
 def grip(robot: RobotConfig, press: Press) -> tuple[np.ndarray, np.ndarray]:
     """Force (T,) on each pad [N] and command (T,) [m] of a press: u = o − F / k_grip with F = K δ, at rest.
 
-    Rigid pads do not say how hard they are pressed: then commands are openings.
+    For rigid pads the force is not known, and commands equal openings.
     """
     stiffness = robot.pad_stiffness_n_per_m if robot.pads == "sprung" else 0.0
     force = stiffness * np.maximum(press.penetration_m(), 0.0)
@@ -204,7 +205,7 @@ def grip(robot: RobotConfig, press: Press) -> tuple[np.ndarray, np.ndarray]:
 
 
 def travel_m(robot: RobotConfig) -> float:
-    """Largest depth to which a pad can be pressed, limited by the gripper's force and the rubber's thickness."""
+    """Largest depth to which a pad can be pressed [m], limited by the gripper's force and the rubber's thickness."""
     return min(
         ROBOT.pad_thickness_m,
         robot.grip_force_max_n / robot.pad_stiffness_n_per_m if robot.pads == "sprung" else np.inf,
@@ -228,7 +229,7 @@ def _refusal(robot: RobotConfig, press: Press, target_m: np.ndarray) -> str:
 
 
 def imagined_press(config: TwinConfig, arm: str, press: Press) -> TouchMotion:
-    """Simulated counts of the twin in a press, with noise, in place of a recording that is not made yet."""
+    """Simulated counts of a press with the twin, with noise, in place of a recording that does not exist yet."""
     opening = press.opening_m()
     time_s = np.arange(len(opening)) / RATE_HZ
     target = np.tile([*REST_POSE, ROBOT.opening_max_m] * len(ROBOT.arms), (len(opening), 1))

@@ -1,1 +1,1 @@
-"""Kinds of machines, one module each; ``taccorl.diagnosis.machines.machine`` says what a kind must be able to do."""
+"""Kinds of machines, one module each; ``taccorl.diagnosis.machines.machine`` defines the methods of a kind."""

@@ -28,15 +28,16 @@ from taccorl.sim.twin_file import write_whole
 SMOOTH_S = 0.05
 """Window of the quadratic whose second derivative is the measured acceleration."""
 INERTIA_OFF = 5.0
-"""Factor between the file's inertia and the one in the recording from which the file cannot be right."""
+"""Ratio of the file's inertia to that in the recording from which on the file must be wrong."""
 INERTIA_SURE = 0.6
-"""Correlation of acceleration and the torque that friction, damping and weight leave, from which that says something."""
+"""Least correlation of acceleration and the torque without friction, damping and weight, at which the inertia in the recording
+is used."""
 
 
 @machines.register("axis")
 @dataclass(frozen=True)
 class Axis(Machine):
-    """An axis, which is its only part."""
+    """A single driven axis, which is its own only part."""
 
     config: AxisConfig
     name: str
@@ -61,7 +62,7 @@ class Axis(Machine):
         return {self.config.name: self.config.unit}
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """Positions beyond the limits, an inertia that cannot be right, an effort of the wrong sign."""
+        """Findings: positions beyond the limits, an impossible inertia, an effort of the wrong sign."""
         found = {}
         for m in measurements.all:
             self._check_signal(m)

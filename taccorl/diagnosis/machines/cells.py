@@ -1,4 +1,4 @@
-"""A sensor of cells as a machine, described by a cells file (``alignment.machines.cells_file``). It is its own only part."""
+"""A sensor of cells as a machine, described by a cells file (``alignment.machines.cells_file``). The sensor is its only part."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
 
 THIRDS = ("first rows", "middle rows", "last rows")
-"""Of a grid of three rows or more."""
+"""Names of thirds, for a grid of three rows or more."""
 
 
 @machines.register("cells")
@@ -55,7 +55,7 @@ class CellsMachine(Machine):
 
     @property
     def units(self) -> Mapping[str, str]:
-        """It has no positions."""
+        """Empty: a sensor of cells has no positions."""
         return {}
 
     def read(
@@ -91,7 +91,7 @@ class CellsMachine(Machine):
         pressed: PressedObject | None = None,
         progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
     ) -> Comparison:
-        """With gain and offset of the file; where it has none, those fitted to the fit recordings."""
+        """Compare with gain and offset from the file; if it states none, with those fitted to the fit recordings."""
         config = self.config
         fit_to = prepared_all(config, measurements.fit)
         calibration = of_file(config) or calibrated(config, [(responses(config, m), m.measured) for m in fit_to])
@@ -160,7 +160,7 @@ class CellsMachine(Machine):
     def by_hand(
         self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
     ) -> list[Addition]:
-        """Gain and offset stay as they are."""
+        """Add an effect with values by hand; gain and offset are not changed."""
         (part,) = self.select((self.config.name,), joints, pads)
         made = self.effect(name, part, {**values, "evidence": "by hand"})
         if made is None:
@@ -170,8 +170,8 @@ class CellsMachine(Machine):
         return [Addition(part, [made], numbers, {})]
 
     def with_additions(self, additions: Sequence[Addition]) -> "CellsMachine":
-        """Gain and offset are those that were fitted beside the effects; without any they are left out, and fitted by who loads
-        the file."""
+        """Add effects, with the gain and offset that were fitted together with them. Without fitted ones both are left out of
+        the file, and are fitted whenever it is used."""
         config = self.config
         for addition in additions:
             names = {e.name for e in addition.effects}

@@ -9,10 +9,10 @@ from taccorl.sim.twin_file import kind_of
 
 
 def load_machine(path: Path | None) -> Machine:
-    """The machine that a file describes; the nominal twin of the PiPER without a file.
+    """Load the machine that a file describes; without a file, the nominal twin of the PiPER.
 
     Raises:
-        SpecError: the file cannot be read, its kind is unknown, or it does not fit that kind; with file and line.
+        SpecError: the file cannot be read, its kind is unknown, or it does not fit that kind; the message names file and line.
     """
     if path is None:
         return PiperTwin.nominal()

@@ -1,4 +1,4 @@
-"""What is compared with measurements and diagnosed: the PiPER's twin, or another machine that a file describes.
+"""Base class of machines that are compared with measurements and diagnosed: the PiPER's twin, or another one described by a file.
 
 The commands ``compare``, ``diagnose`` and ``add-effect`` use a ``Machine`` only by the methods here. ``load_machine`` reads which
 kind a file describes from its key ``kind:``; a file without that key is a ``twin.yaml`` of the PiPER.
@@ -29,15 +29,15 @@ from taccorl.plugins import Registry
 from taccorl.sim.effects.effect import Effect
 
 GainsAre = Literal["auto", "commanded", "fitted"]
-"""``auto``: gains that every recording states stay fixed, others are fitted."""
+"""Treatment of gains. ``auto``: gains that every recording states stay fixed, others are fitted."""
 
 
 class Finding(Protocol):
-    """What was found out about one part of a machine."""
+    """Interface of the finding about one part of a machine."""
 
     @property
     def part(self) -> str:
-        """As tables and reports call it."""
+        """Name of the part in tables and reports."""
         ...
 
     @property
@@ -45,27 +45,27 @@ class Finding(Protocol):
 
     @property
     def can_tell(self) -> Identifiability:
-        """What its recordings can show and tell apart, whatever they say."""
+        """Effects that the recordings can show and separate, independent of the measured values."""
         ...
 
     @property
     def known(self) -> Known | None:
-        """The numbers that the recordings identify; None where that is not worked out."""
+        """Numbers that the recordings identify; None for parts for which they are not computed."""
         ...
 
     @property
     def noise(self) -> str:
-        """Noise floors in words."""
+        """Text of the noise floors."""
         ...
 
     @property
     def numbers(self) -> str:
-        """Where the always fitted numbers are from, in words."""
+        """Text: where the values of the always fitted numbers come from."""
         ...
 
     @property
     def measured(self) -> str:
-        """Channels whose errors are counted, in words."""
+        """Text: channels whose errors are counted."""
         ...
 
     @property
@@ -75,18 +75,18 @@ class Finding(Protocol):
 
     @property
     def rows_split(self) -> bool:
-        """No recording was marked for validation: the last rows of each were used."""
+        """True if no recording was marked for validation, so that the last rows of each were used."""
         ...
 
     @property
     def remark(self) -> str:
-        """What the search could not judge; empty if there is nothing."""
+        """Text: what the search could not judge; empty if there is nothing."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class PartFinding:
-    """A ``Finding`` of a part that needs nothing special."""
+    """A ``Finding`` for parts without special needs."""
 
     part: str
     diagnosis: Diagnosis
@@ -101,19 +101,19 @@ class PartFinding:
 
 
 class Addition(NamedTuple):
-    """What is written into a machine's file at one part."""
+    """Changes of a machine's file for one part."""
 
     part: str
     effects: Sequence[Effect]
-    """Those that are added, and those of the file that were refitted with them."""
+    """Effects to add, and effects of the file that were refitted with them."""
     base: Mapping[str, float]
-    """Always fitted numbers, refitted with them; empty: they stay."""
+    """Always fitted numbers that were refitted with the effects; empty: they are not changed."""
     intervals: Mapping[str, Sequence[float]]
-    """Number → 95 % interval."""
+    """Name of a number → its 95 % interval."""
 
 
 class PartProblem(Startable, Protocol):
-    """A problem with the recordings that it is solved on."""
+    """A search problem together with its recordings."""
 
     fit: Sequence[Recording]
     validation: Sequence[Recording]
@@ -124,41 +124,41 @@ class PartProblem(Startable, Protocol):
 
 
 class Machine(ABC):
-    """A machine as a file describes it. Machines are values: methods that change something return another one."""
+    """A machine as described by a file. Machines are immutable: methods that change something return a new one."""
 
     name: str
-    """For titles and tables: the file's stem."""
+    """Name for titles and tables: the file's stem."""
     part_word: ClassVar[str] = "part"
-    """What messages call one of its parts: joint, axis, pad."""
+    """Word for one of its parts in messages: joint, axis, pad."""
     saved_words: ClassVar[str] = "compare and diagnose load it"
-    """Use of a file that ``save`` has written."""
+    """Words for messages about the use of a file that ``save`` has written."""
 
     @property
     def file_name(self) -> str:
-        """Name of the file, in the folder of the report, that ``diagnose --until=noise_floor`` writes the mended machine to."""
+        """Name of the file in the report's folder to which ``diagnose --until=noise_floor`` writes the corrected machine."""
         return f"{self.name}.yaml"
 
     @classmethod
     @abstractmethod
     def load(cls, path: Path) -> Self:
-        """Read a file.
+        """Load a machine from a file.
 
         Raises:
-            SpecError: with file, line and key.
+            SpecError: the file is invalid; the message names file, line and key.
         """
 
     @abstractmethod
     def save(self, path: Path) -> None:
-        """Write a file that ``load`` reads as the same machine; it is replaced as a whole or not at all."""
+        """Write a file from which ``load`` reads the same machine; it is replaced as a whole or not at all."""
 
     @abstractmethod
     def digest(self) -> str:
-        """16 hexadecimal digits that two machines share only if they are the same."""
+        """Digest of the machine, 16 hexadecimal digits; only equal machines have equal digests."""
 
     @property
     @abstractmethod
     def effects(self) -> tuple[str, ...]:
-        """Names of the effects that it has."""
+        """Names of the machine's effects."""
 
     @property
     @abstractmethod
@@ -168,31 +168,31 @@ class Machine(ABC):
     def read(
         self, path: Path, *, spec: str | None = None, columns: Path | None = None, validation_every: int | None = None
     ) -> Measurements:
-        """Recordings of it, as ``read_measurements`` reads them."""
+        """Read recordings of the machine, as ``read_measurements`` does."""
         return read_measurements(path, spec=spec, columns=columns, validation_every=validation_every, units=self.units)
 
     # measurements ----------------------------------------------------------------------------------------------------
 
     of_joints: ClassVar[bool] = True
-    """Whether its recordings are of joints, which the checks of telemetry judge."""
+    """True if its recordings are of joints, so that the checks of telemetry apply."""
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """Recording → findings that only this machine can make, such as positions beyond its limits."""
+        """Recording → findings of checks specific to this kind of machine, such as positions beyond its limits."""
         return {}
 
     @abstractmethod
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
-        """Parts that the fit recordings excite, so that something can be found out about them.
+        """Parts that the fit recordings excite, so that they can be diagnosed.
 
         Raises:
-            TaccorlError: none; names what to record.
+            TaccorlError: there are none; the message states what to record.
         """
 
     def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
-        """Those of ``parts`` that ``--joints`` and ``--pads`` name; all if neither is given.
+        """Select those of ``parts`` that ``--joints`` and ``--pads`` name; all if neither is given.
 
         Raises:
-            TaccorlError: a name that is none of them.
+            TaccorlError: a name is not among them.
         """
         if pads:
             raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; leave --pads out")
@@ -215,16 +215,16 @@ class Machine(ABC):
         pressed: PressedObject | None = None,
         progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
     ) -> Comparison:
-        """Simulate every recording's commands, and keep what is left.
+        """Simulate every recording's commands, and compute the residuals.
 
         Args:
-            name: for titles; the machine's own if empty.
+            name: name for titles; the machine's own if empty.
             pressed: object between the PiPER's fingers in recordings that do not state one.
-            progress: called with (recording, recordings done, recordings in all).
+            progress: function that is called with (recording, number of recordings done, number in all).
         """
 
     def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> PartProblem:
-        """One part as a problem for the search; kinds with a ``diagnose`` of their own need none."""
+        """Search problem of one part. Kinds that override ``diagnose`` need not implement it."""
         raise NotImplementedError
 
     def diagnose(
@@ -239,7 +239,7 @@ class Machine(ABC):
         """Search for the effect that is missing at one part.
 
         Args:
-            without: effects that are not considered.
+            without: effects that are left out of the search.
         """
         return solved(part, self.problem(part, measurements, gains), search, without)
 
@@ -249,23 +249,23 @@ class Machine(ABC):
     def effect(
         self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
     ) -> Effect | None:
-        """The effect of that name at one part; None if it cannot act there.
+        """Make the effect of that name at one part; None if it cannot act there.
 
         Args:
-            values: its parameters, interval and evidence, and whatever else its fields hold where a report gives them.
+            values: its parameters, interval and evidence, and other fields if a report states them.
             base: always fitted numbers of the diagnosis that fitted it.
 
         Raises:
-            TaccorlError: unknown effect or parameter, or a value out of bounds.
+            TaccorlError: the effect or a parameter is unknown, or a value is out of bounds.
         """
 
     def by_hand(
         self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
     ) -> list[Addition]:
-        """An effect with numbers by hand at the parts that are named; at the only part if the machine has one.
+        """Additions for an effect with values by hand at the named parts; at the only part if the machine has one.
 
         Raises:
-            TaccorlError: it cannot act there, or no part is named.
+            TaccorlError: the effect cannot act there, or no part is named.
         """
         if not joints and len(self.units) > 1:
             raise TaccorlError(f"{name}: which {self.part_word}? --joints={next(iter(self.units))}")
@@ -282,28 +282,29 @@ class Machine(ABC):
         """A copy of the machine with these effects and numbers; an effect of the same name at the same part is replaced.
 
         Raises:
-            TaccorlError: parts that share a number need different ones.
+            TaccorlError: parts that share a number need different values of it.
         """
 
     def mended(self, findings: Sequence[Finding]) -> tuple[Self, str]:
-        """With all that was found, and why a part of it could not be written; empty if all was."""
+        """The machine with everything that was found, and the reason why a part of it could not be written; empty if all was."""
         found = [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in findings]
         return self.with_additions(found), ""
 
     def refitted(self, findings: Sequence[Finding]) -> Self:
-        """With the always fitted numbers refitted and no further effect: what effects are credited against."""
+        """The machine with the always fitted numbers refitted and no further effect: the reference for the improvement by
+        effects."""
         firsts = [(f.part, f.diagnosis.before) for f in findings]
         return self.with_additions([Addition(part, b.effects, b.values, b.intervals()) for part, b in firsts])
 
     def option_of(self, part: str) -> list[str]:
-        """Options with which ``taccorl add-effect`` must name this part although it was diagnosed."""
+        """Options with which ``taccorl add-effect`` must name this part; empty if the diagnosis determines it."""
         return []
 
 
 def solved(
     part: str, problem: PartProblem, search: SearchConfig | None = None, without: Sequence[str] = ()
 ) -> PartFinding:
-    """``solve`` of a problem that holds its recordings.
+    """Call ``solve`` for a problem that holds its recordings.
 
     Raises:
         TaccorlError: nothing was measured in the validation rows.
@@ -335,10 +336,10 @@ def diagnose_parts(
     workers: int = 1,
     done: Callable[[str], None] = lambda _: None,
 ) -> list[Finding]:
-    """Several parts, ``workers`` at a time; the same for any number of them.
+    """Diagnose several parts, ``workers`` at the same time; the result does not depend on ``workers``.
 
     Args:
-        done: called with each part that is finished.
+        done: function that is called with each finished part.
     """
     one = partial(machine.diagnose, measurements=measurements, gains=gains, search=search, without=without)
     return each(one, parts, workers, done)

@@ -61,7 +61,7 @@ class PiperTwin(Machine):
         return {name: unit_of(name) for name in ROBOT.action_names}
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """A table without an arm's other joints: inertia and weight are then those of the bench's pose."""
+        """Findings, such as a table without an arm's other joints: inertia and weight are then those of the bench's pose."""
         return {m.name: _pose_unknown(m) for m in measurements.all}
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
@@ -74,7 +74,8 @@ class PiperTwin(Machine):
         return tuple(found)
 
     def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
-        """``left_joint5``; ``joint5`` and the paper's ``J4`` are that joint of every arm. Pads are named by their arm."""
+        """Select parts by name: ``left_joint5``; ``joint5`` and the paper's ``J4`` are that joint of every arm. Pads are named
+        by their arm."""
         swept = [p for p in parts if p in _SIGNALS]
         pressed = [p.removesuffix(" pads") for p in parts if p not in _SIGNALS]
         arms = _arms_named(pads, pressed) if pads or not joints else []
@@ -108,7 +109,7 @@ class PiperTwin(Machine):
     def effect(
         self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
     ) -> Effect | None:
-        """Of pads: those whose zeros are in ``base``."""
+        """Make an effect; one of pads acts on the pads whose zeros are in ``base``."""
         if {"arm", "joints", "pads"} & {*values}:  # as a report has it: it says itself where it acts
             return make_effect(name, **values)
         where = selectors(effects.get(name), part) if part in _SIGNALS else {"pads": pads.pads_of(base or {})}
@@ -137,7 +138,8 @@ class PiperTwin(Machine):
         return found
 
     def with_additions(self, additions: Sequence[Addition]) -> "PiperTwin":
-        """k_n and k_d are those of all pads: what several arms' pads were fitted to must agree."""
+        """Add effects and numbers. k_n and k_d are common to all pads, so that the values fitted to several arms' pads must
+        agree."""
         config = copy.deepcopy(self.config)
         of_pads = {a.part: (a.base, a.intervals) for a in additions if a.base and a.part not in _SIGNALS}
         if of_pads:
@@ -150,7 +152,7 @@ class PiperTwin(Machine):
         return PiperTwin(config, self.name)
 
     def mended(self, findings: Sequence[Finding]) -> "tuple[PiperTwin, str]":
-        """Without what was found in the pads where two arms need different k_n or k_d."""
+        """The twin with everything that was found, except effects of pads if two arms need different k_n or k_d."""
         try:
             return super().mended(findings)
         except TaccorlError as error:

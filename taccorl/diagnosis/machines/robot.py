@@ -31,7 +31,7 @@ from taccorl.sim.twin_file import write_whole
 @machines.register("robot")
 @dataclass(frozen=True)
 class RobotMachine(Machine):
-    """A robot of an MJCF or URDF file."""
+    """A robot described by an MJCF or URDF file and a robot file."""
 
     robot: Robot
     name: str
@@ -58,7 +58,7 @@ class RobotMachine(Machine):
     # measurements ----------------------------------------------------------------------------------------------------
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """Positions beyond limits, efforts beyond theirs, an inertia that cannot be right, columns that are missing."""
+        """Findings: positions or efforts beyond their limits, an impossible inertia, missing columns."""
         found: dict[str, list[DataFinding]] = {}
         for m in measurements.all:
             moved = [name for name in self.robot.config.joints if moves(m, name)]

@@ -1,10 +1,10 @@
 """Identification of one driven axis: its fitted numbers, candidate effects and recordings, as the search for missing effects
 needs them. An axis is a slide on a bench, a motor with a mass, a servo with a pendulum.
 
-Inertia and a constant torque are fitted, and the weight where the file states one. So are the gains, within ``GAINS_WITHIN`` of
-those commanded, where the effort was recorded, which identifies them: a few per cent of them outweigh the friction of a fast
-drive. Of law ``pwm`` the stall torque and the back-EMF are, within ``WINDING_WITHIN``: data sheets are no better. How late a
-target acts is fitted up to ``TIMING_S``: a cycle of the drive's loop is of no interest, and shows.
+Inertia and a constant torque are always fitted, and the weight if the file states one. If the effort was recorded, the gains are
+also fitted, within ``GAINS_WITHIN`` of the commanded ones, because an error of a few per cent outweighs the friction of a fast
+drive. For law ``pwm`` stall torque and back-EMF are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The
+delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data.
 """
 
 import dataclasses
@@ -27,20 +27,20 @@ from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
 
 GAINS_WITHIN = 1.25
-"""Factor to both sides."""
+"""Factor within which gains are fitted, to both sides."""
 WEIGHT_WITHIN = 3.0
-"""Times the weight's torque that the file states, of both signs."""
+"""Bound of the fitted weight's torque as a multiple of the file's, for both signs."""
 MOST_TORQUE = 20.0
-"""Of a constant torque, in force units of the axis."""
+"""Bound of the constant torque [force units of the axis]."""
 _NO_CANDIDATES = ("armature", "gravity_mismatch")
 """More inertia is the inertia, which is fitted; an axis carries no weight by itself."""
 
 
 class AxisProblem:
-    """An axis and recordings of it. Channels: position, and effort where every recording has it; in the units of the axis.
+    """Search problem of an axis. Channels: position, and effort if every recording has it, in the units of the axis.
 
     Raises:
-        TaccorlError: the recordings lack the axis, have it in another unit, or command what its law does not take.
+        TaccorlError: the recordings lack the axis, have it in another unit, or command a quantity that its law does not use.
     """
 
     def __init__(self, axis: AxisConfig, measurements: Measurements) -> None:
@@ -72,21 +72,21 @@ class AxisProblem:
 
     @property
     def numbers(self) -> str:
-        """Where the always fitted numbers are from."""
+        """Text: where the values of the always fitted numbers come from."""
         return f"fitted: {', '.join(f.name for f in self.base)}; other numbers as the file states them"
 
     @property
     def measured(self) -> str:
-        """What the errors are of."""
+        """Text: channels whose errors are counted."""
         return "positions and efforts together" if self.effort else "positions"
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) position, and effort."""
+        """(T, C) simulated position, and effort."""
         answer = simulated(self._bare.with_numbers(base), recording.data, effects)
         return np.column_stack([answer.reported, answer.effort][: 1 + self.effort])
 
     def learn(self, values: Mapping[str, float]) -> None:
-        """Starts of searches hang on the forces that the motor would give."""
+        """Update the start values of effects, which depend on the forces of the motor."""
         seen = self._seen(values)
         for name in registry:
             if not registry.get(name).fitted or name in _NO_CANDIDATES:
@@ -98,7 +98,7 @@ class AxisProblem:
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """An axis has no maps."""
+        """Return ``effects`` unchanged: an axis has no maps."""
         return list(effects)
 
     def _base(self) -> tuple[Free, ...]:
@@ -173,10 +173,10 @@ class AxisProblem:
 
 
 def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
-    """A recording of an axis, with the gains that it states.
+    """Data of an axis from a recording, with the gains that it states.
 
     Raises:
-        TaccorlError: it lacks the axis, has it in another unit, or commands what its law does not take.
+        TaccorlError: the recording lacks the axis, has it in another unit, or commands a quantity that its law does not use.
     """
     j = m.column(axis.name)
     if m.units[j] != axis.unit:
@@ -185,6 +185,6 @@ def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
 
 
 def simulated(axis: AxisConfig, motion: JointMotion, effects: Sequence[Effect]) -> JointResponse:
-    """Answer of the axis to a recording's targets, with the effects of its file and ``effects``."""
+    """Simulated response of the axis to a recording's targets, with the effects of its file and ``effects``."""
     model = JointModel.of(DrivenAxis(axis))
     return model.simulate(motion, model.gains, effects)

@@ -1,10 +1,9 @@
 """A sensor of cells as a problem for the search: candidates are all effects on readings, channels at most 64 cells.
 
 Each cell's gain and offset are always fitted, in closed form: for every set of effects they are the least squares over the fit
-recordings (variable projection, Golub and Pereyra 1973), so the search sees only what no gain and offset explains, and a grid of
-hundreds of cells costs no more unknowns than one.
-
-Rows in which the converter is at an end are not fitted and not judged.
+recordings (variable projection, Golub and Pereyra 1973), so that the search works on residuals which no gain and offset
+explains, and a grid of hundreds of cells has no more unknowns than one cell. Rows in which the converter is at an end are used
+neither in fits nor in errors.
 
 Letters in shapes: T rows, K cells, C channels.
 """
@@ -37,20 +36,20 @@ from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import CELLS, Effect
 
 SAME_LOAD = 0.2
-"""Share of its motion by which the load of a repeat may differ."""
+"""Largest difference between the load of a repeat and of the original, as a share of the load's motion."""
 SAME_FLOORS = 1.0
-"""A repeat is judged where its load differs by no more than so many noise floors of the reading."""
+"""A repeat is used where its load differs by no more than so many noise floors of the reading."""
 SAME_TEMPERATURE_K = 0.5
-"""The same for its temperature, where that was recorded."""
+"""The same limit for its temperature [K], if recorded."""
 _KEPT = 64
 """Sets of effects whose calibration is remembered: a step of the solver asks for each set once a recording."""
 
 
 class CellsProblem:
-    """Satisfies ``taccorl.diagnosis.machines.machine.PartProblem``.
+    """Search problem of a sensor of cells (a ``machines.machine.PartProblem``).
 
     Args:
-        config: the sensor. Its effects are ``present``: fitted anew with everything else.
+        config: configuration of the sensor. Its effects are ``present``: they are fitted again with all other numbers.
         measurements: ``CellMeasurement``s of it.
 
     Raises:
@@ -63,7 +62,7 @@ class CellsProblem:
     def __init__(self, config: CellsConfig, measurements: Measurements) -> None:
         self.config = dataclasses.replace(config, effects=[])
         self.floor = reading_floor(config, prepared_all(config, measurements.all))
-        """(K,) in the unit of the reading."""
+        """(K,) noise floor in the unit of the reading."""
         sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]
         load = np.concatenate([m.target for m in sides[0]])
         loaded = np.flatnonzero(load.max(axis=0) > LOADED * config.load.rated)
@@ -113,7 +112,7 @@ class CellsProblem:
         )
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) readings."""
+        """(T, C) simulated readings."""
         calibration, known = self._calibrated(effects)
         response = known.get(recording.name)
         if response is None:
@@ -137,7 +136,7 @@ class CellsProblem:
         return np.where(there, r.data.measured, np.nan)
 
     def file_numbers(self, effects: Sequence[Effect]) -> dict[str, float]:
-        """``gain_thumb`` [unit of the reading per unit of the load] and ``offset_thumb`` … beside ``effects``."""
+        """Fitted ``gain_thumb`` [unit of the reading per unit of the load] and ``offset_thumb`` … together with ``effects``."""
         told = file_numbers(self.config, self._calibrated(effects)[0])
         return {
             f"{key}_{name}": x
@@ -146,17 +145,17 @@ class CellsProblem:
         }
 
     def learn(self, values: Mapping[str, float]) -> None:
-        """Starts of searches hang on the recordings alone."""
+        """Does nothing: the start values depend on the recordings alone."""
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """Gains and offsets are no effects: ``simulate`` has them."""
+        """Return ``effects`` unchanged: gains and offsets are computed in ``simulate``."""
         return list(effects)
 
 
 def prepared_all(config: CellsConfig, measurements: Sequence) -> list[CellMeasurement]:
-    """Recordings as they are fitted and judged: without readings at the converter's ends, at most 200 rows a second."""
+    """The recordings for fits and errors: without readings at the converter's ends, at most 200 rows per second."""
     return [
         thinned(dataclasses.replace(m, measured=np.where(within_ends(config, m), m.measured, np.nan)))
         for m in measurements
@@ -164,8 +163,8 @@ def prepared_all(config: CellsConfig, measurements: Sequence) -> list[CellMeasur
 
 
 def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
-    """(K,) noise floor of each cell in the unit of the reading: its own noise and, times its gain, that of the load; where a
-    press was repeated, at least what the cell does not repeat under the same load."""
+    """(K,) noise floor of each cell in the unit of the reading: its own noise and, times its gain, that of the load; if a press
+    was repeated, at least the difference between repeats under the same load."""
     step = np.max([m.quantum for m in measurements], axis=0) / math.sqrt(12)
     own, load = (_own_noise([(getattr(m, kind), m.rate_hz) for m in measurements]) for kind in ("measured", "target"))
     gain = np.abs(calibrated(config, [(m.target, m.measured) for m in measurements]).gain)

@@ -1,7 +1,6 @@
-"""One joint as a problem for the search: its controller's numbers, the effects it may have, its recordings.
-
-Channels are the angle, and the motor's effort where every recording has it. Commanded gains that the recordings state stay fixed:
-free ones hide missing physics (on the knee of a Unitree Go2 they gave K_p 116 for a commanded 20; recordings of
+"""One joint as a problem for the search: its controller's numbers, candidate effects and recordings. Channels are the angle, and
+the motor's effort if every recording has it. Commanded gains that the recordings state stay fixed, because fitted gains can hide
+a missing effect (on the knee of a Unitree Go2 the fit gave K_p 116 for a commanded 20; recordings of
 iit-DLSLab/sim2real-robot-identification).
 """
 
@@ -30,46 +29,51 @@ from taccorl.sim.effects.speed_delay import SpeedDelay
 from taccorl.sim.twin import TwinConfig
 
 GainsAre = Literal["auto", "commanded", "fitted"]
-"""``auto``: commanded where every recording states K_p and K_d."""
+"""Treatment of gains. ``auto``: commanded if every recording states K_p and K_d, else fitted."""
 # Paper App. B.1.
 KP = Free(name="kp", unit="N·m/rad", start=500.0, low=10.0, high=1e5, log=True)
 KD = Free(name="kd", unit="N·m·s/rad", start=50.0, low=1.0, high=1e3, log=True)
 TORQUE_FF = Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0)
-"""The paper's bounds are ± 8 N·m; at such a bound an effect has to make up for the rest (a stiff joint off by 10 mrad has 18)."""
+"""Bounds of the fitted T_ref [N·m], wider than the paper's ± 8, at which an effect would have to compensate (a stiff joint with
+an error of 10 mrad has 18)."""
 WIDER = 100.0
-"""Softly driven joints have gains far below the paper's bounds, which are for whole position drives: both bounds are wider by
-this factor, downwards."""
+"""Factor by which the bounds of K_p and K_d extend below the paper's, which are for stiff position drives; softly driven joints
+have far lower gains."""
 _GAIN_LIKE = ("torque_scale",)
-"""No candidates where gains are fitted: those take it up, and what it does to the carried weight is ``gravity_mismatch``."""
+"""Effects that are no candidates if gains are fitted: the gains take their place, and their influence on gravity compensation is
+``gravity_mismatch``."""
 WEIGHS = 3.0
-"""Floors of the angle by which a weight must move the joint (standard deviation) to tell the scale of the torques. A choice."""
+"""Least motion of the joint due to weight, in noise floors of the angle (standard deviation), at which the weight determines the
+scale of the torques. A choice."""
 EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
-"""Reported effort over torque: PiPER firmware differs in it."""
+"""Ratio of reported effort to torque, which differs between versions of PiPER firmware."""
 SPEED_DELAY = Free(name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3)
-"""τ of the effect speed_delay: what a sampled loop does to the inertia. Fitted where something besides the inertia
-says something about the scale of the torques: else K_p takes it up (``taccorl.diagnosis.search.identifiable``)."""
+"""τ of the effect speed_delay, the influence of a sampled loop on the inertia. It is fitted if something besides the inertia
+determines the scale of the torques; otherwise a change of K_p is equivalent (``taccorl.diagnosis.search.identifiable``)."""
 POSITION_AGE = Free(name="position_age_s", unit="s", start=0.0, low=-1e-3, high=TIMING_S, scale=1e-4)
-"""Age of the measured position when the drive's torque acts, besides what is known of the loop. Fitted beside commanded gains
-where the machine says so (``RigidJoint.exact_timing``): fitted ones take it up, K_d − K_p a."""
+"""Age of the measured position when the drive's torque acts, beyond the age that follows from the loop. It is fitted together
+with commanded gains if the machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is
+equivalent."""
 PAYLOAD_PLACE = tuple(
     Free(name=name, unit="m", start=0.0, low=-0.05, high=0.05, scale=5e-3)
     for name in ("payload_sin_m", "payload_cos_m")
 )
-"""s and c of ``PayloadLever``. Fitted where a fit recording holds a payload whose place is not stated; 50 mm are a choice."""
+"""Bounds of s and c of ``PayloadLever`` [m]. They are fitted if a fit recording holds a payload whose position is not stated; 50
+mm are a choice."""
 OF_RECORDINGS = (EFFORT_SCALE.name, *(f.name for f in PAYLOAD_PLACE))
-"""Always fitted numbers that say something of the recordings; the twin has no place for them."""
+"""Always fitted numbers that describe recordings and are not stored in the twin."""
 
 
 class JointProblem:
-    """A joint of the PiPER's twin, or of another machine, and recordings of it.
+    """Search problem of a joint of the PiPER's twin, or of another machine.
 
     Args:
-        signal: name of the joint; of the PiPER ``left_joint5``.
-        gains: whether commanded gains are believed.
-        effort: whether the motor's effort is a second channel where every recording has it.
+        signal: name of the joint, for the PiPER ``left_joint5``.
+        gains: whether gains are commanded or fitted.
+        effort: whether the motor's effort is a second channel if every recording has it.
 
     Raises:
-        TaccorlError: no such joint, gains that are to be believed and are not stated, recordings that cannot be used.
+        TaccorlError: there is no such joint, commanded gains are not stated, or recordings cannot be used.
     """
 
     def __init__(
@@ -97,7 +101,7 @@ class JointProblem:
         self.model = JointModel.of(bare)
         self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
         self.floors = floors_of(everything, signal, effort=self.effort)
-        """Pooled over all recordings; one whose motion was repeated is judged by its own."""
+        """Noise floors over all recordings; a recording whose motion was repeated has its own."""
         root = motions(everything)
         repeated = [r for r in root.values() if sum(other == r for other in root.values()) > 1]
         groups = {r: [m for m in everything if root[m.name] == r] for r in repeated}
@@ -121,11 +125,11 @@ class JointProblem:
 
     @property
     def inertia_kgm2(self) -> float:
-        """Of the joint: the least of the fit recordings, whose loop timing is the most uncertain."""
+        """Inertia of the joint [kg·m²]: the least of the fit recordings, at which the loop's timing has most influence."""
         return min(self.model.inertia_kgm2(r.data) for r in self.fit)
 
     def pinned_by(self, names: Sequence[str]) -> tuple[str, ...]:
-        """What fixes the scale of the torques (``diagnosis.search.identifiable``) while the effects ``names`` are fitted."""
+        """Facts that fix the scale of the torques (``diagnosis.search.identifiable``) while the effects ``names`` are fitted."""
         commanded = self.commanded and not self.model.joint.winding
         words = "commanded gains" if self.model.joint.gain_names else "commanded torques"
         found = [words] * commanded + ["recorded effort"] * (self.effort and not commanded)
@@ -152,7 +156,7 @@ class JointProblem:
         return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) angle [rad], and effort [N·m] as the driver would report it."""
+        """(T, C) simulated angle [rad], and effort [N·m] as the driver would report it."""
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
         if SPEED_DELAY.name in base:
             effects = [
@@ -167,7 +171,7 @@ class JointProblem:
         return np.column_stack([answer.reported, base.get("effort_scale", 1.0) * answer.effort])
 
     def learn(self, values: Mapping[str, float]) -> None:
-        """Starts of searches hang on the torques that the motor would give with these gains."""
+        """Update the start values of effects, which depend on the torques of the motor with these gains."""
         seen = self._seen(values)
         for name in registry:
             cls = registry.get(name)
@@ -179,7 +183,7 @@ class JointProblem:
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """Joints have no maps."""
+        """Return ``effects`` unchanged: joints have no maps."""
         return list(effects)
 
     def _asked(self, motion: JointMotion) -> np.ndarray:
@@ -267,10 +271,10 @@ def _within(name: str, value: float) -> Free:
 
 
 def floors_of(measurements: Sequence[Measurement], signal: str, *, effort: bool) -> list[SignalFloor]:
-    """Noise floor of the angle, and of the effort.
+    """Noise floors of the angle and of the effort.
 
     Raises:
-        TaccorlError: never measured.
+        TaccorlError: the joint was never measured.
     """
     found = []
     for kind in ("position", "effort")[: 1 + effort]:

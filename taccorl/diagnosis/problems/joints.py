@@ -1,4 +1,4 @@
-"""Every joint that the recordings move, each diagnosed by itself, and the twin that comes out of it."""
+"""Diagnose every joint that the recordings move, each separately, and write the results into the twin."""
 
 import copy
 import dataclasses
@@ -26,32 +26,32 @@ from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, TouchEffe
 from taccorl.sim.twin import TwinConfig
 
 MOVES_RAD = 2e-3
-"""A joint that is commanded to move by more, or moves by more where it is not commanded by position, is swept."""
+"""Least commanded (or, without position commands, measured) range of a joint that is diagnosed [rad]."""
 SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints)
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointFinding:
-    """What was found out about one joint."""
+    """Finding about one joint."""
 
     signal: str
     diagnosis: Diagnosis
     can_tell: Identifiability
-    """What its recordings can show and tell apart, whatever they say."""
+    """Effects that its recordings can show and separate, independent of the measured values."""
     floors: tuple[SignalFloor, ...]
-    """Of the angle, and of the effort if that was used."""
+    """Noise floor of the angle, and of the effort if it was used."""
     commanded: bool
-    """Gains are the commanded ones; else they were fitted."""
+    """True: gains are the commanded ones; False: they were fitted."""
     recordings: dict[str, tuple[str, ...]]
     """fit, validation, test → names."""
     rows_split: bool
-    """No recording was marked for validation: rows at the end of each were."""
+    """True: no recording was marked for validation, so that the last rows of each were used."""
     known: Known
-    """The numbers that the recordings identify, and what they leave open of the others."""
+    """Numbers that the recordings identify, and the range of those that they do not."""
 
     @property
     def part(self) -> str:
-        """How tables and reports call it."""
+        """Name of the part in tables and reports."""
         return self.signal
 
     @property
@@ -60,27 +60,27 @@ class JointFinding:
 
     @property
     def numbers(self) -> str:
-        """Where the always fitted numbers are from."""
+        """Text: where the values of the always fitted numbers come from."""
         if "stall_nm" in self.diagnosis.base:
             return "gains as the file states them, stall torque and back-EMF fitted"
         return "commanded gains" if self.commanded else "gains fitted (not stated by the recordings)"
 
     @property
     def measured(self) -> str:
-        """What the errors are of."""
+        """Text: channels whose errors are counted."""
         return "angles and efforts together" if len(self.floors) > 1 else "angles"
 
     remark = ""
 
 
 def swept_joints(measurements: Measurements) -> tuple[str, ...]:
-    """Joints that at least one fit recording moves."""
+    """Joints that move in at least one fit recording."""
     return tuple(s for s in SIGNALS if any(moves(m, s) for m in measurements.fit))
 
 
 def moves(m: Measurement, signal: str) -> bool:
-    """Whether the recording commands the joint to move, and its arm presses nothing: what pushes back at a hand turns its joints,
-    and one joint by itself does not know of it."""
+    """Whether the recording commands the joint to move while its arm presses nothing: contact forces at the hand turn its
+    joints, and the one-joint model does not include them."""
     if m.pressed is not None and signal.startswith(f"{m.pressed.arm}_"):
         return False
     if signal not in m.signals:
@@ -90,7 +90,7 @@ def moves(m: Measurement, signal: str) -> bool:
 
 
 def of_joints(measurements: Measurements, signals: Sequence[str]) -> Measurements:
-    """Without the recordings that move none of ``signals``."""
+    """The measurements without recordings that move none of ``signals``."""
     sides = {
         use: tuple(m for m in getattr(measurements, use) if any(moves(m, s) for s in signals))
         for use in ("fit", "validation", "test")
@@ -107,10 +107,10 @@ def diagnose_joint(
     search: SearchConfig | None = None,
     without: Sequence[str] = (),
 ) -> JointFinding:
-    """Search for what is missing at one joint, in the recordings that move it.
+    """Search for the effect that is missing at one joint, in the recordings that move it.
 
     Raises:
-        TaccorlError: none of the fit recordings moves it.
+        TaccorlError: no fit recording moves the joint.
     """
     own = of_joints(measurements, [signal])
     if not own.fit:
@@ -131,7 +131,7 @@ def diagnose_joint(
 
 
 def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
-    """What the recordings of a joint identify of the numbers that were fitted to them."""
+    """Of the fitted numbers of a joint: those that its recordings identify."""
     pinned_by = problem.pinned_by(found.names)
     kd = problem.model.gains.kd if problem.commanded else None
     return Known(
@@ -142,7 +142,8 @@ def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
 
 
 def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
-    """``found`` with the absolute numbers' intervals, in its effects too, and the identified numbers in their evidence."""
+    """``found`` with the intervals of the absolute numbers, also in its effects, and with the identified numbers in their
+    evidence."""
     effects = []
     for effect in found.effects:
         prefix = f"{effect.name}."
@@ -173,7 +174,7 @@ def _payload_remarks(found: Diagnosis) -> list[str]:
 def each[FindingT](
     diagnosed: Callable[[str], FindingT], parts: Sequence[str], workers: int, done: Callable[[str], None]
 ) -> list[FindingT]:
-    """``diagnosed`` of every part, in ``workers`` processes; the same for any number of them."""
+    """Results of ``diagnosed`` for every part, in ``workers`` processes; they do not depend on ``workers``."""
     if workers <= 1 or len(parts) <= 1:
         found = []
         for part in parts:
@@ -191,9 +192,8 @@ def each[FindingT](
 def set_numbers(
     config: TwinConfig, signal: str, base: Mapping[str, float], intervals: Mapping[str, Sequence[float]]
 ) -> None:
-    """Write fitted gains into one arm of ``config``, and the delay of the speed unless its interval holds 0.
-
-    Where a payload lies and how efforts are scaled belongs to recordings, not to the twin.
+    """Write fitted gains into one arm of ``config``, and the delay of the speed unless its interval contains 0. Payload
+    positions and effort scales belong to recordings, not to the twin.
     """
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
@@ -210,7 +210,7 @@ def set_numbers(
 
 
 def add_effect(config: TwinConfig, effect: Effect) -> None:
-    """Put an effect into ``config``; what an entry of the same name does to the same joints or pads, it replaces."""
+    """Add an effect to ``config``. It replaces an entry of the same name for the same joints or pads."""
     kept: list[Effect] = []
     for other in config.effects:
         shared = set(other.acts_on()) & set(effect.acts_on()) if other.name == effect.name else set()

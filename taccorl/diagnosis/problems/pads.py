@@ -1,7 +1,6 @@
-"""The pads of every arm that pressed a known object, each pair diagnosed by itself, and the twin that comes out of it.
-
-A pair is judged by matched contact replays (``TouchProblem``): its fingers stand where they were measured, in an object whose
-place is known. A twin has one k_n and one k_d for all of its pads, effects act on the pads in which they were found.
+"""Diagnose the pads of every arm that pressed a known object, each pair separately, and write the results into the twin. A pair
+is diagnosed with matched contact replays (``TouchProblem``): measured poses of the fingers, and an object at a known pose. A
+twin has one k_n and one k_d for all of its pads; effects act on the pads in which they were found.
 """
 
 import dataclasses
@@ -29,41 +28,42 @@ from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
 from taccorl.sim.twin import TwinConfig
 
 FIELDS = {"k_n": "normal_stiffness_per_m", "k_d": "normal_damping_s_per_m"}
-"""Fitted number → field of the twin's sensor. The zeros of pads are of a recording's baseline and have no place in a twin."""
+"""Fitted number → field of the twin's sensor. The zeros of pads belong to a recording's baseline and are not stored in a twin."""
 Range = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PadFinding:
-    """What was found out about the pads of one arm."""
+    """Finding about the pads of one arm."""
 
     arm: str
     pads: tuple[str, ...]
-    """Those that came near the objects."""
+    """Names of the pads that came near the objects."""
     diagnosis: Diagnosis
     can_tell: Identifiability
-    """What their recordings can show and tell apart, whatever they say."""
+    """Effects that their recordings can show and separate, independent of the measured values."""
     floor_count: float
-    """Noise floor of a row, the mean of ``FRAMES_A_ROW`` frames: median over the taxels that were looked at."""
+    """Noise floor of a row, the mean of ``FRAMES_A_ROW`` frames [counts]: median over the simulated taxels."""
     lower_bound: bool
-    """No press was recorded twice: what the pads and the opening do not repeat is not in the floor."""
+    """True: no press was recorded twice, so that the floor lacks the variation between repeats."""
     recordings: dict[str, tuple[str, ...]]
     """fit, validation, test → names."""
     rows_split: bool
-    """No recording was marked for validation: rows at the end of each were."""
+    """True: no recording was marked for validation, so that the last rows of each were used."""
     gains: GainStatistics | None = None
-    """That taxels' gains differ, which no validation recording could judge: none presses the taxels that were fitted to."""
+    """Statistics of differing taxel gains that could not be validated, because no validation recording presses the fitted
+    taxels; None otherwise."""
     not_shared: tuple[str, ...] = ()
-    """These validation recordings."""
+    """Names of these validation recordings."""
 
     @property
     def part(self) -> str:
-        """``left pads``: how tables and reports call them."""
+        """Name of the part in tables and reports: ``left pads``."""
         return part_of(self.arm)
 
     @property
     def remark(self) -> str:
-        """What the search could not judge, and the press that would show it; empty if there is nothing."""
+        """Text: what the search could not judge, and the press that would show it; empty if there is nothing."""
         return gain_words(self.gains, self.not_shared) if self.gains else ""
 
     @property
@@ -73,7 +73,7 @@ class PadFinding:
 
     @property
     def numbers(self) -> str:
-        """Where the always fitted numbers are from."""
+        """Text: where the values of the always fitted numbers come from."""
         return "k_n, k_d and each pad's zero fitted"
 
     measured = f"means of {FRAMES_A_ROW} frames"
@@ -85,12 +85,12 @@ def part_of(arm: str) -> str:
 
 
 def pads_of(base: Mapping[str, float]) -> list[str]:
-    """Pads whose zero is among the fitted numbers."""
+    """Pads whose zeros are among the fitted numbers."""
     return [name.removeprefix("zero_") for name in base if name.startswith("zero_")]
 
 
 def presses(m: Measurement, arm: str) -> bool:
-    """Whether it is stated what the pads of an arm pressed in a recording."""
+    """Whether the recording states what the pads of an arm pressed."""
     return m.pressed is not None and m.pressed.arm == arm
 
 
@@ -107,10 +107,10 @@ def diagnose_arm(
     search: SearchConfig | None = None,
     without: Sequence[str] = (),
 ) -> PadFinding:
-    """Search for what is missing in the pads of one arm, in the recordings that say what they pressed.
+    """Search for the effect that is missing in the pads of one arm, in the recordings that state what they pressed.
 
     Raises:
-        TaccorlError: no fit recording says so, or one that cannot be a matched contact replay of the same pads.
+        TaccorlError: no fit recording states it, or no matched contact replay of the same pads can be made.
     """
     uses: dict[str, tuple[Measurement, ...]] = {
         use: tuple(m for m in getattr(measurements, use) if presses(m, arm)) for use in ("fit", "validation", "test")
@@ -151,12 +151,10 @@ def unjudged_gains(
     validation: Sequence[Recording],
     config: SearchConfig,
 ) -> GainStatistics | None:
-    """Statistics of the taxels' gains, if a map of them explains what a search has left over but cannot be judged by it, because
-    validation recordings press other taxels.
-
-    The map is then judged in time instead of on other recordings: estimated from the first rows of every recording, on the
-    others, by the search's own measures. None if it is not believed, or if the search could judge it: a map that it took
-    without a common taxel only moved k_n.
+    """Statistics of the taxels' gains, if a gain map explains the residual after a search that could not judge it, because
+    validation recordings press other taxels. The map is then validated in time instead of on other recordings: it is estimated
+    from the first rows of every recording and evaluated on the last rows, with the search's own criteria. None if it does not
+    meet them, or if the search could judge it: a map that the search added without common taxels only changed k_n.
     """
     name = TaxelGainMap.name
     names = tuple(n for n in found.names if n != name)
@@ -175,7 +173,7 @@ def unjudged_gains(
 
 
 def gain_words(gains: GainStatistics, not_shared: Sequence[str]) -> str:
-    """One remark: what is the matter, why it is no finding of the search, what to record."""
+    """Text of a remark: the fault, why it is not a finding of the search, and what to record."""
     parts = []
     if gains.num_dead:
         parts.append(f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({gains.dead_share:.0%}) read nothing")
@@ -206,19 +204,19 @@ def _check_pads(motions: Sequence[TouchMotion]) -> None:
 
 
 def set_numbers(config: TwinConfig, base: Mapping[str, float]) -> None:
-    """Write fitted k_n and k_d into ``config``: they are those of all its pads."""
+    """Write fitted k_n and k_d, which hold for all its pads, into ``config``."""
     fields = {field: float(base[name]) for name, field in FIELDS.items()}
     config.sensor = dataclasses.replace(config.sensor, **fields)
 
 
 def agreed(fitted: Mapping[str, tuple[Mapping[str, float], Mapping[str, Sequence[float]]]]) -> dict[str, float]:
-    """k_n and k_d that all parts can share: means of those fitted, each with the weight of its interval.
+    """k_n and k_d for all parts: means of the fitted values, weighted by their intervals.
 
     Args:
         fitted: ``left pads`` → fitted numbers and their 95 % intervals.
 
     Raises:
-        TaccorlError: two parts' intervals have nothing in common.
+        TaccorlError: the intervals of two parts do not overlap.
     """
     found = {}
     for name in FIELDS:

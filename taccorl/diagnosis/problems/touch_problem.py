@@ -1,12 +1,10 @@
 """The pads as a problem for the search: k_n, k_d and each pad's zero are always fitted; candidates are effects on readings.
 
-A recording's channels are the taxels that matter in it, at most ``MAX_CHANNELS``: those the object comes near and those that
-read something. They are simulated with all taxels around them that the object comes near. A row is the mean of ``FRAMES_A_ROW``
-frames: what many scans say together stands out of noise in which each of them is lost. All rows are kept while something touches
-and for a second after, one in five otherwise.
-
-What a taxel's own gain is can only be known of taxels that were pressed: those that no fit recording pressed are left out of
-validation and test recordings, whatever effect is judged on them (``recordings``).
+A recording's channels are at most ``MAX_CHANNELS`` taxels: those that the object comes near and those above the noise. They are
+simulated with all taxels around them that the object comes near. A row is the mean of ``FRAMES_A_ROW``
+frames: averaging reduces the noise. All rows are kept during contact and for a second after, otherwise one in five. A taxel's
+gain can only be known if it was pressed: taxels that no fit recording pressed are left out of validation and test recordings,
+for every effect (``recordings``).
 
 Letters in shapes: T frames, S rows, P pads, R × C taxels, C channels.
 """
@@ -35,7 +33,7 @@ from taccorl.sim.twin import TwinConfig
 
 MAX_CHANNELS = 64
 FRAMES_A_ROW = 5
-"""50 ms: a delay of a fifth of that still moves the mean of a press's edge."""
+"""Number of frames per row (50 ms): a delay of a fifth of it still changes the mean at the edge of a press."""
 _SELDOM = 5  # of the rows in which nothing happens one in so many is kept
 _SIGNAL = 1.3  # a taxel reads something if its RMS in contact is so many times its noise
 _FIXED = {
@@ -46,9 +44,9 @@ _INDEPENDENT_ROWS = 4.0  # so many rows say about a gain what an independent one
 _MOST_GAIN = 5.0
 _PRESSED_M, _PRESSED_FRAMES = 5e-5, 25  # a taxel that deep for a quarter of a second is pressed
 DEAD_GAIN = 0.1
-"""A taxel that reads less than this share of the median one counts as dead."""
+"""A taxel is dead if its gain is below this share of the median gain."""
 FEWEST_SHARED = 8
-"""Pressed taxels that a validation recording must share with the fit recordings for a map of gains to be judged on it."""
+"""Least number of pressed taxels that a validation recording must share with the fit recordings for judging a gain map on it."""
 _WINDOW_M = 1e-3  # taxels that the object comes so near to are simulated,
 _RIM = 1  # and so many rows and columns around them
 
@@ -86,12 +84,12 @@ class _Chosen:
 
 @dataclass(frozen=True, kw_only=True)
 class GainStatistics:
-    """How taxels' gains differ, of those that were pressed."""
+    """Statistics of the gains of pressed taxels."""
 
     log_std: float
-    """Standard deviation of ln g of those that read anything, beyond the error of each."""
+    """Standard deviation of ln g over taxels that are not dead, without the estimation error of each."""
     num_dead: int
-    """Of gain below ``DEAD_GAIN``."""
+    """Number of taxels with a gain below ``DEAD_GAIN``."""
     num_taxels: int
 
     @property
@@ -106,22 +104,23 @@ class _Gains:
     gains: np.ndarray
     """(P, R, C) as the map has them."""
     least: np.ndarray
-    """(K,) least squares, over their median, of the taxels that were pressed enough,"""
+    """(K,) least-squares gains of the taxels that were pressed enough, divided by their median."""
     variance: np.ndarray
-    """(K,) and of each its error, squared."""
+    """(K,) squared standard error of each of these gains."""
 
 
 class TouchProblem:
-    """Satisfies ``taccorl.diagnosis.search.problem.Problem``. Simulates and measures in counts above baseline.
+    """Search problem of the pads (a ``diagnosis.search.problem.Problem``), in counts above baseline.
 
     Args:
-        motions: all recordings that will be looked at; noise and facts for starts come from them.
-        config: the twin. Its own touch effects on just these pads are ``present``: fitted anew with everything else. Its others
-            act as they are and are no candidates here.
-            Those that repeat another one's motion (``Measurement.repeat_of``) say what the pads do not repeat.
+        motions: all recordings; noise and facts for start values come from them.
+        config: configuration of the twin. Its touch effects on exactly these pads are ``present``: they are fitted again with
+            all other numbers. Its other effects act unchanged and are no candidates.
+
+    Recordings that repeat another one (``Measurement.repeat_of``) determine the variation between repeats.
 
     Raises:
-        TaccorlError: recordings of different pads, none, or none without contact for a while.
+        TaccorlError: there is no recording, recordings are of different pads, or none has enough time without contact.
     """
 
     def __init__(self, motions: Sequence[TouchMotion], config: TwinConfig) -> None:
@@ -135,10 +134,11 @@ class TouchProblem:
         self._still_count = _still_floor(motions)
         repeated = _repeat_floor(motions, self._still_count)
         self.floor_count = np.maximum(self._still_count, repeated.taxel_count)
-        """(P, R, C) of a row, each taxel: its noise; where a motion was repeated, what it does not repeat."""
+        """(P, R, C) noise floor of a row of each taxel [counts]; if a motion was repeated, including the variation between
+        repeats."""
         self._touched_count = repeated.touched_count
         self.not_shared: list[str] = []
-        """Recordings for validation that press hardly a taxel which a fit recording presses (``recordings``)."""
+        """Validation recordings that press hardly any taxel which a fit recording presses (``recordings``)."""
         sensor = self._model.sensor
         k_n, k_d = sensor.normal_stiffness_per_m, sensor.normal_damping_s_per_m
         zeros = [
@@ -163,7 +163,7 @@ class TouchProblem:
         self.start: Values = {f.name: f.start for f in self.base} | {
             f.name: getattr(e, f.name.split(".", 1)[1]) for e in own for f in self.candidates[e.name].frees
         }
-        """To start a search from: the twin's own numbers."""
+        """Start values of a search: the twin's own numbers."""
 
     def _candidate(self, cls: type[Effect]) -> Candidate:
         found = touch_candidate(cls, self.seen, list(self.pads))
@@ -172,8 +172,8 @@ class TouchProblem:
     def recordings(
         self, fit: Sequence[TouchMotion], validation: Sequence[TouchMotion], test: Sequence[TouchMotion] = ()
     ) -> tuple[list[Recording], list[Recording], list[Recording]]:
-        """Motions as the search sees them. Of those that are not fitted to, taxels are left out that they press and no fit motion
-        does; all stay where fewer than ``FEWEST_SHARED`` would be left (``not_shared``)."""
+        """Motions in the form for the search. From validation and test motions, taxels that no fit motion presses are left out;
+        none is left out if fewer than ``FEWEST_SHARED`` would remain (``not_shared``)."""
         known = np.any([_pressed(m) for m in fit], axis=0)
         self.not_shared = [m.name for m in validation if (_pressed(m) & known).sum() < FEWEST_SHARED]
         return (
@@ -183,13 +183,13 @@ class TouchProblem:
         )
 
     def recording(self, motion: TouchMotion, known: np.ndarray | None = None) -> Recording:
-        """A motion as the search sees it.
+        """A motion in the form for the search.
 
         Args:
-            known: (P · R · C,) bool, taxels of which more may be known than their gain in this motion; None: all.
+            known: (P · R · C,) bool, taxels whose gain can be known; None: all.
 
         Raises:
-            TaccorlError: it is of other pads than the problem.
+            TaccorlError: the motion is of other pads than the problem.
         """
         if motion.pads != self.pads:
             raise TaccorlError(
@@ -246,7 +246,7 @@ class TouchProblem:
         return f"{self.pads[pad]}[{row}, {column}] [count]"
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(S, C) counts above baseline."""
+        """(S, C) simulated counts above baseline."""
         chosen: _Chosen = recording.data
         return self._counts(base, effects, chosen, chosen.channels)
 
@@ -270,12 +270,12 @@ class TouchProblem:
         return _row_counts(seen, places, chosen.rows if all_frames else np.arange(len(chosen.rows)), *numbers)
 
     def learn(self, values: Mapping[str, float]) -> None:
-        """Starts of searches hang on the recordings alone."""
+        """Does nothing: the start values depend on the recordings alone."""
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """``effects`` with the gain map of all taxels, if there is one among them, estimated from ``recordings``."""
+        """``effects`` in which a gain map, if there is one, is estimated for all taxels from ``recordings``."""
         if not any(isinstance(effect, TaxelGainMap) for effect in effects):
             return list(effects)
         gains = self._gains(dict(base), [e for e in effects if not isinstance(e, TaxelGainMap)], recordings)
@@ -319,7 +319,7 @@ class TouchProblem:
     def gain_statistics(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> GainStatistics:
-        """How the gains of the taxels that ``recordings`` press are distributed, beside ``effects`` other than a map."""
+        """Statistics of the gains of the taxels that ``recordings`` press, with ``effects`` other than a gain map."""
         found = self._gains(dict(base), [e for e in effects if not isinstance(e, TaxelGainMap)], recordings)
         dead = found.least < DEAD_GAIN
         alive = np.maximum(found.least[~dead], DEAD_GAIN)
@@ -333,7 +333,7 @@ class TouchProblem:
 
 
 def touch_candidate(cls: type[Effect], seen: Mapping[str, float], pads: list[str]) -> Candidate:
-    """An effect on readings as a candidate, without parameters that others take up (``_FIXED``)."""
+    """An effect on readings as a candidate, without parameters that are equivalent to other numbers (``_FIXED``)."""
     found = candidate(cls, seen, pads=pads, **_FIXED.get(cls.name, {}))
     fixed = {f"{cls.name}.{p}" for p in _FIXED.get(cls.name, {})}
     frees = tuple(f for f in found.frees if f.name not in fixed)

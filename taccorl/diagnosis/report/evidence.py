@@ -18,7 +18,7 @@ from taccorl.sim.effects.effect import Effect
 
 
 def first_read(v: Verdict) -> str:
-    """First section of a report: verdict, confidence, and what to record next, with the command."""
+    """First section of a report: verdict, confidence, and the next recording with its command."""
     lines = [
         f"<b>{html.escape(v.finding)}</b>",
         html.escape(v.confidence),

@@ -1,4 +1,4 @@
-"""Text of a diagnosis, the same in the terminal and on the page."""
+"""Texts of a diagnosis, the same in the terminal and on the page."""
 
 from collections.abc import Sequence
 
@@ -8,18 +8,20 @@ from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 
 OVERWHELMING_BIC, OVERWHELMING_SCORE = 100.0, 5.0
-"""ΔBIC, twice the logarithm of a Bayes factor (above 10 is very strong: Kass and Raftery 1995), and standard errors."""
+"""Values from which on ΔBIC and the score are only shown as "more than". ΔBIC is twice the logarithm of a Bayes factor (above 10
+is very strong: Kass and Raftery 1995); the score is in standard errors."""
 UNJUDGED = 1.3
-"""Ratio of the errors on fit and validation recordings that is remarkable: more than another motion's noise makes it."""
+"""Ratio of the errors on fit and validation recordings from which on they disagree: more than the noise of another motion
+causes."""
 NO_GAIN = 0.01
-"""Of the validation squared error above the floor: less is none."""
+"""Least share of the validation squared error above the floor that counts as an improvement."""
 
 
 def evidence_words(e: Evidence) -> str:
     """Evidence for an effect as text: ΔBIC on the recordings that it was fitted to, gain and standard errors on validation
     recordings.
 
-    ``weak`` is what the search would not add; ``none``: nothing goes away.
+    ``weak``: the search would not add the effect; ``none``: it removes nothing.
     """
     if e.gain < NO_GAIN or e.bic <= 0:
         return "none"
@@ -31,8 +33,8 @@ def evidence_words(e: Evidence) -> str:
 def unjudged(d: Diagnosis) -> str:
     """Text on the regimes in which fit and validation recordings disagree after the fit; empty if there are none.
 
-    What shows only in the recordings that were fitted can be neither confirmed nor refused; what shows only in those that
-    validate was fitted to something else.
+    An error that appears only in fit recordings can be neither confirmed nor rejected; one that appears only in validation
+    recordings was not part of the fit.
     """
     fit, validation = d.errors["after"]["fit"], d.errors["after"]["validation"]
     if fit > UNJUDGED * max(validation, 1.0):
@@ -68,7 +70,7 @@ def to_record(part: str, name: str, rivals: Sequence[str]) -> list[str]:
 
 
 def effect_class(name: str) -> type[Effect] | None:
-    """None: an effect of a problem outside the registry, such as a one-axis drive's own."""
+    """Class of a registered effect; None for an effect that only a problem defines."""
     try:
         return effects.get(name)
     except TaccorlError:

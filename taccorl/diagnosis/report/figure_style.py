@@ -1,7 +1,7 @@
 """Common style of all figures: colours, readable units, label of the data's origin, and PNG encoding for a page.
 
-The measurement is black, the twin before a change orange, after it blue (Okabe and Ito's, apart for colour-blind eyes), the noise
-floor a grey band.
+The measurement is black, the twin before a change orange, after it blue (Okabe and Ito's colours, distinguishable with colour
+blindness), the noise floor a grey band.
 """
 
 import base64
@@ -20,7 +20,7 @@ DOTS_PER_INCH = 110
 
 
 def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[str]) -> Figure:
-    """New empty figure with the origin of the data in its second title line."""
+    """Create a figure with the origin of the data in its second title line."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained", dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)
     figure.suptitle(f"{title}\n", fontsize=11, fontweight="bold", x=0.01, ha="left")
@@ -31,7 +31,7 @@ def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[
 
 
 def floor_band(axes: Axes, floor: float, unit: str) -> None:
-    """± 2 floors: where 95 % of a perfect twin's residual would lie."""
+    """Draw the band of ± 2 noise floors, in which 95 % of a perfect twin's residual would lie."""
     high = 2 * floor * shown_unit(unit)[0]
     axes.axhspan(-high, high, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor: ± 2 × {shown(floor, unit)}", zorder=0)
 
@@ -62,6 +62,6 @@ def data_uri(picture: bytes) -> str:
 
 
 def robust_limit(values: np.ndarray, least: float) -> float:
-    """Limit of a symmetric axis that shows all but the largest 0.1 % of residuals, and the noise floor."""
+    """Limit of a symmetric axis: the 99.9 % quantile of |``values``| with a margin, but at least ``least``."""
     values = np.abs(values[np.isfinite(values)])
     return 1.15 * max(float(np.quantile(values, 0.999)) if len(values) else 0.0, least)

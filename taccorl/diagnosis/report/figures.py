@@ -24,7 +24,7 @@ from taccorl.diagnosis.report.figure_style import (
 
 TWINS = ("twin", "twin, mended")
 LANES = ("near zero speed", "after a reversal", "high speed", "high load", "in contact")
-"""Regimes drawn as lanes under a residual."""
+"""Regimes drawn as bars below a residual."""
 
 
 def joint_response(before: Trace, after: Trace | None = None, names: tuple[str, str] = TWINS) -> Figure:
@@ -32,7 +32,7 @@ def joint_response(before: Trace, after: Trace | None = None, names: tuple[str, 
 
     Args:
         after: the same signal of the same recording, replayed by another twin.
-        names: of the twins.
+        names: names of the twins.
     """
     motion = motions_of([before])[0]
     lanes = [(r.name, r.rows(motion)) for r in REGIMES if r.name in LANES]
@@ -91,7 +91,7 @@ def heat_map_figure(cells: Sequence[Cell], origins: Sequence[str], title: str, m
     """Heat map, signal × regime, of RMSE over the noise floor. Empty cells have too few rows.
 
     Args:
-        most: floors that the colours reach, at least.
+        most: least upper end of the colour scale [noise floors].
     """
     shown_ones = [r for r in REGIMES if any(c.regime == r.name for c in cells)]
     figure = ratio_map(cells, [r.name for r in shown_ones], origins, title, most)
@@ -104,7 +104,7 @@ def heat_map_figure(cells: Sequence[Cell], origins: Sequence[str], title: str, m
 def ratio_map(
     cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[str], title: str, most: float = 0.0
 ) -> Figure:
-    """Signal × regime, each with its number."""
+    """Table of ratios, signal × regime, as coloured cells with their numbers."""
     signals = list(dict.fromkeys(c.signal for c in cells))
     ratio = np.full((len(signals), len(regimes)), np.nan)
     for c in cells:
@@ -134,7 +134,7 @@ def residual_along_variables(
     """Figure of the mean or RMS residual along each variable, with its 95 % band.
 
     Args:
-        traces: of the same signal, for its floor and units.
+        traces: traces of the same signal, for its floor and units.
     """
     first = traces[0]
     factor, unit = shown_unit(first.unit)

@@ -19,9 +19,9 @@ class Step:
 
     label: str
     error: float
-    """Validation RMSE in noise floors."""
+    """Validation RMSE [noise floors]."""
     interval: tuple[float, float] | None = None
-    """95 %."""
+    """95 % interval of the error; None if it is not known."""
 
 
 def waterfall(
@@ -30,8 +30,8 @@ def waterfall(
     """Waterfall figure: validation error after each added effect, down to the noise floor.
 
     Args:
-        steps: the twin as it was first, then one for each effect.
-        goal: floors at which a search stops.
+        steps: the original twin, then one entry for each effect.
+        goal: error at which the search stops [noise floors].
     """
     figure = new_figure(max(6.0, 2.2 + 1.15 * len(steps)), 4.4, title, origins)
     axes = figure.subplots()
@@ -69,7 +69,7 @@ def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[
     """Confusion matrix: hidden effect × named effect. Rows add up to the number of seeds.
 
     Args:
-        counts: hidden → named → number of seeds; names that are not hidden ones ("nothing", "something else") come last.
+        counts: hidden → named → number of seeds; names other than hidden effects ("nothing", "something else") come last.
     """
     hidden = list(counts)
     named = [*hidden, *dict.fromkeys(n for row in counts.values() for n in row if n not in counts)]
@@ -98,18 +98,19 @@ def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[
 
 
 SLOPE = 5.0
-"""Of all detection curves, in log odds over log signal: from 10 to 90 % within a factor of 2.4 of the signal."""
+"""Slope of all detection curves, in log odds over log signal: from 10 to 90 % within a factor of 2.4 of the signal."""
 
 
 def half_detected(signals: np.ndarray, found: np.ndarray, slope: float = SLOPE) -> tuple[float, float, float]:
-    """Signal to noise at which half the seeds find it, with its 95 % interval: p = 1 / (1 + (s½ / s)^slope), likeliest s½.
+    """Signal-to-noise ratio at which half the seeds find an effect, with its 95 % interval: maximum-likelihood s½ of p = 1 / (1
+    + (s½ / s)^slope).
 
     Args:
-        signals: (n,) of single seeds, above 0.
-        found: (n,) bool.
+        signals: (n,) signal-to-noise ratios of single seeds, above 0.
+        found: (n,) bool, whether the seed found the effect.
 
     Returns:
-        s½ and the ends of its interval by likelihood ratio; 0 and inf stand for an end that the seeds do not show.
+        s½ and the ends of its interval by likelihood ratio; 0 and inf stand for an end that the seeds do not determine.
     """
     grid = np.geomspace(0.02, 200.0, 2000)
     odds = slope * (np.log(signals)[:, None] - np.log(grid))
@@ -128,7 +129,7 @@ def detection_curves(
 
     Args:
         points: effect → signals (n,) and whether it was found (n,).
-        edges: of the bins in which seeds are counted together.
+        edges: edges of the bins in which seeds are counted together.
     """
     columns = 5
     rows = -(-len(points) // columns)

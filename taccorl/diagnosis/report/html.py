@@ -7,7 +7,7 @@ from collections.abc import Container, Sequence
 def table(
     heads: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Container[int] = (), classes: Sequence[str] = ()
 ) -> str:
-    """Rows of HTML cells; ``numbers``: columns set to the right; ``classes``: one for each row."""
+    """HTML table from rows of HTML cells. ``numbers``: columns that are right-aligned; ``classes``: one for each row."""
     top = "<tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in heads) + "</tr>" if heads else ""
     lines = []
     for k, row in enumerate(rows):

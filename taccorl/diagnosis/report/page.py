@@ -1,4 +1,4 @@
-"""The page of a report: HTML with its pictures inside. Nothing is fetched when it is opened."""
+"""The page of a report: one HTML file with its pictures inside, which loads no other file."""
 
 import html
 from collections.abc import Iterable, Sequence
@@ -49,7 +49,7 @@ USE_WORDS = {"fit": "fit", "validation": "validation", "test": "test"}
 
 
 def page(report: Report) -> str:
-    """The whole page."""
+    """Text of the whole page."""
     c, after = report.without_effects, report.after
     regimes = report.regimes()
     parts = [
@@ -212,7 +212,7 @@ def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind) ->
 
 
 def representative(traces: Sequence[Trace]) -> Trace:
-    """Of the validation recordings (else test, else fit) the one with the median error."""
+    """The recording with the median error among the validation recordings (else test, else fit)."""
     for use in ("validation", "test", "fit"):
         own = sorted(
             (t for t in traces if t.use == use), key=lambda t: float((t.residual**2)[t.residual == t.residual].mean())

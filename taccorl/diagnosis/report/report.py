@@ -30,25 +30,26 @@ class Report:
 
     title: str
     comparison: Comparison
-    """Of the twin as it was."""
+    """Comparison with the original twin."""
     after: Comparison | None = None
-    """Of the mended twin, or of another one, on the same recordings."""
+    """Comparison with the corrected twin, or with another one, on the same recordings; None without one."""
     refitted: Comparison | None = None
-    """Of the twin with its always fitted numbers refitted and no further effect: what an effect is credited against."""
+    """Comparison with the twin whose always fitted numbers were refitted without a further effect: the reference for the
+    improvement by effects."""
     diagnoses: Mapping[str, Diagnosis] = field(default_factory=dict)
-    """Part ("left_joint5", "left pads") → what was found there."""
+    """Part ("left_joint5", "left pads") → its diagnosis."""
     can_tell: Mapping[str, Identifiability] = field(default_factory=dict)
-    """Part → what its recordings can tell, whatever they say."""
+    """Part → effects that its recordings can show and separate, independent of the measured values."""
     known: Mapping[str, Known] = field(default_factory=dict)
-    """Part → the numbers that its recordings identify, and what they leave open of the others."""
+    """Part → numbers that its recordings identify, and the range of those that they do not."""
     options: Sequence[str] = ()
-    """Of commands that are suggested, such as ``--twin=twin.yaml``."""
+    """Options in suggested commands, such as ``--twin=twin.yaml``."""
     findings: Mapping[str, Sequence[Finding]] = field(default_factory=dict)
-    """Recording → what the checks before said."""
+    """Recording → findings of the checks before the comparison."""
     pictures: Mapping[str, bytes] = field(default_factory=dict)
-    """Caption → PNG, such as the camera's overlay before and after."""
+    """Caption → PNG, such as a camera's overlay before and after."""
     provenance: Mapping[str, str] = field(default_factory=dict)
-    """The command, the twin's file, digests: what was this made from?"""
+    """Origin of the report, by name: the command, the twin's file, digests."""
 
     @property
     def origins(self) -> tuple[str, ...]:
@@ -56,11 +57,12 @@ class Report:
 
     @property
     def without_effects(self) -> Comparison:
-        """Reference for the improvement by effects: the refitted twin, or the original one where nothing was refitted."""
+        """Reference for the improvement by effects: the comparison with the refitted twin, or with the original one if nothing
+        was refitted."""
         return self.comparison if self.refitted is None else self.refitted
 
     def cells(self) -> list[Cell]:
-        """Errors of the twin without further effects by regime: positions, efforts, pads."""
+        """Errors by regime, of positions, efforts and pads, for the twin without further effects."""
         return cells_of(self.without_effects)
 
     def regimes(self) -> dict[str, RegimeErrors]:
@@ -85,10 +87,8 @@ class Report:
         }
 
     def unsettled(self, part: str) -> list[str]:
-        """Errors that the checks found in the recordings of one part; of a joint those that move it.
-
-        An offset of the clock counts if the fitted twin sees it at this part: one that lacks an effect may see an offset that is
-        not there.
+        """Errors that the checks found in the recordings of one part (for a joint: those that move it). A clock offset counts
+        only if it is also found with the fitted twin, because a missing effect can look like an offset.
         """
         last = self.comparison if self.after is None else self.after
         moved = {t.recording for t in self.comparison.of(part)}
@@ -103,7 +103,7 @@ class Report:
 
 
 def cells_of(c: Comparison) -> list[Cell]:
-    """Errors of positions, efforts and pads by regime."""
+    """Errors by regime, of positions, efforts and pads."""
     return [*heat_map(c, "position"), *heat_map(c, "effort"), *touch_heat_map(c.touches)]
 
 

@@ -1,6 +1,5 @@
-"""Verdict of a diagnosis: what is missing, how certain that is, and what to record next. One sentence each.
-
-A pure function of what was found; the terminal and the page show the same sentences.
+"""Verdict of a diagnosis: the missing effect, the confidence, and what to record next, in one sentence each. A pure function of
+the findings; the terminal and the page show the same sentences.
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ Kind = Literal[
 ]
 Level = Literal["high", "moderate", "low"]
 FLOOR, LITTLE = SearchConfig().stop_at, SearchConfig().little
-"""Noise floors up to which an error counts as at the floor."""
+"""Largest errors [noise floors] that count as at the floor, and as little above it."""
 _UNCERTAIN: tuple[Kind, ...] = ("more", "something_else", "gains_moved", "not_converged", "data_first")
 _MOST = 3  # names or reasons in one sentence
 
@@ -29,14 +28,14 @@ class Verdict:
     part: str
     kind: Kind
     level: Level
-    """How far the finding can be relied on."""
+    """Confidence in the finding."""
     finding: str
     confidence: str
     record_next: str
     command: str
-    """What plans that recording; empty where no command does."""
+    """Command that plans the next recording; empty if none does."""
     remarks: tuple[str, ...]
-    """What else must be known about the result, a sentence each."""
+    """Remarks about the result, a sentence each."""
 
 
 def verdict(
@@ -52,11 +51,11 @@ def verdict(
     """Verdict on one part.
 
     Args:
-        can_tell: what its recordings can show at all.
-        known: its numbers, if they were told apart into those that positions identify and others.
-        data: what is wrong with the recordings and must be settled before an effect can be named.
-        doubts: other reasons to rely on it less, such as ranges that no validation recording covers.
-        options: of the command, such as ``--twin=twin.yaml``.
+        can_tell: effects that its recordings can show and separate.
+        known: its numbers, if they were divided into identified and other ones.
+        data: faults of the recordings that must be corrected before an effect can be named.
+        doubts: other reasons for less confidence, such as ranges that no validation recording covers.
+        options: options of suggested commands, such as ``--twin=twin.yaml``.
     """
     kind = _kind(d, data)
     told = (*d.remarks, *doubts[:_MOST])
@@ -81,7 +80,7 @@ def refitted_words(d: Diagnosis) -> str:
 
 
 def added(d: Diagnosis) -> tuple[str, ...]:
-    """Effects that the twin lacked."""
+    """Effects that were added, which the twin lacked."""
     return tuple(name for name in d.names if name not in d.present)
 
 

@@ -1,6 +1,5 @@
-"""Write a report: ``report.html`` for people, ``report.json`` with every number of it.
-
-An earlier report of ours is replaced, and the caller is told so; any other file of that name is left alone.
+"""Write a report: ``report.html`` to read, and ``report.json`` with all its numbers. An earlier report is replaced, and the
+result states it; another file of that name is not overwritten.
 """
 
 import datetime
@@ -21,17 +20,17 @@ class Written:
     page: Path
     numbers: Path
     replaced: str
-    """When the report was made that stood there before; empty if there was none."""
+    """Date of the earlier report that was replaced; empty if there was none."""
 
 
 def check_folder(folder: Path, measurements: Path | None = None) -> str:
     """Check that a report may be written there; returns the date of the report that it will replace, empty if there is none.
 
     Args:
-        measurements: folder of recordings, which is read as a whole and so must hold no report.
+        measurements: folder of recordings, which must not contain the report, because all its files are read.
 
     Raises:
-        TaccorlError: a file of its name that is not ours, no folder can be there, or it is the folder of the recordings.
+        TaccorlError: another file has the report's name, the folder cannot be made, or it is the folder of the recordings.
     """
     if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
         raise TaccorlError(f"{folder}: holds the recordings; give another folder for the report")
@@ -56,7 +55,7 @@ def _head(path: Path) -> str:
 
 
 def write_report(report: Report, folder: Path) -> Written:
-    """``report.html`` and ``report.json`` in ``folder``, which is made if it is not there.
+    """Write ``report.html`` and ``report.json`` into ``folder``, which is created if necessary.
 
     Raises:
         TaccorlError: as ``check_folder``, or the folder cannot be written to.

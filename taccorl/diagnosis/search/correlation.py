@@ -1,7 +1,5 @@
-"""Correlation of residuals along time: how many rows are independent, and blocks of time that may be taken as independent.
-
-Channels of one row (taxels of a pad, angle and effort of a joint) are no neighbours in time: correlation is computed along time,
-channel by channel, within one recording.
+"""Correlation of residuals over time: the number of independent rows, and blocks of time that count as independent. The
+correlation is computed over time for each channel (a taxel of a pad, angle or effort of a joint) of one recording.
 
 Letters in shapes: T rows, C channels of one recording, n measured entries of all recordings.
 """
@@ -13,18 +11,19 @@ import numpy as np
 from scipy.fft import next_fast_len
 
 BLOCK_S = 0.5
-"""Length of a block. Residuals within one are correlated, as a misfit lasts as long as a motion; blocks count as independent."""
+"""Length of a block [s]. Residuals within a block are correlated, because a misfit lasts as long as a motion; blocks count as
+independent."""
 SMALL = 0.05
-"""Autocorrelation below which later lags are taken as noise of the estimate."""
+"""Autocorrelation below which further lags are taken as noise of the estimate."""
 FEWEST = 10.0
-"""Independent rows that are assumed at least."""
+"""Least number of independent rows that is assumed."""
 
 
 class Rows(NamedTuple):
-    """Entries of one recording in a stacked vector of residuals."""
+    """Position of one recording's entries in a stacked vector of residuals."""
 
     measured: np.ndarray
-    """(T, C) bool."""
+    """(T, C) bool: entries that were measured."""
     rate_hz: float
 
 
@@ -34,10 +33,8 @@ def rate_of(time_s: np.ndarray) -> float:
 
 
 def block_of_rows(num_rows: int, rate_hz: float) -> np.ndarray:
-    """(T,) number of the block of ``BLOCK_S`` that each row of a recording belongs to.
-
-    A rest at the end that is shorter than half a block joins the block before it: a block of one row would weigh as much as a
-    whole one.
+    """(T,) index of the block of ``BLOCK_S`` to which each row of a recording belongs. A remainder shorter than half a block
+    joins the block before it, because a block of one row would have the weight of a whole one.
     """
     length = max(1, round(BLOCK_S * rate_hz))
     block = np.arange(num_rows) // length
@@ -48,7 +45,7 @@ def block_of_rows(num_rows: int, rate_hz: float) -> np.ndarray:
 
 
 def unstacked(values: np.ndarray, layout: Sequence[Rows]) -> Iterator[np.ndarray]:
-    """Values (T, C) of each recording from the stacked ``values`` (n,); NaN where nothing was measured."""
+    """Values (T, C) of each recording from the stacked ``values`` (n,); NaN where not measured."""
     at = 0
     for rows in layout:
         count = int(rows.measured.sum())

@@ -21,7 +21,7 @@ class Blocks:
 
     @property
     def mean(self) -> float:
-        """Over all entries, in floors²."""
+        """Mean squared residual over all entries [floors²]."""
         return float(self.weights @ self.squares)
 
     def __sub__(self, other: "Blocks") -> "Blocks":
@@ -43,7 +43,7 @@ def block_squares(problem: Problem, model: Fit, recordings: Sequence[Recording])
 
 
 def standard_score(blocks: Blocks) -> float:
-    """Weighted mean over its standard error, blocks taken as independent: 2 is hardly chance. One block alone proves nothing."""
+    """Weighted mean divided by its standard error, with independent blocks: 2 is hardly chance. A single block gives 0."""
     count = len(blocks.squares)
     if count < 2:
         return 0.0
@@ -56,8 +56,8 @@ def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     """Decrease of the Bayesian information criterion from ``parent`` to ``child``: 10 is strong evidence (Kass and
     Raftery 1995).
 
-    The noise is known: residuals are in floors, and what ``child`` leaves above one floor counts as noise, too. Rows count as
-    often as those of ``child`` are independent.
+    The noise is known (residuals are in floors), and the residual of ``child`` above one floor also counts as noise. The number
+    of rows is that of independent residuals of ``child``.
     """
     rows = child.effective_rows
     noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))

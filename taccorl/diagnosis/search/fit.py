@@ -15,14 +15,14 @@ from taccorl.diagnosis.search.problem import Free, Problem, Recording, Values, c
 from taccorl.sim.effects.effect import Effect
 
 FAR = 1e5
-"""Residual in floors where a simulation ended in NaN, and the most that one row counts."""
+"""Residual [floors] of a simulation that ended in NaN, and upper bound for the residual of a row."""
 MANY_BLOCKS = 20
-"""Blocks of time that are enough to estimate by how much residuals within a block pull the numbers to one side."""
+"""Least number of blocks of time for an estimate from the scatter between blocks."""
 MANY_RECORDINGS = 4
-"""Recordings that are enough for the same between recordings."""
+"""Least number of recordings for an estimate from the scatter between recordings."""
 COARSE, FINE = 1e-3, 1e-4
-"""Steps of finite differences, in coordinates of order 1: coarse ones see past the kinks of dry friction and limits while
-hypotheses compete; only fine ones go along the ridge of K_p and K_d to its top, and give intervals that hold."""
+"""Steps of finite differences, in coordinates of order 1. Coarse ones average over the kinks of dry friction and limits while
+hypotheses are compared; fine ones are needed to follow the ridge of K_p and K_d to its top, and for correct intervals."""
 _OPEN = 1e-14
 """Directions that move the residuals, squared, so little of the strongest one count as this: open."""
 _AT_BOUND = 1e-3
@@ -31,30 +31,30 @@ _AT_BOUND = 1e-3
 
 @dataclass(frozen=True)
 class Fit:
-    """What came out of one fit."""
+    """Result of one fit."""
 
     names: tuple[str, ...]
-    """Effects in the hypothesis."""
+    """Names of the effects in the fitted hypothesis."""
     values: Values
     residuals: np.ndarray = field(repr=False)
-    """(n,) simulation − measurement in floors, all recordings one after the other."""
+    """(n,) simulation − measurement [noise floors], all recordings stacked."""
     layout: tuple[Rows, ...] = field(repr=False)
-    """Which rows and channels of each recording they are."""
+    """Rows and channels of each recording in the stacked residuals."""
     jacobian: np.ndarray = field(repr=False)
-    """(n, p) by the coordinates of ``frees``."""
+    """(n, p) derivatives of the residuals by the coordinates of ``frees``."""
     frees: tuple[Free, ...]
     at_bound: tuple[str, ...]
     trouble: str
-    """Why it is not converged; empty if it is."""
+    """Reason why the fit did not converge; empty if it did."""
     evaluations: int
     effects: tuple[Effect, ...]
-    """As fitted."""
+    """The effects with fitted parameters."""
     moved: np.ndarray | None = field(default=None, repr=False)
-    """(p,) by how much the coordinates would move if other recordings were fitted, too (``moved_by``)."""
+    """(p,) change of the coordinates if other recordings were fitted, too (``moved_by``); None if not computed."""
 
     @property
     def error(self) -> float:
-        """RMS in floors on the recordings that it was fitted to."""
+        """RMS residual [floors] on the recordings that were fitted."""
         return rms(self.residuals)
 
     @property
@@ -63,15 +63,16 @@ class Fit:
         return independent_rows(list(unstacked(self.residuals, self.layout)))
 
     def covariance(self) -> np.ndarray:
-        """(p, p) of the coordinates.
+        """(p, p) covariance of the coordinates.
 
         The largest, for each number, of three estimates: σ² (JᵀJ)⁻¹ with as many rows as are independent; and the sandwich
-        (JᵀJ)⁻¹ Σ_b g_b g_bᵀ (JᵀJ)⁻¹ with the gradients g_b of blocks b of time, all channels of a block together, which is right
-        where the model is not quite, and once more with recordings for blocks, if there are ``MANY_RECORDINGS``. To that is added
-        the square of ``moved``. Directions that the data leave open are huge.
+        (JᵀJ)⁻¹ Σ_b g_b g_bᵀ (JᵀJ)⁻¹ with the gradients g_b of blocks b of time, all channels of a block together, which holds
+        for slightly wrong models, and the same with recordings as blocks, if there are ``MANY_RECORDINGS``. The square of
+        ``moved`` is added. Directions that the data do not determine have a very large variance.
 
-        On surrogates with the right effects the first two alone held the truth in 81 %, all of it in 89 % of 446 numbers (185
-        cases, seeds 15000 on; docs/diagnosis.md has others): no twin is quite right, and recordings differ in what is wrong.
+        On surrogates with the right effects intervals from the first two alone contained the truth in 81 %, from all of it in 89
+        % of 446 numbers (185 cases, seeds 15000 on; docs/diagnosis.md has others): no twin is exact, and its errors differ
+        between recordings.
         """
         n, p = self.jacobian.shape
         if p == 0:
@@ -97,15 +98,15 @@ class Fit:
         return plain * np.outer(wider, wider)
 
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Parameter → 95 % interval in its unit, cut at its bounds."""
+        """Parameter → 95 % interval in its unit, limited to its bounds."""
         spread = self.quantile * np.sqrt(np.diag(self.covariance()))
         middle = [f.coordinate(self.values[f.name]) for f in self.frees]
         return {f.name: (f.value(m - s), f.value(m + s)) for f, m, s in zip(self.frees, middle, spread, strict=True)}
 
     @property
     def quantile(self) -> float:
-        """Standard errors to each side of a 95 % interval: Student's t with as many degrees of freedom as there are blocks of
-        time beyond the fitted numbers."""
+        """Half width of a 95 % interval in standard errors: Student's t, with the number of blocks of time minus that of fitted
+        numbers as degrees of freedom."""
         blocks = len(block_sums(self.residuals, self.layout))
         return float(student.ppf(0.975, max(blocks - len(self.frees), 3)))
 
@@ -113,12 +114,11 @@ class Fit:
 def moved_by(
     problem: Problem, model: Fit, fitted_to: Sequence[Recording], others: Sequence[Recording], step: float = FINE
 ) -> np.ndarray:
-    """(p,) step of Gauss and Newton from ``model`` to the fit of all recordings: how far its coordinates are from there. Numbers
-    at their bound stay there: 0.
+    """(p,) Gauss–Newton step from ``model`` to the fit of all recordings; 0 for numbers at their bound.
 
     Args:
-        fitted_to: recordings of ``model``; they decide numbers that are prepared, such as maps.
-        others: those that were not fitted.
+        fitted_to: recordings of ``model``, which determine prepared numbers such as maps.
+        others: recordings that were not fitted.
     """
     middle = np.array([f.coordinate(model.values[f.name]) for f in model.frees])
     candidates = chosen(problem, model.names)
@@ -155,7 +155,7 @@ def rms(residuals: np.ndarray) -> float:
 def residuals(
     problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
 ) -> np.ndarray:
-    """(T, C) simulation − measurement in floors; NaN where nothing was measured."""
+    """(T, C) simulation − measurement [floors]; NaN where not measured."""
     left = (problem.simulate(base, effects, recording) - recording.measured) / recording.floor
     left[~np.isfinite(left) & np.isfinite(recording.measured)] = FAR
     return np.clip(left, -FAR, FAR)
@@ -164,7 +164,7 @@ def residuals(
 def stacked(
     problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
 ) -> np.ndarray:
-    """(n,) residuals of all recordings, without what was not measured."""
+    """(n,) residuals of all recordings, without entries that were not measured."""
     rows = [residuals(problem, base, effects, r) for r in recordings]
     return np.concatenate([left[np.isfinite(left)] for left in rows])
 
@@ -177,12 +177,12 @@ def fit(
     most: int = 40,
     step: float = COARSE,
 ) -> Fit:
-    """Fit the numbers of a hypothesis, all at once.
+    """Fit all numbers of a hypothesis together.
 
     Args:
-        start: numbers to start from; those left out start at their own.
-        most: steps of the solver.
-        step: of its finite differences.
+        start: start values; numbers that are left out start at their defaults.
+        most: most steps of the solver.
+        step: step of its finite differences.
     """
     layout = tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s)) for r in recordings)
     candidates = chosen(problem, names)
@@ -259,5 +259,5 @@ def best_fit(
     starts: Sequence[Mapping[str, float]],
     most: int = 40,
 ) -> Fit:
-    """The best of the fits from several starts."""
+    """The best of several fits with different start values."""
     return min((fit(problem, recordings, names, start, most) for start in starts), key=lambda f: f.error)

@@ -1,6 +1,6 @@
 """Identifiability before any fit: which effects these recordings can show, and which they cannot separate.
 
-Every effect is simulated at a typical strength; the part that the always fitted numbers can reproduce does not count.
+Every effect is simulated at a typical strength, without the part that the always fitted numbers can reproduce.
 """
 
 import dataclasses
@@ -14,9 +14,10 @@ from taccorl.diagnosis.search.problem import Problem, Recording, Values
 from taccorl.diagnosis.search.screen import alike, probe
 
 VISIBLE = 0.75
-"""RMS of a signature in floors: √(1 + 0.75²) = 1.25, the error above which the search looks for an effect."""
+"""Least RMS of a signature for a visible effect [floors]: √(1 + 0.75²) = 1.25, the error above which the search looks for an
+effect."""
 ALIKE = 0.95
-"""|cos| of two signatures above which recordings do not tell two effects apart; a choice."""
+"""|cos| of two signatures above which recordings do not separate two effects; a choice."""
 RIDGE = 0.999
 """|correlation| of two fitted numbers above which only a combination of them is known."""
 
@@ -26,9 +27,9 @@ class Identifiability:
     """Effects that a set of recordings can show and separate, independent of the measured values."""
 
     visible: dict[str, float]
-    """Effect → RMS of what it would leave at a typical strength, in floors."""
+    """Effect → RMS residual that it would cause at a typical strength [floors]."""
     pairs: tuple[tuple[str, str, float], ...]
-    """(one, other, |cos|) of visible effects that these recordings do not tell apart, most alike first."""
+    """(one, other, |cos|) of visible effects that these recordings do not separate, the most similar first."""
     ridges: tuple[tuple[str, str, float], ...]
     """(one, other, correlation) of always fitted numbers of which only a combination is known."""
 

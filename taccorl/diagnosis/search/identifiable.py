@@ -1,11 +1,12 @@
 """Numbers of a fit that the recordings identify, and the range of those that they do not.
 
-Positions identify ratios to K_p. All torques of a joint times one factor move it the same way but for its inertia:
+Positions identify ratios to K_p. Multiplying all torques of a joint by one factor does not change its motion, except through its
+inertia:
 
     J q̈ = K_p (q* − q) − K_d q̇ + T_ref − F sign q̇ − b q̇ − k (q − q₀) …
 
-J is the twin's and fixes the factor, but only by the term J q̈, and the timing of the control loop adds to that term. A velocity
-that is filtered or delayed by τ gives −K_d (q̇ − τ q̈), so
+J, taken from the twin, fixes the factor, but only by the term J q̈, to which the timing of the control loop also contributes. A
+velocity that is filtered or delayed by τ gives −K_d (q̇ − τ q̈), so
 
     (J − K_d τ) q̈ = K_p (q* − q) − K_d q̇ + …
 
@@ -14,12 +15,12 @@ right J finds them, K_fit = K · J / (J − K_d τ), and with K_d = K_d,fit / s 
 
     s = 1 + K_d,fit τ / J,    K = K_fit / s
 
-No recording of positions tells τ. It lies between 0 and ``TIMING_S``, so every absolute torque is known only to within s. The
-ratios F / K_p, T_ref / K_p, b / K_p … do not contain s. Commanded gains, recorded efforts and weight that is known fix the
-factor without the dynamics: then the absolute numbers are identified, too.
+Recordings of positions do not determine τ. It lies between 0 and ``TIMING_S``, so every absolute torque is known only to within
+s. The ratios F / K_p, T_ref / K_p, b / K_p … do not contain s. Commanded gains, recorded efforts and weight that is known fix
+the factor without the dynamics: then the absolute numbers are identified, too.
 
 A loop that acts on a position of age a gives K_p (q* − q + a q̇): a fit finds K_d,fit = K_d − K_p a, so K_d / K_p is up to
-``POSITION_AGE_S`` greater than fitted. ``test_identifiable.py`` finds all of this on loops of 0.5 to 8 kHz.
+``POSITION_AGE_S`` greater than fitted. ``test_identifiable.py`` tests all of this with loops of 0.5 to 8 kHz.
 """
 
 import dataclasses
@@ -47,7 +48,7 @@ OVER_KP = {
     "kg": "kg·rad/(N·m)",
     "1": "rad/(N·m)",
 }
-"""Unit of a number → its unit over K_p in N·m/rad."""
+"""Unit of a number → unit of its ratio to K_p [N·m/rad]."""
 INERTIA = "kg·m²"
 _MOST = 700.0  # exp of it is the largest number there is
 
@@ -57,14 +58,14 @@ class Identified:
     """A number with its 95 % interval."""
 
     name: str
-    """``coulomb_friction.torque_nm/kp``, ``kd/kp``; without ``/kp`` the number itself."""
+    """Name: ``coulomb_friction.torque_nm/kp``, ``kd/kp``; without ``/kp`` the number itself."""
     value: float
     low: float
     high: float
     unit: str
 
     def words(self) -> str:
-        """``coulomb_friction.torque_nm/kp 0.002649 rad (0.002634 … 0.002663)``"""
+        """Text such as ``coulomb_friction.torque_nm/kp 0.002649 rad (0.002634 … 0.002663)``."""
         unit = "" if self.unit == "1" else f" {self.unit}"
         return f"{self.name} {self.value:.4g}{unit} ({self.low:.4g} … {self.high:.4g})"
 
@@ -76,9 +77,9 @@ class Known:
     identifiable: tuple[Identified, ...]
     """The primary numbers: those that the recordings identify."""
     absolute: tuple[Identified, ...]
-    """All numbers of the twin, with the interval that the unknown timing of the loop leaves."""
+    """All numbers of the twin, with intervals that include the unknown timing of the loop."""
     pinned_by: tuple[str, ...]
-    """What fixes the scale of the torques: commanded gains, recorded effort, known weight. Empty: nothing does."""
+    """Facts that fix the scale of the torques: commanded gains, recorded effort, known weight. Empty: none."""
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
@@ -90,10 +91,10 @@ def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | No
     """The numbers that the recordings identify, with intervals by the delta method from ``fit.covariance()``.
 
     Args:
-        commanded: gains are known, so every torque is.
+        commanded: gains are known, so that every torque is.
         effort: the motor's effort was recorded, or something else fixes the scale of all torques: those of effects are absolute,
             too. The gains are not: on sampled loops (docs/diagnosis.md) none of 52 intervals held the true K_p.
-        kd: N·m·s/rad, where it is commanded and not fitted: what the loop's timing does to an inertia depends on it.
+        kd: K_d [N·m·s/rad], if it is commanded and not fitted: the influence of the loop's timing on an inertia depends on it.
     """
     frees = {f.name: k for k, f in enumerate(fit.frees)}
     if commanded or "kp" not in frees:
@@ -115,10 +116,10 @@ def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | No
 
 
 def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float | None = None) -> tuple[Identified, ...]:
-    """Every fitted number with its interval; where nothing pins the torques, that of τ between 0 and ``TIMING_S``.
+    """Every fitted number with its interval, which covers τ between 0 and ``TIMING_S`` if nothing fixes the scale of the torques.
 
     Args:
-        inertia_kgm2: of the joint, as the twin has it; the least of all recordings.
+        inertia_kgm2: inertia of the joint in the twin; the least of all recordings.
         pinned: commanded gains, efforts or known weight fix the scale of the torques.
     """
     plain = [_timed(n, _kd_over(fit, "1", kd)) for n in _plain(fit, fit.frees)]
@@ -138,7 +139,7 @@ def identified_value(name: str, values: Mapping[str, float]) -> float:
     """The number ``name`` of an ``Identified`` from other values, such as the truth of a simulated robot.
 
     Raises:
-        KeyError: a number that it is made of is not in ``values``.
+        KeyError: ``values`` lacks a number from which it is computed.
     """
     if not name.endswith("/kp"):
         return values[name]

@@ -17,7 +17,7 @@ from taccorl.sim.effects.effect import Effect, Parameter
 
 _MOST = 700.0  # exp of it is the largest number there is
 Values = dict[str, float]
-"""``kp`` or ``coulomb_friction.torque_nm`` → number in the unit of that parameter."""
+"""Name of a number, ``kp`` or ``coulomb_friction.torque_nm`` → value in the unit of that parameter."""
 _SMALLEST = 1e-3
 """A strength that fades to 0 is searched, on a logarithmic scale, down to this share of its typical value."""
 
@@ -32,9 +32,9 @@ class Free:
     low: float
     high: float
     log: bool = False
-    """Searched on a logarithmic scale; both bounds are above 0."""
+    """True: searched on a logarithmic scale; both bounds are then above 0."""
     scale: float = 1.0
-    """Of a linear one: a change that matters."""
+    """For a linear scale: a change of the number that is relevant."""
 
     def coordinate(self, value: float) -> float:
         """Value of the number in the search's coordinate, scaled so that a relevant change is of order 1."""
@@ -64,11 +64,12 @@ class Candidate:
     cls: type[Effect]
     frees: tuple[Free, ...]
     starts: tuple[Values, ...]
-    """Where searches start; what a start leaves out is at its typical value."""
+    """Start values of searches; numbers that a start leaves out have typical values."""
     selectors: Mapping[str, Any]
-    """What of the robot it acts on: arm, joints, pads."""
+    """Arguments that select where it acts: arm, joints, pads."""
     num_maps: int = 0
-    """Numbers besides ``frees`` that the data decide (one for each taxel of a map): they count as parameters, too."""
+    """Number of values besides ``frees`` that are estimated from the data (one for each taxel of a map), which count as
+    parameters, too."""
 
     @property
     def name(self) -> str:
@@ -79,13 +80,13 @@ class Candidate:
         return len(self.frees) + self.num_maps
 
     def make(self, values: Mapping[str, float]) -> Effect:
-        """The effect with the parameters in ``values``, whose keys are full names."""
+        """Make the effect with the parameters in ``values``, whose keys are full names."""
         numbers: dict[str, Any] = {f.name.split(".", 1)[1]: values[f.name] for f in self.frees}
         return self.cls(**self.selectors, **numbers)
 
 
 def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) -> Candidate:
-    """An effect as its class describes it, for a search over recordings with the facts ``seen`` (``Effect.starts``)."""
+    """Candidate for an effect, from its class, for a search over recordings with the facts ``seen`` (``Effect.starts``)."""
     frees = tuple(free(p, cls.name) for p in cls.parameters())
     starts = tuple({f"{cls.name}.{k}": v for k, v in start.items()} for start in cls.starts(seen))
     return Candidate(cls=cls, frees=frees, starts=starts, selectors=selectors)
@@ -93,19 +94,19 @@ def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) ->
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """One measurement in the form that the search takes."""
+    """One measurement in the form for the search."""
 
     name: str
     time_s: np.ndarray
-    """(T,)."""
+    """(T,) times [s]."""
     measured: np.ndarray
-    """(T, C); NaN where there is nothing."""
+    """(T, C) measured values; NaN where not measured."""
     floor: np.ndarray
-    """(C,) noise floor of each channel, in its unit: residuals are counted in it."""
+    """(C,) noise floor of each channel in its unit; residuals are divided by it."""
     channels: tuple[str, ...]
-    """Name and unit of each channel, e.g. "left_joint5 [rad]"."""
+    """Name and unit of each channel, such as "left_joint5 [rad]"."""
     data: Any = field(repr=False)
-    """What the problem needs to simulate it."""
+    """Data that the problem needs to simulate it."""
 
     def __post_init__(self) -> None:
         if self.measured.shape != (len(self.time_s), len(self.channels)) or self.floor.shape != (len(self.channels),):
@@ -118,7 +119,7 @@ class Recording:
 
 
 class Problem(Protocol):
-    """A part of the robot: one joint, or the pads."""
+    """Interface of a part of a machine for the search: one joint, or the pads."""
 
     base: tuple[Free, ...]
     candidates: dict[str, Candidate]
@@ -134,14 +135,14 @@ class Problem(Protocol):
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """``effects`` with what is estimated in closed form from the fit recordings (maps of taxels) filled in."""
+        """``effects`` in which values that are estimated in closed form from the fit recordings (maps of taxels) are set."""
         ...
 
 
 def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[list[Recording], list[Recording]]:
     """Split recordings without validation marks: the first ``share`` of the rows of each for fitting, the others for validation.
 
-    Both are simulated from the beginning, where the robot was at rest.
+    Both parts are simulated from the beginning, where the robot was at rest.
     """
     early, late = [], []
     for r in recordings:
@@ -154,14 +155,14 @@ def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[lis
 
 
 Progress = Callable[[str], None]
-"""Called with what is being done."""
+"""Function that is called with a text about the present step."""
 
 
 def chosen(problem: Problem, names: Sequence[str]) -> list[Candidate]:
-    """Candidates by name.
+    """Candidates of these names.
 
     Raises:
-        TaccorlError: an effect that is no candidate of this problem.
+        TaccorlError: an effect is not a candidate of this problem.
     """
     for name in names:
         if name not in problem.candidates:

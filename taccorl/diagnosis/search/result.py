@@ -1,4 +1,4 @@
-"""Criteria by which the search accepts an effect, and the result that it hands to verdicts and reports."""
+"""Criteria by which the search accepts an effect, and the result for verdicts and reports."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,47 +24,52 @@ class SearchConfig:
     """Acceptance criteria of an effect. The values are choices, checked in docs/diagnosis.md."""
 
     stop_at: float = 1.3
-    """Validation error in noise floors at which nothing more is looked for,"""
+    """Validation error [noise floors] at or below which the search ends, provided that ``stop_fit_at`` holds, too."""
     stop_fit_at: float = 1.5
-    """if the error of the fit recordings is at most this: a sampled control loop, with nothing missing, leaves up to 1.45."""
+    """Fit error [noise floors] at or below which the search may end: a sampled control loop without a missing effect leaves up
+    to 1.45."""
     little: float = 1.5
-    """Where no effect is accepted, fit and validation errors up to so many floors say that nothing is missing: the floor itself
-    is known only to some tenths."""
+    """If no effect is accepted, fit and validation errors up to this [noise floors] mean that nothing is missing, since the
+    floor itself is known only to some tenths."""
     min_gain: float = 0.10
-    """Of the validation error squared that lies above the floor, an effect must take away so much,"""
+    """Least share of the validation squared error above the floor that an accepted effect removes."""
     min_score: float = 2.0
-    """by so many standard errors between blocks,"""
+    """Least improvement of an accepted effect in standard errors between blocks, unless it reaches ``sure_gain``."""
     sure_gain: float = 0.5
-    """or so much of it: rare events (a limit that is reached twice) never get a great score,"""
+    """Share of the validation squared error above the floor for which ``min_score`` is not required: rare events (a limit that is
+    reached twice) never get a high score."""
     min_bic: float = 10.0
-    """and lower the Bayesian information criterion by so much on the fit recordings; those that are sure on the validation ones
-    by both measures above need only lower it at all."""
+    """Least decrease of the Bayesian information criterion on the fit recordings. For effects that meet ``sure_gain`` and
+    ``min_score`` any decrease suffices."""
     tie_share: float = 0.05
-    """Effects that take away as much but for this share are ties,"""
+    """An effect ties with the best one if its remaining squared error exceeds the best's by at most this share of what the best
+    removes, and ``tie_rise`` holds, too."""
     tie_rise: float = 0.25
-    """if what they leave is greater by no more than this share (of squares: 12 % of the error); so are,"""
+    """Largest relative increase of the remaining squared error for such a tie (0.25: 12 % of the error)."""
     wide_tie_share: float = 0.2
-    """up to this share, those whose blocks do not differ by ``min_score``."""
+    """Like ``tie_share``, for effects whose errors differ by less than ``min_score`` standard errors between blocks; ``tie_rise``
+    is then not required."""
     simpler: float = 1.1
-    """Of ties the one with the fewest parameters is taken if what it leaves, squared, is at most so many times the least."""
+    """Of ties the one with the fewest parameters is taken, if its remaining squared error is at most this multiple of the
+    least."""
     from_tie: float = 0.25
-    """Where the search ended above the floor, a search from a tie of an added effect replaces it if what that leaves, squared, is
-    below this share: half of the error."""
+    """If the search ended above the floor, a search that starts from a tie of an added effect replaces it if its remaining
+    squared error is below this share (half of the error)."""
     max_effects: int = 4
     num_refitted: int = 12
-    """Effects that are refitted after the screening: the true one was among the first 12 in every case (research §4.4)."""
+    """Number of effects that are refitted after the screening: the true one was among the first 12 in every tested case."""
     first_steps: int = 5
-    """Of the refits that find out which of them are worth more;"""
+    """Most steps of the solver in the first refits, which select effects for the full refits."""
     num_finished: int = 2
-    """so many are refitted to the end, from several starts, so are"""
+    """Number of effects with the least error that are refitted fully, from several starts."""
     num_likely: int = 2
-    """so many that the screening put first, and those whose error is within"""
+    """Number of effects, the first of the screening, that are refitted fully in any case."""
     near_best: float = 1.3
-    """times the best."""
+    """Effects whose error is within this factor of the best are refitted fully, too."""
     steps: int = 30
-    """Most steps of the least-squares solver in such a refit."""
+    """Most steps of the solver in a full refit."""
     last_steps: int = 100
-    """Of the last refit of what was found, with finer slopes."""
+    """Most steps of the solver in the last refit of the result, with finer finite differences."""
 
     def refusal(self, gain: float, score: float, bic: float) -> str:
         """Reason why an effect is not accepted; empty if it is."""
@@ -74,7 +79,7 @@ class SearchConfig:
         return self.too_little(gain, score)
 
     def too_little(self, gain: float, score: float) -> str:
-        """Reason why an effect with this gain is not accepted; empty if it is."""
+        """Reason why an effect with this gain and score is not accepted; empty if it is."""
         if gain < self.min_gain:
             return f"takes away {max(gain, 0.0):.0%} of what lies above the floor, less than {self.min_gain:.0%}"
         if score < self.min_score and gain < self.sure_gain:
@@ -88,39 +93,39 @@ class Evidence:
 
     name: str
     values: Values
-    """The effect's own."""
+    """Values of the effect's own parameters."""
     base: Values
-    """All other numbers, refitted with it."""
+    """Values of all other numbers, refitted with it."""
     explained: float
-    """Share of the residual that its probe explained, before any refit."""
+    """Share of the squared residual that its probe explained, before any refit."""
     fit_error: float
     validation_error: float
-    """RMS in floors, after refitting everything."""
+    """Validation RMS after refitting everything [floors]."""
     gain: float
-    """Share of the validation squared error above the floor that goes away."""
+    """Share of the validation squared error above the floor that the effect removes."""
     score: float
-    """That gain over its standard error between half-second blocks."""
+    """That share divided by its standard error between half-second blocks."""
     bic: float
     at_bound: tuple[str, ...]
     trouble: str
     verdict: str
-    """In words: accepted, tied with, too little, no more than chance …"""
+    """Text of the decision: accepted, tied with, too little, no more than chance …"""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Of ``values``: of a slide N and m."""
+    """Units of ``values``; for a slide N and m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Round:
-    """One search for one more effect."""
+    """One round of the search, which looks for one more effect."""
 
     evidence: tuple[Evidence, ...]
-    """Best first."""
+    """Evidence for each refitted effect, best first."""
     not_refitted: tuple[str, ...]
     added: str | None
     ties: tuple[str, ...]
-    """Effects that explain as much as the added one, without it."""
+    """Effects that explain as much as the added one, without that one."""
     validation_error: float
-    """Afterwards."""
+    """Validation error after the round [floors]."""
     fit_error: float
 
 
@@ -130,29 +135,29 @@ class Diagnosis:
 
     status: Status
     effects: tuple[Effect, ...]
-    """To be added to the twin, with intervals and evidence."""
+    """Effects to add to the twin, with intervals and evidence."""
     present: tuple[str, ...]
-    """Those of ``effects`` that the twin had from the beginning."""
+    """Names of those of ``effects`` that the twin had from the beginning."""
     base: Values
     """The always fitted numbers, refitted with the effects."""
     start: Values
-    """The same before anything was added."""
+    """The always fitted numbers before anything was added."""
     intervals: dict[str, tuple[float, float]]
     rounds: tuple[Round, ...]
     rivals: dict[str, tuple[str, ...]]
-    """Added effect → effects that do as well in its place: these recordings do not tell which it is."""
+    """Added effect → effects that explain as much in its place; these recordings do not separate them."""
     twins: dict[str, dict[str, str]]
-    """Added effect → its near-twins by nature and what would tell them apart."""
+    """Added effect → its near-twins by nature, each with the recording that would separate them."""
     removed: tuple[str, ...]
-    """Accepted and later found superfluous."""
+    """Effects that were accepted and later found superfluous."""
     swapped: tuple[tuple[str, str], ...]
     errors: dict[str, dict[str, float]]
-    """``before`` (with the start numbers as given), ``fitted`` (numbers fitted, no effect) and ``after`` → fit, validation, test
-    in floors. Test recordings were not looked at for any choice."""
+    """RMS errors [floors]: ``before`` (with the given start values), ``fitted`` (numbers fitted, no effect) and ``after`` → fit,
+    validation, test. No choice depends on test recordings."""
     steps: tuple[tuple[str, float], ...]
-    """(what was added, validation error in floors) for the waterfall."""
+    """(name of the added effect, validation error afterwards [floors]) for the waterfall figure."""
     remarks: tuple[str, ...]
-    """What else must be known about the result, a sentence each."""
+    """Remarks about the result, a sentence each."""
     at_bound: tuple[str, ...]
     trouble: str
     evaluations: int

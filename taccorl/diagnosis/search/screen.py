@@ -1,8 +1,9 @@
 """Screening: the signature that each effect would leave in these recordings, beyond what the fitted numbers can reproduce.
 
-One probe simulation for each start of each effect. Its difference from the fitted model, less what a change of the fitted numbers
-would do as well (projection), is the effect's *signature* on these recordings. A score test (Rao) then says how much of the
-residual the signature explains; the angle between two signatures says whether these recordings can tell the two effects apart.
+There is one probe simulation for each start of each effect. Its difference from the fitted model, without the part that a change
+of the fitted numbers can reproduce (projection), is the effect's *signature* in these recordings. A score test (Rao) estimates
+the share of the residual that the signature explains; the angle between two signatures shows whether these recordings can
+separate the two effects.
 """
 
 from collections.abc import Sequence
@@ -15,14 +16,15 @@ from taccorl.diagnosis.search.problem import Candidate, Problem, Recording, Valu
 from taccorl.sim.effects.effect import Parameter
 
 INVISIBLE = 1e-6
-"""RMS of a signature, in floors, that is no more than rounding."""
+"""RMS of a signature [floors] that is no more than rounding."""
 TOO_STRONG, WEAKENED = 3.0, 4
-"""A start whose signature is so many times what is left to be explained is weakened, at most so often: an arm that friction
-stops altogether says nothing about a little of it."""
+"""A start whose signature exceeds the residual by this factor is weakened, at most so many times: a simulation in which friction
+stops the arm gives no information about a small friction."""
 FAR_OFF = 10.0
-"""A multiple beyond this factor is no longer in proportion; 2 for effects that are absent at infinity."""
+"""Factor beyond which a multiple of a signature is not used, because the response is no longer proportional; 2 for effects that
+are absent at infinity."""
 WRONG_SIGN = 0.1
-"""An effect whose start would have to be subtracted is ranked as if it explained this share of what it does."""
+"""Share of its explanation with which an effect is ranked if its start has the wrong sign."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +34,11 @@ class Probe:
     name: str
     start: Values
     signature: np.ndarray
-    """(n,) in floors, without what the fitted numbers take up."""
+    """(n,) signature [floors], without the part that the fitted numbers can reproduce."""
     explained: float
-    """Share of the squared residual that goes away with the best multiple of it within reach, 0 … 1."""
+    """Share of the squared residual that its best multiple within reach removes, 0 … 1."""
     multiple: float
-    """The best multiple: 1 is an effect as strong as the start."""
+    """The best multiple; 1 is an effect as strong as the start."""
 
     @property
     def visible(self) -> float:
@@ -50,7 +52,7 @@ def probe(
     """Probe every start of every candidate, in addition to the effects of ``parent``.
 
     Args:
-        recordings: those that ``parent`` was fitted to.
+        recordings: recordings to which ``parent`` was fitted.
     """
     # A number at its bound makes up for half of what its slope says; it does not hide an effect of the other half (a delay of
     # the loop is less inertia, an armature is more).
@@ -123,7 +125,7 @@ def can_fade(c: Candidate) -> bool:
 
 
 def alike(one: Probe, other: Probe) -> float:
-    """|cos| of the angle between two signatures: 1 where these recordings cannot tell the effects apart."""
+    """|cos| of the angle between two signatures; 1 if these recordings cannot separate the effects."""
     norms = float(np.linalg.norm(one.signature) * np.linalg.norm(other.signature))
     return abs(float(one.signature @ other.signature)) / norms if norms > 0 else 0.0
 

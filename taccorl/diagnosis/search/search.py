@@ -1,13 +1,13 @@
-"""Search for missing effects: fit, screen, refit, judge on validation recordings, accept or report "something else".
+"""Search for missing effects: fit, screen, refit, validate, accept or report "something else".
 
     1. The numbers that are always fitted are fitted to the fit recordings.
     2. While the validation error is above ``stop_at`` noise floors, or the fit error above ``stop_fit_at``:
        a. every effect is probed once (``screen``); the likeliest are refitted together with all numbers;
        b. they are ranked by their error on the validation recordings;
-       c. an effect is accepted if it takes away enough of what lies above the floor, more than chance and more than its
-          parameters explain (BIC), and if it was not fitted to nothing. The best of those is added. Those that do as
-          well are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else;
-       d. if none is accepted, the search ends with "something else".
+       c. an effect is accepted if it removes enough of the error above the floor, more than chance and more than its number of
+       parameters justifies (BIC), and if it was not fitted to its absent value. The best of those is added. Effects with an
+       equal error are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else; d. if
+       none is accepted, the search ends with "something else".
     3. Where that ends above the floor, it is done again from the ties of the first effect. Effects that others have made
        superfluous go; each is tried against its ties once more, now that the others are in. An
        effect that contains a simpler one (Stribeck contains Coulomb friction) must do better than the simpler one and another.
@@ -31,12 +31,12 @@ from taccorl.diagnosis.search.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
 
 MOST_TIES = 3
-"""Of one round, from which the search is done again where it ended above the floor."""
+"""Most ties of one round from which the search is repeated if it ended above the floor."""
 BESIDE = (0.9, 0.97, 1.03, 1.1)
-"""Factors to an effect's numbers from which it is fitted once more."""
+"""Factors on an effect's fitted values from which it is fitted again."""
 GAINS_MOVED = 2.0
-"""Factor to the twin's gains from which a refit of them is a finding of its own: late positions, a wrong unit of time, or gains
-other than the commanded ones cause it."""
+"""Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
+wrong unit of time, or gains other than the commanded ones."""
 
 
 def diagnose(
@@ -54,9 +54,9 @@ def diagnose(
     """Search for the effects that are missing.
 
     Args:
-        start: numbers to start from.
-        present: effects that the twin has already: they are refitted and stay.
-        without: effects that are not considered.
+        start: start values.
+        present: effects that the twin has already: they are refitted and never removed.
+        without: effects that are left out of the search.
     """
     search = _Search(problem, fit_to, validation, config or SearchConfig(), progress)
     return search.run(test, dict(start or {}), tuple(present), without)
@@ -392,7 +392,7 @@ class _Search:
         return self.error(model) <= self.config.stop_at and model.error <= self.config.stop_fit_at
 
     def error(self, model: Fit) -> float:
-        """RMS on the validation recordings, in floors."""
+        """RMS on the validation recordings [floors]."""
         return rms(stacked(self.problem, model.values, model.effects, self.validation))
 
     def _errors(self, values: Values, effects: Sequence[Effect], test: Sequence[Recording]) -> dict[str, float]:
@@ -451,12 +451,12 @@ def _untouched(f: Free, model: Fit) -> bool:
 
 
 def gain_of(better: Blocks, before: Blocks) -> float:
-    """Share of the validation squared error above the floor that goes away: how much better, and the error before."""
+    """Share of the validation squared error above the floor that a model removes, and the error before."""
     return better.mean / max(before.mean - 1.0, 1e-12)
 
 
 def above_floor(squares: Blocks) -> float:
-    """Mean squared validation error in floors², at least that of one floor: below it no model is better than another."""
+    """Mean squared validation error [floors²], at least that of one floor, below which no model is better than another."""
     return max(squares.mean, 1.0)
 
 

@@ -1,4 +1,4 @@
-"""What every part of a machine goes through: which rows judge, what they can tell, and the search."""
+"""Diagnosis of one part, the same for every machine: choice of validation rows, identifiability, and the search."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
@@ -13,10 +13,10 @@ from taccorl.errors import TaccorlError
 
 
 class Startable(Problem, Protocol):
-    """A problem that knows where its search starts."""
+    """Interface of a problem with start values."""
 
     start: Values
-    """Numbers from which the search starts."""
+    """Start values of the search."""
     present: tuple[str, ...]
     """Names of the effects that the machine's file has already."""
 
@@ -26,12 +26,12 @@ class Solved(NamedTuple):
 
     diagnosis: Diagnosis
     can_tell: Identifiability
-    """What the fit recordings can show and tell apart, whatever they say."""
+    """Effects that the fit recordings can show and separate, independent of the measured values."""
     fit_to: Sequence[Recording]
     validation: Sequence[Recording]
-    """Recordings, or their last rows, that effects were chosen by."""
+    """Recordings, or their last rows, by whose error effects were chosen."""
     rows_split: bool
-    """No recording was marked for validation: the last rows of each were used."""
+    """True if no recording was marked for validation, so that the last rows of each were used."""
 
 
 def solve(
@@ -46,8 +46,8 @@ def solve(
     """Search for the effect that is missing in one part's problem.
 
     Args:
-        part: its name, for messages.
-        without: effects that are not considered.
+        part: name of the part, for messages.
+        without: effects that are left out of the search.
 
     Raises:
         TaccorlError: nothing was measured in the validation rows.
