@@ -65,7 +65,7 @@ class Hold:
     first: int
     """First row in which the gripper stands still."""
     end: int
-    """Last row + 1."""
+    """Last row of the hold + 1."""
     stop_s: float | None
     """Episode time [s] at which the gripper came within STOP_BAND_M of its held opening; None if the hold began before row 0."""
 

@@ -57,7 +57,7 @@ class Record(NamedTuple):
     opcode: int
     offset: int
     length: int
-    """Bytes of its body."""
+    """Length of its body in bytes."""
 
     @property
     def body(self) -> int:

@@ -32,7 +32,7 @@ class Draws(NamedTuple):
     """Random numbers of samples, drawn before sampling, so that rows can be computed in any grouping."""
 
     initial_BHD: Tensor
-    """x at t = 1."""
+    """Initial noise: x at t = 1."""
     noise_BSHD: Tensor
     step_BS: Tensor
     """Index k of the stochastic step for each noise; −1: unused."""

@@ -74,7 +74,7 @@ class Acted:
     outcomes: list[str | None]
     """(N,) ``success``, ``timeout`` or the failure, for episodes that ended and had begun with a reset; else None."""
     later_outcomes: list[str | None] = field(default_factory=list)
-    """(N,) the same for episodes that had begun in a state of an earlier episode (``start_states``)."""
+    """(N,) outcome, like ``outcomes``, of episodes that had begun in a state of an earlier episode (``start_states``)."""
 
 
 class World(Protocol):

@@ -41,7 +41,7 @@ class Shard(ABC):
 
 
 class LocalShard(Shard):
-    """In this process."""
+    """Shard that runs in this process."""
 
     def __init__(self, make: Callable[[], TwinShard]) -> None:
         self.twins = make()
@@ -55,7 +55,7 @@ class LocalShard(Shard):
 
 
 class ProcessShard(Shard):
-    """In another process of this machine.
+    """Shard that runs in another process of this machine.
 
     A script that makes one must do so below ``if __name__ == "__main__":``, because multiprocessing imports the script again.
     """
@@ -63,7 +63,7 @@ class ProcessShard(Shard):
     def __init__(self, make: Callable[[], TwinShard]) -> None:
         """
         Args:
-            make: is pickled, and called there.
+            make: function that makes the ``TwinShard``; it is pickled, and called in the other process.
 
         Raises:
             TaccorlError: as the environments raise.
@@ -122,14 +122,14 @@ def _serve(pipe: Connection, make: Callable[[], TwinShard]) -> None:
 
 
 class RayShard(Shard):
-    """In a Ray actor."""
+    """Shard that runs in a Ray actor."""
 
     def __init__(self, ray: Any, make: Callable[[], TwinShard], num_cpus: int) -> None:
         """
         Args:
             ray: module from ``start_ray``.
-            make: is pickled, and called there.
-            num_cpus: that the actor takes.
+            make: function that makes the ``TwinShard``; it is pickled, and called in the actor.
+            num_cpus: number of CPUs that the actor reserves.
         """
         self._ray = ray
         self._actor = ray.remote(LocalShard).options(num_cpus=num_cpus).remote(make)

@@ -43,15 +43,15 @@ class ShardActed(NamedTuple):
 
     reward_N: np.ndarray
     terminated_N: np.ndarray
-    """bool: succeeded or failed."""
+    """(N,) bool: the episode succeeded or failed."""
     truncated_N: np.ndarray
-    """bool: out of time."""
+    """(N,) bool: the episode ran out of time."""
     last: Observation | None
-    """Of the environments that ran out of time, in their order, before the reset; None: there is none."""
+    """Last observations, before the reset, of the environments that ran out of time, in their order; None if there are none."""
     outcome_N: np.ndarray
-    """object: ``success``, ``timeout`` or the failure, of episodes that ended; else None."""
+    """(N,) object: ``success``, ``timeout`` or the failure of episodes that ended; else None."""
     began_later_N: np.ndarray
-    """bool: the episode had begun in a state of an earlier one (``start_states``)."""
+    """(N,) bool: the episode had begun in a state of an earlier one (``start_states``)."""
     num_steps_N: np.ndarray
     """(N,) number of executed control steps: fewer than n if the episode ended."""
     seed_N: np.ndarray

@@ -45,7 +45,7 @@ class EpisodeWatch:
     chunks: list[np.ndarray] = field(default_factory=list)
     values: list[np.ndarray] = field(default_factory=list)
     value: float = math.nan
-    """Of the next decision."""
+    """The critic's value of the next decision."""
     ended: WatchedEpisode | None = None
 
     def reset(self) -> None:

@@ -61,9 +61,9 @@ class Capsules:
 
     geoms: np.ndarray
     radius_m: np.ndarray
-    """(G, 1)"""
+    """(G, 1) radius [m]."""
     half_length_m: np.ndarray
-    """(G, 1)"""
+    """(G, 1) half the length of the axis [m]."""
 
     def feel(self, shape: np.ndarray, position: np.ndarray, velocity: np.ndarray, grid: np.ndarray) -> Felt:
         def feel_some(shape: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> Felt:
@@ -84,9 +84,9 @@ class Cylinders:
 
     geoms: np.ndarray
     radius_m: np.ndarray
-    """(G, 1)"""
+    """(G, 1) radius [m]."""
     half_length_m: np.ndarray
-    """(G, 1)"""
+    """(G, 1) half the length of the axis [m]."""
 
     def feel(self, shape: np.ndarray, position: np.ndarray, velocity: np.ndarray, grid: np.ndarray) -> Felt:
         def feel_some(shape: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> Felt:

@@ -93,9 +93,10 @@ class Kind:
     """Whether it can be seen on drives that are as stiff and as damped as the paper's."""
     registered: bool = True
     near: tuple[str, ...] = ()
-    """Of those outside the registry: its effects that do nearly the same by nature, so that either may be named."""
+    """For kinds outside the registry: effects of the registry with nearly the same consequences, which a diagnosis may name
+    instead."""
     whole_arm: bool = False
-    """It acts on every joint of the arm under test."""
+    """True: the effect acts on every joint of the arm under test."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +107,9 @@ class Hidden:
     values: Values
     severity: float
     registered: bool
-    """Outside of it there is nothing to find; a diagnosis should say so."""
+    """True: the effect is in the registry. False: a diagnosis cannot name it, and should report "something else"."""
     selectors: Mapping[str, Any] = field(default_factory=dict)
-    """Arm and joints."""
+    """Arm and joints on which it acts."""
 
     @property
     def change(self) -> Change:
@@ -127,7 +128,7 @@ class Hidden:
 
 def kind(name: str) -> Kind:
     """Raises:
-    TaccorlError: nothing of that name can be hidden.
+    TaccorlError: there is no hidden effect of that name.
     """
     if name not in KINDS:
         raise TaccorlError(f"surrogate: no hidden effect {name!r}; {nearest(name, KINDS)}")
@@ -143,7 +144,7 @@ def selectors(name: str, signal: str) -> dict[str, Any]:
 
 
 def within_bounds(name: str, values: Values) -> Values:
-    """``values`` clipped to what the registry admits; nothing is known of effects outside of it."""
+    """``values`` clipped to the bounds of the registry; those of effects outside of it are returned unchanged."""
     if not KINDS[name].registered:
         return values
     known = {p.name: p for p in effects.get(name).parameters()}
@@ -489,8 +490,8 @@ KINDS: dict[str, Kind] = {
         near=("asymmetric_friction",),
     ),
 }
-"""Name → kind."""
+"""Name → kind of hidden effect."""
 NOT_FITTED = ("dropped_commands",)
-"""Not repeated by any recording: no fit finds it, a finding about the recordings may."""
+"""Effects that differ between recordings of one motion: no fit can find them, but the checks of recordings can."""
 REGISTERED = tuple(name for name, k in KINDS.items() if k.registered and name not in NOT_FITTED)
 OUTSIDE = tuple(name for name, k in KINDS.items() if not k.registered and name not in NOT_FITTED)

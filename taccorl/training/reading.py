@@ -104,7 +104,8 @@ _requested: CacheRequest | None = None
 
 
 _reads_pictures = True
-"""Likewise: False: the policy has no cameras (``--policy.pictures=false``), so that no frame is decoded or cached."""
+"""Also of the training that is being created. False: the policy has no cameras (``--policy.pictures=false``), so that no frame
+is decoded or cached."""
 
 
 def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -116,7 +116,7 @@ class CameraFit:
     """(6,) half width of the estimate's 95 % interval, from edge noise and from errors of the twin's shapes and joint zeros;
     infinite for directions that the pictures do not determine."""
     noise_half_width: np.ndarray
-    """(6,) the same from edge noise alone: the repeatability with the same pictures."""
+    """(6,) half width of the 95 % interval from edge noise alone: the repeatability with the same pictures."""
     correlation: np.ndarray
     """(6, 6) correlation matrix of the estimate."""
     before_px: float

@@ -42,7 +42,7 @@ class LightFit:
     grey_before: float
     """Mean difference of the grey values between picture and twin [levels of 255], away from edges."""
     grey_after: float
-    """The same after gain and gamma are applied to the twin."""
+    """Mean difference of the grey values [levels of 255] after gain and gamma are applied to the twin."""
 
 
 def camera_light(frames: CameraFrames, config: TwinConfig, camera: str) -> LightFit:

@@ -68,7 +68,7 @@ class AxisConfig(DriveLaw):
     weight_sin: float = 0.0
     """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
     weight_cos: float = 0.0
-    """C [N·m]."""
+    """C in the torque S sin q + C cos q that holds the axis's own weight [N·m]."""
     lever_m: float = 0.0
     """Distance from the axis at which a recording's ``payload_kg`` is held, unless the recording states another one; not for
     slides."""

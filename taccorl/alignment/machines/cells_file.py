@@ -91,7 +91,7 @@ class Load:
     """Load that presses the cells."""
 
     unit: str
-    """A key of ``LOADS``."""
+    """Unit of the load, a key of ``LOADS``."""
     rated: float
     """Greatest load for which the sensor is made, in ``unit``."""
     shared: bool = True
@@ -103,7 +103,7 @@ class Reading:
     """Unit, converter range and direction of the readings, the same for all cells."""
 
     unit: str
-    """A key of ``READINGS``."""
+    """Unit of the readings, a key of ``READINGS``."""
     lowest: float | None = None
     """Lower end of the converter, in ``unit``; none if not given."""
     highest: float | None = None

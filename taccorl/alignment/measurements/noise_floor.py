@@ -41,8 +41,8 @@ remains."""
 REST_TARGET = 2e-5
 """Range within which a command counts as resting [rad, m]: 0.001°, PiPER's resolution."""
 WINDOW, ORDER = 9, 4
-"""Of the smooth. It follows motion up to 0.61 of half the row rate (Schafer 2011, f_c = (ORDER + 1) / (3.2 M −
-4.6), M = 4)."""
+"""Window [rows] and order of the Savitzky–Golay smooth. It follows motion up to 0.61 of half the row rate (Schafer 2011, f_c =
+(ORDER + 1) / (3.2 M − 4.6), M = 4)."""
 BANDWIDTH_FACTOR = 5.0
 """Least ratio of the smooth's bandwidth to the motion's highest frequency: with 5 the smooth misses 2 · 10⁻⁵ of the motion."""
 MOTION_POWER = 0.99

@@ -40,7 +40,7 @@ SAME_LOAD = 0.2
 SAME_FLOORS = 1.0
 """A repeat is used where its load differs by no more than so many noise floors of the reading."""
 SAME_TEMPERATURE_K = 0.5
-"""The same limit for its temperature [K], if recorded."""
+"""A repeat is used where its temperature differs by no more than this [K], if recorded."""
 _KEPT = 64
 """Sets of effects whose calibration is remembered: a step of the solver asks for each set once a recording."""
 

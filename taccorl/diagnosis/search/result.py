@@ -104,7 +104,7 @@ class Evidence:
     gain: float
     """Share of the validation squared error above the floor that the effect removes."""
     score: float
-    """That share divided by its standard error between half-second blocks."""
+    """Share of the validation error that it removes (``gain``), divided by its standard error between half-second blocks."""
     bic: float
     at_bound: tuple[str, ...]
     trouble: str

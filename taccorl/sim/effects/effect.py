@@ -47,7 +47,8 @@ else:  # the names that a twin.yaml may give: others are an error with its line
     ArmChoice = Literal[*ROBOT.arms, "both"]
 
 Kind = Literal["joint", "pads", "camera", "cells", "scene"]
-"""What effects act on: a driven joint of any robot or axis, the pads of a hand, a camera, a sensor of cells, or loose parts."""
+"""Kind of a part on which effects act: a driven joint of any robot or axis, the pads of a hand, a camera, a sensor of cells, or
+loose parts."""
 KINDS: tuple[Kind, ...] = ("joint", "pads", "camera", "cells", "scene")
 NEEDS = {
     "target": "commands that are sent to the joint's controller",
