@@ -49,8 +49,12 @@ WINDING_WITHIN = 3.0
 better."""
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
 _KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque"}
-_OF_POSITION_LOOPS = ("integral_action", "error_deadband", "velocity_feedforward")
-"""Effects in a position controller."""
+_OF_LOOPS: Mapping[str, tuple[TargetKind, ...]] = {
+    "integral_action": ("position", "velocity"),
+    "error_deadband": ("position",),
+    "velocity_feedforward": ("position",),
+}
+"""Effects in a controller → kinds of targets whose controllers can have them."""
 
 
 @dataclass(kw_only=True)
@@ -149,7 +153,7 @@ class DriveLaw:
 
     def takes(self, effect: str) -> bool:
         """Whether an effect of this name can act in the law's controller."""
-        return self.target_kind == "position" or effect not in _OF_POSITION_LOOPS
+        return self.target_kind in _OF_LOOPS.get(effect, (self.target_kind,))
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:
         """Fields of this class from fitted values: torque_ff; kp and kd as in ``loop_gains``; ``stall_nm`` and ``back_emf``."""

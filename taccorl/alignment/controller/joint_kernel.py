@@ -108,7 +108,7 @@ class Drive(NamedTuple):
     deadband: float = 0.0
     """Half width of the dead band of the position error, in which the controller does not act."""
     integral_rate: float = 0.0
-    """r in K_p r ∫ e dt [1/s]."""
+    """r in K_p r ∫ e dt [1/s]; of a velocity loop in K_d r ∫ (q̇* − q̇) dt."""
     torque_lag: float = 0.0
     torque_max: float = math.inf
     stall_torque: float = math.inf
@@ -208,7 +208,8 @@ def _asked(
     if p.command == TORQUE:
         return on * (command + p.torque_ff + added), 0.0, 0.0
     if p.command == VELOCITY:
-        return on * (p.kd * (command - v) + p.torque_ff + added), 0.0, on * p.kd
+        asked = p.kd * (command - v + p.integral_rate * integral) + p.torque_ff + added
+        return on * asked, on * p.kd * p.integral_rate, on * p.kd  # ∫ q̇ dt is the position: a spring
     seen = q + p.encoder_bias
     slope = p.encoder_scale * (1.0 + p.encoder_wave * math.cos(seen + p.encoder_wave_phase))
     angle = p.encoder_scale * (seen + p.encoder_wave * math.sin(seen + p.encoder_wave_phase))
@@ -313,7 +314,7 @@ def simulate(
         p.cogging_periods * q + p.cogging_phase
     )
     if p.integral_rate > 0.0:
-        integral = missing / (p.torque_scale * p.kp * p.integral_rate)
+        integral = missing / (p.torque_scale * (p.kd if p.command == VELOCITY else p.kp) * p.integral_rate)
         torque += missing / p.torque_scale
         missing = 0.0
     z = min(max(-missing, -static), static) / bristle if bristle > 0.0 else 0.0
@@ -354,6 +355,8 @@ def simulate(
             ring[n % ring.size] = _reading(p, q)
 
         # The drive.
+        if p.integral_rate > 0.0 and p.command == VELOCITY:
+            integral += ahead * h * command[n]  # taken ahead as the position is, which is its other part
         asked, stiffness, damping = _asked(
             p, command[n], until_now, q, v, integral, supply[n // hold], on[n // hold], added[n // hold]
         )
@@ -443,9 +446,13 @@ def simulate(
         if p.torque_lag > 0.0:  # as the step took it: at the step's end
             at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next
             torque += newest_share * (at_end - torque)
+        moved = h * (ahead * v_next + (1.0 - ahead) * v)
         if p.integral_rate > 0.0:
-            integral += h * (command[n] - p.encoder_scale * q)
+            if p.command == VELOCITY:
+                integral += (1.0 - ahead) * h * command[n] - moved
+            else:
+                integral += h * (command[n] - p.encoder_scale * q)
         acceleration = (v_next - v) / h
-        q += h * (ahead * v_next + (1.0 - ahead) * v)
+        q += moved
         v = v_next
     return reported, effort

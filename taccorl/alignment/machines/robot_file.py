@@ -202,9 +202,7 @@ def load_robot(path: Path) -> Robot:
             if not acts_on_joint(type(effect), weight=True, rotor=True):
                 raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
             if not joint.takes(effect.name):
-                raise document.error(
-                    key, f"{effect.name} acts in a position loop, and law {joint.law} has none; remove it"
-                )
+                raise document.error(key, f"{effect.name} acts in a loop that law {joint.law} has not; remove it")
             if effect.name in NEED_ROTOR and joint.armature == 0.0:
                 raise document.error(
                     key, f"{effect.name} needs the inertia of the motor: write rotor_inertia (kg·m²) and gear of {name}"

@@ -35,7 +35,7 @@ from taccorl.errors import RecordingError, nearest
 from taccorl.robots import ROBOT
 
 SUFFIXES = (".csv", ".parquet", ".mat")
-SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
+SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 
 _TURN, _DEG = 2 * math.pi, math.pi / 180
 TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -111,7 +111,7 @@ class TableSpec:
     signals: dict[str, SignalColumns]
     """Signal → its columns. The robot's signals are ``left_joint1`` … ``right_gripper``; others may have any name."""
     separator: str = "comma"
-    """Separator of CSV files: comma, semicolon or tab."""
+    """Separator of CSV files: comma, semicolon, tab or space; several spaces count as one."""
     target_rows_late: int = 0
     """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
     −1 if it holds that of row k + 1."""
@@ -370,7 +370,8 @@ def _read_csv(
 ) -> tuple[list[str], dict[str, np.ndarray]]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.reader(file, delimiter=SEPARATORS[separator], strict=True)
+            lines = (" ".join(line.split()) for line in file) if separator == "space" else file
+            rows = csv.reader(lines, delimiter=SEPARATORS[separator], strict=True)
             header = [cell.strip() for cell in next(rows, [])]
             if not header:
                 raise RecordingError(f"{path}: is empty")

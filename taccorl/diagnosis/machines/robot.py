@@ -108,7 +108,10 @@ class RobotMachine(Machine):
             if known:
                 commanded = m.with_position_targets(np.zeros(m.target.shape))
                 uncertain = [s for s in known if self.robot.config.joints[s].is_uncertain]
-                clock[m.name] = tuple(check_against_twin(commanded, response.reported, levels, uncertain))
+                at = [m.column(s) for s in known]
+                clock[m.name] = tuple(
+                    check_against_twin(commanded.only(known), response.reported[:, at], levels, uncertain)
+                )
         progress("", len(uses), len(uses))
         if not traces:
             raise TaccorlError(

@@ -20,6 +20,7 @@ from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
 from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.errors import TaccorlError
@@ -156,6 +157,7 @@ class AxisProblem:
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         motions: list[JointMotion] = [r.data for r in self.fit]
         bare = self._bare.with_numbers(values)
+        inertias = [bare.inertia + m.mounted_kgm2 for m in motions]
         answers = [simulated(bare, m, []) for m in motions]
         asked = [
             m.target if self.axis.target_kind == "position" else a.reported
@@ -169,7 +171,7 @@ class AxisProblem:
             "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
             "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
             "duration_s": max(float(m.time_s[-1]) for m in motions),
-        }
+        } | position_waves(motions, inertias)
 
 
 def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:

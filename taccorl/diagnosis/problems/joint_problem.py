@@ -20,6 +20,7 @@ from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
+from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
 from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.errors import TaccorlError
@@ -255,7 +256,7 @@ class JointProblem:
             "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
             "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
             "duration_s": max(float(m.time_s[-1]) for m in motions),
-        }
+        } | position_waves(motions, [self.model.inertia_kgm2(m) for m in motions])
 
 
 def _around(gain: Free, start: float) -> Free:

@@ -126,7 +126,7 @@ def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float |
     if "kp" not in fit.values or "kd" not in fit.values:
         return tuple(plain)
     over = _over_kp(fit)
-    kd_high = next(n.high for n in plain if n.name == "kd")
+    kd_high = fit.intervals()["kd"][1]  # of a gain that nothing determines, the end of its range
     inertia = inertia_kgm2 + sum(fit.values[f.name] for f in fit.frees if f.unit == INERTIA and f.name in over)
     most = 1.0 + kd_high * TIMING_S / inertia
     open_ = [

@@ -69,11 +69,20 @@ class Cogging(JointEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values: sine and cosine of both signs; numbers of periods in steps of half the resolution of a recording over
-        ``span_rad``, from half a period in this range on; amplitude a twentieth of the torque that the controller commands."""
+        ``span_rad``, from half a period in this range on; amplitude a twentieth of the torque that the controller commands.
+        Where the recordings span many turns, the numbers of periods are ``wave_periods_1`` … instead, the phases
+        ``wave_phase_1`` … and π/4 to both sides."""
         apart = max(0.5 * math.pi / max(seen["span_rad"], 0.05), _MOST_PERIODS / _MOST_STARTS)
         periods = np.arange(min(max(2 * apart, 6.0), _MOST_PERIODS), _MOST_PERIODS + 1e-9, apart)
         torque_nm = float(np.clip(0.05 * seen["peak_torque_nm"], 1e-3, 5.0))
         phases = (0.0, math.pi / 2, math.pi, -math.pi / 2)
+        waves = [(seen[f"wave_periods_{k}"], seen[f"wave_phase_{k}"]) for k in (1, 2, 3) if f"wave_periods_{k}" in seen]
+        if waves:
+            return [
+                {"torque_nm": torque_nm, "periods": n, "phase_rad": math.remainder(phase + turn, math.tau)}
+                for n, phase in waves
+                for turn in (0.0, *(0.25 * math.pi * side for side in (-1, 1)))
+            ]
         return [{"torque_nm": torque_nm, "periods": float(n), "phase_rad": phase} for n in periods for phase in phases]
 
     def drive(self) -> dict[str, float]:

@@ -22,12 +22,15 @@ class IntegralAction(JointEffect):
     """τ = K_p (q* − q) + K_p r I − K_d q̇ + T_ref with İ = q* − q: a joint that rests off its target creeps there at rate r.
 
     An episode or a replay begins with the I that holds the joint where it is, and a physics step applies I_n and makes
-    I_{n+1} = I_n + h (q*_n − q_n). MuJoCo's PID actuator. An encoder's bias on the same joint is not integrated.
+    I_{n+1} = I_n + h (q*_n − q_n). MuJoCo's PID actuator. An encoder's bias on the same joint is not integrated. Of a velocity
+    loop, which an axis or robot file may have, τ = K_d (q̇* − q̇ + r I) with İ = q̇* − q̇.
     """
 
     name: ClassVar = "integral_action"
     needs: ClassVar = ("target", "position")
-    equation: ClassVar = "τ = K_p (e + r ∫ e dt) − K_d q̇ + T_ref, e = q* − q"
+    equation: ClassVar = (
+        "τ = K_p (e + r ∫ e dt) − K_d q̇ + T_ref, e = q* − q; of a velocity loop K_d (e + r ∫ e dt) + T_ref, e = q̇* − q̇"
+    )
     in_words: ClassVar = (
         "The drive's I-gain is on: what friction and weight leave of an error is worked off in a second or so."
     )
@@ -44,9 +47,9 @@ class IntegralAction(JointEffect):
         symbol="r",
         absent=0.0,
         low=0.0,
-        high=5.0,
+        high=50.0,
         typical=0.5,
-        source="a choice: K_i / K_p",
+        source="a choice: K_i / K_p; position loops have up to 5, velocity loops 10 and more",
     )
 
     def drive(self) -> dict[str, float]:

@@ -7,7 +7,7 @@ import pytest
 from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
 
 from taccorl.alignment.controller import arm_bench
-from taccorl.alignment.controller.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.joint_kernel import VELOCITY, Drive, simulate
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import joint_motion, motion_of
 from taccorl.alignment.controller.rigid_joint import Gains
@@ -307,6 +307,32 @@ def test_a_sliding_axis_follows_its_closed_form() -> None:
     assert 0.02 - with_friction.reported[-1] == pytest.approx(20 / 1e4, rel=0.02)  # F / K_p before its target
     with pytest.raises(TaccorlError, match="test_late cannot be had"):
         model.simulate(joint_motion(m, None, "slide"), model.gains, [_Late(late=1.0)])
+
+
+def test_an_integral_in_a_velocity_loop_follows_its_closed_form_and_holds_a_constant_load() -> None:
+    """J v̇ = K_d (v* − v + r ∫ (v* − v) dt) − d: a step of v* answers as (K_d s + K_d r) / (J s² + K_d s + K_d r), whatever d."""
+    inertia, kd, rate, load_nm, step_s = 0.1, 2.0, 10.0, 0.7, 1e-3
+    drive = Drive(
+        kp=0.0,
+        kd=kd,
+        torque_ff=0.0,
+        inertia=inertia,
+        integral_rate=rate,
+        command=VELOCITY,
+        effort_after=1.0,
+        midpoint=1.0,
+    )
+    goal = np.full(1500, 1.0)
+    still = np.zeros_like(goal)
+    angle, effort = simulate(
+        drive, np.append(0.0, goal[1:]), still + load_nm, still + 1, still + 1, still, 0.0, 1, 1, step_s
+    )
+    time_s = step_s * np.arange(-1, 1499)
+    lag, wave = 0.5 * kd / inertia, np.sqrt(kd * rate / inertia - (0.5 * kd / inertia) ** 2)
+    assert (lag, wave) == pytest.approx((10.0, 10.0))  # so v = 1 − e^(−10 t) (cos 10 t − sin 10 t), and its integral:
+    exact = time_s - 0.1 * np.exp(-lag * time_s) * np.sin(wave * time_s)
+    assert np.abs(angle - np.where(time_s > 0, exact, 0.0)).max() < 5e-6
+    assert effort[-1] == pytest.approx(load_nm, abs=1e-4)
 
 
 def test_a_joint_starts_in_balance() -> None:

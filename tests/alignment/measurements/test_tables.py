@@ -83,6 +83,19 @@ def test_semicolons_and_blank_lines(tmp_path):
         read_table(path)
 
 
+def test_several_spaces_part_columns_as_one(tmp_path):
+    """As logs of robot drivers have them, and tables aligned by blanks."""
+    path = tmp_path / "run.csv"
+    path.write_text("t  a.q   a.q_target \n0.00  1.5    2\n0.01  -1.5  2  \n0.02 1.0   2.5\n")
+    signal = "a: {q: {column: a.q, unit: rad}, q_target: {column: a.q_target, unit: rad}}"
+    spec = f"separator: space\ntime: {{column: t, unit: s}}\nsignals: {{{signal}}}\n"
+    (tmp_path / "columns.yaml").write_text(spec)
+    m = read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    assert m.measured[:, 0].tolist() == [1.5, -1.5, 1.0] and m.target[:, 0].tolist() == [2.0, 2.0, 2.5]
+    with pytest.raises(RecordingError, match="parted by space; write `separator: space`"):
+        read_table(path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

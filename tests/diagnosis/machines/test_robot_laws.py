@@ -166,7 +166,12 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
             4,
             "write those that the servo has, and `gains: commanded`",
         ),
-        ("law: velocity, kd: 1.0, effects: [{effect: integral_action, rate_per_s: 1.0}]", 4, "acts in a position loop"),
+        (
+            "law: velocity, kd: 1.0, effects: [{effect: error_deadband, width_rad: 0.01}]",
+            4,
+            "loop that law velocity has not",
+        ),
+        ("law: torque, effects: [{effect: integral_action, rate_per_s: 1.0}]", 4, "loop that law torque has not"),
         ("law: pd, kp: 1.0, kd: 1.0", 4, "'pd' is none of 'impedance'"),
     ],
 )

@@ -242,3 +242,13 @@ def test_a_number_that_nothing_but_its_bounds_holds_is_not_identified():
         made_fit(frees, {"torque_ff": 0.5, "stall_nm": 1.5}, slopes), commanded=True, effort=False
     )
     assert [n.name for n in found] == ["torque_ff"]
+
+
+def test_where_nothing_determines_the_damping_a_torque_s_interval_takes_the_end_of_its_range():
+    """K_p = 151 may be 1 + K_d τ_max / J times less than it looks: here with K_d = 1000 N·m·s/rad, the upper bound."""
+    slopes = np.random.default_rng(1).standard_normal((4000, 3)) * [1.0, 1e-9, 1.0]
+    model = made_fit(OneJoint.base, {name: TRUTH[name] for name in ("kp", "kd", "torque_ff")}, slopes)
+    found = named(absolute_numbers(model, inertia_kgm2=J_KGM2, pinned=False))
+    assert set(found) == {"kp", "torque_ff"}
+    kp = model.intervals()["kp"]
+    assert found["kp"].low == pytest.approx(kp[0] / (1.0 + 1e3 * TIMING_S / J_KGM2), rel=1e-6)

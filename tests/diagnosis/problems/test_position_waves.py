@@ -1,0 +1,48 @@
+"""Position-periodic torques in recordings of many turns."""
+
+import math
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.diagnosis.problems.position_waves import position_waves
+from taccorl.sim.effects.cogging import Cogging
+
+INERTIA, WAVE_NM, PERIODS, PHASE_RAD = 0.004, 0.03, 42.0, 0.7
+NOISE_RAD = 7.7e-4 / math.sqrt(12)  # of an encoder of 8192 steps a turn
+
+
+def motion(amplitude_rad: float, hz: float, seed: int) -> JointMotion:
+    """14 s of q = A sin(2π f t) at 200 Hz with the effort that holds it: J q̈ − 0.03 N·m sin(42 q + 0.7) + 0.01 N·m sign q̇."""
+    t = np.arange(2800) / 200.0
+    w = math.tau * hz
+    q = amplitude_rad * np.sin(w * t)
+    effort = -INERTIA * w * w * q - WAVE_NM * np.sin(PERIODS * q + PHASE_RAD) + 0.01 * np.sign(np.cos(w * t))
+    rng = np.random.default_rng(seed)
+    return JointMotion(
+        name="wheel",
+        time_s=t,
+        rate_hz=200.0,
+        target=np.zeros_like(t),
+        measured=q + NOISE_RAD * rng.standard_normal(len(t)),
+        effort=effort + 0.002 * rng.standard_normal(len(t)),
+        coupling_nm=np.zeros_like(t),
+        start=0.0,
+        pose=np.zeros(0),
+    )
+
+
+def test_the_strongest_wave_of_a_wheel_is_the_one_that_its_effort_works_against() -> None:
+    found = position_waves([motion(12.0, 0.1, 1), motion(7.0, 0.25, 2)], [INERTIA, INERTIA])
+    # Over 24 rad the numbers of periods that can be told apart are 2π / 24 = 0.26 apart.
+    assert found["wave_periods_1"] == pytest.approx(PERIODS, abs=0.05)
+    assert math.remainder(found["wave_phase_1"] - PHASE_RAD, math.tau) == pytest.approx(0.0, abs=0.3)
+    starts = Cogging.starts(found | {"span_rad": 24.0, "peak_torque_nm": 0.3})
+    assert starts[0]["periods"] == found["wave_periods_1"]
+    assert starts[0]["phase_rad"] == pytest.approx(found["wave_phase_1"])
+    assert len(starts) == 9
+
+
+def test_a_joint_that_turns_by_less_than_half_a_turn_is_searched_by_the_grid() -> None:
+    assert position_waves([motion(1.5, 0.1, 1)], [INERTIA]) == {}
