@@ -8,7 +8,7 @@ export HF_HUB_OFFLINE := 1
 # Compiled modules are kept, whatever the shell says: importing LeRobot takes 25 s without, and tests start many processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test test-slow lint bench pictures notebooks lock clean
+.PHONY: help demo test test-slow lint bench pictures notebooks docs lock clean
 
 demo: .venv/.ready  ## simulated demonstrations → recordings → dataset → checks → Rerun file; a hidden effect is found (the default)
 	@echo "demo: simulated demonstrations → recordings → dataset → checks → Rerun; then a hidden effect is found. Nothing here comes from a robot."
@@ -41,6 +41,10 @@ pictures: .venv/.ready  ## draw the pictures of the README and docs/effects.md a
 
 notebooks: .venv/.ready  ## run the notebooks and store their outputs (ONLY=2: the second)
 	$(BIN)/python tests/notebooks/stored_outputs.py $(ONLY)
+
+docs: .venv/.ready  ## the documentation as a site, in outputs/docs/index.html; a broken link is an error
+	$(BIN)/python -m sphinx -q -W --keep-going -c docs . outputs/docs
+	@echo "outputs/docs/index.html"
 
 # Names and versions only: no addresses, no hashes.
 lock: .venv/.ready  ## newest versions that fit pyproject.toml, into requirements.lock
