@@ -63,7 +63,9 @@ def read_source(app: Any, docname: str, content: list[str]) -> None:
     if app.env.doc2path(docname).suffix == ".ipynb":
         content[0] = notebook_page(content[0])
     if docname == root_doc:
-        content[0] += "\n\n" + table_of_contents([f"notebooks/{p.stem}" for p in Path(app.srcdir).glob("notebooks/*.ipynb")])
+        content[0] += "\n\n" + table_of_contents(
+            [f"notebooks/{p.stem}" for p in Path(app.srcdir).glob("notebooks/*.ipynb")]
+        )
 
 
 def write_index(app: Any, error: Exception | None) -> None:

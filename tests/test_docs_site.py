@@ -33,7 +33,20 @@ class Page(HTMLParser):
 @pytest.mark.slow
 def test_every_link_and_picture_of_the_site_is_in_it(tmp_path: Path) -> None:
     site = tmp_path / "site"
-    words = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-c", "docs", ".", str(site), "-d", str(tmp_path / "d")]
+    words = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-c",
+        "docs",
+        ".",
+        str(site),
+        "-d",
+        str(tmp_path / "d"),
+    ]
     built = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (built.returncode, built.stderr) == (0, "")
     pages = {path: Page(path) for path in site.rglob("*.html")}
