@@ -17,6 +17,7 @@ VERBS = {
         "post-train": "a policy → a better one: PPO in the twin, held to real demonstrations",
         "init-robot": "MJCF or URDF of your own robot → a robot file for compare, diagnose and add-effect",
         "compare": "how far the twin is from measurements, and where: table, report, Rerun overlay",
+        "align": "gains of joints, stiffness of pads and poses of cameras, fitted to measurements → a new twin",
         "diagnose": "which physical effect the twin lacks, with what evidence, and what cannot be told apart",
         "add-effect": "the twin with one effect more, with the fitted values",
         "effects": "the physical effects that can be found; `effects new NAME` writes an example of your own",

@@ -79,7 +79,7 @@ def main(argv: list[str]) -> int:
     with contextlib.ExitStack() as stack:
         from taccorl.views.part import part_of
 
-        whole = stack.enter_context(_opened(config.path, config.episode, config.spec, "--spec"))
+        whole = stack.enter_context(opened_episode(config.path, config.episode, config.spec, "--spec"))
         shown = episode = part_of(whole, config.start_s, config.end_s)
         if config.against is not None:
             from taccorl.views.pair import Pair
@@ -113,7 +113,7 @@ def _other(config: ViewConfig, path: Path, episode: "Episode") -> Iterator["Epis
         return
     is_dataset = (path / "meta" / "info.json").is_file()
     spec = config.against_spec if is_dataset else config.against_spec or config.spec
-    with _opened(path, config.against_episode, spec, "--against_spec") as other:
+    with opened_episode(path, config.against_episode, spec, "--against_spec") as other:
         yield other
 
 
@@ -158,7 +158,15 @@ def _check_outputs(config: ViewConfig) -> None:
 
 
 @contextlib.contextmanager
-def _opened(path: Path, number: int, spec: str | None, option: str) -> Iterator["Episode"]:
+def opened_episode(path: Path, number: int, spec: str | None, option: str) -> Iterator["Episode"]:
+    """Open one episode of a dataset, a recording or an attempt.
+
+    Args:
+        option: name of the option for the recording's spec, for messages.
+
+    Raises:
+        TaccorlError: there is no such file or episode, or a recording's spec is missing.
+    """
     if (path / "meta" / "info.json").is_file() and spec is None:
         from taccorl.data.dataset import Dataset
 

@@ -1,0 +1,209 @@
+"""``taccorl align sweeps/ --twin=twin.yaml``: fit the numbers that the PiPER's twin has anyway to measurements (paper App. B).
+
+Joints that move: K_d and T_ref, with --fit_kp=true also K_p. Pads for which measurements.yaml states the pressed object: k_n and
+k_d. Cameras that --cameras names: pose, latency and exposure, from the first episode. Each number has its 95 % interval; errors
+before and after are those of validation recordings. Writes a new twin. Then ``taccorl diagnose`` searches for effects.
+
+    --joints=[J3,left_joint5] --pads=[left] --cameras=[front]    only these
+    --fit_kp=true    fit K_p, too
+    --method=spsa    the paper's search for gains, slower and less exact than least squares
+    --out=DIR        twin.yaml, report.json, and a picture with the outlines before and after for each camera
+"""
+
+import dataclasses
+import json
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from taccorl.cli.parse import parse
+from taccorl.errors import TaccorlError, nearest
+
+if TYPE_CHECKING:
+    from taccorl.diagnosis.align import Alignment
+    from taccorl.diagnosis.machines.piper import PiperTwin
+
+TWIN, REPORT = "twin.yaml", "report.json"
+FAR_ABOVE_FLOOR = 2.0
+"""Noise floors of error left on validation recordings from which on a missing effect is named as the reason."""
+
+
+@dataclass(kw_only=True)
+class AlignConfig:
+    """Fit the numbers that the PiPER's twin has anyway to measurements."""
+
+    measurements: Path
+    """A recording, table or dataset, or a folder of those. With --cameras: one recording or dataset."""
+    twin: Path | None = None
+    """A twin.yaml of the PiPER; the nominal twin if not given. It is not changed."""
+    joints: list[str] = field(default_factory=list)
+    """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If no part is named: all joints
+    that move and all pads with a stated object."""
+    pads: list[str] = field(default_factory=list)
+    """Only the pads of these arms: left, right."""
+    cameras: list[str] = field(default_factory=list)
+    """These cameras: front, left_wrist, right_wrist."""
+    fit_kp: bool = False
+    """Fit K_p of joints, too. Positions determine K_d / K_p and T_ref / K_p but hardly K_p itself; without this option K_p stays
+    what the recordings state, or the twin's."""
+    method: Literal["least_squares", "spsa"] = "least_squares"
+    """Search for the gains of joints."""
+    out: Path = Path("alignment")
+    """Folder of the result; it must be new or empty."""
+    workers: int = 2
+    """Number of joints, or arms with pads, that are aligned at the same time."""
+    spec: str | None = None
+    """Recording spec; required where several shipped ones read the format."""
+    columns: Path | None = None
+    """Columns file, for tables with other column names or units than taccorl's."""
+    validation_every: int | None = None
+    """Every k-th motion is for validation; as measurements.yaml states if not given."""
+    accept: list[str] = field(default_factory=list)
+    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings."""
+
+
+def main(argv: list[str]) -> int:
+    """Run ``taccorl align``; exit status 0: all parts were aligned, 1: some were not, or the measurements have errors."""
+    config = parse(AlignConfig, argv, positional="measurements")
+    from taccorl.lineage.destinations import is_free
+
+    if not is_free(config.out):
+        raise TaccorlError(f"--out={config.out}: holds files already; nothing was touched: give another folder")
+    from taccorl.diagnosis.align import aligned
+    from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.diagnosis.machines.piper import PiperTwin
+    from taccorl.sim.twin_file import save_twin
+
+    machine = load_machine(config.twin)
+    if not isinstance(machine, PiperTwin):
+        raise TaccorlError(
+            f"{config.twin}: describes another machine than the PiPER; its numbers are fitted by taccorl diagnose "
+            "--until=noise_floor, which writes them into a new file"
+        )
+    found = _joints_and_pads(config, machine) if config.joints or config.pads or not config.cameras else []
+    if found is None:
+        return 1
+    found += _cameras(config, machine)
+    for one in found:
+        _print(one)
+    twin, disagree = aligned(machine.config, found)
+    if disagree:
+        print(disagree)
+    good = [one.part for one in found if not one.trouble]
+    config.out.mkdir(parents=True, exist_ok=True)
+    report = {
+        "command": shlex.join(["taccorl", "align", *argv]),
+        "twin": str(config.twin) if config.twin else "nominal twin",
+        "twin, SHA-256": machine.digest(),
+        "not written": disagree,
+        "parts": [one.record() for one in found],
+    }
+    (config.out / REPORT).write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    _write_overlays(config.out, found)
+    if not good:
+        print(f"wrote {config.out / REPORT}; no twin, since nothing was aligned")
+        return 1
+    save_twin(twin, config.out / TWIN)
+    print(f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}")
+    print(f"next: {shlex.join(['taccorl', 'diagnose', str(config.measurements), f'--twin={config.out / TWIN}'])}")
+    return int(len(good) < len(found) or bool(disagree))
+
+
+def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment] | None":
+    """None if the measurements have errors."""
+    from taccorl.alignment.checks.telemetry import check_names
+    from taccorl.cli.measured import checked, clock_is_off, of_replays, print_findings, unused_accepts
+    from taccorl.diagnosis.align import align_parts
+    from taccorl.diagnosis.problems.joints import of_joints
+
+    check_names(config.accept)
+    measurements = machine.read(
+        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
+    )
+    if config.joints and not config.pads:
+        measurements = of_joints(measurements, machine.select(machine.parts(measurements), config.joints, []))
+    findings = checked(machine, measurements, "not aligned", config.accept)
+    if findings is None:
+        return None
+    before = machine.compare(measurements)
+    late = of_replays(before, findings, config.accept)
+    unused_accepts(config.accept, findings, late)
+    print_findings({f"replay of {name}": found for name, found in late.items()})
+    if clock_is_off(late, len(measurements.all)):
+        print("not aligned: time stamps of most recordings are off, see above; an offset of one row changes every gain")
+        return None
+    parts = machine.select(machine.parts(measurements), config.joints, config.pads)
+    found = align_parts(
+        parts,
+        machine.config,
+        measurements,
+        method=config.method,
+        fit_kp=config.fit_kp,
+        workers=config.workers,
+    )
+    floors = {s.signal: s.floor for s in before.scores() if s.kind == "position" and s.use == "validation"}
+    return [_beside_floor(one, floors.get(one.part)) for one in found]
+
+
+def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
+    """With a remark if much more than noise is left."""
+    if floor is None or one.trouble or one.after < FAR_ABOVE_FLOOR * floor:
+        return one
+    remark = (
+        f"{one.after / floor:.3g} noise floors are left, so the twin lacks an effect, and these gains take up part of it. Find it "
+        "with taccorl diagnose, add it, then align again"
+    )
+    return dataclasses.replace(one, remarks=(remark, *one.remarks))
+
+
+def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
+    if not config.cameras:
+        return []
+    from taccorl.cli.view import opened_episode
+    from taccorl.diagnosis.align import align_camera
+
+    known = [camera.name for camera in machine.config.cameras]
+    for name in config.cameras:
+        if name not in known:
+            raise TaccorlError(f"--cameras={name}: the twin has no such camera; {nearest(name, known)}")
+    with opened_episode(config.measurements, 0, config.spec, "--spec") as episode:
+        return [align_camera(name, machine.config, episode) for name in config.cameras]
+
+
+def _print(one: "Alignment") -> None:
+    from rich.table import Table
+
+    from taccorl.cli.tables import Text, console
+
+    out = console()
+    out.print()
+    out.print(Text(one.part, "bold"))
+    if one.trouble:
+        out.print(Text(f"  not aligned: {one.trouble}", "red"), soft_wrap=True)
+    if not one.numbers:
+        return
+    out.print(Text(f"  fitted to {_few(one.fitted_to)}; judged by {_few(one.judged_by)}"), soft_wrap=True)
+    table = Table(box=None, pad_edge=False, padding=(0, 2))
+    for head in ("", "before", "fitted", "95 % interval", "unit"):
+        table.add_column(head, justify="left" if head in ("", "unit") else "right")
+    for n in one.numbers:
+        interval = "not fitted" if n.fixed else f"{n.low:.4g} … {n.high:.4g}"
+        table.add_row(f"  {n.name}", f"{n.before:.4g}", f"{n.value:.4g}", interval, n.unit)
+    out.print(table)
+    out.print(Text(f"  {one.error_name}: {one.before:.3g} → {one.after:.3g}"), soft_wrap=True)
+    for remark in one.remarks:
+        out.print(Text(f"  Remark: {remark}"), soft_wrap=True)
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _write_overlays(folder: Path, found: "Sequence[Alignment]") -> None:
+    for one in found:
+        for stage, picture in one.overlays.items():
+            import cv2
+
+            cv2.imwrite(str(folder / f"{one.part.replace(' ', '_')}_{stage}.png"), picture[..., ::-1])

@@ -1,0 +1,356 @@
+"""Fit the numbers that the PiPER's twin has anyway to measurements: gains of joints, k_n and k_d of pads, poses of cameras.
+
+No effect is added or searched for; that is ``taccorl diagnose``. The methods are the paper's App. B: ``alignment.controller``,
+``alignment.touch`` and ``alignment.camera``. A result that is not trustworthy states why in ``trouble`` and is not written.
+"""
+
+import copy
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from taccorl.alignment.camera.calibration import CameraFrames, calibrate_camera
+from taccorl.alignment.camera.episode import all_pictures, camera_frames, joint_rows
+from taccorl.alignment.camera.light import camera_light
+from taccorl.alignment.camera.timing import camera_latency
+from taccorl.alignment.controller.identification import ControllerFit, Method, identify_controller
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_recording import joint_motion
+from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.touch.calibration import calibrate_touch
+from taccorl.alignment.touch.motion import touch_motion
+from taccorl.data.episode import Episode
+from taccorl.diagnosis.problems import joints, pads
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.twin import TwinConfig
+
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedNumber:
+    """One number before and after, with its 95 % interval."""
+
+    name: str
+    unit: str
+    before: float
+    """Value in the twin that was given; NaN if the twin has none."""
+    value: float
+    low: float
+    high: float
+    fixed: bool = False
+    """True if it was not fitted: it is what the recordings state, or the twin's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alignment:
+    """Result for one part: a joint, the pads of one arm, or a camera."""
+
+    part: str
+    numbers: tuple[FittedNumber, ...] = ()
+    error_name: str = ""
+    """Name of the error with its unit, such as ``RMS error of the angle, rad``."""
+    before: float = math.nan
+    """Error of the twin that was given, on ``judged_by``."""
+    after: float = math.nan
+    judged_by: tuple[str, ...] = ()
+    """Recordings (for cameras: frames) of the two errors. They are not those of the fit, unless there were no others."""
+    fitted_to: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    trouble: str = ""
+    """Reason why the numbers are not written; empty if they are."""
+    effects: tuple[Effect, ...] = ()
+    """Effects whose parameters were fitted with the numbers: latency and exposure of a camera."""
+    twin: TwinConfig | None = None
+    """For a camera: the twin with its new pose."""
+    overlays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """For a camera: stage → picture with the outlines before and after, (rows, columns, 3) uint8 RGB."""
+
+    def record(self) -> dict[str, Any]:
+        """The result as JSON values; NaN becomes None."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_STORED}
+        values["numbers"] = [dataclasses.asdict(n) for n in self.numbers]
+        values["effects"] = [effect.name for effect in self.effects]
+        return _plain(values)
+
+
+_NOT_STORED = ("numbers", "effects", "twin", "overlays")
+
+
+def align_part(
+    part: str,
+    config: TwinConfig,
+    measurements: Measurements,
+    *,
+    method: Method = "least_squares",
+    fit_kp: bool = False,
+) -> Alignment:
+    """Align one joint (``left_joint5``) or the pads of one arm (``left pads``); why it cannot be done is its ``trouble``.
+
+    Args:
+        fit_kp: fit K_p, too. Positions determine K_d / K_p and T_ref / K_p, and K_p only through small terms that other errors
+            of the model change; without, K_p is what the recordings state, or the twin's.
+    """
+    try:
+        if part in joints.SIGNALS:
+            return _align_joint(part, config, measurements, method, fit_kp)
+        return _align_pads(part, config, measurements)
+    except TaccorlError as error:
+        return Alignment(part=part, trouble=str(error))
+
+
+def align_parts(
+    parts: Sequence[str],
+    config: TwinConfig,
+    measurements: Measurements,
+    *,
+    method: Method = "least_squares",
+    fit_kp: bool = False,
+    workers: int = 1,
+) -> list[Alignment]:
+    """Align several parts, ``workers`` at the same time; results do not depend on ``workers``."""
+    one = partial(align_part, config=config, measurements=measurements, method=method, fit_kp=fit_kp)
+    return joints.each(one, parts, workers, lambda part: None)
+
+
+def _align_joint(
+    signal: str, config: TwinConfig, measurements: Measurements, method: Method, fit_kp: bool
+) -> Alignment:
+    own = joints.of_joints(measurements, [signal])
+    model = JointModel(config, signal)
+    motions = [joint_motion(m, config, signal) for m in own.fit]
+    free = ["torque_ff"]
+    free += ["kd"] * (not all(m.kd_known for m in motions))
+    free += ["kp"] * (fit_kp and not all(m.kp_known for m in motions))
+    fit = identify_controller(
+        motions,
+        model,
+        method=method,
+        free=free,
+        validation=[joint_motion(m, config, signal) for m in own.validation],
+    )
+    judged = [e for e in fit.errors if e.use == "validation"] or list(fit.errors)
+    before, after = (
+        float(np.sqrt(np.mean([getattr(e, name) ** 2 for e in judged]))) for name in ("rmse_before", "rmse_after")
+    )
+    trouble = "" if fit.converged else "; ".join(r for r in fit.remarks if r.startswith("not converged"))
+    if not trouble and after > before:
+        trouble = f"the error on {', '.join(e.name for e in judged)} is larger with the fitted gains"
+    return Alignment(
+        part=signal,
+        numbers=_gains(fit, model),
+        error_name="RMS error of the angle, rad",
+        before=before,
+        after=after,
+        judged_by=tuple(e.name for e in judged),
+        fitted_to=tuple(e.name for e in fit.errors if e.use == "fit"),
+        remarks=tuple(r for r in fit.remarks if not r.startswith("not converged")),
+        trouble=trouble,
+    )
+
+
+def _gains(fit: ControllerFit, model: JointModel) -> tuple[FittedNumber, ...]:
+    had = model.gains
+    before = had._asdict() | {"lag": had.kd / had.kp, "offset": had.torque_ff / had.kp}
+    words = {"lag": "kd/kp", "offset": "torque_ff/kp"}
+    return tuple(
+        FittedNumber(
+            name=words.get(name, name),
+            unit=found.unit,
+            before=before[name],
+            value=found.value,
+            low=found.low,
+            high=found.high,
+            fixed=found.fixed,
+        )
+        for name, found in fit.estimates.items()
+        if name in before
+    )
+
+
+def _align_pads(part: str, config: TwinConfig, measurements: Measurements) -> Alignment:
+    arm = part.removesuffix(" pads")
+    fit, validation = (
+        [touch_motion(m, config, m.pressed) for m in side if m.pressed is not None and pads.presses(m, arm)]
+        for side in (measurements.fit, measurements.validation)
+    )
+    found = calibrate_touch(fit, validation, config)
+    trouble = found.trouble
+    if not trouble and found.after.rms_count > found.before.rms_count:
+        trouble = f"the error on {', '.join(found.validation)} is larger with the fitted numbers"
+    sensor = config.sensor
+    return Alignment(
+        part=part,
+        numbers=tuple(
+            FittedNumber(
+                name=name,
+                unit=number.unit,
+                before=float(getattr(sensor, pads.FIELDS[name])),
+                value=number.value,
+                low=number.low,
+                high=number.high,
+            )
+            for name, number in (("k_n", found.stiffness), ("k_d", found.damping))
+        ),
+        error_name="RMS error of the counts of active taxels",
+        before=found.before.rms_count,
+        after=found.after.rms_count,
+        judged_by=found.validation,
+        fitted_to=found.fitted_to,
+        remarks=(
+            f"λ_noise {found.noise.threshold_count:g} counts, noise {found.noise.pooled_std_count:.2f} counts; masks of active "
+            f"taxels: intersection over union {found.before.mask_iou:.3f} → {found.after.mask_iou:.3f}",
+        ),
+        trouble=trouble,
+    )
+
+
+def align_camera(camera: str, config: TwinConfig, episode: Episode) -> Alignment:
+    """Fit pose, latency and exposure of one camera to an episode's pictures; why it cannot be done is its ``trouble``."""
+    part = f"camera {camera}"
+    try:
+        return _align_camera(part, camera, config, episode)
+    except TaccorlError as error:
+        return Alignment(part=part, trouble=str(error))
+
+
+def _align_camera(part: str, camera: str, config: TwinConfig, episode: Episode) -> Alignment:
+    had = _effects_of(config, camera)
+    late = camera_latency(all_pictures(episode, camera), episode.time_s, joint_rows(episode), config, camera)
+    known_s = sum(float(getattr(e, "delay_s", 0.0)) for e in had)
+    latency_s = 0.0 if late.problems else late.latency_s
+    frames = camera_frames(episode, camera, latency_s=latency_s)
+    fit = calibrate_camera(frames, config, camera)
+    numbers = [
+        FittedNumber(name=name, unit=unit, before=float(a), value=float(b), low=float(b - h), high=float(b + h))
+        for name, unit, a, b, h in zip(
+            [*(f"turn_{x}" for x in _AXES), *(f"shift_{x}" for x in _AXES)],
+            ["rad"] * 3 + ["m"] * 3,
+            fit.start,
+            fit.offset,
+            fit.half_width,
+            strict=True,
+        )
+    ]
+    remarks, effects, twin = [f"latency not fitted: {why}" for why in late.problems], [], None
+    if not late.problems:
+        low, high = late.interval_s
+        numbers.append(FittedNumber(name="latency", unit="s", before=known_s, value=late.latency_s, low=low, high=high))
+        if low > 0.0:
+            effects.append(
+                make_effect(
+                    "camera_latency", cameras=[camera], delay_s=late.latency_s, interval={"delay_s": (low, high)}
+                )
+            )
+    if fit.converged:
+        twin = fit.twin(config)
+        try:
+            exposure, of_exposure, said = _exposure(camera, twin, frames, had)
+        except TaccorlError as error:
+            remarks.append(f"exposure not fitted: {error}")
+        else:
+            effects.append(exposure)
+            numbers += of_exposure
+            remarks.append(said)
+    return Alignment(
+        part=part,
+        numbers=tuple(numbers),
+        error_name="mean distance of the arms' outlines from the pictures' edges, px",
+        before=fit.before_px,
+        after=fit.after_px,
+        judged_by=(f"{fit.num_held_out} frames of {fit.name}",),
+        fitted_to=(f"{fit.num_frames} frames of {fit.name}",),
+        remarks=tuple(remarks),
+        trouble="; ".join(fit.problems),
+        effects=tuple(effects),
+        twin=twin,
+        overlays=fit.overlays,
+    )
+
+
+def _exposure(
+    camera: str, config: TwinConfig, frames: CameraFrames, had: Sequence[Effect]
+) -> tuple[Effect, list[FittedNumber], str]:
+    """Effect, its numbers, and how well the grey values match, for a camera whose pose in ``config`` is fitted."""
+    light = camera_light(frames, _without(config, camera, ("camera_exposure",)), camera)
+    ends = {"gain": light.gain_interval, "gamma": light.gamma_interval, "blur_px": light.blur_interval_px}
+    made = make_effect(
+        "camera_exposure", cameras=[camera], gain=light.gain, gamma=light.gamma, blur_px=light.blur_px, interval=ends
+    )
+    before = next((e for e in had if e.name == made.name), make_effect(made.name, cameras=[camera]))
+    numbers = [
+        FittedNumber(
+            name=p.name,
+            unit=p.unit,
+            before=float(getattr(before, p.name)),
+            value=float(getattr(made, p.name)),
+            low=ends[p.name][0],
+            high=ends[p.name][1],
+        )
+        for p in made.parameters()
+    ]
+    said = f"grey values away from edges: mean difference {light.grey_before:.1f} → {light.grey_after:.1f} of 255"
+    return made, numbers, said
+
+
+def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig, str]:
+    """The twin with the numbers of ``found`` that have no trouble, and why some of them could not be written; empty if all were.
+
+    k_n and k_d are common to all pads: if two arms need different ones, the pads stay as they were.
+    """
+    config = copy.deepcopy(config)
+    good = [a for a in found if not a.trouble]
+    why = ""
+    for a in good:
+        values = {n.name: n.value for n in a.numbers if n.name in Gains._fields and not n.fixed}
+        if a.part in joints.SIGNALS:
+            joints.set_numbers(config, a.part, values, {})
+        elif a.twin is not None:
+            camera = a.part.removeprefix("camera ")
+            new = next(c for c in a.twin.cameras if c.name == camera)
+            config.cameras = [new if c.name == camera else c for c in config.cameras]
+            gone = ("camera_pose", *(e.name for e in a.effects))
+            config = _without(config, camera, gone)
+            config.effects = [*config.effects, *(e for e in a.effects if not e.is_absent)]
+    of_pads = {
+        a.part: ({n.name: n.value for n in a.numbers}, {n.name: (n.low, n.high) for n in a.numbers})
+        for a in good
+        if a.part.endswith(" pads")
+    }
+    if of_pads:
+        try:
+            pads.set_numbers(config, pads.agreed(of_pads))
+        except TaccorlError as error:
+            why = f"the pads are as they were: {error}"
+    return config, why
+
+
+def _effects_of(config: TwinConfig, camera: str) -> list[Effect]:
+    return [e for e in config.effects if e.name.startswith("camera_") and camera in e.acts_on()]
+
+
+def _without(config: TwinConfig, camera: str, names: Sequence[str]) -> TwinConfig:
+    """The twin without its effects ``names`` on this camera; entries that name several cameras keep the others."""
+    kept = []
+    for effect in config.effects:
+        if effect.name not in names or camera not in effect.acts_on():
+            kept.append(effect)
+        elif others := [c for c in effect.acts_on() if c != camera]:
+            kept.append(dataclasses.replace(effect, cameras=others))
+    return dataclasses.replace(config, effects=kept)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value

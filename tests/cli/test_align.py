@@ -1,0 +1,125 @@
+"""``taccorl align`` as a user types it, on recordings of a twin with other numbers (simulated, not a robot's)."""
+
+import copy
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_press import K_D, K_N, ball_at, press
+from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
+
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.diagnosis.align import align_part, aligned
+from taccorl.robots import ROBOT
+from taccorl.sim.effects import make_effect
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import load_twin, save_twin
+
+J = ROBOT.joints.index("joint5")
+
+
+def other_gains() -> TwinConfig:
+    """The nominal twin, but for K_d and T_ref of left_joint5."""
+    config = TwinConfig()
+    control = copy.deepcopy(config.controller_of("left"))
+    control.kd_nms_per_rad[J] *= 1.5
+    control.torque_ff_nm[J] += 0.8
+    config.arm_controllers["left"] = control
+    return config
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("align")
+    write_folder(path / "sweeps", sweeps(other_gains(), seconds=3.0))
+    return path
+
+
+def test_gains_are_found_and_the_error_falls_to_the_noise(folder: Path, said: Any, tmp_path: Path):
+    code, text = said("align", folder / "sweeps", "--out=found")
+    assert code == 0, text
+    report = json.loads((tmp_path / "found" / "report.json").read_text())
+    [part] = report["parts"]
+    assert part["part"] == SIGNAL and part["judged_by"] == ["sweep_2.csv"] and part["trouble"] == ""
+    assert part["before"] > 4 * part["after"] and part["after"] == pytest.approx(2e-4, rel=0.2), (
+        "made with 0.2 mrad of noise"
+    )
+    had, truth = TwinConfig().controller_of("left"), other_gains().controller_of("left")
+    numbers = {n["name"]: n for n in part["numbers"]}
+    lag = truth.kd_nms_per_rad[J] / truth.kp_nm_per_rad[J]
+    half = (numbers["kd/kp"]["high"] - numbers["kd/kp"]["low"]) / 2
+    assert abs(numbers["kd/kp"]["value"] - lag) < 2 * half < 0.05 * lag
+    assert numbers["kd/kp"]["before"] == pytest.approx(had.kd_nms_per_rad[J] / had.kp_nm_per_rad[J])
+    # The twin that was written has them; other joints, and the other arm, are as they were.
+    twin = load_twin(tmp_path / "found" / "twin.yaml")
+    now = twin.controller_of("left")
+    assert now.torque_ff_nm[J] == pytest.approx(truth.torque_ff_nm[J], rel=0.01)
+    assert now.kd_nms_per_rad[J] == pytest.approx(truth.kd_nms_per_rad[J], rel=0.005)
+    assert now.kp_nm_per_rad == had.kp_nm_per_rad and numbers["kp"]["fixed"]
+    assert now.kp_nm_per_rad[:J] == had.kp_nm_per_rad[:J] and now.kd_nms_per_rad[:J] == had.kd_nms_per_rad[:J]
+    assert twin.controller_of("right") == TwinConfig().controller_of("right")
+    assert "mrad" in said("compare", folder / "sweeps", "--twin=found/twin.yaml")[1]
+
+
+def test_gains_that_stand_in_for_a_missing_effect_are_said_to_do_so(said: Any, tmp_path: Path):
+    write_folder(tmp_path / "sweeps", sweeps(friction(2.0), seconds=3.0))
+    _, text = said("align", "sweeps")
+    [part] = json.loads((tmp_path / "alignment" / "report.json").read_text())["parts"]
+    assert part["trouble"] or any("noise floors" in r and "diagnose" in r for r in part["remarks"]), text
+
+
+def test_what_would_be_overwritten_or_is_no_piper_is_refused(folder: Path, said: Any, tmp_path: Path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+    code, text = said("align", folder / "sweeps", "--out=mine")
+    assert code == 2 and "mine" in text and (tmp_path / "mine" / "notes.txt").read_text() == "keep"
+    (tmp_path / "axis.yaml").write_text("kind: axis\nname: carriage\nunit: m\ninertia: 1.0\nkp: 10.0\nkd: 1.0\n")
+    code, text = said("align", folder / "sweeps", "--twin=axis.yaml")
+    assert code == 2 and "axis.yaml" in text
+    code, text = said("align", folder / "sweeps", "--cameras=[frnt]")
+    assert code == 2 and "frnt" in text and "front" in text
+    assert not (tmp_path / "alignment").exists()
+
+
+def test_pads_get_stiffness_and_damping_and_what_has_no_validation_says_so():
+    config, ball = TwinConfig(), ball_at(0.001, 0.003)
+    presses = [dataclasses.replace(press(seed), pressed=ball) for seed in (0, 1)]
+    found = align_part("left pads", config, Measurements((presses[0],), (presses[1],), rule="by hand"))
+    assert found.trouble == "" and found.after < found.before
+    twin, why = aligned(config, [found])
+    assert why == ""
+    assert vars(twin.sensor)["normal_stiffness_per_m"] == pytest.approx(K_N, rel=0.01)
+    assert vars(twin.sensor)["normal_damping_s_per_m"] == pytest.approx(K_D, rel=0.1)
+    alone = align_part("left pads", config, Measurements((presses[0],), (), rule="by hand"))
+    assert "validation" in alone.trouble
+    assert aligned(config, [alone])[0] == config
+
+
+@pytest.mark.slow
+def test_a_camera_is_aligned_from_a_dataset(said: Any, tmp_path: Path):
+    off = {"turn_x_rad": 0.02, "turn_y_rad": -0.015, "shift_x_m": -0.01, "shift_z_m": 0.01}
+    effects = [
+        make_effect("camera_pose", cameras=["front"], **off),
+        make_effect("camera_exposure", cameras=["front"], gain=0.8),
+    ]
+    save_twin(TwinConfig(effects=effects), tmp_path / "robot.yaml")
+    code, text = said(
+        "collect", "--task=assembly_1", "--episodes=1", "--twin=robot.yaml", "--out=seen", "--store=store"
+    )
+    assert code == 0, text
+    code, text = said("align", "seen", "--cameras=[front]", "--out=found")
+    assert code == 0, text
+    [part] = json.loads((tmp_path / "found" / "report.json").read_text())["parts"]
+    assert part["trouble"] == "" and part["after"] < 0.7 * part["before"]
+    numbers = {n["name"]: n for n in part["numbers"]}
+    assert numbers["turn_x"]["value"] == pytest.approx(0.02, abs=0.005)
+    assert numbers["shift_z"]["value"] == pytest.approx(0.01, abs=0.005)
+    assert numbers["gain"]["value"] == pytest.approx(0.8, abs=0.05)
+    twin = load_twin(tmp_path / "found" / "twin.yaml")
+    front = next(c for c in twin.cameras if c.name == "front")
+    assert np.linalg.norm(np.array(front.offset.rotation_rad) - [0.02, -0.015, 0.0]) < 0.006
+    assert [e.name for e in twin.effects] in (["camera_exposure"], ["camera_latency", "camera_exposure"])
+    assert sorted(p.name for p in (tmp_path / "found").glob("*.png"))
