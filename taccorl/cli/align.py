@@ -152,7 +152,7 @@ def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
     if floor is None or one.trouble or one.after < FAR_ABOVE_FLOOR * floor:
         return one
     remark = (
-        f"{one.after / floor:.3g} noise floors are left, so the twin lacks an effect, and these gains take up part of it. Find it "
+        f"{one.after / floor:.3g} noise floors are left: the twin lacks an effect, and these gains take up part of it. Find it "
         "with taccorl diagnose, add it, then align again"
     )
     return dataclasses.replace(one, remarks=(remark, *one.remarks))
