@@ -1,4 +1,4 @@
-"""Figures of post-training: ``make bench ONLY=rollout_shards`` anywhere, ``make bench ONLY=full_post_training`` on a GPU."""
+"""Figures of post-training: ``make bench ONLY=rollout_speed`` anywhere, ``make bench ONLY=full_post_training`` on a GPU."""
 
 import dataclasses
 import math
@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -15,91 +16,93 @@ from pipelines.benchmarks.rows import Row, benchmark, spread
 from pipelines.benchmarks.sim import NUM_SIMS, REPEATS, holding
 from taccorl.rl.shards import ProcessShard
 from taccorl.rl.twin_shard import make_shard
+from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
-_ACTIONS = 16  # of a chunk
+_CHUNKS = (8, 16)  # actions
+_CPUS = len(os.sched_getaffinity(0))
 
 
-def _process_shard(numbers: np.ndarray, num_threads: int) -> ProcessShard:
-    envs = {"task": "assembly_1", "num_envs": len(numbers), "twin": TwinConfig(), "num_threads": num_threads}
-    return ProcessShard(partial(make_shard, envs, history=10, privileged=True, first=int(numbers[0])))
+class _Shards:
+    """Environments of Assembly #1 with parts in both hands, in ``num`` worker processes that share all CPUs."""
 
-
-def call(shard: ProcessShard, method: str, *args: Any) -> Any:
-    """Result of a method of a shard."""
-    shard.start(method, *args)
-    return shard.result()
-
-
-@benchmark("rollout_shards")
-def rollout_shards() -> Iterator[Row]:
-    """Benchmark of chunks of 16 actions and the observations after them, with parts in both hands: in one process with all
-    threads, and in as many processes as CPUs, relative to the physics steps alone in one process; wall time, in turns."""
-    cpus = len(os.sched_getaffinity(0))
-    sim, goal = holding()
-    threaded = TaccorlVectorEnv("assembly_1", num_envs=NUM_SIMS, num_threads=cpus)
-    threaded.reset(seed=0)
-    steps = sim.config.physics.steps_per_control_step
-    chunks = np.repeat(goal.astype(np.float32)[:, None], _ACTIONS, axis=1)
-    held = sim.snapshot()
-
-    def bare() -> float:
-        threaded.sim.restore(held)
-        before = time.perf_counter()
-        for _ in range(_ACTIONS):
-            threaded.sim.batch.step(nstep=steps)
-        return time.perf_counter() - before
-
-    def of_shards(num: int) -> tuple[Callable[[], float], Callable[[], None]]:
-        parts = np.array_split(np.arange(NUM_SIMS), num)
-        shards = [_process_shard(part, cpus // num) for part in parts]
-        states = []
-        for shard, part in zip(shards, parts, strict=True):
-            call(shard, "restart", 0)
+    def __init__(self, sim: Simulation, num: int) -> None:
+        self.parts = np.array_split(np.arange(NUM_SIMS), num)
+        self.shards, self._states = [], []
+        for part in self.parts:
+            envs = {"task": "assembly_1", "num_envs": len(part), "twin": TwinConfig(), "num_threads": _CPUS // num}
+            make = partial(make_shard, envs, history=10, privileged=True, first=int(part[0]))
+            self.shards.append(ProcessShard(make))
+        self.each("restart", [(0,)] * num)
+        for part, state in zip(self.parts, self.each("state_dict", [()] * num), strict=True):
             snapshot = sim.snapshot(part)
             fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
-            states.append(call(shard, "state_dict") | {"snapshot": fields})
+            self._states.append((state | {"snapshot": fields},))
 
-        def each(method: str, arguments: Sequence[tuple[Any, ...]]) -> None:
-            for shard, args in zip(shards, arguments, strict=True):
-                shard.start(method, *args)
-            for shard in shards:
-                shard.result()
+    def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        for shard, args in zip(self.shards, arguments, strict=True):
+            shard.start(method, *args)
+        return [shard.result() for shard in self.shards]
 
-        def measure() -> float:
-            each("load_state_dict", [(state,) for state in states])
-            before = time.perf_counter()
-            each("act", [(chunks[part],) for part in parts])
-            each("observe", [()] * num)
-            return time.perf_counter() - before
+    def chunk_s(self, chunks: np.ndarray) -> tuple[float, float]:
+        """Wall and CPU-seconds of all processes for one chunk and the observations after it, from the held parts."""
+        self.each("load_state_dict", self._states)
+        wall_s, cpu_s = time.perf_counter(), self._cpu_s()
+        self.each("act", [(chunks[part],) for part in self.parts])
+        self.each("observe", [()] * len(self.shards))
+        return time.perf_counter() - wall_s, self._cpu_s() - cpu_s
 
-        def close() -> None:
-            for shard in shards:
-                shard.close()
+    def _cpu_s(self) -> float:
+        """CPU-seconds of this process and of the workers, all threads."""
+        stats = [
+            Path(f"/proc/{shard.process.pid}/stat").read_text().rpartition(")")[2].split() for shard in self.shards
+        ]
+        ticks = sum(int(fields[11]) + int(fields[12]) for fields in stats)  # utime, stime
+        return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
 
-        return measure, close
+    def close(self) -> None:
+        for shard in self.shards:
+            shard.close()
 
-    (one, close_one), (many, close_many) = of_shards(1), of_shards(cpus)
-    for measure in (bare, one, many):
-        measure()
-    times = [(bare(), one(), many()) for _ in range(REPEATS)]
-    close_one()
-    close_many()
+
+@benchmark("rollout_speed")
+def rollout_speed() -> Iterator[Row]:
+    """Benchmark of chunks of actions and the observations after them, with parts in both hands: in one process with all threads,
+    and in as many processes as CPUs, relative to the physics steps alone in one process with all threads. In turns."""
+    sim, goal = holding()
+    threaded = TaccorlVectorEnv("assembly_1", num_envs=NUM_SIMS, num_threads=_CPUS)
+    threaded.reset(seed=0)
+    steps, held = sim.config.physics.steps_per_control_step, sim.snapshot()
+    one, many = _Shards(sim, 1), _Shards(sim, _CPUS)
+
+    def bare_s(num_actions: int) -> tuple[float, float]:
+        threaded.sim.restore(held)
+        wall_s, cpu_s = time.perf_counter(), time.process_time()
+        for _ in range(num_actions):
+            threaded.sim.batch.step(nstep=steps)
+        return time.perf_counter() - wall_s, time.process_time() - cpu_s
+
+    for num_actions in _CHUNKS:
+        chunks = np.repeat(goal.astype(np.float32)[:, None], num_actions, axis=1)
+        turns = [(bare_s(num_actions), one.chunk_s(chunks), many.chunk_s(chunks)) for _ in range(1 + REPEATS)][1:]
+        for place, where, goal_text in ((1, "one process", ""), (2, f"{_CPUS} processes", "≥ 0.9")):
+            for kind, time_of in enumerate(("wall time", "CPU time")):
+                shares = [turn[0][kind] / turn[place][kind] for turn in turns]
+                yield Row(
+                    name=f"control steps of {NUM_SIMS} environments, chunks of {num_actions}, in {where}, over those of a bare "
+                    f"Batch.step loop in the same {time_of}",
+                    value=median(shares),
+                    unit="1",
+                    goal=goal_text if time_of == "CPU time" else "",
+                    rival=f"Batch.step, control steps/s of {time_of}",
+                    rival_value=NUM_SIMS * num_actions / median(turn[0][kind] for turn in turns),
+                    n=len(shares),
+                    spread=spread(shares),
+                )
+    one.close()
+    many.close()
     threaded.close()
-    rate = NUM_SIMS * _ACTIONS / median(b for b, _, _ in times)
-    for column, what, goal_text in ((1, "one process", ""), (2, f"{cpus} processes", "≥ 0.9")):
-        shares = [row[0] / row[column] for row in times]
-        yield Row(
-            name=f"control steps/s of {NUM_SIMS} environments in {what} over a bare Batch.step loop's, {cpus} CPUs, wall",
-            value=median(shares),
-            unit="1",
-            goal=goal_text,
-            rival="Batch.step, control steps/s",
-            rival_value=rate,
-            n=len(shares),
-            spread=spread(shares),
-        )
 
 
 @benchmark("full_post_training")

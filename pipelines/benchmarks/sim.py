@@ -130,47 +130,6 @@ def twin_speed() -> Iterator[Row]:
     )
 
 
-@benchmark("rollout_speed")
-def rollout_speed() -> Iterator[Row]:
-    """Benchmark of chunks of actions as in rollouts, with parts in both hands, on all CPUs, relative to the physics steps alone;
-    wall time."""
-    sim, goal = holding()
-    env = TaccorlVectorEnv("assembly_1", num_envs=NUM_SIMS, num_threads=0)
-    env.reset(seed=0)
-    state, actions = sim.snapshot(), goal.astype(np.float32)
-    steps, chunk = env.sim.config.physics.steps_per_control_step, 8
-    actions = np.repeat(actions[:, None], chunk, axis=1)
-
-    def wall_s(work: Callable[[], object]) -> float:
-        """Of a control step."""
-        env.sim.restore(state)
-        before = time.perf_counter()
-        work()
-        return (time.perf_counter() - before) / chunk
-
-    def bare() -> None:
-        for _ in range(chunk):
-            env.sim.batch.step(nstep=steps)
-
-    def full() -> None:
-        env.step_chunk(actions)
-
-    wall_s(full)
-    pairs = [(wall_s(bare), wall_s(full)) for _ in range(REPEATS)]
-    shares = [b / f for b, f in pairs]
-    yield Row(
-        name=f"control steps/s of {NUM_SIMS} environments over a bare Batch.step loop's, {env.sim.batch.nthread} threads, wall",
-        value=median(shares),
-        unit="1",
-        goal="≥ 0.9",
-        rival="Batch.step, control steps/s",
-        rival_value=NUM_SIMS / median(b for b, _ in pairs),
-        n=len(shares),
-        spread=spread(shares),
-    )
-    env.close()
-
-
 @benchmark("grip")
 def grip() -> Iterator[Row]:
     """Benchmark of a held part: creep, slip, and influence of its mass on the pads' reading."""

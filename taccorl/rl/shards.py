@@ -71,8 +71,8 @@ class ProcessShard(Shard):
         context = multiprocessing.get_context("forkserver")  # imports once, and forks before there are threads
         context.set_forkserver_preload([__name__])
         self._pipe, there = context.Pipe()
-        self._process = context.Process(target=_serve, args=(there, make), daemon=True)
-        self._process.start()
+        self.process = context.Process(target=_serve, args=(there, make), daemon=True)
+        self.process.start()
         there.close()  # so that the end of either process ends the other's waiting
         self.facts = self.result()
 
@@ -95,10 +95,10 @@ class ProcessShard(Shard):
         return result
 
     def close(self) -> None:
-        self._process.terminate()  # it holds nothing that must be saved
-        self._process.join(_PATIENCE_S)
-        self._process.kill()
-        self._process.join()
+        self.process.terminate()  # it holds nothing that must be saved
+        self.process.join(_PATIENCE_S)
+        self.process.kill()
+        self.process.join()
         self._pipe.close()
 
 

@@ -95,6 +95,9 @@ def test_critic_and_actor_do_not_reach_each_other() -> None:
     learner._actor_gradient(found, found.advantage_M, torch.Generator(), True)
     assert all(p.grad is None for p in learner.critic.parameters())
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in learner.actor.trained_parameters())
+    features = torch.zeros(3, 64, requires_grad=True)
+    learner.critic(features, torch.zeros(3, 0)).sum().backward()
+    assert features.grad is None
 
 
 def test_a_large_critic_gradient_leaves_the_actors_step() -> None:
@@ -107,6 +110,19 @@ def test_a_large_critic_gradient_leaves_the_actors_step() -> None:
         learner.update(found, torch.Generator().manual_seed(2))
         moved.append(weights(learner.actor))  # pyright: ignore
     assert torch.equal(*moved)
+
+
+def test_advantages_are_normalised_over_the_rollout() -> None:
+    """Another unit and another zero of rewards give the same update."""
+    moved = []
+    for scale, shift in ((1.0, 0.0), (10.0, 7.0)):
+        learner = ppo(LinePolicy())
+        found = rollout(learner)
+        found = Decisions(**{**vars(found), "advantage_M": scale * found.advantage_M + shift})
+        learner.update(found, torch.Generator().manual_seed(2))
+        moved.append(weights(learner.actor))  # pyright: ignore
+    torch.testing.assert_close(*moved, atol=2e-5, rtol=0)
+    assert (moved[0] - weights(LinePolicy())).abs().max() > 5e-4
 
 
 def test_learning_rate_zero_moves_nothing() -> None:

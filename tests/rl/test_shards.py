@@ -87,10 +87,10 @@ def test_an_error_in_a_process_says_where_it_arose() -> None:
 def test_a_process_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shards, "_PATIENCE_S", 0.5)
     shard = ProcessShard(maker())
-    assert shard._process.pid is not None
-    os.kill(shard._process.pid, signal.SIGSTOP)
+    assert shard.process.pid is not None
+    os.kill(shard.process.pid, signal.SIGSTOP)
     shard.close()
-    assert not shard._process.is_alive()
+    assert not shard.process.is_alive()
 
 
 def test_what_environments_refuse_in_a_process_is_said_here() -> None:
@@ -101,7 +101,7 @@ def test_what_environments_refuse_in_a_process_is_said_here() -> None:
 def test_a_process_that_was_killed_is_named() -> None:
     shard = ProcessShard(maker())
     call(shard, "restart", 0)
-    shard._process.kill()
+    shard.process.kill()
     with pytest.raises(TaccorlError, match=r"--env\.shards.*--resume=true"):
         call(shard, "observe")
     shard.close()
@@ -125,7 +125,7 @@ def test_environments_end_with_the_process_that_was_killed(tmp_path: Path) -> No
         "from taccorl.rl.twin_shard import make_shard\n"
         "if __name__ == '__main__':\n"
         "    shard = ProcessShard(partial(make_shard, {'task': 'assembly_2'}, history=3))\n"
-        "    print(shard._process.pid, flush=True)\n"
+        "    print(shard.process.pid, flush=True)\n"
         "    time.sleep(60)\n"
     )
     parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)

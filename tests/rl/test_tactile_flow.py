@@ -215,10 +215,11 @@ def test_real_anchor_is_linear_in_beta(real: Path) -> None:
 
 
 def test_real_anchor_is_a_step_of_co_training(real: Path) -> None:
-    """The same rows and noise through the policy's own loss."""
+    """The same rows, noise and random changes of the images through the policy's own loss."""
     from torch.utils.data import default_collate
 
-    policy = actor(image_randomization=False, image_noise_std=0.0, discrete_state_input=None)
+    policy = actor(discrete_state_input=None)
+    assert policy.policy._change_images is not None
     given = anchor(policy, real, batch_size=4)
     found = anchor_gradient(policy, real, batch_size=4)
     rows = given._draw(4, torch.Generator().manual_seed(0))
