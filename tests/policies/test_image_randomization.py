@@ -222,7 +222,7 @@ def test_a_batch_at_once_as_on_a_gpu_is_what_its_images_are_one_by_one():
         torch.testing.assert_close(turned[k : k + 1], alone, rtol=0, atol=1e-6)
         alone = _jittered(alone, factors[:, k : k + 1], orders[k : k + 1])
         torch.testing.assert_close(together[k : k + 1], alone, rtol=0, atol=1e-6)
-    assert change._changed(images).shape == images.shape
+    assert change._changed(images, *change._draw(images)).shape == images.shape
 
 
 # in the policy --------------------------------------------------------------------------------------------------------
@@ -236,6 +236,24 @@ def test_the_policy_changes_images_in_training_and_never_else():
     assert not torch.equal(first, second)
     assert torch.equal(chunk(policy.train(), batch), chunk(policy.eval(), batch))
     assert torch.equal(losses(policy.eval(), batch), seen)
+
+
+@pytest.mark.parametrize("noise_std", [0.0, 0.03])
+def test_cameras_that_are_computed_together_are_as_one_after_the_other(noise_std: float):
+    """As on a GPU, where a batch is computed at once: bit by bit, with the same random numbers, and as many drawn."""
+    change = ImageRandomizationConfig(noise_std=noise_std).build()
+    cameras = [torch.rand(n, 3, 20, 24) for n in (4, 4, 2)]
+    torch.manual_seed(5)
+    expected = [change._changed(images, *change._draw(images)) for images in cameras]
+    after = torch.get_rng_state()
+    torch.manual_seed(5)
+    found = change._together(cameras)
+    assert torch.equal(torch.get_rng_state(), after)
+    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+    torch.manual_seed(5)
+    own = change.of_cameras(cameras)
+    torch.manual_seed(5)
+    assert all(torch.equal(one, change(images)) for one, images in zip(own, cameras, strict=True))
 
 
 def test_the_training_loss_is_that_of_images_changed_beforehand():

@@ -90,19 +90,16 @@ def tcp_poses(state_BS: Tensor, chains: Tensor) -> list[Tensor]:
         state_BS: joint angles [rad] and gripper openings [m], arm by arm.
         chains: (arms, 7, 4, 4), see ``arm_chains``.
     """
-    poses = []
-    for arm, chain in zip(ROBOT.arms, chains, strict=True):
-        joints_BJ = state_BS[:, ROBOT.joint_slice(arm)]
-        cos_BJ, sin_BJ = joints_BJ.cos(), joints_BJ.sin()
-        turns_BJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(*joints_BJ.shape, 1, 1)
-        turns_BJ44[..., 0, 0], turns_BJ44[..., 0, 1] = cos_BJ, -sin_BJ
-        turns_BJ44[..., 1, 0], turns_BJ44[..., 1, 1] = sin_BJ, cos_BJ
-        steps_BJ44 = _product(chain[:-1], turns_BJ44)
-        pose_B44 = steps_BJ44[:, 0]
-        for j in range(1, ROBOT.num_joints):
-            pose_B44 = _product(pose_B44, steps_BJ44[:, j])
-        poses.append(_product(pose_B44, chain[-1]))
-    return poses
+    joints_BAJ = torch.stack([state_BS[:, ROBOT.joint_slice(arm)] for arm in ROBOT.arms], dim=1)  # A arms, J joints
+    cos_BAJ, sin_BAJ = joints_BAJ.cos(), joints_BAJ.sin()
+    turns_BAJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(*joints_BAJ.shape, 1, 1)
+    turns_BAJ44[..., 0, 0], turns_BAJ44[..., 0, 1] = cos_BAJ, -sin_BAJ
+    turns_BAJ44[..., 1, 0], turns_BAJ44[..., 1, 1] = sin_BAJ, cos_BAJ
+    steps_BAJ44 = _product(chains[:, :-1], turns_BAJ44)
+    poses_BA44 = steps_BAJ44[:, :, 0]
+    for j in range(1, ROBOT.num_joints):
+        poses_BA44 = _product(poses_BA44, steps_BAJ44[:, :, j])
+    return list(_product(poses_BA44, chains[:, -1]).unbind(1))
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:

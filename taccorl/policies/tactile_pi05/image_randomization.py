@@ -9,6 +9,7 @@ and the seam of the black corners is as bright as its share of the picture, not 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
@@ -82,29 +83,48 @@ class ImageRandomization(nn.Module):
         Raises:
             TaccorlError: images are of another type or number of channels.
         """
-        if not images.is_floating_point() or images.ndim < 3 or images.shape[-3] != 3:
-            raise TaccorlError(
-                f"image randomisation: images are {images.dtype} {tuple(images.shape)}; (…, 3, rows, columns) of float in "
-                "[0, 1] are changed: divide counts by 255, move colours to the front"
-            )
-        flat = images.reshape(-1, *images.shape[-3:]).to(torch.float32)
+        flat = _flat(images)
         if not len(flat):
             return images
         # A CPU's cache holds one image, a GPU wants them all at once.
         parts = flat.split(1) if images.device.type == "cpu" else [flat]
-        return torch.cat([self._changed(part) for part in parts]).reshape(images.shape).to(images.dtype)
+        changed = torch.cat([self._changed(part, *self._draw(part)) for part in parts])
+        return changed.reshape(images.shape).to(images.dtype)
 
-    def _changed(self, images_N3RC: Tensor) -> Tensor:
+    @torch.no_grad()
+    def of_cameras(self, cameras: Sequence[Tensor]) -> list[Tensor]:
+        """Images of several cameras, each as ``forward`` changes them one camera after the other. On a GPU, images of one size
+        are computed together: in a third of the kernels for three cameras, with the same random numbers.
+
+        Raises:
+            TaccorlError: as ``forward``.
+        """
+        sizes = {images.shape[-2:] for images in cameras}
+        if len(sizes) != 1 or any(images.device.type == "cpu" or not len(images) for images in cameras):
+            return [self(images) for images in cameras]
+        return self._together(cameras)
+
+    def _together(self, cameras: Sequence[Tensor]) -> list[Tensor]:
+        flat = [_flat(images) for images in cameras]
+        draws, noise = zip(*(self._draw(images) for images in flat), strict=True)
+        joined_noise = None if noise[0] is None else torch.cat(noise)
+        changed = self._changed(torch.cat(flat), torch.cat(draws, dim=1), joined_noise).split([len(x) for x in flat])
+        return [new.reshape(old.shape).to(old.dtype) for new, old in zip(changed, cameras, strict=True)]
+
+    def _draw(self, images_N3RC: Tensor) -> tuple[Tensor, Tensor | None]:
+        """(7, N) numbers 0 … 1, and normal noise of the images' shape if there is any."""
+        draws_7N = torch.rand(7, len(images_N3RC), device=images_N3RC.device)
+        return draws_7N, torch.randn_like(images_N3RC) if self.config.noise_std else None
+
+    def _changed(self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None) -> Tensor:
         config = self.config
-        draws = torch.rand(7, len(images_N3RC), device=images_N3RC.device)
         if config.crop < 1 or config.rotation_deg:
-            images_N3RC = self._cut_and_turned(images_N3RC, *draws[:3])
+            images_N3RC = self._cut_and_turned(images_N3RC, *draws_7N[:3])
         colours = (config.brightness, config.contrast, config.saturation)
         if any(row != (1, 1) for row in colours):
-            factors = [low + (high - low) * draw for (low, high), draw in zip(colours, draws[3:6], strict=True)]
-            images_N3RC = _jittered(images_N3RC, torch.stack(factors), (draws[6] * len(_ORDERS)).long())
-        if config.noise_std:
-            noise_N3RC = torch.randn_like(images_N3RC)
+            factors = [low + (high - low) * draw for (low, high), draw in zip(colours, draws_7N[3:6], strict=True)]
+            images_N3RC = _jittered(images_N3RC, torch.stack(factors), (draws_7N[6] * len(_ORDERS)).long())
+        if noise_N3RC is not None:
             images_N3RC = noise_N3RC.mul_(config.noise_std).add_(images_N3RC).clamp_(0, 1)
         return images_N3RC
 
@@ -130,6 +150,20 @@ class ImageRandomization(nn.Module):
         )
         sampled_N3RC = grid_sample(images_N3RC, grid_NRC2, padding_mode="border", align_corners=False)
         return sampled_N3RC.mul_(seen_NRC[:, None])
+
+
+def _flat(images: Tensor) -> Tensor:
+    """(N, 3, R, C) float32 of images (…, 3, R, C).
+
+    Raises:
+        TaccorlError: images are of another type or number of channels.
+    """
+    if not images.is_floating_point() or images.ndim < 3 or images.shape[-3] != 3:
+        raise TaccorlError(
+            f"image randomisation: images are {images.dtype} {tuple(images.shape)}; (…, 3, rows, columns) of float in "
+            "[0, 1] are changed: divide counts by 255, move colours to the front"
+        )
+    return images.reshape(-1, *images.shape[-3:]).to(torch.float32)
 
 
 def _inside(from_middle: Tensor, size: int) -> Tensor:

@@ -179,7 +179,9 @@ class TactilePI05Policy(PI05Policy):
     def _losses_and_tokens(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, list[Tensor]]:
         """``action_losses``, and each camera's tokens (B, M, D), where cameras have weights of their own."""
         if self.training and self._change_images is not None:
-            batch = {**batch, **{k: self._change_images(batch[k]) for k in self.config.image_features if k in batch}}
+            cameras = [key for key in self.config.image_features if key in batch]
+            changed = self._change_images.of_cameras([batch[key] for key in cameras])
+            batch = {**batch, **dict(zip(cameras, changed, strict=True))}
         images, image_masks = self._preprocess_images(batch)
         images = self._tokens(images)
         actions = self.prepare_action(batch)
