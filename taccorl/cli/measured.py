@@ -20,6 +20,8 @@ AS_FAR_AS_TARGET = 0.8
 """A replay explains hardly anything if its RMS error is more than this share of the tracking error (measured − target). For a
 simulated servo the share was 0.9 to 6 with 1000 times the supply voltage, or with kp 57 times too large or small; 0.34 with the
 right values and a hidden friction."""
+MOSTLY_CONSTANT = 0.5
+"""Share of the squared error from which its mean is named: two columns whose zeros differ. A choice."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
@@ -117,10 +119,18 @@ def far_off(comparison: "Comparison") -> list[str]:
                 if has_target and of_target > 0
                 else ""
             )
+            off = np.concatenate([t.measured - t.replayed for t in traces])
+            mean = float(np.nanmean(off))
+            constant = (
+                f"Most of it is a constant: measured positions stand {mean:+.3g} {traces[0].unit} from the replay. Give the "
+                "number that a column has at 0 as its `zero:` in a columns file. Else check"
+                if mean * mean > MOSTLY_CONSTANT * s.rmse**2
+                else "A wrong number is more likely than a missing effect: check"
+            )
             lines[s.signal] = (
-                f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}){of}. A "
-                "wrong number is more likely than a missing effect: check unit or factor of its columns, kp and kd (per rad, "
-                "not per degree), inertia, and of law pwm supply_v, resistance_ohm and torque_nm_per_a"
+                f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}){of}. "
+                f"{constant} unit or factor of its columns, kp and kd (per rad, not per degree), inertia, and of law pwm "
+                "supply_v, resistance_ohm and torque_nm_per_a"
             )
     return list(lines.values())
 

@@ -407,7 +407,8 @@ def check_start(m: Measurement) -> list[Finding]:
         if unit == "rad" and abs(off) > START_OFFSET_RAD and np.ptp(target) < 1e-3 and speed <= allowed:
             text = (
                 f"{name} stands {off:+.3f} rad from its command at row 0 (0.000 s) and stays there: switched off, "
-                "blocked, or a zero point that differs between the two; record with the motor on"
+                "blocked, or a zero point that differs between the two (`zero:` of a column in a columns file is its number "
+                "at 0 rad); record with the motor on"
             )
             findings.append(Finding("start_offset", "warning", name, text, (0, rows)))
     return findings

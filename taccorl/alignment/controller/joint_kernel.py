@@ -308,7 +308,8 @@ def simulate(
             if p.compliance == 0.0:  # the soft end of the play
                 gear -= load * _LIMIT_SOFTNESS * gear_mobility / _LIMIT_STIFFNESS
     integral = 0.0
-    torque = _asked(p, command[0], command[0], q, v, integral, supply[0], on[0], added[0])[0]
+    until_now = 0.0 if p.command == VELOCITY else command[0]  # who rests was commanded no velocity
+    torque = _asked(p, until_now, until_now, q, v, integral, supply[0], on[0], added[0])[0]
     missing = weight + coupling[0] + p.spring_stiffness * (q - p.spring_rest) + p.coulomb * p.asymmetry
     missing -= p.torque_scale * (torque + carried) + p.cogging_torque * math.sin(
         p.cogging_periods * q + p.cogging_phase

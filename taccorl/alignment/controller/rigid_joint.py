@@ -197,13 +197,16 @@ class AxisJoint(RigidJoint):
 
 
 def resting(m: Measurement, j: int) -> float:
-    """Mean position measured before the targets change, over a tenth of a second at most, to reduce noise.
+    """Mean position measured before the targets change, over a tenth of a second at most, to reduce noise. A velocity or torque
+    other than 0 moves the joint at once: then the first position.
 
     Raises:
         TaccorlError: nothing was measured before the targets change.
     """
     changed = np.flatnonzero(m.target[:, j] != m.target[0, j])
     rest = min(changed[0] + 1 if len(changed) else m.num_rows, max(1, round(_START_S * m.rate_hz)))
+    if m.target_kind(m.signals[j]) != "position" and m.target[0, j] != 0.0:
+        rest = 1
     rows = m.measured[:rest, j]
     if np.isfinite(rows).any():
         return float(np.nanmean(rows))

@@ -8,7 +8,7 @@ is off. Other names and units are written down in a columns file; no unit is eve
     time: {column: stamp, unit: ms}
     signals:
       left_joint5:
-        q:        {column: pos_5, unit: deg}
+        q:        {column: pos_5, unit: deg, factor: 0.0879, zero: 2048}   # ticks, 2048 where the joint is at 0
         q_target: {column: cmd_5, unit: deg}
         qd:       {column: speed_5, unit: rpm}
         tau:      {column: current_5, unit: Nm, factor: 0.000082}    # mA, 0.082 Nm/A; a factor of -1 mends a sign
@@ -73,6 +73,8 @@ class Column:
     unit: str
     factor: float = 1.0
     """Factor from the column's numbers to ``unit``: turns per tick, N·m per mA, or −1 to reverse the sign."""
+    zero: float = 0.0
+    """The column's number at 0 of its quantity, such as 512 counts or a pulse of 1500 µs; subtracted before ``factor``."""
     if_missing: float | None = None
     """Value for files without the column; if not given, such a file is rejected."""
 
@@ -159,6 +161,8 @@ def load_table_spec(path: Path) -> TableSpec:
                 if column.unit in ("ticks", "tick", "counts", "count"):
                     hint = "; write `unit: rad` with `factor:` in rad a tick"
                 raise document.error(where, f"{column.unit!r} is no unit of {key}; {nearest(column.unit, known)}{hint}")
+            if not math.isfinite(column.zero):
+                raise document.error(f"signals/{name}/{key}/zero", f"{column.zero:g}; give a finite number")
             if not math.isfinite(column.factor) or column.factor == 0.0:
                 raise document.error(where, f"factor {column.factor:g}; give a finite number other than 0")
             if known[column.unit][0]:
@@ -289,7 +293,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
                 kinds.append(_KINDS[key])
             read = columns[column.column] if column.column in columns else np.full(len(time_s), column.if_missing)
             values["q_target" if key in TARGETS else key][:, j] = (
-                read * column.factor * _CONVERSIONS[key][column.unit][1]
+                (read - column.zero) * column.factor * _CONVERSIONS[key][column.unit][1]
             )
     between = ~np.isin(values["enabled"], (0.0, 1.0))
     if between.any():

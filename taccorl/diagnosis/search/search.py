@@ -117,7 +117,11 @@ class _Search:
             },
             steps=tuple(steps),
             remarks=tuple(self._remarks(model)),
-            at_bound=tuple(f.name for f in model.frees if f.name in model.at_bound and not _untouched(f, model)),
+            at_bound=tuple(
+                f.name
+                for f in model.frees
+                if f.name in model.at_bound and not _untouched(f, model) and _determined(f, model)
+            ),
             trouble=model.trouble,
             evaluations=self.evaluations,
             cpu_s=time.process_time() - began,
@@ -448,6 +452,12 @@ class _Search:
 def _untouched(f: Free, model: Fit) -> bool:
     """Whether a number is at the end of its range because it starts there and nothing moves it: absent, not far off."""
     return f.start in (f.low, f.high) and abs(f.coordinate(model.values[f.name]) - f.coordinate(f.start)) < 0.01
+
+
+def _determined(f: Free, model: Fit) -> bool:
+    """Whether the recordings say anything of a number: its interval is not the whole range."""
+    low, high = model.intervals()[f.name]
+    return low > f.low or high < f.high
 
 
 def gain_of(better: Blocks, before: Blocks) -> float:

@@ -1,5 +1,6 @@
 """Integral action: the controller integrates its error until it vanishes."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -51,6 +52,11 @@ class IntegralAction(JointEffect):
         typical=0.5,
         source="a choice: K_i / K_p; position loops have up to 5, velocity loops 10 and more",
     )
+
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """Rates of slow position loops, and those of velocity loops."""
+        return [*super().starts(seen), {"rate_per_s": 6.0}, {"rate_per_s": 25.0}]
 
     def drive(self) -> dict[str, float]:
         return {"integral_rate": self.rate_per_s}

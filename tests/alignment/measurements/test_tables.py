@@ -83,6 +83,22 @@ def test_semicolons_and_blank_lines(tmp_path):
         read_table(path)
 
 
+def test_a_column_s_zero_is_subtracted_before_its_factor(tmp_path):
+    """512 counts are 0, 300 / 1024 ° a count: 522 counts are 2.93°. A pulse of 1500 µs is 0, 0.09° a µs."""
+    path = tmp_path / "run.csv"
+    path.write_text("t,adc,us\n0.00,512,1500\n0.02,522,1600\n")
+    q, target = (
+        "{column: adc, unit: deg, factor: 0.29296875, zero: 512}",
+        "{column: us, unit: deg, factor: 0.09, zero: 1500}",
+    )
+    (tmp_path / "columns.yaml").write_text(
+        f"time: {{column: t, unit: s}}\nsignals: {{a: {{q: {q}, q_target: {target}}}}}\n"
+    )
+    m = read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    np.testing.assert_allclose(np.degrees(m.measured[:, 0]), [0.0, 2.9296875])
+    np.testing.assert_allclose(np.degrees(m.target[:, 0]), [0.0, 9.0])
+
+
 def test_several_spaces_part_columns_as_one(tmp_path):
     """As logs of robot drivers have them, and tables aligned by blanks."""
     path = tmp_path / "run.csv"

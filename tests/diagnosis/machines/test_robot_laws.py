@@ -229,6 +229,16 @@ def test_millivolts_and_gains_per_degree_are_suspected_and_hidden_friction_is_no
     assert len(lines) == expected and all("swing" in line and "supply_v" in line for line in lines), lines
 
 
+def test_a_zero_that_only_one_of_two_columns_has_is_named_with_its_size(tmp_path: Path) -> None:
+    made = RobotMachine(robot(tmp_path, FILES["impedance"]), "robot")
+    m = recording("impedance", "sweep", 1.5, 1)
+    (line,) = far_off(made.compare(Measurements((dataclasses.replace(m, measured=m.measured + 0.26),))))
+    assert "swing" in line and "`zero:`" in line
+    assert float(line.split(" rad from the replay")[0].split()[-1]) == pytest.approx(
+        0.26, abs=0.01
+    )  # less the first swing
+
+
 @pytest.mark.slow
 def test_a_servo_that_clips_its_duty_under_law_impedance_is_suspected_to_be_one(tmp_path: Path) -> None:
     """kp V k_t / R = 6 · 2.4 N·m/rad and k_t k_e / R = 0.16 N·m·s/rad below a clip at 1/6 rad, which 30 % of the rows exceed."""
