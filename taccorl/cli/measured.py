@@ -113,7 +113,7 @@ def far_off(comparison: "Comparison") -> list[str]:
         of_target = math.sqrt(np.nansum([np.nansum(np.square(t.measured - t.target)) for t in traces]) / max(s.n, 1))
         # A drive that takes no position has the replay in place of a target.
         has_target = not any(np.array_equal(t.target, t.replayed, equal_nan=True) for t in traces)
-        if s.nrmse > FAR_OFF or (has_target and s.rmse > AS_FAR_AS_TARGET * of_target):
+        if s.nrmse > FAR_OFF or (has_target and s.rmse > AS_FAR_AS_TARGET * of_target > 0):
             of = (
                 f", {s.rmse / of_target:.0%} of what the target by itself is off"
                 if has_target and of_target > 0
