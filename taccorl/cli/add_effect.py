@@ -51,6 +51,11 @@ def main(argv: list[str]) -> int:
 
     machine = load_machine(config.twin)
     by_hand = config.values
+    for key in by_hand:
+        if ":" in key:
+            raise TaccorlError(
+                f"--values: {key!r} is read as one word; YAML needs a space after the colon: '{{torque_nm: 0.4}}'"
+            )
     added = (
         machine.by_hand(config.effect, config.joints, config.pads, by_hand) if by_hand else _diagnosed(config, machine)
     )

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.parse import parse
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
@@ -87,6 +87,10 @@ def main(argv: list[str]) -> int:
     measurements = twins[0].read(
         config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
     )
+    signals = sorted({signal for m in measurements.all for signal in m.signals})
+    for name in config.joints:  # before the replays, which take minutes
+        if name not in signals:
+            raise TaccorlError(f"--joints: {name!r} is in no recording; {nearest(name, signals)}")
     findings = checked(twins[0], measurements, "not compared", config.accept)
     if findings is None:
         return 1

@@ -88,6 +88,8 @@ def main(argv: list[str]) -> int:
         part_poses=config.part_poses,
         seed=config.seed,
     )
+    if config.policy.path is None:
+        raise TaccorlError("missing --policy.path=CHECKPOINT, the policy to correct")
     if config.num_envs < 1:
         raise TaccorlError(f"--num_envs={config.num_envs}: at least 1")
     out = config.out or Path("outputs") / f"{config.task}_corrections"

@@ -87,12 +87,12 @@ def _part(config: ExciteConfig) -> str:
     from taccorl.robots import ROBOT
 
     if config.joint is not None and config.pads is not None:
-        raise TaccorlError(f"excite: {config.joint} or --pads={config.pads}: one at a time")
+        raise TaccorlError(f"--joint={config.joint} or --pads={config.pads}: one at a time")
     if config.joint is not None:
         joint_number(config.joint)
         return config.joint
     if config.pads is None:
-        raise TaccorlError("excite: missing --joint=left_joint5, or --pads=left for the pads of that arm")
+        raise TaccorlError("missing --joint=left_joint5, or --pads=left for the pads of that arm")
     if config.pads not in ROBOT.arms:
         raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ROBOT.arms)}")
     for name in ("gains", "floor_rad"):
@@ -175,7 +175,7 @@ def _rivals(config: ExciteConfig, part: str) -> tuple[list[str], dict[str, dict[
         names = [n for name, others in d.get("rivals", {}).items() for n in (name, *others)]
         if len(names) < 2:
             raise TaccorlError(
-                f"excite: which effects are to be told apart? {path} names no rivals of {part}; "
+                f"which effects shall be separated? {path} names no rivals of {part}; "
                 f"give --effects={'taxel_creep,touch_lag' if config.pads else 'backlash,joint_compliance'}"
             )
     names = [part for name in names for part in name.split(",")]

@@ -24,6 +24,8 @@ DEEPEST_VALUE = 100
 HELP = ("-h", "--help")
 _BOOLEANS = ("true", "false", "yes", "no", "on", "off")  # YAML's
 _NEGATIVE = re.compile(r"-\.?\d.*")
+_NUMBERS = {"int": "a whole number", "float": "a number"}
+_WRONG_NUMBER = re.compile(r"`([\w.]+)`: .*?Couldn't parse '(.*?)' into an? (int|float)\b")  # draccus' words
 
 
 def parse[ConfigT](
@@ -247,7 +249,11 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
             if isinstance(cause, TaccorlError):  # a config's own check says it better than draccus, which wraps it
                 raise cause from None
             cause = cause.__cause__ or cause.__context__
-        raise TaccorlError(" ".join(str(error).split())) from error
+        text = " ".join(str(error).split())
+        wrong = _WRONG_NUMBER.match(text)
+        if wrong:
+            raise TaccorlError(f"--{wrong[1]}={wrong[2]}: expected {_NUMBERS[wrong[3]]}") from error
+        raise TaccorlError(text) from error
 
 
 def _check_size(name: str, value: str) -> None:

@@ -53,8 +53,10 @@ def main(argv: list[str]) -> int:
     if config.reveal is not None:
         print(json.dumps(reveal(config.reveal), indent=2, ensure_ascii=False))
         return 0
-    if config.secret is None or config.secret < 0:
+    if config.secret is None:
         raise TaccorlError("missing --secret=, a whole number of at least 0; --help says more")
+    if config.secret < 0:
+        raise TaccorlError(f"--secret={config.secret}: at least 0")
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
     if not is_free(out):
         raise TaccorlError(f"{out}: is there already; give another --out, or remove it")

@@ -455,11 +455,13 @@ class _Loader:
             missing.append(marker)
         if missing:
             lost = next((str(d) for d in self.reader.damage), "")
-            hint = (
-                "; ".join(f"{t}: {nearest(t, present)}" for t in missing[:3])
-                if present
-                else lost or "the file names no topics"
-            )
+            unknown = [t for t in missing if t not in present]
+            if unknown and present:
+                hint = "; ".join(f"{t}: {nearest(t, present)}" for t in unknown[:3])
+            else:
+                hint = lost or (
+                    "the file names them, but holds no message of them" if present else "the file names no topics"
+                )
             raise RecordingError(
                 f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint})"
             )

@@ -52,8 +52,15 @@ def _read(path: Path, most_bytes: int, what: str) -> str:
                 f"{path}: is larger than {most_bytes:,} bytes, the most that is read of such a file: is it another?"
             )
         return content.decode("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SpecError(f"{path}: cannot be read as {what}: {error}") from error
+    except FileNotFoundError as error:
+        siblings = [p.name for p in path.parent.glob("*.y*ml")]
+        raise SpecError(f"{path}: no such file" + (f"; {nearest(path.name, siblings)}" if siblings else "")) from error
+    except IsADirectoryError as error:
+        raise SpecError(f"{path}: is a folder; give a file of it") from error
+    except UnicodeDecodeError as error:
+        raise SpecError(f"{path}: cannot be read as {what}: it is not a text file ({error})") from error
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 class Document[T]:

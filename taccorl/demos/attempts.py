@@ -164,7 +164,7 @@ def check_destination(out: Path, stage: Stage, task: str, may_be_ours: Callable[
         held = f"is {kind} without a taccorl manifest"
     raise InTheWayError(
         f"{out} is in the way: it {held}; this run makes {stage.name} v{stage.version} of {task}. "
-        "Nothing was touched: give another destination, or move that one away yourself."
+        "Nothing was changed: give another --out, or move that one away yourself."
     )
 
 

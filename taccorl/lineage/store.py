@@ -357,7 +357,7 @@ def _entry(artefact: Artefact) -> dict[str, Any]:
 
 def _in_the_way(job: _Job) -> str:
     wanted = f"{job.stage.name} v{job.stage.version}, key {job.key}"
-    way_out = "Nothing was touched: give another destination, or move that one away yourself."
+    way_out = "Nothing was changed: give another destination (--out), or move that one away yourself."
     manifest = read_manifest(job.final)
     if not manifest:
         kind = f"a folder of {sum(1 for _ in job.final.rglob('*'))} entries" if job.final.is_dir() else "a file"

@@ -131,7 +131,7 @@ def kind(name: str) -> Kind:
     TaccorlError: there is no hidden effect of that name.
     """
     if name not in KINDS:
-        raise TaccorlError(f"surrogate: no hidden effect {name!r}; {nearest(name, KINDS)}")
+        raise TaccorlError(f"no hidden effect {name!r}; {nearest(name, KINDS)}")
     return KINDS[name]
 
 

@@ -39,7 +39,7 @@ def recordings(case: Case, design: str | None = None) -> Measurements:
     """
     design = case.design if design is None else design
     if design not in DESIGNS:
-        raise TaccorlError(f"surrogate: no design {design!r}; {nearest(design, DESIGNS)}")
+        raise TaccorlError(f"no design {design!r}; {nearest(design, DESIGNS)}")
     uses: dict[str, Sequence[Motion]] = {"fit": DESIGNS[design], "validation": VALIDATION, "test": TEST}
     made = [record(case, motion) for motions in uses.values() for motion in motions]
     return split(made, validation=[m.name for m in VALIDATION], test=[m.name for m in TEST])

@@ -72,9 +72,7 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
     """
     datasets = [Dataset(root) for root in (*real, *sim)]
     if not datasets:
-        raise DatasetError(
-            "co-training: no dataset given: --real=FOLDER, --sim=FOLDER, each as often as there are some"
-        )
+        raise DatasetError("no dataset given: --real=FOLDER, --sim=FOLDER; repeat them for several")
     for d in datasets:
         if IS_SIM in d.info["features"]:
             raise DatasetError(f"{d.root} has {IS_SIM}, it is merged already: give the datasets that it was made of")

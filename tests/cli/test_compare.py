@@ -110,7 +110,7 @@ def test_an_error_can_be_accepted_by_name_and_stays_in_the_report(folder: Path, 
 def test_only_the_joints_that_were_asked_for(folder: Path, said: Any):
     code, text = said(folder / "sweeps", "--joints=[right_joint1]")
     assert code == 2
-    assert "'right_joint1' was not compared" in text and SIGNAL in text
+    assert "'right_joint1'" in text and SIGNAL in text
 
 
 @pytest.mark.parametrize(

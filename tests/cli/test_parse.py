@@ -7,6 +7,7 @@ from typing import Any
 import draccus
 import pytest
 
+from taccorl.cli.collect import CollectConfig
 from taccorl.cli.parse import given_names, parse
 from taccorl.errors import TaccorlError
 
@@ -241,3 +242,16 @@ def test_every_field_of_every_verb_survives_the_way_through(tmp_path: Path) -> N
     assert isinstance(source, ExpertSource) and source.hands.speed == 1.2
     words[-1:] = ["--engine.type=slurm", "--engine.partition=gpu", "--engine.time=01:00:00"]
     assert parse(IngestConfig, words, positional="paths").engine == SlurmEngine(partition="gpu", time="01:00:00")
+
+
+@pytest.mark.parametrize(
+    ("words", "facts"),
+    [
+        (["--episodes=many"], ("--episodes=many", "whole number")),
+        (["--randomization=half"], ("--randomization=half", "expected a number")),
+    ],
+)
+def test_a_word_in_place_of_a_number_names_option_and_value(words: list[str], facts: tuple[str, ...]) -> None:
+    with pytest.raises(TaccorlError) as raised:
+        parse(CollectConfig, ["--task=bench", *words])
+    assert all(fact in str(raised.value) for fact in facts) and "parse" not in str(raised.value)

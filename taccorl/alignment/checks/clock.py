@@ -128,9 +128,9 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
         worst = max(unclear, key=lambda t: t.fit.rms / floor[t.signal])
         step = max(_least_step(m, floor[t.signal]) for t in unclear)
         why = (
-            f"{listed([t.signal for t in unclear])} do not answer their targets as a delay and a lag would (which leave "
-            f"{worst.fit.rms / floor[worst.signal]:.0f} noise floors at {worst.signal}), so that motion does not show it. "
-            "The command goes on. To have it judged, add a recording in which each of them rests for "
+            f"a delay and a lag do not describe the motion of {listed([t.signal for t in unclear])} (their fit leaves "
+            f"{worst.fit.rms / floor[worst.signal]:.0f} noise floors at {worst.signal}), and only then a motion shows such an "
+            "offset. The command continues. For this check, add a recording in which each of these joints rests for "
             f"{2 * REST_S:g} s and its target then jumps by {step:.2g} {m.units[m.column(worst.signal)]} or more, twice: the row "
             "in which it first moves shows an offset"
         )

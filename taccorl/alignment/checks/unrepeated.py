@@ -209,7 +209,7 @@ def _dropped_finding(s: Unrepeated, d: Dropped, worst: str) -> Finding:
         f"if the previous target stayed in force for {d.hold_rows:.1f} commands on average ({d.mirrored} events of the "
         "opposite sign, which only noise and unmodelled physics produce); at least "
         f"{d.rate:.1%} of {d.commands} commands. In {worst} at {where} s{more}. No effect of the twin explains that: "
-        "look for lost frames on the bus (taccorl inspect, candump) or a driver that skips commands when its queue is full"
+        "look for lost frames on the bus (taccorl ingest inspect, candump) or a driver that skips commands when its queue is full"
     )
     return Finding("dropped_commands", "warning", s.signal, text)
 

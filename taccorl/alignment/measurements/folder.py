@@ -405,9 +405,7 @@ def _read(
         found += _read_recordings(path, spec, left)
     except _NoRecording as error:
         if not found:
-            raise RecordingError(
-                f"{error}; tables ({', '.join(SUFFIXES)}) and datasets there are none either"
-            ) from error
+            raise RecordingError(f"{error}, and no tables ({', '.join(SUFFIXES)}) or datasets") from error
     read = {p.name for p in (*datasets, *tables)} | {INDEX}
     read |= {p.name for p in children if p.suffix in (".yaml", ".yml")}  # specs and columns files
     skipped += [text for text in left if text.split(" (")[0] not in read]
@@ -449,6 +447,6 @@ def _only_spec(path: Path, reader: str) -> RecordingSpec:
     if len(fitting) != 1:
         raise RecordingError(
             f"{path}: {len(fitting)} shipped specs read {reader} ({', '.join(fitting) or 'none'}); say which: "
-            f"--spec=NAME, or `spec:` in {INDEX}. `taccorl inspect` drafts one"
+            f"--spec=NAME, or `spec:` in {INDEX}. `taccorl ingest inspect` drafts one"
         )
     return next(iter(fitting.values()))

@@ -97,7 +97,9 @@ def read_stored(root: Path) -> StoredActions:
     """
     path = root / META
     if not path.is_file():
-        raise DatasetError(f"{root}: has no {META}; taccorl augment --rows=actions writes such folders")
+        raise DatasetError(
+            f"{root}: is no folder of stored actions (no {META}); taccorl augment --rows=actions writes one"
+        )
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:

@@ -132,9 +132,7 @@ def plan(
     check_rivals(rivals)
     room = room_of(config, signal, pose)
     if min(room.wide_rad, room.sweep_rad) <= 0:
-        raise TaccorlError(
-            f"excite: {signal} stands at {room.middle_rad:.3f} rad, at its limit; give it room to both sides"
-        )
+        raise TaccorlError(f"{signal} stands at {room.middle_rad:.3f} rad, at its limit; give it room to both sides")
     planned, refused = [], {}
     for motion in LIBRARY:
         target = motion.target(room)
@@ -172,9 +170,7 @@ def check_rivals(rivals: Sequence[str]) -> None:
         TaccorlError: there are fewer than two.
     """
     if len(set(rivals)) < 2:
-        raise TaccorlError(
-            f"excite: give two effects or more that are to be told apart, not {', '.join(rivals) or 'none'}"
-        )
+        raise TaccorlError(f"give two or more effects to separate, found {', '.join(rivals) or 'none'}")
 
 
 def best_first[PlannedT: Planned](planned: Sequence[PlannedT]) -> tuple[PlannedT, ...]:

@@ -165,7 +165,7 @@ def plan_presses(
             recording states what these pads pressed, or the sensor is not FlexiTac.
     """
     if arm not in ROBOT.arms:
-        raise TaccorlError(f"excite: no pads of an arm {arm!r}; {nearest(arm, ROBOT.arms)}")
+        raise TaccorlError(f"no pads of an arm {arm!r}; {nearest(arm, ROBOT.arms)}")
     check_rivals(rivals)
     for name in rivals:
         _check_of_pads(name)
@@ -305,20 +305,18 @@ def _mapped(e: Explanation, pads: Sequence[str]) -> Explanation:
 
 def _check_of_pads(name: str) -> None:
     if not issubclass(registry.get(name), TouchEffect):
-        raise TaccorlError(
-            f"excite: {name} is no effect of pads: nothing that they read in a known object would show it"
-        )
+        raise TaccorlError(f"{name} is no effect of pads: nothing that they read in a known object would show it")
 
 
 def _check_candidates(problem: TouchProblem, config: TwinConfig, arm: str, rivals: Sequence[str]) -> None:
     for name in rivals:
         if name in problem.present or any(name == e.name and {*e.acts_on()} & {*problem.pads} for e in config.effects):
             raise TaccorlError(
-                f"excite: the twin has {name} on the {part_of(arm)} already; leave it out, or take it from the twin's file"
+                f"the twin has {name} on the {part_of(arm)} already; leave it out, or take it from the twin's file"
             )
         if name not in problem.candidates:
             raise TaccorlError(
-                f"excite: {name} has no numbers that could be fitted to what pads read; these have: "
+                f"{name} has no numbers that could be fitted to what pads read; these have: "
                 f"{', '.join(problem.candidates)}"
             )
 

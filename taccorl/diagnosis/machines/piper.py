@@ -201,6 +201,8 @@ def _arms_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
         TaccorlError: one whose pads are not known.
     """
     for name in names:
+        if name not in ROBOT.arms:
+            raise TaccorlError(f"--pads={name}: no such arm; {nearest(name, ROBOT.arms)}")
         if name not in known:
             way_out = nearest(name, known) if known else "state `pressed` in measurements.yaml"
             raise TaccorlError(f"--pads={name}: no pads of that arm here; {way_out}")
