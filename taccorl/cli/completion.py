@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 from taccorl.cli.main import VERBS
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError
 
 SECOND_WORDS = {
     "effects": ("new",),
@@ -31,7 +31,7 @@ def main(argv: list[str]) -> int:
         return 0
     if len(argv) != 1 or argv[0] not in shells:
         typed = " ".join(argv)
-        raise TaccorlError(f"{nearest(typed, shells)}: found {typed!r}; taccorl completion {'|'.join(shells)}")
+        raise TaccorlError(f"found {typed!r}; give one shell: taccorl completion {'|'.join(shells)}")
     print(shells[argv[0]]())
     return 0
 

@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
         print(__doc__)
         return 0
     if argv[0] not in verbs:
-        raise TaccorlError(f"taccorl lineage has no verb {argv[0]!r}; {nearest(argv[0], verbs)}")
+        raise TaccorlError(f"no verb {argv[0]!r}; {nearest(argv[0], verbs)}")
     return verbs[argv[0]](argv[1:])
 
 

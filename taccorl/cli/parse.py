@@ -163,7 +163,7 @@ def _check_option(option: str, hints: dict[str, Any]) -> None:
     if name not in known or not option.startswith("--"):
         raise TaccorlError(f"unknown option {option!r}; {nearest(name, [n.rstrip('_') for n in known])}")
     if not equals or not value:
-        raise TaccorlError(f"option {option!r} needs a value: --{name}=…")
+        raise TaccorlError(f"option {option!r} needs a value: --{name}={'true' if hints.get(name) is bool else '…'}")
     if hints.get(name) is bool and value.lower() not in _BOOLEANS:
         raise TaccorlError(f"option --{name} takes a bool, found {value!r}: --{name}=true")
     if value in getattr(hints.get(name), "get_known_choices", dict)():

@@ -100,7 +100,7 @@ def test_recordings_that_are_there_say_the_floor_and_where_the_arm_stands(sweeps
     [
         (["left_joint9", RIVALS], "no joint 'left_joint9'"),
         ([SIGNAL, "--effects=[backlsh,cogging]"], "backlash"),
-        ([SIGNAL, "--effects=[backlash]"], "two effects or more"),
+        ([SIGNAL, "--effects=[backlash]"], "two or more effects"),
         ([SIGNAL, "--effects=[speed_delay,backlash]"], "speed_delay: no search fits it, so no recording is planned"),
         ([SIGNAL], "which effects shall be separated?"),
         ([SIGNAL, RIVALS, "--twin={tmp}/no.yaml"], "no.yaml"),

@@ -88,7 +88,7 @@ def test_three_rivals_are_three_pairs_and_the_worst_counts():
 
 @pytest.mark.parametrize("rivals", [(), ("backlash",), ("backlash", "backlash")])
 def test_less_than_two_rivals_are_refused(rivals):
-    with pytest.raises(TaccorlError, match="two effects or more"):
+    with pytest.raises(TaccorlError, match="two or more effects"):
         planned(*rivals)
 
 
