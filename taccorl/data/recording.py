@@ -454,14 +454,15 @@ class _Loader:
         if marker and not self.log[marker]:
             missing.append(marker)
         if missing:
-            lost = next((str(d) for d in self.reader.damage), "")
             unknown = [t for t in missing if t not in present]
-            if unknown and present:
+            if self.reader.damage:
+                hint = f"the file is damaged or cut off: {self.reader.damage[0]}"
+            elif not present:
+                hint = "the file names no topics"
+            elif unknown:
                 hint = "; ".join(f"{t}: {nearest(t, present)}" for t in unknown[:3])
             else:
-                hint = lost or (
-                    "the file names them, but holds no message of them" if present else "the file names no topics"
-                )
+                hint = "the file names them, but holds no message of them"
             raise RecordingError(
                 f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint})"
             )

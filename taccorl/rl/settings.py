@@ -74,7 +74,7 @@ class FlowSDESettings:
     """Settings of the exploration noise."""
 
     num_steps: int = 4
-    """K_denoise. The policy's num_inference_steps is set to it."""
+    """K_denoise: number of denoising steps of a chunk. The policy's num_inference_steps is set to it."""
     level: float = 0.5
     """σ_SDE: standard deviation of the first stochastic step, in normalised actions. 0: no noise."""
     stochastic_steps: str = "one"

@@ -468,3 +468,10 @@ def test_300_mb_of_pictures_do_not_enter_memory(tmp_path):
     assert (pictures, states) == (3000, 3003)
     assert loaded_mb < 15
     assert streamed_mb < 15
+
+
+def test_a_recording_that_was_cut_off_is_said_to_be_so_where_topics_are_missing(tmp_path):
+    source = write(tmp_path / "a.mcap", usual_messages(), chunk_size=300)
+    source.path.write_bytes(source.path.read_bytes()[:900])  # the last topics come later
+    with pytest.raises(RecordingError, match=r"without messages.*damaged or cut off: a\.mcap bytes [\d,]+ to 900"):
+        load_recording(source, recording_spec(tmp_path), tmp_path)

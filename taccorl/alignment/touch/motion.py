@@ -102,7 +102,9 @@ class TouchMotion:
         instants, places = (groups >= 0).any(axis=1), (groups >= 0).any(axis=0)
         groups = groups[np.ix_(instants, places)]
         if (groups < 0).any():
-            raise TaccorlError(f"touch motion: taxels {window} are no rectangle of what the board reads at one instant")
+            raise TaccorlError(
+                f"touch motion: taxels {window} are not the whole set of taxels that the board reads at some instants"
+            )
         arrays = {
             name: np.ascontiguousarray(getattr(self, name)[frames][:, :, instants])
             for name in ("object_from_pad", "velocity", "clearance_m")

@@ -109,7 +109,7 @@ class PiperTwin(Machine):
     def effect(
         self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
     ) -> Effect | None:
-        """Make an effect; one of pads acts on the pads whose zeros are in ``base``."""
+        """Make an effect at one part. An effect on pads acts on those pads whose zeros are in ``base``."""
         if {"arm", "joints", "pads"} & {*values}:  # as a report has it: it says itself where it acts
             return make_effect(name, **values)
         where = selectors(effects.get(name), part) if part in _SIGNALS else {"pads": pads.pads_of(base or {})}
