@@ -32,7 +32,7 @@ def main(argv: list[str]) -> int:
     if config.resume:
         from taccorl.rl import run_settings
 
-        config = run_settings.complete(config, given_names(argv))
+        config = parse(PostTrainConfig, [*argv, *run_settings.stored_options(config.out, given_names(argv))])
     import logging
 
     from lerobot.utils.import_utils import register_third_party_plugins

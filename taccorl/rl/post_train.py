@@ -105,6 +105,8 @@ class PostTraining:
         self._recent: list[tuple[float, int]] = []
         """Success rate and number of episodes of recent iterations in which episodes ended."""
         self._wants_rerun = True
+        self._episode_decisions = math.ceil(self.world.limit_steps / policy.config.n_action_steps)
+        """Decisions of an episode at its time limit."""
         if settings.resume:
             self._resume(checkpoint.load_state(self._opened.path))
         else:
@@ -136,11 +138,10 @@ class PostTraining:
     def _check_noise(self) -> None:
         """Warn if noise costs the policy more than half of its successes."""
         settings, rates = self.settings, []
-        decisions = math.ceil(self.world.limit_steps / self._actor.policy.config.n_action_steps)
         for sde in (FlowSDE(dataclasses.replace(settings.noise, level=0.0)), self._sde):
             self.world.restart(settings.seed + _CHECK_SEED)
             generator = torch.Generator().manual_seed(settings.seed)
-            found = first_episodes(self.world, self._actor, sde, generator, decisions)
+            found = first_episodes(self.world, self._actor, sde, generator, self._episode_decisions)
             rates.append(found.count(SUCCESS) / len(found))
         self.world.restart(settings.seed)
         self._clock.restart()
@@ -173,13 +174,8 @@ class PostTraining:
     def run(self) -> None:
         """Run the remaining iterations."""
         settings, ppo = self.settings, self._ppo
-        longest = max(settings.save_freq, settings.collapse_iterations)
         while self._iteration < settings.iterations:
-            decisions = settings.env.decisions
-            rollout = collect(
-                self.world, self._actor, ppo.critic, self._sde, decisions, ppo.settings, self._generator, self._clock,
-                self._note_value,
-            )  # fmt: skip
+            rollout = collect(self.world, ppo, settings.env.decisions, self._generator, self._clock, self._note_value)
             with self._clock.part("update"):
                 facts = ppo.update(rollout.decisions, self._generator)
             if self._anchor is not None:
@@ -195,12 +191,17 @@ class PostTraining:
                     f"warning: the first step at --ppo.actor_lr={row['actor_lr']:g} moved the policy by KL > --ppo.kl_stop="
                     f"{settings.ppo.kl_stop:g} and was undone: it does not learn. Lower it, or begin with --ppo.adapt_lr=true"
                 )
-            if row["episodes"]:
-                self._recent = [*self._recent, (row["success"], row["episodes"])][-longest:]
+            self._remember(row)
             self._guard_collapse()
             self._write_rerun()
             if self._iteration % settings.save_freq == 0 or self._iteration == settings.iterations:
                 self._save()
+
+    def _remember(self, row: dict[str, Any]) -> None:
+        """Keep the success of the last iterations; not of the first ones, in which only short episodes can have ended."""
+        longest = max(self.settings.save_freq, self.settings.collapse_iterations)
+        if row["episodes"] and self._iteration * self.settings.env.decisions >= self._episode_decisions:
+            self._recent = [*self._recent, (row["success"], row["episodes"])][-longest:]
 
     def _note_value(self, value_N: Tensor) -> None:
         self.world.watch.value = float(value_N[0])

@@ -18,11 +18,9 @@ from torch import Tensor
 
 from taccorl.evaluation.episodes import SUCCESS
 from taccorl.rl.advantages import estimate_advantages, explained_variance
-from taccorl.rl.critic import Critic
 from taccorl.rl.flow_policy import Batch, FlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
-from taccorl.rl.ppo import Decisions
-from taccorl.rl.settings import PPOSettings
+from taccorl.rl.ppo import PPO, Decisions
 
 
 class Clock:
@@ -103,11 +101,8 @@ class Rollout:
 
 def collect(
     world: World,
-    actor: FlowPolicy,
-    critic: Critic,
-    sde: FlowSDE,
+    learner: PPO,
     num_decisions: int,
-    settings: PPOSettings,
     generator: torch.Generator,
     clock: Clock,
     on_values: Callable[[Tensor], None] = lambda value_N: None,
@@ -118,6 +113,7 @@ def collect(
         generator: random generator on the CPU for the noise.
         on_values: function that is called with the values (N,) of each decision before it is executed.
     """
+    actor, critic, sde = learner.actor, learner.critic, learner.sde
     kept: list[dict[str, Tensor]] = []
     batches: list[Batch] = []
     outcomes, later, won_by_step = Counter[str](), Counter[str](), dict[int, list[bool]]()
@@ -167,9 +163,8 @@ def collect(
     columns = {name: torch.stack([row[name] for row in kept]) for name in kept[0]}
     value_TN, end_TN = columns.pop("value"), columns.pop("end")
     following_TN = torch.where(end_TN, columns.pop("last_value"), torch.cat([value_TN[1:], next_N[None]]))
-    advantage_TN, return_TN = estimate_advantages(
-        columns.pop("reward"), value_TN, following_TN, end_TN, gamma=settings.gamma, gae_lambda=settings.gae_lambda
-    )
+    discounts = {"gamma": learner.settings.gamma, "gae_lambda": learner.settings.gae_lambda}
+    advantage_TN, return_TN = estimate_advantages(columns.pop("reward"), value_TN, following_TN, end_TN, **discounts)
     decisions = Decisions(
         batch={key: torch.cat([batch[key] for batch in batches]) for key in batches[0]},
         advantage_M=advantage_TN.flatten(),

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import typing
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -26,30 +25,15 @@ def write(settings: PostTrainSettings) -> None:
     new.replace(settings.out / SETTINGS)
 
 
-def complete[SettingsT: PostTrainSettings](settings: SettingsT, given: Collection[str]) -> SettingsT:
-    """Replace settings that ``given`` does not name (such as ``ppo.clip``, ``iterations``) by those of the run in
-    ``settings.out``.
+def stored_options(out: Path, given: Collection[str]) -> list[str]:
+    """Options (``--ppo.clip=0.2``) with which the run in ``out`` was begun, except those whose names are ``given``.
 
     Raises:
-        TaccorlError: there is no run in ``settings.out``.
+        TaccorlError: there is no run in ``out``.
     """
-    stored = {name: value for name, value in _read(settings.out).items() if name not in given}
-    try:
-        return _replaced(settings, stored)
-    except TypeError as error:
-        raise TaccorlError(f"--resume=true: {settings.out / SETTINGS}: a value is of another type: {error}") from error
-
-
-def _replaced[T](target: T, stored: dict[str, Any], prefix: str = "") -> T:
-    hints, new = typing.get_type_hints(type(target)), {}
-    for f in dataclasses.fields(target):  # pyright: ignore[reportArgumentType]
-        name, value = f"{prefix}{f.name}", getattr(target, f.name)
-        if dataclasses.is_dataclass(value):
-            new[f.name] = _replaced(value, stored, f"{name}.")
-        elif name in stored:
-            is_path = Path in (hints[f.name], *typing.get_args(hints[f.name]))
-            new[f.name] = Path(stored[name]) if is_path and stored[name] is not None else stored[name]
-    return dataclasses.replace(target, **new)  # pyright: ignore[reportArgumentType]
+    names = _to_json(PostTrainSettings()).keys() - {_TWIN_DIGEST, *given}
+    stored = {name: value for name, value in _read(out).items() if name in names and value is not None}
+    return [f"--{name}={json.dumps(value)}" for name, value in stored.items()]  # JSON is YAML
 
 
 def refuse_changes(settings: PostTrainSettings) -> None:

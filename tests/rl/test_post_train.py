@@ -164,6 +164,13 @@ def run(start: Path, out: Path, lines: list[str], save: Any = None, **changes: A
 def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path) -> None:
     lines: list[str] = []
     made = run(start, tmp_path / "out", lines, noise_check=False, keep_checkpoints=1)
+    for iteration, counted in (
+        (1, []),
+        (2, [(1.0, 4)]),
+    ):  # 2 decisions of 5 of 12 steps: only short episodes have ended
+        made._iteration = iteration
+        made._remember({"episodes": 4, "success": 1.0})
+        assert made._recent == counted
     bias = made._actor.model.action_out_proj.bias
     for iteration, success in ((10, 0.6), (20, 0.8), (30, 0.5)):
         with torch.no_grad():

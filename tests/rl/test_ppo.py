@@ -26,9 +26,7 @@ def ppo(policy: LinePolicy, settings: PPOSettings = SETTINGS, beta: float | None
 def rollout(learner: PPO, num_envs: int = 16, decisions: int = 12, seed: int = 0) -> Decisions:
     generator = torch.Generator().manual_seed(seed)
     world = LineWorld(num_envs, seed)
-    return collect(
-        world, learner.actor, learner.critic, learner.sde, decisions, learner.settings, generator, Clock()
-    ).decisions
+    return collect(world, learner, decisions, generator, Clock()).decisions
 
 
 def weights(policy: LinePolicy) -> torch.Tensor:
@@ -238,8 +236,7 @@ def test_value_of_the_last_observation_counts_where_time_ran_out() -> None:
     torch.nn.init.zeros_(learner.critic.head[-1].weight)  # pyright: ignore
     torch.nn.init.constant_(learner.critic.head[-1].bias, 7.0)  # pyright: ignore
     world = LineWorld(32)
-    clock, generator = Clock(), torch.Generator().manual_seed(0)
-    found = collect(world, learner.actor, learner.critic, learner.sde, 20, learner.settings, generator, clock)
+    found = collect(world, learner, 20, torch.Generator().manual_seed(0), Clock())
     assert found.outcomes[SUCCESS] > 0 and found.outcomes["timeout"] > 0
     returns = found.decisions.return_M
     wins = (returns - 1.0).abs() < 1e-5
@@ -297,7 +294,7 @@ def train(iterations: int, beta: float | None = None) -> tuple[float, float, flo
 
     before, world, generator = success(), LineWorld(128), torch.Generator().manual_seed(0)
     for _ in range(iterations):
-        found = collect(world, policy, learner.critic, learner.sde, 16, learner.settings, generator, Clock())
+        found = collect(world, learner, 16, generator, Clock())
         learner.update(found.decisions, generator)
     return before, success(), DemoAnchor(policy, 1.0).drift(2000)
 

@@ -21,7 +21,8 @@ BEGUN = [
 
 
 def resumed(*argv: str) -> PostTrainConfig:
-    return run_settings.complete(parse(PostTrainConfig, argv), given_names(argv))
+    stored = run_settings.stored_options(parse(PostTrainConfig, argv).out, given_names(argv))
+    return parse(PostTrainConfig, [*argv, *stored])
 
 
 @pytest.fixture
