@@ -298,7 +298,7 @@ def _report(
         title=f"What {before.twin} lacks, from {config.measurements.name}",
         comparison=before,
         refitted=refitted.compare(measurements, name="refitted twin"),
-        after=mended.compare(measurements, name="mended twin"),
+        after=mended.compare(measurements, name="corrected twin"),
         diagnoses={f.part: f.diagnosis for f in found},
         can_tell={f.part: f.can_tell for f in found},
         known={f.part: f.known for f in found if f.known is not None},

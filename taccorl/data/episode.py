@@ -77,7 +77,7 @@ class Episode:
     """Video key → (T,) index of the source picture that each row shows, for finding frozen cameras; empty for an episode of a
     dataset."""
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
-    """Tactile key → (K,) counts that were subtracted."""
+    """Tactile key → (K,) counts of the untouched pad that were subtracted from the readings."""
     videos: dict[str, Video] = field(default_factory=dict)
     """Video key → file, where the episode comes from a dataset."""
     stages: tuple[tuple[int, str], ...] = ()

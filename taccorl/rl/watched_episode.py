@@ -59,7 +59,7 @@ class EpisodeWatch:
         self.value = math.nan
 
     def end(self, seed: int, outcome: str | None, partial: int) -> None:
-        """End the present episode; ``outcome`` None: it is not kept."""
+        """End the present episode; without an ``outcome`` it is not kept."""
         if self.ended is None and outcome is not None:
             actions_TA, values_T = np.concatenate(self.chunks), np.concatenate(self.values)
             self.ended = WatchedEpisode(seed, outcome, partial, actions_TA, values_T)

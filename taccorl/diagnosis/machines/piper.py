@@ -157,7 +157,7 @@ class PiperTwin(Machine):
             return super().mended(findings)
         except TaccorlError as error:
             found, _ = super().mended([f for f in findings if f.part in _SIGNALS])
-            return found, f"the mended twin's pads are as they were: {error}"
+            return found, f"the corrected twin's pads are as they were: {error}"
 
     def refitted(self, findings: Sequence[Finding]) -> "PiperTwin":
         try:

@@ -22,7 +22,7 @@ from taccorl.diagnosis.report.figure_style import (
     tidy,
 )
 
-TWINS = ("twin", "twin, mended")
+TWINS = ("twin", "twin with effect")
 LANES = ("near zero speed", "after a reversal", "high speed", "high load", "in contact")
 """Regimes drawn as bars below a residual."""
 
