@@ -19,12 +19,13 @@ from pipelines.studies.joints_and_pads import (
     named,
     silently_wrong,
 )
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.report.figures_evidence import confusion_matrix, detection_curves, half_detected
 
 PAGE = Path("docs/diagnosis.md")
 OTHERS = "<!-- Other machines: each section below is written by the command that it names. -->"
 """What follows this line in the page stays."""
-ORIGIN = ["surrogate robots, simulated; no robot was near"]
+ORIGIN = [Origin("surrogate", "simulated robots; no robot was near")]
 SIGNAL_BINS = (0.1, 0.5, 0.75, 1.1, 1.6, 2.4, 4.0, 8.0, 16.0, 64.0)
 RUN = "pack chirp pairs none loop outside removed dropped touch touch_none touch_outside"
 HEAD = f"""# Is the search for missing effects right?

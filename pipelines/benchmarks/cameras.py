@@ -18,6 +18,7 @@ from taccorl.alignment.camera.interval import JOINT_RAD, SHAPE_M
 from taccorl.alignment.camera.light import camera_light
 from taccorl.alignment.camera.timing import camera_latency
 from taccorl.alignment.camera.view import TwinView, as_offset
+from taccorl.data.origin import Origin
 from taccorl.lineage.processes import cpu_s
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.camera_exposure import blurred, toned
@@ -26,7 +27,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 
-ORIGIN = "surrogate: the twin under other light, not a camera"
+ORIGIN = Origin("surrogate", "the twin under other light, not a camera")
 OFF_RAD, OFF_M = np.deg2rad(2.7), 0.025
 """How far off the mounts are: about axes and along directions drawn at random."""
 _AMPLITUDE_RAD = np.array([0.35, 0.21, 0.21, 0.175, 0.175, 0.175])

@@ -77,6 +77,7 @@ def _write(root: Path, cameras: int) -> Path:
     """Noisy touch and smooth, moving pictures: simulated, not a robot's."""
     from taccorl.data.episode import Episode, Pictures
     from taccorl.data.lerobot_format import write_episodes
+    from taccorl.data.origin import Origin
     from taccorl.data.spec import find_spec, load_dataset_spec
 
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
@@ -104,7 +105,7 @@ def _write(root: Path, cameras: int) -> Path:
         return Episode(
             name=f"benchmark {seed}", spec=spec, start_ns=0, arrays=arrays, picture_keys=tuple(spec.keys("video")),
             pictures=pictures if cameras else lambda: iter([{}] * EPISODE_ROWS), instruction="insert the plug",
-            origin="simulated: made for a benchmark",
+            origin=Origin("twin", "made for a benchmark"),
         )  # fmt: skip
 
     write_episodes([episode(seed) for seed in range(EPISODES)], root)

@@ -77,7 +77,8 @@ def main(argv: list[str]) -> int:
     used = [made.folder for made in made_attempts(plan, config.source, store, report["attempts"])]
     known = isinstance(config.engine, LocalEngine) and not any(folder.name in before for folder in used)
     page = write_report(plan, config.source, out, store, report["attempts"], spent=spent if known else None)
-    print(f"{config.rows + ':':8s} {out}  ({report['episodes']} episodes, {report['rows']} rows): {plan.origin}")
+    said = f"{report['domain']}: {report['origin']}"
+    print(f"{config.rows + ':':8s} {out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
     if (chosen := report.get("stratify")) is None:
         print(f"yield:   {Share(successes=report['episodes'], attempts=report['attempts'])}")
     else:

@@ -9,9 +9,11 @@ A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
+from taccorl.data.origin import Origin
 from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
 from taccorl.demos.recorder import ORIGIN
@@ -48,8 +50,10 @@ class CollectConfig:
     """Also write failed attempts."""
     seed: int = 0
     """Seed of all attempts, at least 0; another seed gives other scenes."""
-    origin: str = ORIGIN
-    """Label of the origin in all outputs; write "surrogate: …" where the twin stands in for the robot."""
+    domain: Literal["twin", "surrogate"] = "twin"
+    """Domain of all outputs; ``surrogate``: the twin stands in for the robot, as recordings always do."""
+    origin: str = ORIGIN.text
+    """Description of the origin in all outputs."""
 
 
 def main(argv: list[str]) -> int:
@@ -69,7 +73,7 @@ def main(argv: list[str]) -> int:
         images=config.images,
         seed=config.seed,
         keep_failures=config.keep_failures,
-        origin=config.origin,
+        origin=Origin(config.domain, config.origin),
     )
     if isinstance(plan.source, ActionsSource):
         plan = plan.source.plan(plan)
@@ -77,13 +81,11 @@ def main(argv: list[str]) -> int:
     out = config.out or Path("outputs") / plan.task
     if config.as_recording:
         written = collect_recordings(plan, out)
-        print(f"{len(written)} recordings in {out}: {config.origin}")
+        print(f"{len(written)} recordings in {out}: surrogate: of the {plan.origin.text}")
         print(f"next: taccorl ingest {out} --spec=piper_flexitac_mcap --out={out}_dataset")
         return 0
     report = collect(plan, out, Store(config.store))
-    print(
-        f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {config.origin}"
-    )
+    print(f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {plan.origin}")
     add_card(out)
     print(f"next: taccorl view {out}")
     return 0

@@ -111,7 +111,8 @@ def main(argv: list[str]) -> int:
     print(f"expert:    {successes} of {over} succeeded ({100 * successes / over:.1f} %, 95 %: {low:.1f} … {high:.1f})")
     for outcome, count in report["outcomes"].items():
         print(f"           {outcome} {count}")
-    print(f"{plan.rows + ':':11s}{out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
+    said = f"{report['domain']}: {report['origin']}"
+    print(f"{plan.rows + ':':11s}{out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
     if plan.rows == "dataset":
         add_card(out)
     join = "merge --sim=DEMONSTRATIONS --sim" if plan.rows == "dataset" else "execute --source=DEMONSTRATIONS --source"

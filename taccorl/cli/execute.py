@@ -67,7 +67,8 @@ def main(argv: list[str]) -> int:
         frames, of_frames = render_frames(config.out, resolution, store, config.engine)
         print(f"frames rendered and stored in {time.monotonic() - began_s:.0f} s")
         seconds |= of_frames
-    print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows): {report['origin']}")
+    said = f"{report['domain']}: {report['origin']}"
+    print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
     print(
         f"differs: {report['differs']} of {report['demonstrations']} end in another state here than when they were made"
     )

@@ -12,9 +12,10 @@ import os
 import shlex
 import signal
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
@@ -46,6 +47,8 @@ class IngestConfig:
     watch: bool = False
     """Ingest recordings as they arrive in the folders, with one line each, until Ctrl-C or SIGTERM; then publish the dataset of
     all complete ones. A recording is complete when its files have not changed for 5 s."""
+    domain: Literal["real", "surrogate", "twin"] | None = None
+    """Who made the recordings that do not say so themselves: real (a robot), surrogate (a simulation in its place) or twin."""
     replace: bool = False
     """If `out` holds another dataset, move that one aside (out.old-1, …) and publish the new one."""
     engine: Engine = field(default_factory=LocalEngine)
@@ -102,7 +105,7 @@ def _ingest(config: IngestConfig) -> int:
             print("no recording arrived; nothing was written")
             return 0
     else:
-        jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped)
+        jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped, config.domain)
     for line in skipped:
         print(f"not read: {printable(line)}")
     _check_out(config, jobs)
@@ -155,7 +158,7 @@ def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "
         jobs: dict[str, Job] = {}
         for path in config.paths:
             with contextlib.suppress(RecordingError):  # nothing there yet
-                found = find_jobs([path], spec, config.spec, config.store, False, skipped)
+                found = find_jobs([path], spec, config.spec, config.store, False, skipped, config.domain)
                 jobs |= {job.source.name: job for job in found}
         return list(jobs.values())
 
@@ -224,13 +227,17 @@ def _check_same(out: Path, jobs: "list[Job]") -> None:
     try:
         made_by = json.loads(manifest.read_text())["config"]
         there = {(name, part) for name, part, _ in made_by["recordings"]}
-        same_spec = made_by["spec"] == jobs[0].spec.digest
+        same_spec = (made_by["spec"], made_by.get("domain")) == (jobs[0].spec.digest, jobs[0].domain)
     except (OSError, ValueError, KeyError, TypeError):
         raise DatasetError(f"{out} exists and is no dataset of taccorl: {way_out}") from None
     wanted = {(job.source.path.name, job.source.part) for job in jobs}
     if there != wanted or not same_spec:
         new, gone = len(wanted - there), len(there - wanted)
-        why = f"{new} recordings are new, {gone} are missing" if new or gone else "it was made with another spec"
+        why = (
+            f"{new} recordings are new, {gone} are missing"
+            if new or gone
+            else "it was made with another spec or domain"
+        )
         raise DatasetError(
             f"{out} exists and holds another dataset ({why}): {way_out}. Finished recordings are not done again"
         )
@@ -248,12 +255,20 @@ def _write_report(report: dict[str, Any], config: IngestConfig) -> Path:
 
 
 def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None:
+    from taccorl.data.origin import Origin
+
     if config.dry_run:
         print("dry run: nothing was written")
         return
     print(f"report:  {path}")
     if report["episodes"]:
         print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows)")
+        origins = Counter(
+            str(Origin.read(e)) for r in report["recordings"] for e in r["episodes"] if e["outcome"] == "written"
+        )
+        print(f"origin:  {printable('; '.join(f'{label} ({num} episodes)' for label, num in origins.most_common()))}")
+        if any(e["domain"] is None for r in report["recordings"] for e in r["episodes"]):
+            print("         --domain=real states that a robot made the recordings that do not say so")
         add_card(config.out)
         print(f"look:    taccorl view {shlex.quote(str(config.out))} --episode=0")
 

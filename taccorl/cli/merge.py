@@ -39,7 +39,7 @@ def main(argv: list[str]) -> int:
     parts = publish(config.real, config.sim, config.out, Store(config.store))
 
     def told(of: list[Part]) -> str:
-        origins = sorted({origin for part in of for origin in part.origins})
+        origins = sorted({str(origin) for part in of for origin in part.origins})
         said = f" ({'; '.join(origins)})" if origins else ""
         return f"{sum(p.episodes for p in of)} episodes, {sum(p.rows for p in of)} rows{said}"
 

@@ -16,6 +16,7 @@ from taccorl.data.arms import ACTION, STATE
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
 from taccorl.data.finding import Finding
 from taccorl.data.joint_checks import check_sample_jumps
+from taccorl.data.origin import Domain
 from taccorl.data.recording import Recording, find_sources, opened, release
 from taccorl.data.spec import FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
 from taccorl.data.timing import NS_PER_S
@@ -83,8 +84,16 @@ class BrokenPicture(RecordingError):
 class Cutter:
     """Cuts one recording. ``cut`` may be called again after broken pictures were dropped."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, domain: Domain | None = None) -> None:
+        """
+        Args:
+            domain: domain that the user states for a recording that states none.
+
+        Raises:
+            TaccorlError: the recording states another domain.
+        """
         self.recording, self.spec = recording, recording.spec
+        self.origin = recording.origin.agreed(domain, "--domain")
         self.dropped: dict[str, set[tuple[int, int | None]]] = {}
         self.broken_pictures_s: dict[str, list[float]] = {}
         """Channel → when the dropped pictures were logged, in seconds since the recording's first sample."""
@@ -391,7 +400,7 @@ class Cutter:
             picture_keys=tuple(sources),
             instruction=interval.instruction,
             success=interval.success,
-            origin=next((r["origin"] for r in self.recording.reader.metadata.values() if "origin" in r), ""),
+            origin=self.origin,
             timing=tuple(timings),
             picture_rows={key: index for key, (_, index) in sources.items()},
             baselines=dict(self.baselines),

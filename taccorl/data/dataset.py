@@ -11,7 +11,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
 from taccorl.data.file_kinds import no_recording
+from taccorl.data.origin import Origin
 from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, nearest
@@ -66,7 +67,7 @@ class Dataset:
                 "not stored as video; frames are in the cache of training (lerobot-train --dataset.cache=gpu|host|disk)"
             )
             self.skipped |= dict.fromkeys(self.unstored, why)
-        self._records = _read_records(self.root, self._table)
+        self._records = _read_records(self.root, self._table, self.info["features"])
         manifest = self.root / PROVENANCE / "manifest.json"
         self.provenance: dict[str, Any] | None = _read_json(manifest) if manifest.is_file() else None
         absent = sorted({str(p) for i in range(self.num_episodes) if not (p := self.data_file(i)).is_file()})
@@ -141,9 +142,11 @@ class Dataset:
         return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
 
     def told(self, index: int) -> dict[str, Any]:
-        """Fields of ``Episode`` from ``meta/taccorl/`` (success, origin, baselines, …), where ingest wrote them; empty for other
-        people's datasets."""
-        return {} if self._records is None else dict(self._records[index])
+        """Fields of ``Episode`` from ``meta/taccorl/`` (success, origin, baselines, …) where taccorl wrote them; otherwise the
+        origin only."""
+        if self._records is None:
+            return {"origin": Origin.read({}, self.info["features"])}
+        return dict(self._records[index])
 
     def episode(self, index: int) -> Episode:
         """Read one episode: its numbers at once, its pictures on demand."""
@@ -288,7 +291,7 @@ def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
         "rows": episode.num_rows,
         "instruction": episode.instruction,
         "success": episode.success,
-        "origin": episode.origin,
+        **episode.origin.record(),
         "baselines": {key: np.asarray(counts).tolist() for key, counts in episode.baselines.items()},
         "timing": [dataclasses.asdict(t) for t in episode.timing],
         "stages": [[int(row), name] for row, name in episode.stages],
@@ -296,12 +299,12 @@ def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
     }
 
 
-def _from_record(record: dict[str, Any]) -> dict[str, Any]:
+def _from_record(record: dict[str, Any], features: Iterable[str]) -> dict[str, Any]:
     """Fields of ``Episode`` from its record; ``stages`` only where there are any."""
     fields: dict[str, Any] = {
         "start_ns": int(record["start_ns"]),
         "success": record["success"],
-        "origin": record["origin"],
+        "origin": Origin.read(record, features),
         "baselines": {key: np.array(counts) for key, counts in record["baselines"].items()},
         "timing": tuple(ChannelTiming(**t) for t in record["timing"]),
         "provenance": {k: record.get(k) for k in ("recording", "part", "source_digest", "simulation")},
@@ -456,7 +459,7 @@ def _names(names: Any, shape: tuple[int, ...]) -> tuple[str, ...]:
     return tuple(map(str, names))
 
 
-def _read_records(root: Path, table: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
+def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[str]) -> list[dict[str, Any]] | None:
     path = root / PROVENANCE / "episodes.json"
     if not path.is_file():
         return None
@@ -468,7 +471,7 @@ def _read_records(root: Path, table: list[dict[str, Any]]) -> list[dict[str, Any
             f"{sum(r['length'] for r in table)} rows: edited by another tool? Remove this file to read it without"
         )
     try:
-        return [_from_record(r) for r in records]
+        return [_from_record(r, features) for r in records]
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: not as taccorl writes it ({type(error).__name__}: {error})") from error
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from taccorl.data.finding import Finding
+from taccorl.data.origin import UNSTATED, Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
@@ -70,8 +71,8 @@ class Episode:
     instruction: str
     success: bool | None = None
     """True or False as the operator's marker states; None without a marker."""
-    origin: str = ""
-    """Origin of the episode, such as "surrogate stand-in, not a robot"; empty for a recording that states none."""
+    origin: Origin = UNSTATED
+    """Origin as the recording or the dataset states it."""
     timing: tuple[ChannelTiming, ...] = ()
     picture_rows: dict[str, np.ndarray] = field(default_factory=dict)
     """Video key → (T,) index of the source picture that each row shows, for finding frozen cameras; empty for an episode of a

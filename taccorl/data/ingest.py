@@ -26,6 +26,7 @@ from taccorl.data.checks import Finding, check_episode, check_recording_episodes
 from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Loss, Unfit
 from taccorl.data.dataset import dataset_spec_to_json, episode_record
 from taccorl.data.episode import Episode, Pictures
+from taccorl.data.origin import Domain
 from taccorl.data.picture_checks import PictureWatch
 from taccorl.data.recording import Damage, Recording, Source, find_sources, opened
 from taccorl.data.spec import RecordingSpec
@@ -61,6 +62,8 @@ class Job:
     spec_name: str
     store: Path
     dry_run: bool = False
+    domain: Domain | None = None
+    """Domain of a recording that states none itself."""
 
 
 class NothingToWrite(RecordingError):
@@ -78,12 +81,14 @@ def find_jobs(
     store: Path,
     dry_run: bool,
     skipped: list[str] | None = None,
+    domain: Domain | None = None,
 ) -> list[Job]:
     """One job per recording under ``paths``, in the order given, folders in natural order; a file that is named twice is one
     input.
 
     Args:
         skipped: if given, other entries of the folders and the reasons why they are not read are added to it.
+        domain: domain of recordings that state none themselves.
 
     Raises:
         RecordingError: a path holds no recording.
@@ -91,7 +96,7 @@ def find_jobs(
     jobs: dict[tuple[Path, str | None], Job] = {}
     for path in paths:
         for _, source in find_sources(path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped):
-            jobs.setdefault((source.path.resolve(), source.part), Job(source, spec, spec_name, store, dry_run))
+            jobs.setdefault((source.path.resolve(), source.part), Job(source, spec, spec_name, store, dry_run, domain))
     return list(jobs.values())
 
 
@@ -136,7 +141,7 @@ def ingest(
     )
     # Names without folders: the same files reached by another path are the same dataset.
     named = [[Path(e["recording"]).name, e["part"], e["outcome"]] for e in entries]
-    config = {"spec": spec.digest, "recordings": named}
+    config = {"spec": spec.digest, "recordings": named} | _stated(jobs[0].domain)
     inputs = [Artefact(path, json.loads((path / "manifest.json").read_text())["digest"]) for _, path in shards]
     try:
         try:
@@ -248,8 +253,13 @@ def _stored(job: Job, progress: Progress | None, digests: list[str]) -> dict[str
     stage = Stage("recording", lambda config, inputs, folder: _build(job, folder, progress), RECORDING_STAGE_VERSION)
     inputs = [store.source(path) for path in job.source.files]
     digests += [artefact.digest for artefact in inputs]
-    artefact = store.run(stage, {"spec": job.spec.digest, "part": job.source.part}, inputs)
+    artefact = store.run(stage, {"spec": job.spec.digest, "part": job.source.part} | _stated(job.domain), inputs)
     return {**json.loads((artefact.path / "entry.json").read_text()), "artefact": str(artefact.path)}
+
+
+def _stated(domain: Domain | None) -> dict[str, str]:
+    """Part of a stage's configuration; empty where nobody states a domain."""
+    return {} if domain is None else {"domain": domain}
 
 
 def _build(job: Job, folder: Path, progress: Progress | None) -> None:
@@ -263,7 +273,7 @@ def _build(job: Job, folder: Path, progress: Progress | None) -> None:
         write_episodes(episodes, folder / "dataset", progress=lambda done: tell(job.source.name, done, rows))
 
     with opened(job.source, job.spec) as recording:
-        good, entry = _settle(Cutter(recording), write)
+        good, entry = _settle(Cutter(recording, job.domain), write)
         records = [episode_record(e, "") for e in good]
     _dump(folder / "entry.json", entry)
     _dump(folder / "episodes.json", records)
@@ -285,7 +295,7 @@ def _dry(job: Job, progress: Progress | None) -> dict[str, Any]:
                     progress(job.source.name, done, rows)
 
     with opened(job.source, job.spec) as recording:
-        return _settle(Cutter(recording), look)[1]
+        return _settle(Cutter(recording, job.domain), look)[1]
 
 
 def _first_rows(episode: Episode, rows: int = 2) -> Episode:
@@ -365,7 +375,7 @@ def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tu
                 "rows": e.num_rows,
                 "instruction": e.instruction,
                 "success": e.success,
-                "origin": e.origin,
+                **e.origin.record(),
                 "findings": [dataclasses.asdict(f) for f in found],
                 "timing": [dataclasses.asdict(t) for t in e.timing],
             }

@@ -19,6 +19,7 @@ import numpy as np
 
 from taccorl.data import decode
 from taccorl.data.file_kinds import no_recording, sniff
+from taccorl.data.origin import DOMAINS, Origin
 from taccorl.data.spec import ChannelSpec, RecordingSpec, shipped_recording_specs
 from taccorl.errors import RecordingError, nearest
 from taccorl.plugins import Registry
@@ -328,6 +329,18 @@ class Recording:
     @property
     def damage(self) -> list[Damage]:
         return self.reader.damage
+
+    @property
+    def origin(self) -> Origin:
+        """Origin that the file's metadata state.
+
+        Raises:
+            TaccorlError: they state a real domain of a simulated recording.
+        """
+        records = self.reader.metadata.values()
+        stated = (r for r in records if r.get("domain") in DOMAINS)  # other people's key may have any value
+        named = ({"origin": r["origin"]} for r in records if "origin" in r)
+        return Origin.read(next(stated, None) or next(named, {}))
 
     def pictures(
         self, wanted: dict[str, list[tuple[int, int | None]]]

@@ -17,6 +17,7 @@ import draccus
 import numpy as np
 
 from taccorl.data.dataset import PROVENANCE, episode_record
+from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.experts import expert_of
@@ -78,8 +79,8 @@ class Plan(attempts.AttemptPlan):
     source: Source = field(default_factory=ExpertSource)
     keep_failures: bool = False
     """True: failed attempts become episodes too, labelled as failures."""
-    origin: str = ORIGIN
-    """Label of the origin in all outputs, such as "surrogate: …" if the twin stands in for the robot."""
+    origin: Origin = ORIGIN
+    """Origin of all outputs; its domain is ``surrogate`` if the twin stands in for the robot."""
 
     @property
     def num_attempts(self) -> int | None:
@@ -196,7 +197,8 @@ def _may_be_of(plan: Plan, manifest: dict[str, Any], out: Path, store: Store) ->
 def _attempt_config(plan: Plan, scene: dict[str, Any], k: int) -> dict[str, Any]:
     """Settings on which attempt ``k`` depends, the scene's (``Plan.scene_config``) included; not the number of attempts."""
     source = {"type": plan.source.get_choice_name(type(plan.source)), **dataclasses.asdict(plan.source)}
-    own = {"source": source, "seed": plan.attempt_seed(k), "images": plan.images, "origin": plan.origin}
+    own = {"source": source, "seed": plan.attempt_seed(k), "images": plan.images, "origin": plan.origin.text}
+    own |= {} if plan.origin.domain == ORIGIN.domain else {"domain": plan.origin.domain}
     return canonical(scene | own | {"keep_failures": plan.keep_failures})
 
 
@@ -223,7 +225,7 @@ def _build_attempt(
 def _report(plan: Plan, entries: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "task": plan.task,
-        "origin": plan.origin,
+        **plan.origin.record(),
         "attempts": len(entries),
         "outcomes": attempts.outcomes(entries),
         "episodes": sum(e["kept"] for e in entries),
@@ -254,7 +256,7 @@ def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = prin
         if recorder.is_kept(plan):
             path = out / f"{plan.task}_{len(written):03d}.mcap"
             part = path.with_suffix(".part")
-            origin = f"surrogate recording from the {plan.origin}"
+            origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
             write_twin_mcap(part, sim, recorder.trajectory(), success=success, origin=origin)
             part.replace(path)
             written.append(path)

@@ -127,7 +127,12 @@ class CorrectionPlan(attempts.AttemptPlan):
 
     def config(self, k: int) -> dict[str, Any]:
         """Settings on which the correction of episode ``k`` depends, besides the policy's episodes; part of the store's key."""
-        own = {"policy_digest": self.policy_digest, "takeover": self.takeover, "images": self.images, "origin": ORIGIN}
+        own = {
+            "policy_digest": self.policy_digest,
+            "takeover": self.takeover,
+            "images": self.images,
+            "origin": ORIGIN.text,
+        }
         own |= {"part_poses": True} if self.part_poses else {}
         own |= {"rows": self.rows} if self.rows == "actions" else {}
         return canonical(self.scene_config() | own | {"root_seed": self.seed, "episode": k})
@@ -425,7 +430,7 @@ def correction_report(plan: CorrectionPlan, entries: Sequence[dict[str, Any]]) -
     over = [e for e in entries if e["takeover_step"] is not None]
     return {
         "task": plan.task,
-        "origin": ORIGIN,
+        **ORIGIN.record(),
         "policy": plan.policy,
         "policy_digest": plan.policy_digest,
         "attempts": len(entries),

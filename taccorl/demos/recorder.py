@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.episode import EXECUTED, Episode, Pictures
+from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec, find_spec, load_dataset_spec
 from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY, POSE_UNITS, part_pose_names, part_poses, posed_bodies
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
-ORIGIN = "MuJoCo twin, not a robot"
+ORIGIN = Origin("twin", "MuJoCo twin, not a robot")
 _ANY = (-1e12, 1e12)
 _REACH = (-10.0, 10.0)  # [m] a part that fell off the table is still within it
 PICTURE = "observation.images."

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taccorl.data.episode import Episode
+from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
@@ -93,7 +94,7 @@ def replay_episode(sim: Simulation, episode: Episode) -> Episode:
         arrays=arrays,
         pictures=lambda: iter(()),
         picture_keys=(),
-        origin=f"twin replay of: {episode.origin or episode.name}",
+        origin=Origin("twin", f"replay of: {episode.origin.text or episode.name}"),
         picture_rows={},
         videos={},
         timing=(),

@@ -21,6 +21,7 @@ import numpy as np
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading, save_cells
 from taccorl.alignment.measurements.folder import INDEX, Measurements
+from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError, nearest
 from taccorl.surrogate.touch_hidden import MILLISECOND, Values, material, spread
 from taccorl.surrogate.writing import seal
@@ -171,7 +172,7 @@ def record(case: CellsCase, name: str) -> CellMeasurement:
         signals=config.names,
         units=("count",) * cells,
         quantum=np.ones(cells),
-        origin=ORIGIN,
+        origin=Origin("surrogate", ORIGIN),
         repeat_of="presses" if name == "presses_again" else None,
         temperature_c=20.0 + warm_k[rows],
     )
@@ -205,7 +206,12 @@ def write_cells(case: CellsCase, folder: Path) -> int:
             writer.writerows([[f"{x:.6g}" for x in row] for row in zip(*columns, strict=True)])
     uses = [f"  {name}.csv: {{use: {use}}}" for name, (use, _) in RECORDINGS.items() if name != "presses_again"]
     uses.append("  presses_again.csv: {use: fit, repeat_of: presses.csv}")
-    columns = ["time: {column: t, unit: s}", "temperature: {column: temperature_c}", f"origin: {ORIGIN}"]
+    columns = [
+        "time: {column: t, unit: s}",
+        "temperature: {column: temperature_c}",
+        "domain: surrogate",
+        f"origin: {ORIGIN}",
+    ]
     columns += ["load: {column: force_n, unit: N}"] if config.load.shared else []
     columns.append("cells:")
     for cell in config.names:

@@ -19,6 +19,7 @@ import numpy as np
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError
 
 ORIGIN = "simulated robot (taccorl.surrogate.foreign)"
@@ -215,7 +216,7 @@ class Plant:
             signals=tuple(link.joint for link in self.case.links),
             units=("rad",) * len(self.case.links),
             repeat_of=repeat_of,
-            origin=ORIGIN,
+            origin=Origin("surrogate", ORIGIN),
         )
 
 

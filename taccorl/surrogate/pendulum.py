@@ -145,6 +145,7 @@ REPEATED = ((2, 0), (4, 1))
 """Load and gain of the recordings that are made twice."""
 COLUMNS = """\
 time: {column: ms, unit: ms}
+domain: surrogate
 origin: simulated servo (taccorl.surrogate.pendulum)
 signals:
   servo:

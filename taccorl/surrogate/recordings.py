@@ -13,13 +13,14 @@ from scipy.signal import lfilter
 from taccorl.alignment.measurements.folder import Measurements, split
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import DESIGNS, OPENING_M, RATE_HZ, REST_POSE, TEST, VALIDATION, Motion
+from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.surrogate.cases import Case
 from taccorl.surrogate.plant import COMMAND_MS
 from taccorl.surrogate.robot import NOISE_RAD, QUANTUM_RAD
 
-ORIGIN = "surrogate robot, simulated; not a robot"
+ORIGIN = "robot simulated apart from the twin, not a robot"
 SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
 EFFORT_NOISE_SHARE, EFFORT_NOISE_NM, EFFORT_QUANTUM_NM = 0.01, 0.005, 1e-3
 """Noise of efforts: share of the largest effort in the recording, and least value [N·m], both choices; step in which PiPER
@@ -71,7 +72,7 @@ def record(case: Case, motion: Motion) -> Measurement:
         ),
         velocity=_rounded(_noisy(rng, velocity, SPEED_NOISE_RAD_PER_S, 0.0), SPEED_QUANTUM_RAD_PER_S, 1e-3),
         effort=_rounded(_noisy(rng, effort, _effort_noise(effort), 0.0), EFFORT_QUANTUM_NM, 1e-3),
-        origin=f"{ORIGIN}; {case.signal} under test",
+        origin=Origin("surrogate", f"{ORIGIN}; {case.signal} under test"),
         instruction=f"sweep of {case.signal}: {motion.name}",
         repeat_of=motion.repeat_of,
         payload_kg={ROBOT.arms[robot.arm]: motion.payload_kg} if motion.payload_kg else {},

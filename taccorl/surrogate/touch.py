@@ -22,6 +22,7 @@ from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.motions import RATE_HZ, REST_POSE
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
+from taccorl.data.origin import Origin
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
@@ -248,7 +249,7 @@ def record_touch(case: TouchCase, press: Press) -> Measurement:
             counts=(wire - baseline).reshape(len(stamps), -1).astype(np.int16),
             baseline=baseline.ravel(),
         ),
-        origin=f"{ORIGIN}; {case.arm} pads",
+        origin=Origin("surrogate", f"{ORIGIN}; {case.arm} pads"),
         instruction=f"press a {press.shape}: {press.name}",
         repeat_of=press.repeat_of,
     )

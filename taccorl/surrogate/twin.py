@@ -15,7 +15,7 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
-ORIGIN = "surrogate robot: the twin with hidden effects and other cameras, not a robot"
+ORIGIN = "twin with hidden effects and other cameras, not a robot"
 FRICTION_NM = (0.1, 0.5)
 GRAVITY_SHARE = (0.85, 1.1)
 DELAY_S = (0.005, 0.02)

@@ -14,6 +14,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from taccorl.data.origin import Origin, labelled
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.trajectory import SAMPLE_HZ, Trajectory
@@ -124,12 +125,12 @@ class TwinScene:
             renderer.close()
 
 
-def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, success: bool, origin: str) -> None:
+def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, success: bool, origin: Origin) -> None:
     """Write one episode as one recording; an existing file is replaced.
 
     Args:
         sim: the simulation that the trajectory is of.
-        origin: label such as "surrogate: …", stored in the file and in every dataset made from it.
+        origin: stored in the file and in every dataset made from it.
     """
     story = TwinStory(sim, trajectory, "success" if success else "failure")
     config = StandInConfig(
@@ -142,7 +143,7 @@ def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, succ
     scene = TwinScene(story, config.camera_size)
     try:
         label = {
-            "origin": origin,
+            **labelled(origin),
             "task": sim.task.name,
             "seed": str(int(sim.seeds[0])),
             "instruction": sim.task.instruction,

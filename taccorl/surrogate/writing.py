@@ -23,6 +23,7 @@ import yaml
 from taccorl.alignment.measurements.folder import INDEX, Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.data.origin import labelled
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.shapes import Capsule, Cylinder
@@ -125,7 +126,7 @@ def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: 
     config = StandInConfig(
         duration_s=story.duration_s, seed=seed, instruction=measurement.instruction, pad_gain_spread=0.0
     )
-    label = {"origin": measurement.origin, "instruction": measurement.instruction, "repeat_of": repeat_of or ""}
+    label = labelled(measurement.origin) | {"instruction": measurement.instruction, "repeat_of": repeat_of or ""}
     label |= {key: json.dumps(getattr(measurement, key)) for key in ("kp", "kd", "gain_scale", "payload_kg")}
     publish(path, _Sweep(config, story), label)
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from taccorl.data.dataset import PROVENANCE, Dataset, dataset_spec_to_json, episode_record
 from taccorl.data.lerobot_format import merge, quiet_lerobot, require_videos, write_exact_statistics
+from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
-from taccorl.demos.recorder import ORIGIN
 from taccorl.errors import DatasetError, InTheWayError
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.stage import Stage
@@ -37,8 +37,8 @@ class Part:
     is_sim: bool
     episodes: int
     rows: int
-    origins: tuple[str, ...]
-    """Origins that its episodes state, such as a surrogate robot; empty: none is stated."""
+    origins: tuple[Origin, ...]
+    """Origins of its episodes, each once."""
 
 
 def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) -> list[Part]:
@@ -61,7 +61,7 @@ def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) 
     config = {"real": len(real), "sim": len(sim)}  # which they are, their content says
     store.run(stage, config, [store.dataset(root) for root in (*real, *sim)], destination=out)
     told = json.loads((out / RECORD).read_text(encoding="utf-8"))
-    return [Part(**{**part, "origins": tuple(part["origins"])}) for part in told]
+    return [Part(**{**part, "origins": tuple(map(Origin.read, part["origins"]))}) for part in told]
 
 
 def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
@@ -78,18 +78,14 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
             raise DatasetError(f"{d.root} has {IS_SIM}, it is merged already: give the datasets that it was made of")
         d.spec.require_action_time(str(d.root))
     for d in datasets[: len(real)]:
-        origins = _origins(d)
-        is_nameless = not origins and any(key.startswith("sim.") for key in d.info["features"])
-        if ORIGIN in origins or is_nameless:
-            said = "it holds a simulator's state" if is_nameless else f"its episodes say {ORIGIN!r}"
+        if twin := [origin for origin in _origins(d) if origin.domain == "twin"]:
             raise DatasetError(
-                f"--real={d.root}: {said}: --sim={d.root}. Where the twin plays the robot, collect with --origin='surrogate: …'"
+                f"--real={d.root}: its episodes are {twin[0]}: --sim={d.root}. Where the twin stands in for the "
+                "robot, collect with --domain=surrogate"
             )
     for d in datasets[len(real) :]:
-        if stands_in := [origin for origin in _origins(d) if origin.startswith("surrogate")]:
-            raise DatasetError(
-                f"--sim={d.root}: its episodes stand for the robot's ({stands_in[0]!r}): --real={d.root}"
-            )
+        if other := [origin for origin in _origins(d) if origin.domain in ("real", "surrogate")]:
+            raise DatasetError(f"--sim={d.root}: its episodes are {other[0]}: --real={d.root}")
     return _shared_features(datasets)
 
 
@@ -121,7 +117,7 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
         Part(str(d.root), k >= len(real), d.num_episodes, int(d.info["total_frames"]), _origins(d))
         for k, d in enumerate(datasets)
     ]
-    _dump(out / RECORD, [asdict(part) for part in parts])
+    _dump(out / RECORD, [asdict(part) | {"origins": [o.record() for o in part.origins]} for part in parts])
     _dump(out / PROVENANCE / "episodes.json", [record for d in datasets for record in _records(d, shared)])
     described = [d for d in datasets if (d.root / PROVENANCE / "dataset_spec.json").is_file()]
     if described:
@@ -181,7 +177,14 @@ def _records(dataset: Dataset, shared: set[str]) -> list[dict[str, Any]]:
     if not path.is_file():
         return [episode_record(dataset.episode(k), "") for k in range(dataset.num_episodes)]
     records = json.loads(path.read_text(encoding="utf-8"))
-    return [{**r, "baselines": {k: v for k, v in r["baselines"].items() if k in shared}} for r in records]
+    return [
+        {
+            **r,
+            **dataset.told(k)["origin"].record(),
+            "baselines": {key: v for key, v in r["baselines"].items() if key in shared},
+        }
+        for k, r in enumerate(records)
+    ]
 
 
 def _spec(dataset: Dataset, shared: set[str]) -> DatasetSpec:
@@ -204,6 +207,6 @@ def _dump(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _origins(dataset: Dataset) -> tuple[str, ...]:
-    told = {str(dataset.told(k).get("origin") or "") for k in range(dataset.num_episodes)}
-    return tuple(sorted(told - {""}))
+def _origins(dataset: Dataset) -> tuple[Origin, ...]:
+    """Origins of the episodes, each once, in the order of their labels."""
+    return tuple(sorted({dataset.told(k)["origin"] for k in range(dataset.num_episodes)}, key=str))

@@ -19,21 +19,21 @@ from PIL import Image, ImageDraw
 
 from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, Dataset
 from taccorl.data.finding import listed
+from taccorl.data.origin import Domain, Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.errors import printable
 from taccorl.lineage.manifest import CARD
 from taccorl.views.colors import ARM_COLORS, heat
 from taccorl.views.contact_sheet import INK, PAPER, SOFT, draw_sheet, font
 from taccorl.views.groups import element_names, units_of
-from taccorl.views.provenance import NO_ORIGIN
 
 PICTURES = ".card"
 EPISODE_PICTURE, COVERAGE_PICTURE = f"{PICTURES}/episode_0.jpg", f"{PICTURES}/coverage.png"
 SHEET_WIDTH_PX = 1200
 LABEL_PX, BARS_PX, MAP_PX, ROW_PX, GAP_PX = 150, 380, 104, 24, 20
 LIGHT_BAR = (191, 205, 224)
-ORIGIN_TAGS = {"surrogate": "surrogate", "MuJoCo": "simulated", "simulated": "simulated"}
-"""First word of an origin → tag of the card. No origin is tagged as a robot's, because that cannot be checked."""
+DOMAIN_TAGS: dict[Domain | None, str] = {"real": "real", "surrogate": "surrogate", "twin": "simulated"}
+"""Domain → tag of the card."""
 MOST_INSTRUCTIONS = 8
 
 
@@ -104,9 +104,9 @@ _ALT = {
 }
 
 
-def _front_matter(dataset: Dataset, origins: Counter[str]) -> dict[str, Any]:
+def _front_matter(dataset: Dataset, origins: Counter[Origin]) -> dict[str, Any]:
     """As LeRobot's own card, without a licence: its owner adds that."""
-    kinds = dict.fromkeys(tag for origin in origins for word, tag in ORIGIN_TAGS.items() if origin.startswith(word))
+    kinds = dict.fromkeys(DOMAIN_TAGS[origin.domain] for origin in origins if origin.domain)
     tags = [
         "LeRobot",
         "taccorl",
@@ -121,12 +121,12 @@ def _front_matter(dataset: Dataset, origins: Counter[str]) -> dict[str, Any]:
     }
 
 
-def _origins(dataset: Dataset) -> Counter[str]:
-    """Origin, as the episodes state it → episodes."""
-    return Counter(printable(dataset.told(i).get("origin") or NO_ORIGIN) for i in range(dataset.num_episodes))
+def _origins(dataset: Dataset) -> Counter[Origin]:
+    """Origin → number of episodes."""
+    return Counter(dataset.told(i)["origin"] for i in range(dataset.num_episodes))
 
 
-def _summary(dataset: Dataset, origins: Counter[str]) -> list[str]:
+def _summary(dataset: Dataset, origins: Counter[Origin]) -> list[str]:
     spec, rows = dataset.spec, sum(dataset.num_rows(i) for i in range(dataset.num_episodes))
     outcomes = Counter(dataset.told(i).get("success") for i in range(dataset.num_episodes))
     words = {True: "success", False: "failure", None: "not stated"}
@@ -136,7 +136,7 @@ def _summary(dataset: Dataset, origins: Counter[str]) -> list[str]:
         f"{_count(dataset.num_episodes, 'episode')}, {rows} rows at {spec.fps} a second, {_duration(rows / spec.fps)}"
     )
     return [
-        f"**Origin: {'; '.join(origins)}**",
+        f"**Data: {'; '.join(printable(str(origin)) for origin in origins)}**",
         "",
         f"- {size}; outcomes: {said}",
         f"- robot: {printable(spec.robot_type)}; data spec {printable(spec.name)}",
@@ -182,14 +182,19 @@ def _unit_and_content(dataset: Dataset, key: str, feature: FeatureSpec) -> tuple
     return units, shown
 
 
-def _origin(dataset: Dataset, origins: Counter[str]) -> list[str]:
-    lines = ["| as the recordings state it | episodes |", "|:--|--:|"]
-    lines += [f"| {origin} | {num} |" for origin, num in origins.most_common()]
+def _origin(dataset: Dataset, origins: Counter[Origin]) -> list[str]:
+    lines = ["| domain: origin | episodes |", "|:--|--:|"]
+    lines += [f"| {printable(str(origin))} | {num} |" for origin, num in origins.most_common()]
     for part in _read(dataset, "cotrain.json", []):
         kind = "simulated" if part["is_sim"] else "given as real"
         lines.append(f"| {kind}: {printable(Path(part['dataset']).name)} | {part['episodes']} |")
-    if NO_ORIGIN in origins:
-        lines += ["", "Where it is not stated, nothing here says whether a robot or a simulator made it."]
+    if any(origin.derived for origin in origins):
+        lines += [
+            "",
+            "Derived: the data were written before taccorl stored domains; the text or the simulator's columns tell it.",
+        ]
+    if any(origin.domain is None for origin in origins):
+        lines += ["", "Where the domain is not stated, nothing here says whether a robot or a simulator made the data."]
     if manifest := dataset.provenance:
         software = ", ".join(
             f"{name} {version}" for name, version in manifest["software"].items() if name in _SHAPED_BY

@@ -18,7 +18,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from taccorl.diagnosis.comparison.result import Comparison, TouchTrace, Trace, shown, shown_unit
+from taccorl.diagnosis.comparison.result import Comparison, TouchTrace, Trace, origin_words, shown, shown_unit
 from taccorl.views.colors import GROUND_COLOR, HEATMAP, NOISE_COLOR
 from taccorl.views.outputs import check_free, replacing
 from taccorl.views.rrd import recording_to
@@ -189,9 +189,8 @@ def _side_by_side(counts: np.ndarray) -> np.ndarray:
 
 def _page(comparison: Comparison, after: Comparison | None) -> str:
     """What was compared with what, in Markdown."""
-    origins = ", ".join(comparison.origins) or "not stated by the recordings"
     lines = [
-        f"**data: {origins}**",
+        f"**{origin_words(comparison.origins)}**",
         "",
         f"- twin: {comparison.twin}, effects {', '.join(comparison.effects) or 'none'}",
     ]

@@ -18,7 +18,7 @@ from taccorl.views.colors import ARM_COLORS, CONTACT_COLOR, LINE_COLORS, NOISE_C
 from taccorl.views.groups import groups_of, short_name
 from taccorl.views.outputs import save_png
 from taccorl.views.part import part_of
-from taccorl.views.provenance import NO_ORIGIN, outcome
+from taccorl.views.provenance import outcome
 from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, Pad, contact_gate, pads_of, peak_row
 
 NUM_INSTANTS = 6
@@ -67,7 +67,7 @@ class Layout:
 def contact_sheet(episode: Episode, path: Path) -> Layout:
     """Draw the episode to a PNG at ``path``."""
     image, layout = draw_sheet(episode)
-    save_png(image, path, episode.name, episode.origin)
+    save_png(image, path, episode.name, str(episode.origin))
     return layout
 
 
@@ -167,7 +167,7 @@ def _draw_head(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout) -> N
     draw.text((MARGIN, 54), f"\u201c{episode.instruction}\u201d   outcome: {outcome(episode)}", INK, font(17))
     facts = f"{episode.num_rows} rows, {episode.num_rows / spec.fps:.2f} s at {spec.fps} fps; {spec.robot_type}; {spec.name}"
     draw.text((MARGIN, 79), facts, SOFT, font(15))
-    text = f"origin: {episode.origin or NO_ORIGIN}"
+    text = f"data: {episode.origin}"
     width = draw.textlength(text, font(17))
     draw.rounded_rectangle((MARGIN, 102, MARGIN + width + 20, 128), 8, fill=ORIGIN_COLOR)
     draw.text((MARGIN + 10, 105), text, PAPER, font(17))

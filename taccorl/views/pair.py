@@ -11,7 +11,7 @@ from taccorl.data.episode import Episode
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
 from taccorl.views.groups import element_names, short_name, units_of, vector_keys
-from taccorl.views.provenance import NO_ORIGIN, outcome
+from taccorl.views.provenance import outcome
 from taccorl.views.touch import CONTACT_THRESHOLD, Pad, contact_gate, pads_of
 
 Align = Literal["start", "contact"]
@@ -62,7 +62,7 @@ class Pair:
 
     @property
     def origin(self) -> str:
-        return "; ".join(f"{name}: {e.origin or NO_ORIGIN}" for name, e in zip(NAMES, self.episodes, strict=True))
+        return "; ".join(f"{name}: {e.origin}" for name, e in zip(NAMES, self.episodes, strict=True))
 
     @property
     def num_rows(self) -> int:
@@ -117,7 +117,7 @@ def page_of(pair: Pair) -> str:
     lines = []
     for name, color, e in zip(NAMES, COLOR_WORDS, pair.episodes, strict=True):
         facts = f"outcome {outcome(e)}; {e.num_rows / e.spec.fps:.2f} s at {e.spec.fps} fps; {_contact_words(e)}"
-        lines += [f"**{name} ({color}): {e.name}**  \norigin: **{e.origin or NO_ORIGIN}**  \n{facts}", ""]
+        lines += [f"**{name} ({color}): {e.name}**  \ndata: **{e.origin}**  \n{facts}", ""]
     aligned = "first contact" if pair.align == "contact" else "first row"
     facts = [f"0 s is the {aligned} of each; curves: state thick, action thin", *_lacks(pair)]
     if pair.shared_pads() and len(pair.common_rows()[0]):

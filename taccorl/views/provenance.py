@@ -8,7 +8,6 @@ from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, pads_of
 
 TIMING_COLUMNS = "rate, gaps, longest gap (ms); age of the sample that a row shows, median and oldest (ms)"
-NO_ORIGIN = "not stated by the recording"
 
 
 def outcome(episode: Episode) -> str:
@@ -21,7 +20,7 @@ def provenance(episode: Episode) -> str:
     facts."""
     spec = episode.spec
     lines = [
-        f"**origin: {episode.origin or NO_ORIGIN}**",
+        f"**data: {episode.origin}**",
         "",
         f"**{episode.name}**",
         "",

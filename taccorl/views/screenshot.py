@@ -73,7 +73,7 @@ def screenshot(
                     f"apt-get install mesa-vulkan-drivers libvulkan1   or   apt-get install chromium && pip install playwright"
                 )
         with Image.open(drawn) as image:
-            save_png(image.convert("RGB"), png, shown.name, shown.origin)
+            save_png(image.convert("RGB"), png, shown.name, str(shown.origin))
     return who
 
 

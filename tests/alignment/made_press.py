@@ -10,6 +10,7 @@ import numpy as np
 
 from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
+from taccorl.data.origin import Origin
 
 RADIUS_M = 0.012
 GAIN_COUNT, BASELINE = 75.0, 20
@@ -106,6 +107,6 @@ def press(
         target=target,
         measured=measured,
         touch=touch,
-        origin="simulated by tests/alignment/made_press.py",
+        origin=Origin("twin", "simulated by tests/alignment/made_press.py"),
         repeat_of=repeat_of,
     )

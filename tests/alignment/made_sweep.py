@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.data.origin import Origin
 from taccorl.robots import ROBOT
 
 RATE_HZ = 200
@@ -103,7 +104,7 @@ def measured(
             "time_s": np.arange(len(target)) / rate_hz,
             "target": target,
             "measured": seen,
-            "origin": "synthetic",
+            "origin": Origin(text="synthetic"),
         }
         | fields
     )

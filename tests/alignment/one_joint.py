@@ -11,6 +11,7 @@ from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.data.origin import Origin
 from taccorl.robots import ROBOT
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects.effect import Effect
@@ -33,7 +34,11 @@ def chirp(
     target = np.tile(HOME, (len(time_s), 1))
     target[:, ROBOT.action_names.index(signal)] += amplitude * np.clip((time_s - 0.5) / 0.5, 0, 1) * np.sin(phase)
     return Measurement(
-        name=f"chirp to {high_hz:g} Hz", time_s=time_s, target=target, measured=target.copy(), origin="simulated"
+        name=f"chirp to {high_hz:g} Hz",
+        time_s=time_s,
+        target=target,
+        measured=target.copy(),
+        origin=Origin("twin", "simulated"),
     )
 
 

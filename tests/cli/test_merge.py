@@ -12,6 +12,7 @@ import pytest
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
+from taccorl.data.origin import Origin
 
 IS_SIM = "observation.is_sim"
 WORDS = ("--real=surrogate", "--sim=twin", "--out=both", "--store=store")
@@ -28,7 +29,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("merge_cli")
     write_tiny(folder / "foreign", rows=(16,), with_spec=False)  # without what taccorl writes down of a dataset
-    for name, seeds, origin in (("surrogate", (0, 1), "surrogate: made up"), ("twin", (2,), ORIGIN)):
+    for name, seeds, origin in (("surrogate", (0, 1), Origin("surrogate", "made up")), ("twin", (2,), ORIGIN)):
         episodes = [
             dataclasses.replace(tiny_episode(tiny_spec(), 20 + seed, seed), origin=origin, success=True)
             for seed in seeds
@@ -48,14 +49,16 @@ def test_who_stands_for_the_robot_is_not_the_twin_and_the_reverse(place: Path, s
     code, shown = said("merge", "--real=surrogate", "--sim=surrogate", "--out=nothing", "--store=store")
     assert code != 0 and "twice" in shown
     code, shown = said("merge", "--sim=surrogate", "--out=nothing", "--store=store")
-    assert code != 0 and "its episodes stand for the robot's ('surrogate: made up'): --real=surrogate" in shown
+    assert code != 0 and "--sim=surrogate" in shown and "surrogate: made up" in shown and "--real=surrogate" in shown
     assert not (place / "nothing").exists()
 
 
 def test_every_episode_keeps_its_origin_and_every_row_its_domain(place: Path) -> None:
     both = Dataset(place / "both")
     episodes = [both.episode(k) for k in range(both.num_episodes)]
-    assert [e.origin for e in episodes] == ["surrogate: made up"] * 2 + ["MuJoCo twin, not a robot"]
+    assert [e.origin for e in episodes] == [Origin("surrogate", "made up")] * 2 + [
+        Origin("twin", "MuJoCo twin, not a robot")
+    ]
     assert [e.num_rows for e in episodes] == [20, 21, 22] and all(e.success for e in episodes)
     assert [set(e.arrays[IS_SIM].ravel().tolist()) for e in episodes] == [{0.0}, {0.0}, {1.0}]
     assert both.spec.features[IS_SIM].range == (0, 1) and "observation.tactile" in both.spec.sensors
@@ -63,7 +66,7 @@ def test_every_episode_keeps_its_origin_and_every_row_its_domain(place: Path) ->
     for line in (
         "- surrogate\n- simulated\n",
         "| surrogate: made up | 2 |",
-        "| MuJoCo twin, not a robot | 1 |",
+        "| twin: MuJoCo twin, not a robot | 1 |",
         "| given as real: surrogate | 2 |",
         "| simulated: twin | 1 |",
     ):
@@ -75,7 +78,7 @@ def test_the_same_command_again_does_nothing_and_lineage_tells_what_it_was_made_
     code, text = said("merge", *WORDS)
     assert code == 0 and (place / "both/meta/info.json").stat().st_mtime_ns == made_ns
     assert "real:      2 episodes, 41 rows (surrogate: made up)" in text
-    assert "simulated: 1 episodes, 22 rows (MuJoCo twin, not a robot)" in text
+    assert "simulated: 1 episodes, 22 rows (twin: MuJoCo twin, not a robot)" in text
     assert "--dataset.repo_id=local/both --dataset.root=both" in text and "sim_weight" not in text
     code, text = said("lineage", "explain", "both", "--store=store")
     assert code == 0 and "cotraining" in text and "surrogate" in text and "twin" in text
@@ -111,7 +114,7 @@ def test_a_dataset_that_says_nothing_of_itself_is_merged_once_its_spec_is_writte
     code, text = said("merge", "--real=described", "--sim=twin", "--out=mixed", "--store=store")
     assert code == 0, text
     mixed = Dataset(place / "mixed")
-    assert [mixed.episode(k).origin for k in range(2)] == ["", "MuJoCo twin, not a robot"]
+    assert [mixed.episode(k).origin for k in range(2)] == [Origin(), Origin("twin", "MuJoCo twin, not a robot")]
     assert said("check", "mixed")[0] in (0, 1)  # random numbers, but it can be read
 
 
@@ -123,7 +126,7 @@ def test_a_dataset_that_says_nothing_of_itself_is_merged_once_its_spec_is_writte
         (("--real=surogate", "--sim=twin", "--out=x"), "surogate: no such folder; did you mean 'surrogate'?"),
         (
             ("--real=twin", "--sim=surrogate", "--out=x"),
-            "--real=twin: its episodes say 'MuJoCo twin, not a robot': --sim=twin",
+            "--real=twin: its episodes are twin: MuJoCo twin, not a robot: --sim=twin",
         ),
         (("--real=surrogate", "--sim=both", "--out=x"), "both has observation.is_sim, it is merged already"),
         (("--sim=twin", "--sim=twin", "--out=x"), "twin is given twice"),

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
+from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
 
 STATE, ACTION, TOUCH = "observation.state", "action", "observation.tactile"
@@ -214,7 +215,7 @@ def make(recipe: Recipe | None = None, **changes: object) -> Episode:
         pictures=stream,
         picture_keys=keys,
         instruction="put the pin into the hole",
-        origin="surrogate: made by tests/data, not a robot",
+        origin=Origin("surrogate", "made by tests/data, not a robot"),
         timing=tuple(good_timing(key) for key in SPEC.features),
         picture_rows={key: np.arange(num_rows) for key in keys},
         baselines={TOUCH: baseline.astype(np.int64)},

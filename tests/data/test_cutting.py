@@ -14,6 +14,7 @@ from edited import NATIVE, SIZE, Raw, changed_specs, read_raw, rewrite, with_mar
 from taccorl.data import cutting
 from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Unfit, open_episodes
 from taccorl.data.episode import Episode
+from taccorl.data.origin import Origin
 from taccorl.data.recording import find_sources, opened
 from taccorl.data.spec import RecordingSpec, load_recording_spec
 from taccorl.errors import RecordingError
@@ -139,7 +140,7 @@ def test_rows_begin_at_the_start_marker_and_end_at_the_end_marker(made: Made) ->
     assert end_s == pytest.approx(2.9 - 0.0015, abs=0.0006)
     assert episode.num_rows == 85  # 2.8 s, both ends on a row
     assert (episode.instruction, episode.success) == ("insert the test tube into the rack", True)
-    assert episode.origin == "surrogate stand-in, not a robot"
+    assert episode.origin == Origin("surrogate", "stand-in recording, not a robot")
 
 
 def test_touch_is_the_recorded_count_minus_the_median_of_the_first_30_frames(made: Made) -> None:

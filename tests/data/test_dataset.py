@@ -17,6 +17,7 @@ import pytest
 
 from taccorl.data.dataset import Dataset, dataset_spec_from_json, dataset_spec_to_json, episode_record
 from taccorl.data.episode import ChannelTiming, Episode
+from taccorl.data.origin import UNSTATED, Origin
 from taccorl.data.spec import data_specs_folder, load_dataset_spec
 from taccorl.errors import DatasetError, SpecError
 
@@ -184,7 +185,7 @@ def test_numbers_tasks_and_names_come_back_exactly(made: dict[str, Path]) -> Non
         assert np.array_equal(episode.arrays["observation.state"], [state(index, row) for row in range(length)])
         assert episode.arrays["observation.grip"].shape == (length, 1)
         assert episode.spec.features["observation.state"].names == ("a", "b", "c")
-        assert (episode.success, episode.origin, episode.baselines, episode.timing) == (None, "", {}, ())
+        assert (episode.success, episode.origin, episode.baselines, episode.timing) == (None, UNSTATED, {}, ())
 
 
 def test_a_video_begins_where_the_episodes_before_it_end(made: dict[str, Path]) -> None:
@@ -429,7 +430,7 @@ def told_episode(index: int) -> Episode:
         picture_keys=(),
         instruction=TASKS[index],
         success=(True, False, None)[index],
-        origin="surrogate stand-in, not a robot",
+        origin=Origin("surrogate", "stand-in, not a robot"),
         timing=(ChannelTiming("left_a", "observation.tactile", "asof", 100.0, 2, 0.05, 0.004, 0.011, duplicates=3),),
         baselines={"observation.tactile": np.arange(1536) % 40},
         stages=((0, "reach"), (7, "insert")) if index == 1 else (),

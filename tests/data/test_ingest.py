@@ -23,6 +23,7 @@ from taccorl.data import ingest as ingest_module
 from taccorl.data import lerobot_format
 from taccorl.data.cutting import Cutter, open_episodes
 from taccorl.data.dataset import Dataset
+from taccorl.data.origin import Origin
 from taccorl.errors import DatasetError
 from taccorl.lineage.store import Store
 from taccorl.surrogate.stand_in.files import CAMERA_TOPICS, StandInConfig, read_frame_id, write_mcap
@@ -197,7 +198,7 @@ def test_provenance_travels_in_the_dataset(mixed: dict[str, Any]) -> None:
     records = json.loads((meta / "episodes.json").read_text())
     assert [Path(r["recording"]).stem for r in records] == ["1_good", "1_good", "2_gap", "2_gap"]
     assert all(len(r["source_digest"]) == 64 for r in records)
-    assert mixed["dataset"].episode(0).origin == "surrogate stand-in, not a robot"
+    assert mixed["dataset"].episode(0).origin == Origin("surrogate", "stand-in recording, not a robot")
 
 
 def test_the_named_commands_show_what_is_wrong(mixed: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,7 +89,7 @@ def test_damage_and_metadata_are_told(stand_in: tuple[Path, Any], tmp_path: Path
     found = inspect(tmp_path / "cut.mcap")
     assert "without a footer" in found.damage[0].reason
     assert "it is damaged: cut.mcap bytes" in found.faults[0]
-    assert found.metadata["taccorl"]["origin"] == "surrogate stand-in, not a robot"
+    assert found.metadata["taccorl"]["origin"] == "stand-in recording, not a robot"
     assert 0 < topic(found, FRONT).num_messages < 80
 
 

@@ -15,6 +15,7 @@ from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode
 from taccorl.data.joining import has_videos
 from taccorl.data.lerobot_format import _aggregate, _join, merge, write_episodes
+from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, load_dataset_spec
 from taccorl.errors import DatasetError
 
@@ -42,7 +43,7 @@ def episode(spec: DatasetSpec, seed: int, rows: int, instruction: str) -> Episod
     arrays = {key: rng.normal(size=(rows, 2)).astype(np.float32) for key in spec.features}
     return Episode(
         name=f"made up {seed}", spec=spec, start_ns=0, arrays=arrays, picture_keys=(), pictures=lambda: iter([{}] * rows),
-        instruction=instruction, origin="made up",
+        instruction=instruction, origin=Origin(text="made up"),
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 
 from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
+from taccorl.data.origin import Origin
 from taccorl.demos.collect import Attempt, Plan, Source, attempt, collect, collect_recordings, outcome_of
 from taccorl.demos.recorder import row_spec
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
@@ -35,7 +36,7 @@ def test_dataset_holds_successes_with_state_seed_and_subtasks(collected):
     assert dataset.num_episodes == 1
     episode = dataset.episode(0)
     assert episode.success
-    assert episode.origin == "MuJoCo twin, not a robot"
+    assert episode.origin == Origin("twin", "MuJoCo twin, not a robot")
     assert episode.arrays["sim.success"][-1, 0] == 1
     assert episode.arrays["sim.state"].dtype == np.float64
     assert len(set(episode.arrays["sim.seed"][:, 0])) == 1
@@ -267,7 +268,7 @@ def test_a_recording_of_the_twin_is_ingested_with_its_touch(tmp_path):
     code = cli(["ingest", str(path), "--spec=piper_flexitac_mcap", f"--out={out}", f"--store={tmp_path / 'store'}"])
     assert code == 0
     episode = Dataset(out).episode(0)
-    assert "surrogate" in episode.origin
+    assert episode.origin == Origin("surrogate", "recording of the MuJoCo twin, not a robot")
     assert episode.success
     assert episode.arrays["observation.tactile"].max() > 45
     assert cli(["check", str(out)]) == 0

@@ -324,7 +324,7 @@ def test_the_dataset_holds_the_experts_rows_and_says_from_where(corrected: tuple
         made = simulation["correction"]
         assert made["takeover_step"] == entry["takeover_step"] < entry["policy_steps"]
         assert made["scene_seed"] == its.scene_seeds[i] and made["policy_digest"] == its.policy_digest
-        assert "twin, not a robot" in episode.origin and episode.success
+        assert episode.origin.domain == "twin" and "not a robot" in episode.origin.text and episode.success
         acted = read_policy_episode(folder / "acted", i)
         assert np.array_equal(episode.arrays["observation.state"][0], acted.states[made["takeover_step"]])
         assert len(episode.arrays["action"]) == entry["rows"]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from taccorl.data.origin import Origin
 from taccorl.demos.collect import ExpertSource, Plan, attempt, outcome_of
 from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.sim.task import HOLD_S
@@ -87,5 +88,5 @@ def test_subtask_labels_rise_one_at_a_time_and_become_stages(recorded):
 
 def test_everything_says_that_it_is_no_robot(recorded):
     *_, episode = recorded
-    assert "not a robot" in episode.origin
+    assert episode.origin == Origin("twin", "MuJoCo twin, not a robot")
     assert episode.provenance["simulation"]["seed"] == episode.arrays["sim.seed"][0, 0]

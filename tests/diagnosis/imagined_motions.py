@@ -8,6 +8,7 @@ from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import RATE_HZ, Motion, Room, chirp
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.experiment_design.excitation import imagined, rest_pose, room_of
 from taccorl.sim.twin import TwinConfig
 
@@ -76,6 +77,6 @@ def recorded(
         effort=efforts,
         gain_scale=scale,
         repeat_of=motion.repeat_of,
-        origin="simulated by the joint model, not a robot",
+        origin=Origin("twin", "simulated by the joint model, not a robot"),
         **gains,
     )

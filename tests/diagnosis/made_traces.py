@@ -5,11 +5,12 @@ from typing import Any
 import numpy as np
 
 from taccorl.alignment.measurements.noise_floor import Estimate, SignalFloor
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.result import Comparison, Trace
 
 RATE_HZ = 200.0
 FLOOR_RAD = 2e-4
-ORIGIN = "made by arithmetic, not a robot"
+ORIGIN = Origin(text="made by arithmetic, not a robot")
 
 
 def floor(value: float = FLOOR_RAD, kind: str = "position", *, lower_bound: bool = False) -> SignalFloor:

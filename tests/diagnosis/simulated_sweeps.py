@@ -9,6 +9,7 @@ import yaml
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.data.origin import Origin
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import make_effect
@@ -18,7 +19,7 @@ from taccorl.sim.twin import TwinConfig
 
 RATE_HZ = 200.0
 NOISE_RAD = 2e-4
-ORIGIN = "simulated by the twin with effects known to the test, not a robot"
+ORIGIN = Origin("twin", "simulated by the twin with effects known to the test, not a robot")
 SIGNAL = "left_joint5"
 
 

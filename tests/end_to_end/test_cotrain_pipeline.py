@@ -9,9 +9,10 @@ import pytest
 
 from pipelines import cotrain
 from taccorl.data.dataset import Dataset
+from taccorl.data.origin import Origin
 
 ROOT = Path(__file__).parents[2]
-TWIN = "MuJoCo twin, not a robot"
+TWIN = Origin("twin", "MuJoCo twin, not a robot")
 
 
 @pytest.mark.slow
@@ -27,7 +28,7 @@ def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(
 
     both = Dataset(out / "surrogate_7_and_twin")
     origins = [both.episode(k).origin for k in range(both.num_episodes)]
-    assert len(origins) == 3 and "surrogate" in origins[0] and origins[1:] == [TWIN, TWIN]
+    assert len(origins) == 3 and origins[0].domain == "surrogate" and origins[1:] == [TWIN, TWIN]
     assert both.spec.action_time == "next_row"
     real = Dataset(out / "surrogate_7")
     assert real.provenance is not None and real.provenance["stage"] == "dataset"  # through recordings and ingest

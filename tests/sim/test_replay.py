@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from taccorl.data.episode import Episode
+from taccorl.data.origin import Origin
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -63,12 +64,12 @@ def test_a_measured_episode_is_replayed_row_by_row(bench):
         action.append(measured.targets[0].astype(np.float32))
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     arrays = {"observation.state": np.array(state), "action": np.array(action)}
-    episode = Episode("run 1", spec, 0, arrays, lambda: iter(()), (), "sweep", origin="surrogate")
+    episode = Episode("run 1", spec, 0, arrays, lambda: iter(()), (), "sweep", origin=Origin("surrogate", "stand-in"))
     twin = replay_episode(bench, episode)
     np.testing.assert_array_equal(twin.arrays["action"], episode.arrays["action"])
     assert twin.arrays["observation.state"].shape == (45, 14)
     assert twin.arrays["observation.tactile"].shape == (45, 1536)
-    assert "twin replay of: surrogate" in twin.origin
+    assert twin.origin == Origin("twin", "replay of: stand-in")
     residual = np.abs(twin.arrays["observation.state"] - episode.arrays["observation.state"]).max()
     same = replay_episode(sticky(), episode)
     assert residual > 3e-4

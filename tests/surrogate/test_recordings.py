@@ -107,7 +107,7 @@ def test_recordings_are_divided_and_hold_what_readers_want(measurements):
     assert by_name["chirp_payload"].payload_kg == {"right": KNOWN_KG}
     for m in measurements.all:
         assert m.rate_hz == 200
-        assert "not a robot" in m.origin
+        assert m.origin.domain == "surrogate" and "not a robot" in m.origin.text
         assert np.isfinite(m.measured).all() and m.has_effort()[m.column("right_joint5")]
 
 

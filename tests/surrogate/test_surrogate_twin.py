@@ -25,7 +25,7 @@ def test_a_secret_is_one_robot_and_another_secret_another(tmp_path: Path) -> Non
 
 
 def test_it_says_that_it_is_a_surrogate_wherever_it_is_written_down() -> None:
-    assert "surrogate" in ORIGIN and "not a robot" in ORIGIN
+    assert "not a robot" in ORIGIN
     assert all(
         "surrogate" in effect.evidence and "secret 7" in effect.evidence for effect in draw_surrogate_twin(7).effects
     )

@@ -9,6 +9,7 @@ from tiny_dataset import IS_SIM, TOUCH, tiny_episode, tiny_spec, write_spec, wri
 
 from taccorl.data.dataset import Dataset
 from taccorl.data.lerobot_format import write_episodes
+from taccorl.data.origin import Origin
 from taccorl.data.spec import FeatureSpec
 from taccorl.errors import DatasetError, InTheWayError
 from taccorl.training.cotrain import merge_domains
@@ -27,7 +28,7 @@ def parts(tmp_path_factory):
     episode = tiny_episode(twin_spec, 21, seed=5)
     shifted = {k: v + 3 if k == "action" else v for k, v in episode.arrays.items()}
     episode = dataclasses.replace(
-        episode, arrays={**shifted, "sim.seed": np.full((21, 1), 5)}, origin="simulated: the twin"
+        episode, arrays={**shifted, "sim.seed": np.full((21, 1), 5)}, origin=Origin("twin", "simulated: the twin")
     )
     write_episodes([episode], folder / "twin")
     write_spec(folder / "twin", twin_spec)

@@ -10,6 +10,7 @@ import numpy as np
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json
 from taccorl.data.episode import Episode, Pictures
 from taccorl.data.lerobot_format import write_episodes
+from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec, data_specs_folder, load_dataset_spec
 
 TOUCH, IS_SIM = "observation.tactile", "observation.is_sim"
@@ -56,7 +57,7 @@ def tiny_episode(spec: DatasetSpec, num_rows: int, seed: int, is_sim: float = 0.
         pictures=pictures if cameras else lambda: iter([{}] * num_rows),
         picture_keys=cameras,
         instruction="insert the plug",
-        origin="surrogate: random numbers, not a robot",
+        origin=Origin("surrogate", "random numbers, not a robot"),
     )
 
 

@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
+from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
 
 os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder is talkative
-ORIGIN = "surrogate: made by tests/views, not a robot"
+ORIGIN = Origin("surrogate", "made by tests/views, not a robot")
 TOUCH = "observation.tactile"
 HOME_RAD = np.array([0.0, 1.35, -1.30, 0.0, 0.85, 0.0])
 CAMERA_COLORS = {"front": (230, 150, 60), "left_wrist": (70, 190, 130), "right_wrist": (80, 130, 240)}

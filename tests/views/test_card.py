@@ -52,8 +52,8 @@ def test_card_states_size_units_origin_and_checks(dataset: Path):
     read = Dataset(dataset)
     rows = sum(read.num_rows(i) for i in range(2))
     assert f"2 episodes, {rows} rows at 30 a second, {rows / 30 / 60:.1f} minutes; outcomes: 2 success" in text
-    assert "**Origin: surrogate stand-in, not a robot**" in text
-    assert "| surrogate stand-in, not a robot | 2 |" in text
+    assert "**Data: surrogate: stand-in recording, not a robot**" in text
+    assert "| surrogate: stand-in recording, not a robot | 2 |" in text
     assert "| `action` | float32 [14] | 6 rad, 1 m, 6 rad, 1 m | left_joint_1.pos … right_gripper.pos |" in text
     assert "flexitac_v2: 4 pads (left_a, left_b, right_a, right_b) of 32 × 12 taxels" in text
     assert "reading = counts × 0.01333 (fixed_scale)" in text
@@ -64,9 +64,9 @@ def test_card_states_size_units_origin_and_checks(dataset: Path):
 def test_origin_that_nobody_stated_stays_unstated(copy: Path):
     path = without_card(copy) / "meta/taccorl/episodes.json"
     records = json.loads(path.read_text())
-    path.write_text(json.dumps([record | {"origin": ""} for record in records]))
+    path.write_text(json.dumps([record | {"origin": "", "domain": None} for record in records]))
     text = (write_card(copy) or Path()).read_text()
-    assert "**Origin: not stated by the recording**" in text
+    assert "**Data: origin not stated**" in text
     assert yaml.safe_load(text.split("---")[1])["tags"] == ["LeRobot", "taccorl", "tactile", "bi_piper_flexitac"]
 
 

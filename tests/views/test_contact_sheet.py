@@ -101,7 +101,7 @@ def test_origin_stands_on_the_sheet_and_inside_the_file(sheet):
     badge = (pixels[100:130, :400] == ORIGIN_COLOR).all(axis=2)
     assert badge.sum() > 3000
     with Image.open(path) as image:
-        assert image.info["Source"] == ORIGIN
+        assert image.info["Source"] == str(ORIGIN)
         assert image.info["Software"] == "taccorl view"
 
 

@@ -10,6 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from taccorl.data.episode import Episode
+from taccorl.data.origin import UNSTATED
 from taccorl.data.spec import FeatureSpec
 from taccorl.views.blueprint import episode_blueprint
 from taccorl.views.episode import save_episode
@@ -154,7 +155,7 @@ def test_av1_stays_video_for_the_rerun_program(in_file: Episode, tmp_path: Path,
 
 def test_page_says_origin_sensor_scheme_baseline_and_timing(from_recording: Logged):
     text = from_recording["/provenance"]["TextDocument:text"].values[0][0]
-    assert text.startswith(f"**origin: {ORIGIN}**")
+    assert text.startswith(f"**data: {ORIGIN}**")
     for words in (
         "instruction: *put the test tube into the rack*",
         "outcome: success",
@@ -191,7 +192,7 @@ VIEWS = {
 
 def test_blueprint_has_a_view_for_everything_and_says_surrogate(episode: Episode):
     assert set(view_regions(episode_blueprint(episode))) == VIEWS
-    assert "surrogate" in ORIGIN
+    assert "surrogate" in str(ORIGIN)
 
 
 def views(part: object) -> list[rrb.View]:
@@ -227,7 +228,7 @@ def test_episode_with_one_camera_shows_one(episode: Episode, tmp_path: Path):
 
 def test_episode_of_numbers_only_opens(episode: Episode, tmp_path: Path):
     bare = without(episode, TOUCH, *episode.picture_keys)
-    bare = dataclasses.replace(bare, stages=(), success=None, origin="", timing=(), instruction="")
+    bare = dataclasses.replace(bare, stages=(), success=None, origin=UNSTATED, timing=(), instruction="")
     names = assert_no_view_is_empty(bare, tmp_path)
     assert "provenance" in names
     assert not any("outcome" in name for name in names)

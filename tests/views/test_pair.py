@@ -11,6 +11,7 @@ import pytest
 import rerun.blueprint as rrb
 
 from taccorl.data.episode import Episode
+from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError
 from taccorl.views.colors import PAIR_COLORS
 from taccorl.views.pair import Align, Pair, page_of
@@ -24,7 +25,7 @@ from .regions import contents
 from .test_episode_in_rerun import views
 from .test_screenshot import TABLE, needs_vulkan, share
 
-TWIN = "MuJoCo twin, not a robot"
+TWIN = Origin("twin", "MuJoCo twin, not a robot")
 Logged = dict[str, dict[str, Column]]
 
 
@@ -151,7 +152,7 @@ def test_what_one_lacks_is_said_and_the_rest_is_shown_together(tmp_path: Path):
         "only in B: curves left_joint_1 [deg]",
     ):
         assert words in page, words
-    assert ORIGIN in page and TWIN in page and "first contact at" in page and "no touch" in page
+    assert str(ORIGIN) in page and str(TWIN) in page and "first contact at" in page and "no touch" in page
 
 
 def test_pads_of_another_layout_are_not_subtracted(tmp_path: Path):

@@ -77,7 +77,7 @@ def test_the_rerun_program_draws_every_view(episode: Episode, tmp_path: Path):
     assert screenshot(episode, png) == "the Rerun program"
     assert_every_view_shows_its_things(png, episode)
     with Image.open(png) as image:
-        assert image.info["Source"] == ORIGIN
+        assert image.info["Source"] == str(ORIGIN)
 
 
 @needs_vulkan

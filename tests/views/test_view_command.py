@@ -47,7 +47,7 @@ def test_dataset_becomes_an_rrd_with_its_own_numbers_and_videos(dataset: Path, t
     pad = episode.pads("observation.tactile")["left_a"]
     assert np.array_equal(shown.reshape(pad.shape), np.clip(pad, 0, 255))
     page = found["/provenance"]["TextDocument:text"].values[0][0]
-    assert page.startswith("**origin: surrogate stand-in, not a robot**")
+    assert page.startswith("**data: surrogate: stand-in recording, not a robot**")
     assert "| left_a | asof |" in page
 
 

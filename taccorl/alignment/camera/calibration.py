@@ -35,6 +35,7 @@ from taccorl.alignment.camera.fit import (
 from taccorl.alignment.camera.interval import Covariance, covariance
 from taccorl.alignment.camera.overlay import overlay
 from taccorl.alignment.camera.view import TwinView, as_offset
+from taccorl.data.origin import UNSTATED, Origin
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.cameras import CameraConfig
@@ -67,8 +68,8 @@ class CameraFrames:
     overlays."""
     name: str = "pictures"
     """Name of the episode, for messages."""
-    origin: str = ""
-    """Origin of the pictures, such as "surrogate …"."""
+    origin: Origin = UNSTATED
+    """Origin of the pictures."""
 
     def __post_init__(self) -> None:
         if self.pictures.ndim != 4 or self.pictures.shape[-1] != 3 or self.pictures.dtype != np.uint8:
@@ -136,7 +137,7 @@ class CameraFit:
     num_frames: int
     num_held_out: int
     name: str
-    origin: str
+    origin: Origin
 
     @property
     def converged(self) -> bool:

@@ -6,13 +6,14 @@ import numpy as np
 from taccorl.alignment.camera.edges import twin_edges
 from taccorl.alignment.camera.fit import pixels_of
 from taccorl.alignment.camera.view import TwinView
+from taccorl.data.origin import Origin
 
 BEFORE_RGB, AFTER_RGB = (230, 60, 50), (40, 200, 90)
 _STRIP = 22  # rows for a panel's title
 
 
 def overlay(
-    view: TwinView, picture: np.ndarray, joints: np.ndarray, before: np.ndarray, after: np.ndarray, origin: str = ""
+    view: TwinView, picture: np.ndarray, joints: np.ndarray, before: np.ndarray, after: np.ndarray, origin: Origin
 ) -> np.ndarray:
     """Picture with four panels side by side: the picture; the twin after the calibration; the picture with the twin's outlines
     before, and after.
@@ -21,9 +22,9 @@ def overlay(
         picture: (rows, columns, 3) uint8 RGB without bars.
         joints: (14,) rad, m.
         before, after: poses (6,).
-        origin: origin of the picture; "surrogate …" is written above it.
+        origin: of the picture; its domain is written above it.
     """
-    kind = "picture" if not origin else "surrogate picture" if "surrogate" in origin else "picture"
+    kind = f"{origin.domain} picture" if origin.domain else "picture"
     panels = [(kind, picture), ("twin, after", view.picture(joints, after))]
     for title, pose, color in (("before", before, BEFORE_RGB), ("after", after, AFTER_RGB)):
         panels.append((f"outlines {title}", _drawn_over(view, picture, joints, pose, color)))

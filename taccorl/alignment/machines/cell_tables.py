@@ -26,6 +26,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.tables import SEPARATORS, TIME_S, Column, read_columns
 from taccorl.data.finding import Finding
+from taccorl.data.origin import Domain, stated_origin
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
 
@@ -70,8 +71,10 @@ class CellTableSpec:
     temperature: TemperatureColumn | None = None
     separator: str = "comma"
     """Separator of CSV files: comma, semicolon or tab."""
+    domain: Domain | None = None
+    """``real``: a robot or device made the file. ``surrogate``: a simulation in its place. None: not stated."""
     origin: str = ""
-    """Origin of the file, such as "simulated …"."""
+    """Description of what made the file."""
 
 
 def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
@@ -195,7 +198,7 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
         units=(config.reading.unit,) * config.num_cells,
         quantum=np.array([find_quantum(column) for column in reading.T]),
         source=path,
-        origin=spec.origin,
+        origin=stated_origin(spec.domain, spec.origin),
         start_ns=round(time_s[0] * 1e9),
         temperature_c=columns[spec.temperature.column] if spec.temperature else np.empty(0),
     )

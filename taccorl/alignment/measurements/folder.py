@@ -34,6 +34,7 @@ from taccorl.alignment.measurements.pressed import PressedObject, indenter
 from taccorl.alignment.measurements.recorded import read_recording
 from taccorl.alignment.measurements.tables import SUFFIXES, TableSpec, load_table_spec, read_table
 from taccorl.data.decode import natural_key
+from taccorl.data.origin import Domain
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_recording_specs
 from taccorl.data.strict_yaml import Document
@@ -113,6 +114,8 @@ class MeasurementIndex:
 
     spec: str | None = None
     columns: str | None = None
+    domain: Domain | None = None
+    """Domain of all recordings that state none, such as ``real``."""
     validation_every: int = 0
     """Every k-th motion is for validation; 0: only recordings that are named."""
     recordings: dict[str, RecordingNote] = field(default_factory=dict)
@@ -368,6 +371,7 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
         noted.append(
             dataclasses.replace(
                 m,
+                origin=m.origin.agreed(index.domain, f"{folder / INDEX}: {m.name}"),
                 repeat_of=repeat_of,
                 kp=m.kp | note.kp,
                 kd=m.kd | note.kd,

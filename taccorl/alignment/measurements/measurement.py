@@ -18,6 +18,7 @@ import numpy as np
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
+from taccorl.data.origin import UNSTATED, Origin
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
@@ -88,8 +89,8 @@ class Measurement:
     touch: Touch | None = None
     source: Path = Path()
     """File or dataset from which it was read."""
-    origin: str = ""
-    """Origin, such as "surrogate recording …"; empty if the file states none."""
+    origin: Origin = UNSTATED
+    """Origin as the file states it."""
     instruction: str = ""
     start_ns: int = 0
     """Time of row 0 on the recording's clock [ns]."""

@@ -21,6 +21,7 @@ from taccorl.data.arms import ACTION, STATE
 from taccorl.data.cutting import Cutter, Unfit
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
+from taccorl.data.origin import Origin
 from taccorl.data.recording import Recording, Source, opened, readers
 from taccorl.data.spec import DatasetSpec, EpisodesSpec, InstructionSpec, RecordingSpec
 from taccorl.data.timing import NS_PER_S
@@ -150,7 +151,7 @@ def _cutter(recording: Recording, found: list[Finding]) -> Cutter:
 class _Notes:
     """What is written down in a recording besides its channels: metadata records of any name, with these keys."""
 
-    origin: str
+    origin: Origin
     instruction: str
     repeat_of: str | None
     numbers: dict[str, dict[str, float]]
@@ -181,7 +182,7 @@ class _Notes:
                 f"{recording.source.name}: metadata payload_position_m is {written['payload_position_m']!r}, not like "
                 '{"left": [0, 0, 0.168]}'
             ) from error
-        return cls(written.get("origin", ""), told, written.get("repeat_of") or None, numbers, places)
+        return cls(recording.origin, told, written.get("repeat_of") or None, numbers, places)
 
 
 class _Rows:

@@ -30,6 +30,7 @@ import scipy.io
 from taccorl.alignment.measurements.even_rows import even_rows
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind, unit_of
 from taccorl.alignment.measurements.quantisation import find_quantum
+from taccorl.data.origin import Domain, stated_origin
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
 from taccorl.robots import ROBOT
@@ -117,8 +118,10 @@ class TableSpec:
     target_rows_late: int = 0
     """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
     −1 if it holds that of row k + 1."""
+    domain: Domain | None = None
+    """``real``: a robot or device made the file. ``surrogate``: a simulation in its place. None: not stated."""
     origin: str = ""
-    """Origin of the file, such as "surrogate …"."""
+    """Description of what made the file."""
     instruction: str = ""
 
 
@@ -327,7 +330,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         target_kinds=tuple(kinds),
         quantum=np.array([find_quantum(column) for column in values["q"].T]),
         source=path,
-        origin=spec.origin,
+        origin=stated_origin(spec.domain, spec.origin),
         instruction=spec.instruction,
         start_ns=round(start * 1e9),
     )

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.dataset import BOOKKEEPING, Dataset
+from taccorl.data.origin import labelled
 from taccorl.data.readers.hdf5 import RowClock
 from taccorl.data.recording import Message, Reader, Source, TopicType, readers
 from taccorl.data.spec import ACTION
@@ -166,7 +167,7 @@ class LerobotReader(Reader):
         if told.get("success") is not None:
             record["success"] = str(told["success"]).lower()
         if told.get("origin"):
-            record["origin"] = told["origin"]
+            record |= labelled(told["origin"])
         self.metadata["episode"] = record
 
     def _numbers(self, topics: list[str]) -> dict[str, np.ndarray]:

@@ -79,7 +79,6 @@ class AugmentPlan(attempts.AttemptPlan):
     not their results."""
     rows: Rows = "dataset"
     """Kind of output: a LeRobot dataset, or seeds and actions (``stored_actions.py``). The attempts are the same."""
-    origin: str = field(default=ORIGIN)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "task", self.spec.task)
@@ -126,7 +125,7 @@ class AugmentPlan(attempts.AttemptPlan):
 
     def config(self, k: int) -> dict[str, Any]:
         """Settings on which attempt ``k`` depends, besides the sources; not the number of attempts."""
-        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, "origin": self.origin}
+        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, "origin": ORIGIN.text}
         return canonical(self.scene_config() | own | {"root_seed": self.seed, "attempt": k})
 
 
@@ -315,7 +314,7 @@ def attempt_episode(folder: Path) -> Episode:
     told = {key: value for key, value in config.items() if key != "spec"} | {"mimicgen": entry["provenance"]}
     ended = f"{entry['outcome']}: {entry['reason']}" if entry["reason"] else entry["outcome"]
     episode = recorder.episode(f"{config['task']} attempt {entry['attempt']}, {ended}", told)
-    return dataclasses.replace(episode, origin=config["origin"], success=entry["outcome"] == "success")
+    return dataclasses.replace(episode, success=entry["outcome"] == "success")
 
 
 def _config(folder: Path) -> dict[str, Any]:
@@ -367,7 +366,6 @@ def write_execution(
     made = stored.provenance if done.is_same else stored.provenance | {DIFFERS: True}
     since = f", from step {stored.first_row}" if stored.first_row else ""
     episode = done.recorder.episode(f"{told['task']} attempt {stored.attempt}{since}", told | {kind: made})
-    episode = dataclasses.replace(episode, origin=told["origin"])
     write_episodes([episode], folder / "dataset")
     (folder / "episodes.json").write_text(json.dumps([episode_record(episode, told["sources"])]), encoding="utf-8")
 
@@ -413,7 +411,7 @@ def _attempts(plan: AugmentPlan, path: Path, digest: str) -> Attempts:
 def _report(plan: AugmentPlan, entries: list[dict[str, Any]]) -> dict[str, Any]:
     report = {
         "task": plan.task,
-        "origin": plan.origin,
+        **ORIGIN.record(),
         "attempts": len(entries),
         "outcomes": attempts.outcomes(entries),
         "episodes": attempts.successes(entries),

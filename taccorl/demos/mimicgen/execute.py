@@ -24,7 +24,7 @@ from taccorl.demos.mimicgen.augment import write_execution
 from taccorl.demos.mimicgen.execution import execute
 from taccorl.demos.mimicgen.from_dataset import simulation_told
 from taccorl.demos.mimicgen.stored_actions import StoredActions, read_stored
-from taccorl.demos.recorder import EpisodeRecorder, row_spec
+from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec
 from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
@@ -246,7 +246,7 @@ def _report(stored: StoredActions, entries: list[dict[str, Any]]) -> dict[str, A
     kept = [e for e in entries if attempts.is_success(e)]
     return {
         "task": stored.meta["task"],
-        "origin": stored.meta["origin"],
+        **ORIGIN.record(),
         "demonstrations": len(entries),
         "differs": sum(e["differs"] for e in entries),
         "dropped": attempts.outcomes([e for e in entries if not attempts.is_success(e)]),

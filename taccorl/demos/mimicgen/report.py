@@ -20,6 +20,7 @@ import taccorl
 from taccorl.demos.mimicgen.augment import AugmentPlan
 from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of, read_attempts, share_of, stratified
 from taccorl.demos.mimicgen.stratify import GIVE_UP_FAILED, GIVE_UP_YIELD
+from taccorl.demos.recorder import ORIGIN
 from taccorl.errors import TaccorlError
 from taccorl.lineage.store import Store
 
@@ -79,7 +80,7 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None)
     return {
         "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
         "task": plan.spec.task,
-        "data": plan.origin,
+        "data": str(ORIGIN),
         "difficulty": plan.difficulty,
         "twin": str(plan.twin) if plan.twin else "nominal",
         "seed": plan.seed,
@@ -154,7 +155,7 @@ def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
     title = f"{plan.spec.task}: {share.successes} new episodes out of {told['source']}"
     parts = [
         f"<h1>{html.escape(title)}</h1>",
-        f'<p class="data">{html.escape(plan.origin)}: simulated</p>',
+        f'<p class="data">{html.escape(str(ORIGIN))}</p>',
         f'<div class="verdict">Yield: {plain}{_of_which(told)}</div>',
         _table(
             ("", ""),
@@ -362,7 +363,7 @@ def coverage_figure(plan: AugmentPlan, told: dict[str, Any]) -> Any:
         Line2D([], [], ls="", marker="x", ms=5, color=_BAD, label="failure"),
     ]
     figure.suptitle(
-        f"{plan.spec.task}: draws of {len(told['draws'])} attempts ({plan.origin}: simulated)",
+        f"{plan.spec.task}: draws of {len(told['draws'])} attempts ({ORIGIN})",
         fontsize=10,
         x=0.01,
         ha="left",

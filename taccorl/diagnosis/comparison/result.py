@@ -17,6 +17,7 @@ import numpy as np
 from taccorl.alignment.measurements.folder import Use
 from taccorl.alignment.measurements.noise_floor import SignalFloor
 from taccorl.data.finding import Finding
+from taccorl.data.origin import NOT_STATED, Origin
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
@@ -28,7 +29,6 @@ BLOCK_S = 0.5
 (block bootstrap, Carlstein 1986)."""
 FELT_FLOORS = 4.0
 """A taxel is touched if it reads more than so many of its noise floors."""
-NOT_STATED = "origin not stated by the recordings"
 DRAWS = 400
 """Number of bootstrap draws: the ends of a 95 % interval then scatter by a tenth of its width."""
 
@@ -58,7 +58,7 @@ class Trace:
     touched: np.ndarray
     """(T,) bool: a pad of this arm is in contact; all False without pads."""
     floor: SignalFloor
-    origin: str
+    origin: Origin
 
     @property
     def residual(self) -> np.ndarray:
@@ -86,7 +86,7 @@ class TouchTrace:
     """(N, P, R, C) replayed readings."""
     floor: np.ndarray
     """(P, R, C) noise floor of each taxel."""
-    origin: str
+    origin: Origin
     touched: np.ndarray | None = None
     """(N, P) bool: the object is in contact with the pad, by their poses; None if that is not known."""
     unit: str = "counts"
@@ -159,7 +159,7 @@ class Comparison:
     """Data that were not compared, with the reason."""
 
     @property
-    def origins(self) -> tuple[str, ...]:
+    def origins(self) -> tuple[Origin, ...]:
         """Origins of the recordings, each once."""
         return tuple(dict.fromkeys(t.origin for t in (*self.traces, *self.touches) if t.origin))
 
@@ -288,9 +288,9 @@ def drawn_blocks(num_blocks: int) -> np.ndarray:
     return np.random.default_rng(0).multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), DRAWS).astype(float)
 
 
-def origin_words(origins: Sequence[str]) -> str:
+def origin_words(origins: Sequence[Origin]) -> str:
     """Text of the data's origin, such as ``data: surrogate …``."""
-    return "data: " + (", ".join(dict.fromkeys(origins)) or NOT_STATED)
+    return "data: " + (", ".join(dict.fromkeys(map(str, origins))) or NOT_STATED)
 
 
 def shown_unit(unit: str) -> tuple[float, str]:

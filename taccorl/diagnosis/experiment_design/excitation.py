@@ -29,6 +29,7 @@ from taccorl.alignment.measurements.motions import (
     Room,
     joint_number,
 )
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.problems.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.problems.joints import moves
 from taccorl.diagnosis.search.fit import fit, rms, stacked
@@ -216,7 +217,7 @@ def imagined(
         kp={signal: control.kp_nm_per_rad[k] * motion.gain},
         kd={signal: control.kd_nms_per_rad[k] * motion.gain},
         payload_kg={arm: motion.payload_kg} if motion.payload_kg else {},
-        origin="imagined: the twin's own answer",
+        origin=Origin("twin", "imagined: the twin's own answer"),
     )
     m.measured[:, j] += control.torque_ff_nm[k] / (control.kp_nm_per_rad[k] * motion.gain)  # where it rests
     model = JointModel(config, signal)

@@ -28,6 +28,7 @@ from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.motions import RATE_HZ, REST_POSE
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.replays import matched_contact
 from taccorl.diagnosis.experiment_design.excitation import (
     Explanation,
@@ -250,7 +251,7 @@ def imagined_press(config: TwinConfig, arm: str, press: Press) -> TouchMotion:
         measured=target.copy(),
         touch=touch,
         pressed=pressed,
-        origin="imagined: the twin's own answer",
+        origin=Origin("twin", "imagined: the twin's own answer"),
     )
     motion = touch_motion(m, config, pressed)
     counts = _said(TouchModel(config), motion)

@@ -3,6 +3,7 @@
 import html
 from collections.abc import Sequence
 
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.regimes import ALL, AT_FLOOR, RegimeError, RegimeErrors
 from taccorl.diagnosis.comparison.result import USES
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS
@@ -34,7 +35,7 @@ def diagnosis_section(
     part: str,
     d: Diagnosis,
     can_tell: Identifiability | None,
-    origins: Sequence[str],
+    origins: Sequence[Origin],
     *,
     known: Known | None = None,
     regimes: RegimeErrors | None = None,

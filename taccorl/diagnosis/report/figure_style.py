@@ -13,13 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.result import origin_words, shown, shown_unit
 
 MEASURED, BEFORE, AFTER, COMMAND, FLOOR = "#111111", "#d55e00", "#0072b2", "#7a7a7a", "#b8bec8"
 DOTS_PER_INCH = 110
 
 
-def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[str]) -> Figure:
+def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[Origin]) -> Figure:
     """Create a figure with the origin of the data in its second title line."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained", dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)

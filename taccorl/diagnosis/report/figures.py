@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import Curve, variable_unit
 from taccorl.diagnosis.comparison.localise import REGIMES, Cell, motions_of
 from taccorl.diagnosis.comparison.result import Trace, shown_unit
@@ -87,7 +88,7 @@ def _residuals(axes: Axes, twins: Sequence[tuple[Trace, str, str]]) -> None:
     axes.set_ylabel(f"residual\nmeasured − twin [{unit}]", fontsize=8)
 
 
-def heat_map_figure(cells: Sequence[Cell], origins: Sequence[str], title: str, most: float = 0.0) -> Figure:
+def heat_map_figure(cells: Sequence[Cell], origins: Sequence[Origin], title: str, most: float = 0.0) -> Figure:
     """Heat map, signal × regime, of RMSE over the noise floor. Empty cells have too few rows.
 
     Args:
@@ -102,7 +103,7 @@ def heat_map_figure(cells: Sequence[Cell], origins: Sequence[str], title: str, m
 
 
 def ratio_map(
-    cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[str], title: str, most: float = 0.0
+    cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[Origin], title: str, most: float = 0.0
 ) -> Figure:
     """Table of ratios, signal × regime, as coloured cells with their numbers."""
     signals = list(dict.fromkeys(c.signal for c in cells))

@@ -9,6 +9,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from scipy.stats import binomtest
 
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.report.figure_style import AFTER, BEFORE, FLOOR, legend, new_figure, tidy
 from taccorl.diagnosis.search.result import SearchConfig
 
@@ -25,7 +26,7 @@ class Step:
 
 
 def waterfall(
-    steps: Sequence[Step], origins: Sequence[str], title: str, goal: float = SearchConfig().stop_at
+    steps: Sequence[Step], origins: Sequence[Origin], title: str, goal: float = SearchConfig().stop_at
 ) -> Figure:
     """Waterfall figure: validation error after each added effect, down to the noise floor.
 
@@ -65,7 +66,7 @@ def waterfall(
     return figure
 
 
-def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[str], title: str) -> Figure:
+def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[Origin], title: str) -> Figure:
     """Confusion matrix: hidden effect × named effect. Rows add up to the number of seeds.
 
     Args:
@@ -123,7 +124,7 @@ def half_detected(signals: np.ndarray, found: np.ndarray, slope: float = SLOPE) 
 
 
 def detection_curves(
-    points: Mapping[str, tuple[np.ndarray, np.ndarray]], origins: Sequence[str], title: str, edges: Sequence[float]
+    points: Mapping[str, tuple[np.ndarray, np.ndarray]], origins: Sequence[Origin], title: str, edges: Sequence[float]
 ) -> Figure:
     """Detection curves, one panel per effect: share of seeds that found it over signal-to-noise, with 95 % Wilson intervals.
 

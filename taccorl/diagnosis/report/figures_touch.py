@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.localise import Cell
 from taccorl.diagnosis.comparison.localise_touch import EVERYWHERE
 from taccorl.diagnosis.comparison.result import FELT_FLOORS, TouchTrace
@@ -146,7 +147,7 @@ def _error_over_time(axes: Axes, before: TouchTrace, after: TouchTrace | None, p
 
 def touch_heat_map_figure(
     cells: Sequence[Cell],
-    origins: Sequence[str],
+    origins: Sequence[Origin],
     title: str = "pads: where the twin is off (RMSE / noise floor)",
     most: float = 0.0,
 ) -> Figure:
@@ -156,5 +157,5 @@ def touch_heat_map_figure(
     return ratio_map(cells, regimes, origins, title, most)
 
 
-def _origins(traces: Sequence[TouchTrace]) -> list[str]:
+def _origins(traces: Sequence[TouchTrace]) -> list[Origin]:
     return list(dict.fromkeys(t.origin for t in traces))

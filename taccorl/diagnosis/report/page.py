@@ -4,6 +4,7 @@ import html
 from collections.abc import Iterable, Sequence
 
 import taccorl
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell, worst_regime
 from taccorl.diagnosis.comparison.result import Comparison, Kind, Score, Trace, origin_words, shown, shown_unit
@@ -175,7 +176,7 @@ def _where(report: Report) -> list[str]:
     return found
 
 
-def _heat_map(cells: Sequence[Cell], kind: str, twin: str, origins: Sequence[str], most: float) -> str:
+def _heat_map(cells: Sequence[Cell], kind: str, twin: str, origins: Sequence[Origin], most: float) -> str:
     """With colours up to ``most`` floors, the same for maps that are compared."""
     if kind == "touch":
         title = f"touch: where the {twin} is off (RMSE / noise floor)"

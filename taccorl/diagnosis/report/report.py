@@ -10,6 +10,7 @@ import numpy as np
 
 import taccorl
 from taccorl.data.finding import Finding
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell, heat_map
 from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
@@ -52,7 +53,7 @@ class Report:
     """Origin of the report, by name: the command, the twin's file, digests."""
 
     @property
-    def origins(self) -> tuple[str, ...]:
+    def origins(self) -> tuple[Origin, ...]:
         return self.comparison.origins
 
     @property
@@ -114,7 +115,8 @@ def as_json(report: Report) -> dict[str, Any]:
     return {
         "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
         "title": report.title,
-        "data": list(report.origins),
+        "data": [str(origin) for origin in report.origins],
+        "domains": sorted({origin.domain or "not stated" for origin in report.origins}),
         "provenance": dict(report.provenance),
         "twin": {"name": c.twin, "effects": list(c.effects)},
         "mended_twin": None if after is None else {"name": after.twin, "effects": list(after.effects)},

@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from taccorl.data.origin import Origin, labelled
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.surrogate.stand_in.config import (
@@ -58,7 +59,7 @@ __all__ = [
     "write_mcap",
 ]
 
-SURROGATE = "surrogate stand-in, not a robot"
+ORIGIN = Origin("surrogate", "stand-in recording, not a robot")
 
 
 def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
@@ -98,7 +99,7 @@ def _label(config: StandInConfig) -> dict[str, str]:
     """The MCAP metadata record that says what this file is."""
     default = asdict(StandInConfig())
     return {
-        "origin": SURROGATE,
+        **labelled(ORIGIN),
         "seed": str(config.seed),
         "duration_s": f"{config.duration_s:g}",
         "episodes": str(config.episodes),
@@ -129,7 +130,7 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     arms["observations/qvel"][:, ROBOT.gripper_indices] = 0.0  # PiPER reports none for its grippers
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
-        file.attrs.update({"sim": False, "compress": config.hdf5_jpeg, "origin": SURROGATE})
+        file.attrs.update({"sim": False, "compress": config.hdf5_jpeg} | labelled(ORIGIN))
         for name, rows in arms.items():
             file[name] = np.roll(rows, ROBOT.num_per_arm if config.swap_arms else 0, axis=1).astype(np.float32)
         file["base_action"] = np.zeros((len(time_s), 2), np.float32)

@@ -10,6 +10,7 @@ from pipelines.benchmarks.cameras import moving_joints, pose_error
 from taccorl.alignment.camera.calibration import calibrate_camera
 from taccorl.alignment.camera.episode import camera_frames, stage_rows
 from taccorl.data.episode import Episode
+from taccorl.data.origin import Origin
 from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
@@ -31,7 +32,9 @@ def episode() -> Episode:
     recorder = EpisodeRecorder(sim, spec)
     for row in moving_joints(np.random.default_rng(0), np.arange(120) / 30):
         recorder.step(row)
-    return dataclasses.replace(recorder.episode("four seconds", {}), origin="surrogate: a twin whose camera is off")
+    return dataclasses.replace(
+        recorder.episode("four seconds", {}), origin=Origin("surrogate", "a twin whose camera is off")
+    )
 
 
 @pytest.mark.slow
@@ -45,7 +48,7 @@ def test_a_camera_is_calibrated_from_an_episode():
     assert angle_deg < 0.3
     assert distance_mm < 4
     assert set(fit.overlays) == set(frames.stages)
-    assert fit.origin == "surrogate: a twin whose camera is off"
+    assert fit.origin == Origin("surrogate", "a twin whose camera is off")
 
 
 def test_frames_are_slow_rows_and_differ():

@@ -21,6 +21,7 @@ from taccorl.alignment.measurements.recorded import read_recording, signal_names
 from taccorl.alignment.measurements.tables import read_table
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record
 from taccorl.data.episode import ChannelTiming, Episode
+from taccorl.data.origin import Origin
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import find_spec, load_dataset_spec, load_recording_spec
 from taccorl.demos.recorder import EpisodeRecorder, row_spec
@@ -116,7 +117,7 @@ def test_mcap_is_read_at_the_command_s_own_200_hz(recorded, moved):
     assert recorded.rate_hz == 200.0
     assert recorded.signals == ROBOT.action_names
     assert recorded.instruction == NO_LOSS.instruction  # of the first start marker
-    assert recorded.origin == "surrogate recording"
+    assert recorded.origin == Origin("surrogate", "surrogate recording", derived=True)
     assert recorded.time_s[-1] > SECONDS + LEAD_S  # rests included
     rows, samples = truth_rows(recorded, moved.trajectory)
     assert len(rows) == len(moved.trajectory.time_s)

@@ -17,6 +17,7 @@ from taccorl.data.dataset import Dataset, dataset_spec_to_json, episode_record
 from taccorl.data.draft import draft_specs
 from taccorl.data.episode import Episode
 from taccorl.data.inspection import inspect_source
+from taccorl.data.origin import Origin
 from taccorl.data.recording import find_sources, opened, readers
 from taccorl.data.spec import RecordingSpec, data_specs_folder, load_dataset_spec, load_recording_spec
 from taccorl.errors import DatasetError, RecordingError
@@ -60,7 +61,7 @@ def made_episode(index: int) -> Episode:
         picture_keys=tuple(f"observation.images.{c}" for c in CAMERAS),
         instruction=INSTRUCTIONS[index],
         success=index == 0,
-        origin="made in a test",
+        origin=Origin(text="made in a test"),
         baselines={"observation.tactile": BASELINE},
     )
 
@@ -155,7 +156,7 @@ def test_a_taccorl_dataset_comes_back_row_for_row_through_its_recording_spec(our
         assert np.array_equal(episode.baselines["observation.tactile"], BASELINE)
         assert episode.instruction == INSTRUCTIONS[index]
         assert episode.success is (index == 0)
-        assert episode.origin == "made in a test"
+        assert episode.origin == Origin(text="made in a test")
         for row, shown in enumerate(episode.pictures()):
             for camera in CAMERAS:
                 assert (

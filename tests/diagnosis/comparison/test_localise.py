@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from made_traces import FLOOR_RAD, RATE_HZ, alike, comparison, swing, trace
 
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.localise import REGIMES, Cell, heat_map, motions_of, worst_regime
 from taccorl.diagnosis.comparison.localise_touch import phases, touch_heat_map
@@ -163,7 +164,7 @@ def press(residual_while: str | None = None) -> TouchTrace:
         measured=measured,
         replayed=measured.copy(),
         floor=np.full((2, 32, 12), 1.3),
-        origin="made by arithmetic",
+        origin=Origin(text="made by arithmetic"),
     )
     if residual_while is not None:
         rows = phases(one, 0)[residual_while]

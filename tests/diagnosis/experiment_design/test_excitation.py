@@ -148,7 +148,7 @@ def test_an_imagined_recording_says_so_and_has_the_noise_that_was_asked_for():
     pose = rest_pose(SIGNAL, None)
     target = CHIRP.target(room_of(NOMINAL, SIGNAL, pose))
     clean, noisy = (imagined(NOMINAL, SIGNAL, pose, CHIRP, target, floor) for floor in (0.0, FLOOR_RAD))
-    assert "imagined" in noisy.origin
+    assert "imagined" in noisy.origin.text
     assert np.std(noisy.measured[:, COLUMN] - clean.measured[:, COLUMN]) == pytest.approx(FLOOR_RAD, rel=0.05)
     assert noisy.kp == {SIGNAL: 151.1}
     np.testing.assert_array_equal(noisy.target[:, COLUMN], target)

@@ -142,7 +142,7 @@ def test_fingers_that_were_too_fast_are_refused(monkeypatch: pytest.MonkeyPatch)
 def test_an_imagined_press_says_so_and_has_the_twin_s_noise():
     config = TwinConfig(sensor=FlexiTacConfig(noise_std_count=2.0))
     motion = imagined_press(config, "right", OF_NAME["rests"])
-    assert motion.pads == ("right_a", "right_b") and "imagined" in motion.measurement.origin
+    assert motion.pads == ("right_a", "right_b") and "imagined" in motion.measurement.origin.text
     quiet = motion.measured[motion.time_s[:, 0] < 9.0]
     assert np.std(quiet) == pytest.approx(np.sqrt(2.0**2 + 1 / 12), rel=0.01)
     # 0.6 mm less what the nearest taxel lies beside the top: k_n δ in counts

@@ -70,7 +70,7 @@ def test_a_robot_that_lacks_nothing_is_replayed_to_its_noise_and_a_hidden_spring
         folder = tmp_path / (hidden or "plain")
         folder.mkdir()
         comparison = load_machine(plant.robot_file(folder)).compare(made)
-        assert [t.signal for t in comparison.traces] == ["scara_2"] and comparison.origins[0].startswith("simulated")
+        assert [t.signal for t in comparison.traces] == ["scara_2"] and comparison.origins[0].domain == "surrogate"
         errors[hidden] = float(np.sqrt(np.mean(comparison.traces[0].residual ** 2)))
     assert errors[""] < 4e-4  # encoder noise of 1e-4 rad, and the drive's filter of 1 ms, which no fit has found yet
     assert errors["cable_spring"] > 10 * errors[""]

@@ -12,6 +12,7 @@ import pytest
 from taccorl.alignment.machines.axis_file import AxisConfig, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.problems.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.problem import Recording
@@ -55,7 +56,7 @@ def simulated(name: str, amplitude_m: float, hz: float, seed: int, repeat_of: st
         signals=("drive",),
         units=("m",),
         repeat_of=repeat_of,
-        origin="simulated by the test, not a drive",
+        origin=Origin("twin", "simulated by the test, not a drive"),
     )
 
 

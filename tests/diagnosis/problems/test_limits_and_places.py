@@ -13,6 +13,7 @@ from taccorl.alignment.controller.joint_kernel import Drive, simulate
 from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
@@ -65,7 +66,7 @@ def recorded(
         measured=measured[:, None],
         signals=("joint",),
         units=("rad",),
-        origin="simulated by the test, not a robot",
+        origin=Origin("twin", "simulated by the test, not a robot"),
         repeat_of=repeat_of,
     )
 
@@ -188,7 +189,7 @@ def test_lost_commands_are_no_candidate_of_a_search_and_stay_in_a_twin_that_has_
         target=home,
         measured=home + 1e-4 * np.random.default_rng(0).standard_normal(home.shape),
         signals=ROBOT.action_names,
-        origin="imagined",
+        origin=Origin("twin", "imagined"),
     )
     plain, with_drops = (
         JointProblem(TwinConfig(effects=have), "left_joint5", Measurements((m,))) for have in ([], [dropping])

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
+from taccorl.data.origin import UNSTATED
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.localise import heat_map
 from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
@@ -59,7 +60,7 @@ def test_joint_response_shows_measurement_twins_residual_floor_and_origin():
     np.testing.assert_allclose(line(residual, BEFORE), 1e3 * LEFT)  # mrad
     np.testing.assert_allclose(line(residual, AFTER), 0.1e3 * LEFT)
     text = words(figure)
-    assert ORIGIN in text and "noise floor: ± 2 × 0.2 mrad" in text
+    assert str(ORIGIN) in text and "noise floor: ± 2 × 0.2 mrad" in text
     assert "nominal: RMSE 2 mrad, 10 × floor" in text and "mended: RMSE 0.2 mrad, 1 × floor" in text
     assert "time [s]" in text and "[mrad]" in text and "[rad]" in text
     band = residual.patches[0].get_extents().transformed(residual.transData.inverted())
@@ -75,7 +76,7 @@ def test_effort_has_no_tracking_error():
 
 
 def test_unstated_origin_is_said():
-    assert "origin not stated" in words(joint_response(trace(LEFT, POSITION, origin="")))
+    assert "origin not stated" in words(joint_response(trace(LEFT, POSITION, origin=UNSTATED)))
 
 
 def test_heat_map_shows_every_cell_s_number():
@@ -182,5 +183,5 @@ def test_touch_figures(touch: TouchTrace):
     sums = touch_over_time(touch)
     np.testing.assert_allclose(line(sums.axes[0], BEFORE), touch.replayed[:, 0].sum(axis=(1, 2)))
     for figure in (histogram, maps, sums, touch_heat_map_figure(touch_heat_map([touch]), [ORIGIN])):
-        assert ORIGIN in words(figure) and "noise floor" in words(figure)
+        assert str(ORIGIN) in words(figure) and "noise floor" in words(figure)
         drawn(figure)

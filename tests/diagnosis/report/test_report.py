@@ -13,6 +13,7 @@ from made_traces import ORIGIN, comparison, swing, trace
 from simulated_sweeps import SIGNAL, friction, sweeps
 
 from taccorl.data.finding import Finding
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint
@@ -77,7 +78,7 @@ def test_numbers_are_those_of_the_comparison(tmp_path: Path):
     score = report.comparison.scores()[0]
     assert found["scores"][0]["rmse"] == score.rmse and found["scores"][0]["ratio"] == score.ratio
     assert found["scores_after"][0]["ratio"] == pytest.approx(1.0, rel=1e-3)
-    assert found["data"] == [ORIGIN]
+    assert found["data"] == [str(ORIGIN)]
     assert {c["regime"] for c in found["where"]["cells"]} >= {"after a reversal", "high speed"}
     text = Tags(written.page.read_text()).text
     assert "5 mrad" in text and "-96%" in text and "mended twin" in text
@@ -114,7 +115,8 @@ def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(w
 def test_names_from_files_are_text_and_no_html(tmp_path: Path):
     name = "<script>alert(1)</script>&.csv"
     bad = comparison(
-        trace(1e-3 * POSITION, POSITION, recording=name, origin="<b>robot</b>"), left_out=(f"touch of {name}",)
+        trace(1e-3 * POSITION, POSITION, recording=name, origin=Origin(text="<b>robot</b>")),
+        left_out=(f"touch of {name}",),
     )
     report = small(comparison=bad, findings={name: [Finding("jitter", "warning", "time", "steps < 5 ms & more")]})
     tags = Tags(write_report(report, tmp_path).page.read_text())

@@ -27,7 +27,7 @@ def test_layout_is_that_of_collect_data(written):
         assert file["base_action"].shape == (60, 2)
         assert sorted(file["observations/images"]) == ["cam_high", "cam_left_wrist", "cam_right_wrist"]
         assert (bool(file.attrs["sim"]), bool(file.attrs["compress"])) == (False, True)
-        assert file.attrs["origin"] == "surrogate stand-in, not a robot"
+        assert file.attrs["origin"] == "stand-in recording, not a robot"
 
 
 def test_action_is_the_command_of_the_next_frame(written):

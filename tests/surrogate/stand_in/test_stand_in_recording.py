@@ -37,7 +37,7 @@ def test_another_seed_gives_another_recording(tmp_path):
 def test_file_says_that_it_is_a_surrogate(record):
     with record().path.open("rb") as file:
         labels = {metadata.name: metadata.metadata for metadata in make_reader(file).iter_metadata()}
-    assert labels["taccorl"]["origin"] == "surrogate stand-in, not a robot"
+    assert labels["taccorl"]["origin"] == "stand-in recording, not a robot"
     assert labels["taccorl"]["seed"] == "0"
     assert labels["taccorl"]["instruction"] == "insert the test tube into the rack"
 

@@ -1,0 +1,122 @@
+"""Origin of data: made by a robot, by a surrogate in its place, or by the twin. Producers state it, consumers read it.
+
+A recording states it in its metadata (MCAP record, HDF5 attributes) by the keys ``domain`` and ``origin``, an episode of a
+dataset in its record of ``meta/taccorl/episodes.json``, a table in its columns file. Only the user knows that a robot made a
+recording: ``taccorl ingest --domain=real``, or ``domain: real`` in a columns file or in measurements.yaml. A statement never
+replaces another one, so that what a simulation made stays simulated.
+
+Data written before there was the key ``domain`` only have a text. Their domain is derived from it in one place, ``_derived``,
+and the label says so: ``surrogate (derived): …``.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, cast, get_args
+
+from taccorl.errors import TaccorlError, nearest
+
+Domain = Literal["real", "surrogate", "twin"]
+"""``real``: a robot. ``surrogate``: a simulated robot in place of a real one. ``twin``: the twin, or another simulation that is
+used as a simulation."""
+DOMAINS: tuple[Domain, ...] = get_args(Domain)
+NOT_STATED = "origin not stated"
+NO_ROBOT = "not a robot"
+"""Words of every text that this project writes about simulated data."""
+_FIRST_WORDS: tuple[tuple[str, Domain], ...] = (
+    ("surrogate", "surrogate"),
+    ("simulated robot (", "surrogate"),
+    ("simulated servo (", "surrogate"),
+    ("MuJoCo twin", "twin"),
+    ("twin replay of", "twin"),
+    ("imagined", "twin"),
+)
+"""First words of the texts written before there was a ``domain``."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where data come from.
+
+    Raises:
+        TaccorlError: an unknown domain, or a real one with a text that says otherwise.
+    """
+
+    domain: Domain | None = None
+    """None: not stated."""
+    text: str = ""
+    """Description for people, such as "stand-in recording, not a robot"."""
+    derived: bool = False
+    """True if the domain is not stated but derived from the text or the features."""
+
+    def __post_init__(self) -> None:
+        if self.domain is not None and self.domain not in DOMAINS:
+            raise TaccorlError(f"domain {self.domain!r} of {self.text!r}: {nearest(self.domain, DOMAINS)}")
+        if self.domain == "real" and (NO_ROBOT in self.text or _derived(self.text)):
+            raise TaccorlError(f"domain 'real' of {self.text!r}: a simulation made it, and it stays simulated")
+
+    def __bool__(self) -> bool:
+        return self.domain is not None or bool(self.text)
+
+    def __str__(self) -> str:
+        """Label in reports and figures: ``surrogate: stand-in recording, not a robot``."""
+        if self.domain is None:
+            return f"domain not stated: {self.text}" if self.text else NOT_STATED
+        words = f"{self.domain} (derived)" if self.derived else self.domain
+        return f"{words}: {self.text}" if self.text else words
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values; ``read`` is the inverse."""
+        return {"domain": self.domain, "origin": self.text} | ({"domain_derived": True} if self.derived else {})
+
+    @classmethod
+    def read(cls, record: Mapping[str, Any], features: Iterable[str] = ()) -> "Origin":
+        """Origin stated by a record with the keys ``domain`` and ``origin``; derived if it has no ``domain``.
+
+        Args:
+            features: features of the dataset; ``sim.*`` are a simulator's state.
+
+        Raises:
+            TaccorlError: an unknown domain, or a real one with a text that says otherwise.
+        """
+        text = str(record.get("origin") or "")
+        if "domain" in record:
+            return cls(cast("Domain | None", record["domain"]), text, str(record.get("domain_derived")) == "True")
+        domain = _derived(text) or ("twin" if any(key.startswith("sim.") for key in features) else None)
+        return cls(domain, text, domain is not None)
+
+    def agreed(self, domain: Domain | None, who: str) -> "Origin":
+        """With the ``domain`` that a user states, if the data state none.
+
+        Args:
+            who: where the user states it, for the error.
+
+        Raises:
+            TaccorlError: the data state another domain.
+        """
+        if domain is None or domain == self.domain:
+            return self
+        if self.domain is not None:
+            raise TaccorlError(f"{who} states domain {domain!r}, the data state {self}: leave the statement out")
+        return Origin(domain, self.text)
+
+
+UNSTATED = Origin()
+
+
+def labelled(origin: Origin) -> dict[str, str]:
+    """Record of text values for the metadata of a recording."""
+    return {key: str(value) for key, value in origin.record().items() if value is not None}
+
+
+def stated_origin(domain: Domain | None, text: str) -> Origin:
+    """Origin from a file in which a user may leave the domain out; derived then.
+
+    Raises:
+        TaccorlError: a real domain with a text that says otherwise.
+    """
+    return Origin.read({"origin": text} | ({} if domain is None else {"domain": domain}))
+
+
+def _derived(text: str) -> Domain | None:
+    """Domain of data written before there was the key ``domain``, by the first words of their text; None if these say nothing."""
+    return next((domain for words, domain in _FIRST_WORDS if text.startswith(words)), None)

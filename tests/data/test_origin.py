@@ -1,0 +1,165 @@
+"""Origin of data: stated, kept through every step, derived only for data written before there was a domain, never made real."""
+
+import json
+from pathlib import Path
+
+import h5py
+import pytest
+
+from taccorl.alignment.measurements.folder import read_measurements
+from taccorl.cli.main import main
+from taccorl.data.cutting import Cutter
+from taccorl.data.dataset import Dataset
+from taccorl.data.ingest import Job, ingest_one
+from taccorl.data.origin import Origin, stated_origin
+from taccorl.data.recording import find_sources, load_recording
+from taccorl.data.spec import load_recording_spec
+from taccorl.errors import TaccorlError
+from taccorl.surrogate.stand_in.config import StandInConfig
+from taccorl.surrogate.stand_in.files import write_cobot_magic_hdf5
+
+SPEC = "piper_flexitac_mcap"
+TABLE = "t,q,u\n" + "".join(f"{0.01 * k:.2f},{0.001 * k:.4f},{0.001 * k:.4f}\n" for k in range(50))
+COLUMNS = """
+time: {column: t, unit: s}
+signals:
+  left_joint5: {q: {column: q, unit: rad}, q_target: {column: u, unit: rad}}
+"""
+
+
+def job(path: Path, store: Path, domain: str | None, spec: str = SPEC) -> Job:
+    loaded = load_recording_spec(spec)
+    [(_, source)] = find_sources(path, reader=loaded.reader)
+    return Job(source, loaded, spec, store, dry_run=True, domain=domain)  # pyright: ignore
+
+
+# ---- the value ----
+
+
+@pytest.mark.parametrize(
+    ("text", "domain"),
+    [
+        ("surrogate stand-in, not a robot", "surrogate"),
+        ("surrogate recording from the MuJoCo twin, not a robot", "surrogate"),
+        ("simulated servo (taccorl.diagnosis.surrogate.pendulum)", "surrogate"),
+        ("MuJoCo twin, not a robot", "twin"),
+        ("twin replay of: recording_3.mcap", "twin"),
+        ("arm 2, Tuesday", None),
+    ],
+)
+def test_texts_written_before_there_was_a_domain_give_it_and_the_label_says_so(text: str, domain: str | None) -> None:
+    found = Origin.read({"origin": text})
+    assert (found.domain, found.text, found.derived) == (domain, text, domain is not None)
+    assert ("(derived)" in str(found)) == found.derived
+
+
+def test_a_simulator_s_columns_are_of_the_twin_where_nothing_is_stated() -> None:
+    assert Origin.read({}, ["action", "sim.state"]) == Origin("twin", "", derived=True)
+    assert Origin.read({}, ["action"]) == Origin()
+    assert Origin.read({"domain": None, "origin": ""}, ["sim.state"]) == Origin()  # stated: not known
+
+
+def test_what_is_stated_is_read_back_as_it_was_and_no_text_overrules_it() -> None:
+    for origin in (
+        Origin("real", "arm 2"),
+        Origin("surrogate", "MuJoCo twin"),
+        Origin("twin", "x", derived=True),
+        Origin(),
+    ):
+        assert Origin.read(json.loads(json.dumps(origin.record()))) == origin
+
+
+def test_an_unknown_domain_is_refused_with_its_value() -> None:
+    with pytest.raises(TaccorlError, match=r"'reel'.*real"):
+        Origin.read({"domain": "reel"})
+
+
+@pytest.mark.parametrize("text", ["stand-in recording, not a robot", "surrogate: anything", "MuJoCo twin"])
+def test_no_text_of_a_simulation_goes_with_real(text: str) -> None:
+    with pytest.raises(TaccorlError, match="stays simulated"):
+        Origin("real", text)
+    with pytest.raises(TaccorlError, match="stays simulated"):
+        stated_origin("real", text)
+
+
+# ---- a stand-in never becomes real ----
+
+
+def test_a_stand_in_cannot_be_ingested_as_real(recordings: Path, tmp_path: Path) -> None:
+    [first, *_] = sorted(recordings.glob("*.mcap"))
+    for domain in ("real", "twin"):
+        entry = ingest_one(job(first, tmp_path, domain))
+        assert entry["outcome"] == "refused"
+        assert domain in entry["reason"] and "surrogate: stand-in recording" in entry["reason"]
+    hdf5 = tmp_path / "episode_0.hdf5"
+    write_cobot_magic_hdf5(hdf5, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
+    assert ingest_one(job(hdf5, tmp_path, "real", "cobot_magic_hdf5"))["outcome"] == "refused"
+
+
+def test_a_stand_in_with_an_edited_label_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "episode_0.hdf5"
+    write_cobot_magic_hdf5(path, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
+    with h5py.File(path, "a") as file:
+        assert file.attrs["domain"] == "surrogate"
+        file.attrs["domain"] = "real"
+    entry = ingest_one(job(path, tmp_path, None, "cobot_magic_hdf5"))
+    assert entry["outcome"] == "refused" and "stays simulated" in entry["reason"]
+
+
+def test_a_dataset_of_a_stand_in_keeps_its_domain_through_another_ingest(dataset: Path, tmp_path: Path) -> None:
+    assert {Dataset(dataset).told(k)["origin"].domain for k in (0, 1)} == {"surrogate"}
+    spec = load_recording_spec("taccorl_lerobot")
+    source = find_sources(dataset, reader=spec.reader)[0][1]
+    assert load_recording(source, spec, tmp_path).origin == Origin("surrogate", "stand-in recording, not a robot")
+
+
+def test_a_folder_of_stand_ins_cannot_be_stated_real_for_compare(recordings: Path, tmp_path: Path) -> None:
+    for path in recordings.glob("*.mcap"):
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "measurements.yaml").write_text("domain: real\n")
+    with pytest.raises(TaccorlError, match=r"measurements\.yaml.*'real'.*surrogate"):
+        read_measurements(tmp_path, spec=SPEC)
+
+
+# ---- what is a robot's ----
+
+
+def test_a_recording_that_states_nothing_is_real_only_if_its_user_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "episode_0.hdf5"
+    write_cobot_magic_hdf5(path, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
+    with h5py.File(path, "a") as file:  # as a robot's recorder leaves it
+        del file.attrs["domain"], file.attrs["origin"]
+    spec = load_recording_spec("cobot_magic_hdf5")
+    recording = load_recording(find_sources(path, reader=spec.reader)[0][1], spec, tmp_path)
+    assert Cutter(recording).cut().episodes[0].origin == Origin()
+    assert Cutter(recording, "real").cut().episodes[0].origin == Origin("real")
+
+
+def test_a_table_s_user_states_its_domain_in_the_columns_file_or_for_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text(TABLE)
+    for columns, index, expected in (
+        ("", "", Origin()),
+        ("domain: real\norigin: bench 4\n", "", Origin("real", "bench 4")),
+        ("origin: bench 4\n", "domain: real\n", Origin("real", "bench 4")),
+        ("origin: simulated servo (made up)\n", "", Origin("surrogate", "simulated servo (made up)", derived=True)),
+    ):
+        (tmp_path / "columns.yaml").write_text(COLUMNS + columns)
+        (tmp_path / "measurements.yaml").write_text("columns: columns.yaml\n" + index)
+        assert [m.origin for m in read_measurements(tmp_path).all] == [expected]
+
+
+def test_check_says_that_a_domain_was_derived(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import shutil
+
+    old = tmp_path / "old"
+    shutil.copytree(dataset, old)
+    path = old / "meta/taccorl/episodes.json"
+    records = json.loads(path.read_text())
+    path.write_text(
+        json.dumps([{k: v for k, v in r.items() if k != "domain"} | {"origin": "surrogate stand-in"} for r in records])
+    )
+    assert Dataset(old).episode(0).origin == Origin("surrogate", "surrogate stand-in", derived=True)
+    main(["check", str(old), "--quick=true", "--pictures=false"])
+    assert "surrogate (derived): surrogate stand-in" in " ".join(capsys.readouterr().out.split())
