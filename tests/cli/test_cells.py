@@ -240,7 +240,7 @@ def test_a_columns_file_gives_other_names_and_units(tmp_path: Path, said) -> Non
         for folder, more in (("ours", []), ("theirs", ["--columns=columns.yaml"]))
     )
     assert ours[0] == theirs[0] == 0
-    assert "data: a test" in theirs[1]
+    assert "data: domain not stated: a test" in theirs[1]
     one, other = (
         next(line.split()[3] for line in shown.splitlines() if "touch" in line) for _, shown in (ours, theirs)
     )
