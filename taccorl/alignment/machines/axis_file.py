@@ -62,6 +62,9 @@ class AxisConfig(DriveLaw):
     unit: Literal["rad", "m"]
     inertia: float
     """Inertia about the axis [kg·m²], at which a fit starts."""
+    gains: Literal["commanded", "fitted"] = "commanded"
+    """``commanded``: the drive runs kp and kd. ``fitted``: nobody knows them, they are the start of a fit, which without efforts
+    leaves ``inertia`` as it is, because positions determine ratios only. Not for law pwm, whose motor is fitted."""
     rotor_inertia: float = 0.0
     """Share of ``inertia`` on the motor's side of the gear [kg·m²]; without it the search does not consider play and
     compliance."""
@@ -106,6 +109,8 @@ class AxisConfig(DriveLaw):
         optional = ("loop_hz", "command_hz", "force_unit_n", "length_unit_m")
         check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
         self.check_law("axis")
+        if self.gains == "fitted" and not (self.gain_names and self.law != "pwm"):
+            raise TaccorlError(f"axis.gains: law {self.law} has no gains that are fitted; remove it")
         if self.limits is not None and not self.limits[0] < self.limits[1]:
             raise TaccorlError(f"axis.limits: {list(self.limits)} must rise; write the lowest position first")
         of_turning = ("weight_sin", "weight_cos", "lever_m", "arm_kg", "hangs_at_rad")

@@ -136,7 +136,7 @@ class Axis(Machine):
                 reported = np.full(m.target.shape, np.nan)
                 reported[:, j] = answer.reported
                 floor = {signal: floors["position"][signal].value}
-                uncertain = [signal] if self.config.law == "pwm" else []
+                uncertain = [signal] if self.config.law == "pwm" or self.config.gains == "fitted" else []
                 clock[m.name] = tuple(check_against_twin(m.only([signal]), reported[:, [j]], floor, uncertain))
         progress("", len(uses), len(uses))
         if not traces:
@@ -151,7 +151,7 @@ class Axis(Machine):
 
     def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> AxisProblem:
         if gains == "fitted":
-            raise TaccorlError(f"--gains=fitted: those of {self.name} stand in its file; leave --gains out")
+            raise TaccorlError(f"--gains=fitted: write `gains: fitted` into {self.name}.yaml and leave --gains out")
         return AxisProblem(self.config, measurements)
 
     def effect(

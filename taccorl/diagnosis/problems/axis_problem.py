@@ -3,8 +3,10 @@ needs them. An axis is a slide on a bench, a motor with a mass, a servo with a p
 
 Inertia and a constant torque are always fitted, and the weight if the file states one. If the effort was recorded, the gains are
 also fitted, within ``GAINS_WITHIN`` of the commanded ones, because an error of a few per cent outweighs the friction of a fast
-drive. For law ``pwm`` stall torque and back-EMF are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The
-delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data.
+drive. Unknown gains (``gains: fitted``) are fitted within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file
+states it, because positions determine ratios only. For law ``pwm`` stall torque and back-EMF are fitted instead, within
+``WINDING_WITHIN``, the accuracy of data sheets. The delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's
+loop is visible in the data.
 """
 
 import dataclasses
@@ -28,7 +30,9 @@ from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
 
 GAINS_WITHIN = 1.25
-"""Factor within which gains are fitted, to both sides."""
+"""Factor within which commanded gains are fitted, to both sides."""
+UNKNOWN_WITHIN = 10.0
+"""The same for gains that nobody knows (``gains: fitted``)."""
 WEIGHT_WITHIN = 3.0
 """Bound of the fitted weight's torque as a multiple of the file's, for both signs."""
 MOST_TORQUE = 20.0
@@ -106,10 +110,11 @@ class AxisProblem:
         axis, unit = self.axis, self.axis.scale.unit_of
         force, inertia = axis.scale.force, axis.inertia
         most = max(MOST_TORQUE * force, 10.0 * abs(axis.torque_ff))
+        unknown = axis.gains == "fitted"
         found = [
-            Free(name="inertia", unit=unit("kg·m²"), start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True),
-            Free(name="torque_ff", unit=unit("N·m"), start=axis.torque_ff, low=-most, high=most, scale=force),
-        ]
+            Free(name="inertia", unit=unit("kg·m²"), start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True)
+        ] * (self.effort or not unknown)
+        found.append(Free(name="torque_ff", unit=unit("N·m"), start=axis.torque_ff, low=-most, high=most, scale=force))
         weight = float(np.hypot(axis.weight_sin, axis.weight_cos))
         if weight > 0.0:
             for name in ("weight_sin", "weight_cos"):
@@ -119,8 +124,9 @@ class AxisProblem:
                 )
         if axis.law == "pwm":
             within, numbers = WINDING_WITHIN, {"stall_nm": axis.stall_nm, "back_emf": axis.back_emf}
-        elif self.effort:
-            within, numbers = GAINS_WITHIN, {"kp": axis.loop_gains.kp, "kd": axis.loop_gains.kd}
+        elif self.effort or unknown:
+            within = UNKNOWN_WITHIN if unknown else GAINS_WITHIN
+            numbers = {"kp": axis.loop_gains.kp, "kd": axis.loop_gains.kd}
         else:
             within, numbers = 1.0, {}
         if axis.target_kind == "position":

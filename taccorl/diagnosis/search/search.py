@@ -494,6 +494,13 @@ class _Row:
         for name, shape in cls.reduces_to.items():
             if self._at_bound(shape) == "low":
                 return f"with {shape} at {self.model.values[f'{cls.name}.{shape}']:.3g} it is {name}"
+        for name, shape in cls.equals_when_wide.items():
+            value, high = (
+                self.model.values[f"{cls.name}.{shape}"],
+                next(p.high for p in cls.parameters() if p.name == shape),
+            )
+            if value > 0.9 * high:
+                return f"with {shape} at {value:.3g} it is {name}"
         for p in cls.parameters():
             side = self._at_bound(p.name)
             if (side and p.absent == (p.low if side == "low" else p.high)) or (side == "high" and p.absent == np.inf):

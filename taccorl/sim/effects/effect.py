@@ -140,6 +140,9 @@ class Effect:
     reduces_to: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect at whose lower bound both are equal. The search prefers the simpler
     one."""
+    equals_when_wide: ClassVar[dict[str, str]] = {}
+    """Name of a simpler effect → parameter of this effect at whose upper bound both are equal. A fit within a tenth of that
+    bound is rejected."""
     fitted: ClassVar[bool] = True
     """Whether a search may fit it. False for effects that do not repeat from one recording to the next: least squares cannot fit
     them, so they are no candidates, and a twin keeps theirs unchanged."""

@@ -39,6 +39,7 @@ class PositionDependentFriction(JointEffect):
         "About one angle the arm stops short of its targets and hangs back; elsewhere it is as trained."
     )
     to_record: ClassVar = "One slow sweep over the whole range, there and back: the friction stays at its place."
+    equals_when_wide: ClassVar = {"coulomb_friction": "width_rad"}
     near_twins: ClassVar = {
         "coulomb_friction": "Over a range that is small against the spot both are alike; sweep slowly over the whole range.",
         "load_friction": (

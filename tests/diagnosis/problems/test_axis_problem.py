@@ -14,7 +14,7 @@ from taccorl.alignment.measurements.folder import Measurements, read_measurement
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.problems.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
-from taccorl.diagnosis.search.fit import Fit
+from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.problem import Recording
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
@@ -69,6 +69,22 @@ def slide() -> Measurements:
 @pytest.fixture(scope="module")
 def problem(slide: Measurements) -> AxisProblem:
     return AxisProblem(AXIS, slide)
+
+
+def test_gains_that_nobody_knows_are_fitted_and_positions_alone_leave_the_inertia(slide: Measurements):
+    """From a third of both gains; ratios to the inertia are what positions determine: K_p / J = 400 1/s², K_d / J = 28 1/s."""
+    unknown = dataclasses.replace(AXIS, kp=KP / 3, kd=KD / 3, gains="fitted")
+    efforts = AxisProblem(unknown, slide)
+    found = best_fit(
+        efforts, efforts.fit, ("coulomb_friction",), [efforts.start | {"coulomb_friction.torque_nm": 10.0}], 30
+    )
+    assert found.values["kp"] == pytest.approx(KP, rel=0.1) and found.values["kd"] == pytest.approx(KD, rel=0.1)
+    silent = [dataclasses.replace(m, effort=np.full_like(m.effort, np.nan)) for m in slide.fit]
+    alone = AxisProblem(unknown, Measurements(tuple(silent)))
+    assert "inertia" not in {f.name for f in alone.base}
+    found = best_fit(alone, alone.fit, ("coulomb_friction",), [alone.start | {"coulomb_friction.torque_nm": 10.0}], 30)
+    assert found.values["kp"] / AXIS.inertia == pytest.approx(KP / MASS_KG, rel=0.1)
+    assert found.values["kd"] / AXIS.inertia == pytest.approx(KD / MASS_KG, rel=0.1)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from taccorl.diagnosis.search import search
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects.effect import parameter
 
 
 def made(*effects, extra=0.0, seeds=(0, 1, 2), noise=0.1):
@@ -196,6 +197,21 @@ def test_below_one_floor_the_simplest_effect_is_taken_and_not_the_one_with_less_
     assert errors["square"] ** 2 == pytest.approx(0.90, abs=0.06)
     assert found.names == ("square",)
     assert found.rivals == {"square": ("richer",)}
+
+
+@dataclasses.dataclass(kw_only=True)
+class Wide(Squire):
+    """A square that idle at its upper bound, 2, makes of it; the search starts there, and no recording moves it."""
+
+    name: ClassVar = "wide"
+    equals_when_wide: ClassVar = {"square": "idle"}
+    idle: float = parameter(unit="1", symbol="i", absent=None, low=0.5, high=2.0, typical=1.9, source="made up")
+
+
+def test_an_effect_as_wide_as_its_bound_is_refused_for_the_simpler_one_that_it_then_is():
+    fit, validation, _ = made(Square(strength=2.0))
+    (row,) = diagnose(MadeProblem(Wide), fit, validation).rounds[0].evidence
+    assert row.gain > 0.9 and "idle at 1.9" in row.verdict and "square" in row.verdict
 
 
 def test_an_effect_that_was_fitted_to_nothing_is_not_added():
