@@ -161,12 +161,16 @@ def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
         )
         return Finding("same_motion", "note", "", text)
     rms, noise = ratios[worst]
-    arm = next((arm for arm in ROBOT.arms if worst.startswith(arm)), ROBOT.arms[0])
+    if worst in ROBOT.action_names:
+        arm = next(arm for arm in ROBOT.arms if worst.startswith(arm))
+        held = f"`payload_kg: {{{arm}: 0.5}}`"
+    else:
+        held = f"`payload_kg: {{{worst}: 0.5}}` with its `lever_m` for an axis file; a robot file needs a model with that mass"
     text = (
         f"{b.name} was given the same commands as {a.name}, but {worst} moved differently: by {rms:.2g} "
         f"{a.units[a.column(worst)]} (RMS), {rms / noise:.0f} times what noise allows. Had it other gains? Write `{b.name}: "
         f"{{gain_scale: {{{worst}: 2.0}}}}` with their factor, or kp and kd, under `recordings:` in measurements.yaml. Did it "
-        f"hold something? Write `payload_kg: {{{arm}: 0.5}}`. Only if nothing was changed and the robot does not repeat, write "
+        f"hold something? Write {held}. Only if nothing was changed and the robot does not repeat, write "
         f"`repeat_of: {a.name}`"
     )
     return Finding("same_commands", "warning", worst, text)

@@ -513,6 +513,14 @@ def test_same_commands_with_another_answer_ask_about_gains_and_payload_not_for_r
     assert "Only if nothing was changed" in f.text
 
 
+def test_same_commands_of_an_axis_ask_for_its_own_payload_and_lever(clean):
+    knee = dataclasses.replace(clean.only(["left_joint5"]), signals=("knee",))
+    slower = np.interp(knee.time_s - 0.02, knee.time_s, knee.measured[:, 0])[:, None]
+    found = check_measurements([knee, dataclasses.replace(knee, name="other", measured=slower)])["other"]
+    (f,) = [f for f in found if f.check == "same_commands"]
+    assert "payload_kg: {knee: 0.5}" in f.text and "lever_m" in f.text and "left" not in f.text
+
+
 JOINT_EFFECTS = [name for name in effects if issubclass(effects.get(name), JointEffect)]
 
 
