@@ -10,18 +10,20 @@ the real side goes the way of a robot's recordings. Everything lands in outputs/
 The paper's numbers want a GPU and π0.5's weights. ``--small`` shows the chain on a CPU in minutes and learns nothing.
 """
 
+import dataclasses
 import json
-import shlex
 import shutil
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from taccorl.cli import main as cli
-from taccorl.cli.parse import parse
+from pipelines.steps import chosen, lerobot, parsed, step
+from taccorl.cli import augment, collect, ingest, merge
+from taccorl.cli.augment import AugmentConfig
+from taccorl.cli.collect import CollectConfig
+from taccorl.cli.ingest import IngestConfig
+from taccorl.cli.merge import MergeConfig
 from taccorl.demos.mimicgen.coverage import Share
-from taccorl.errors import TaccorlError
 from taccorl.sim.twin_file import save_twin
 from taccorl.surrogate.twin import ORIGIN, draw_surrogate_twin
 from taccorl.training.lerobot_commands import FIRST_SEED, Scoring, Training
@@ -58,33 +60,20 @@ class CotrainConfig:
     out: Path = Path("outputs/cotrain")
 
 
-def run(*words: str) -> None:
-    """One command, shown as a user would type it."""
-    print(f"\n$ {shlex.join(words)}", flush=True)
-    program, rest = str(Path(sys.executable).parent / words[0]), words[1:]
-    code = cli.main(list(rest)) if words[0] == "taccorl" else subprocess.run([program, *rest]).returncode
-    if code != 0:
-        raise SystemExit(f"{words[0]} {words[1]} ended with {code}")
-
-
-def record(recordings: Path, *words: str) -> None:
+def record(recordings: Path, config: CollectConfig) -> None:
     """Demonstrations as MCAP files in the folder ``recordings``, once; what an interrupted run left unfinished is made anew."""
     if recordings.exists():
         return
     unfinished = recordings.with_name(f"{recordings.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
-    run("taccorl", "collect", "--as_recording=true", *words, f"--out={unfinished}")
+    step(collect.run, dataclasses.replace(config, out=unfinished))
     unfinished.rename(recordings)
 
 
 def main(words: list[str]) -> None:
-    chosen = [*(SMALL if "--small" in words else ()), *(word for word in words if word != "--small")]
-    try:
-        config = parse(CotrainConfig, chosen, prog="python -m pipelines.cotrain")
-    except TaccorlError as error:
-        raise SystemExit(str(error)) from None
-    out, task, store = config.out / config.task, f"--task={config.task}", f"--store={config.out / 'store'}"
-    recipe, name = config.train or Path(f"configs/cotrain/{config.task}.yaml"), f"surrogate_{config.secret}"
+    config = parsed(CotrainConfig, chosen(words, SMALL), "python -m pipelines.cotrain")
+    out, task, store = config.out / config.task, config.task, config.out / "store"
+    recipe, name = config.train or Path(f"configs/cotrain/{task}.yaml"), f"surrogate_{config.secret}"
     if not recipe.is_file():  # before hours of collecting
         raise SystemExit(f"--train={recipe}: no such file; for a task of your own, copy one of configs/cotrain")
     parts = (f"{name}.yaml", f"{name}_recordings_{config.real}", name, f"{name}_and_twin")
@@ -92,24 +81,25 @@ def main(words: list[str]) -> None:
     sources, many = out / "sources", out / "augmented"
     out.mkdir(parents=True, exist_ok=True)
     save_twin(draw_surrogate_twin(config.secret), robot)
-    where = ("--seed=1", f"--twin={robot}", f"--origin={ORIGIN}")  # the two domains do not share their scenes
-    record(recordings, task, f"--episodes={config.real}", *where, store)
-    run("taccorl", "ingest", str(recordings), f"--spec={RECORDING_SPEC}", f"--out={real}", store)
-    run("taccorl", "collect", task, f"--episodes={config.sources}", f"--out={sources}", store)
-    run("taccorl", "augment", task, f"--source={sources}", f"--episodes={config.augmented}", f"--out={many}", store)
-    run("taccorl", "merge", f"--real={real}", f"--sim={sources}", f"--sim={many}", f"--out={both}", store)
+    shown = CollectConfig(
+        task=task, episodes=config.real, as_recording=True, seed=1, twin=robot, origin=ORIGIN, store=store
+    )
+    record(recordings, shown)  # seed 1: the two domains do not share their scenes
+    step(ingest.run, IngestConfig(paths=[recordings], spec=RECORDING_SPEC, out=real, store=store))
+    step(collect.run, CollectConfig(task=task, episodes=config.sources, out=sources, store=store))
+    step(augment.run, AugmentConfig(source=sources, task=task, episodes=config.augmented, out=many, store=store))
+    step(merge.run, MergeConfig(real=[real], sim=[sources, many], out=both, store=store))
     options = [f"--{name}={n}" for name in ("steps", "batch_size") if (n := getattr(config, name)) is not None]
-    if command := (training := Training(recipe, both, options, out)).command():
-        run(*command)
+    training = Training(recipe, both, options, out)
+    lerobot(training.command())
     limit = [f"--env.episode_length={config.episode_length}"] if config.episode_length else []
-    scored = {"twin": [f"--env.task={config.task}", *limit]}
+    scored = {"twin": [f"--env.task={task}", *limit]}
     scored["surrogate"] = [*scored["twin"], f"--env.twin={robot}"]
     rows = []
     for name, place in scored.items():
         scoring = Scoring(training, place, config.scored)
-        if command := scoring.command():
-            run(*command)
-        told = {"task": config.task, "where": f"{name} (simulated)", "policy": str(training.policy)}
+        lerobot(scoring.command())
+        told = {"task": task, "where": f"{name} (simulated)", "policy": str(training.policy)}
         rows += [told | {"seed": FIRST_SEED + k, "success": s} for k, s in enumerate(scoring.successes())]
     write(rows, config, training, out)
 

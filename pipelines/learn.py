@@ -6,6 +6,7 @@ All of it is simulated: no robot is near. Everything lands in outputs/learn; a s
 (docs/learning.md). ``--small`` shows the chain on a CPU in minutes and learns nothing.
 """
 
+import dataclasses
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,10 +14,14 @@ from typing import NamedTuple
 
 import yaml
 
-from pipelines.cotrain import run
-from taccorl.cli.parse import parse
+from pipelines.steps import chosen, lerobot, parsed, step
+from taccorl.cli import augment, collect, evaluate, execute
+from taccorl.cli.augment import AugmentConfig
+from taccorl.cli.collect import CollectConfig
+from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
+from taccorl.cli.execute import ExecuteConfig
 from taccorl.demos.mimicgen.spec import mimic_spec_path
-from taccorl.errors import TaccorlError
+from taccorl.lineage.engines import LocalEngine
 from taccorl.training.lerobot_commands import Training
 
 SMALL = ("--sources=1", "--episodes=1", "--scored=2", "--episode_length=12", "--workers=1")
@@ -62,33 +67,30 @@ class Learned(NamedTuple):
 
 
 def main(words: list[str]) -> Learned:
-    chosen = [*(SMALL if "--small" in words else ()), *(word for word in words if word != "--small")]
-    try:
-        config = parse(LearnConfig, chosen, prog="python -m pipelines.learn")
-    except TaccorlError as error:
-        raise SystemExit(str(error)) from None
+    config = parsed(LearnConfig, chosen(words, SMALL), "python -m pipelines.learn")
     if not config.train.is_file():  # before hours of demonstrations
         raise SystemExit(f"--train={config.train}: no such file")
-    out, task, store = config.out / config.task, f"--task={config.task}", config.out / "store"
+    out, task, store = config.out / config.task, config.task, config.out / "store"
     sources, actions, rows = out / "sources", out / f"actions_{config.episodes}", out / f"rows_{config.episodes}"
-    spec, kept, engine = out / "mimicgen.yaml", f"--store={store}", f"--engine.workers={config.workers}"
+    spec, engine = out / "mimicgen.yaml", LocalEngine(workers=config.workers)
     out.mkdir(parents=True, exist_ok=True)
-    told = yaml.safe_load(mimic_spec_path(config.task).read_text(encoding="utf-8"))
+    told = yaml.safe_load(mimic_spec_path(task).read_text(encoding="utf-8"))
     spec.write_text(yaml.safe_dump(told | {"datagen_config": told.get("datagen_config", {}) | HOW}), encoding="utf-8")
-    run("taccorl", "collect", task, f"--episodes={config.sources}", "--images=false", f"--out={sources}", kept)
-    made = ("--rows=actions", f"--spec={spec}", f"--episodes={config.episodes}")
-    run("taccorl", "augment", task, f"--source={sources}", *made, f"--out={actions}", engine, kept)
-    frames = ("--pictures=cache", f"--resolution={PX}x{PX}", "--part_poses=true")
-    run("taccorl", "execute", f"--source={actions}", f"--out={rows}", *frames, engine, kept)
+    step(collect.run, CollectConfig(task=task, episodes=config.sources, images=False, out=sources, store=store))
+    made = AugmentConfig(
+        source=sources, task=task, episodes=config.episodes, rows="actions", spec=str(spec), out=actions
+    )
+    step(augment.run, dataclasses.replace(made, engine=engine, store=store))
+    frames = ExecuteConfig(source=[actions], out=rows, pictures="cache", resolution=f"{PX}x{PX}", part_poses=True)
+    step(execute.run, dataclasses.replace(frames, engine=engine, store=store))
     cached = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}"]
     training = Training(config.train, rows, [*cached, f"--policy.pose_loss={POSE_LOSS}", *config.train_options], out)
-    if command := training.command():
-        run(*command)
-    limit = [f"--episode_length={config.episode_length}"] if config.episode_length else []
+    lerobot(training.command())
     score = out / f"score_{training.folder.name}"
     if not score.exists():
-        scenes = (f"--episodes={config.scored}", "--seed=50000", *limit)
-        run("taccorl", "evaluate", f"--policy.path={training.policy}", task, *scenes, f"--out={score}")
+        policy = PolicyChoice(path=training.policy)
+        scenes = EvaluateConfig(policy=policy, task=[task], episodes=config.scored, seed=50000, out=score)
+        step(evaluate.run, dataclasses.replace(scenes, episode_length=config.episode_length))
     print(f"\nscore: {score / 'report.html'}")
     return Learned(training.policy, rows, store)
 

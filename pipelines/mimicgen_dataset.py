@@ -4,35 +4,32 @@
 stopped goes on where it was. There is no robot here: all of it comes from the twin, and says so.
 """
 
+import dataclasses
 import json
 import sys
 import time
 from pathlib import Path
 
-from taccorl.cli import main as cli
+from pipelines.steps import step
+from taccorl.cli import augment, collect
+from taccorl.cli.augment import AugmentConfig
+from taccorl.cli.collect import CollectConfig
 from taccorl.demos.experts import tasks_with_expert
+from taccorl.lineage.engines import LocalEngine
 
 OUT = Path("outputs/mimicgen")
 SOURCES = 20
 OPTIONS = {"episodes": "200", "workers": "2", "images": "true"}
 
 
-def taccorl(*words: str) -> None:
-    """One command, shown as a user would type it."""
-    print(f"\n$ taccorl {' '.join(words)}", flush=True)
-    code = cli.main(list(words))
-    if code != 0:
-        raise SystemExit(f"taccorl {words[0]} ended with {code}")
-
-
 def make(task: str, options: dict[str, str], out: Path = OUT, sources: int = SOURCES) -> Path:
     """Sources and new episodes of one task; returns the dataset's folder."""
-    source, new, store = out / f"{task}_sources", out / task, f"--store={out / 'store'}"
+    source, new, store = out / f"{task}_sources", out / task, out / "store"
     # Pictures of the sources are never looked at.
-    taccorl("collect", f"--task={task}", f"--episodes={sources}", "--images=false", f"--out={source}", store)
-    engine = f"--engine.workers={options['workers']}"
-    words = (f"--episodes={options['episodes']}", f"--images={options['images']}", engine)
-    taccorl("augment", f"--source={source}", f"--task={task}", *words, f"--out={new}", store)
+    step(collect.run, CollectConfig(task=task, episodes=sources, images=False, out=source, store=store))
+    made = AugmentConfig(source=source, task=task, episodes=int(options["episodes"]), out=new, store=store)
+    engine = LocalEngine(workers=int(options["workers"]))
+    step(augment.run, dataclasses.replace(made, images=options["images"] == "true", engine=engine))
     return new
 
 

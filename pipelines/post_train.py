@@ -7,7 +7,9 @@ run goes on where it was. It wants a GPU and 16 cores or more. ``--small`` shows
 The start is scored as its checkpoint says, the result with the denoising steps of post-training (K_denoise).
 """
 
+import dataclasses
 import json
+import shlex
 import shutil
 import sys
 from dataclasses import dataclass, field
@@ -15,9 +17,10 @@ from hashlib import sha256
 from pathlib import Path
 
 from pipelines import learn
-from pipelines.cotrain import run
-from taccorl.cli.parse import parse
-from taccorl.errors import TaccorlError
+from pipelines.steps import chosen, parsed, step
+from taccorl.cli import evaluate
+from taccorl.cli import post_train as cli
+from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
 
 SMALL = ("--config=configs/post_train/tiny.yaml", "--learn=[--small]", "--learn_out=outputs/learn_small")
 SMALL += ("--out=outputs/post_train_small", "--scored=2", "--episode_length=12", "--cache=host")
@@ -53,13 +56,9 @@ class PostTrainPipelineConfig:
 
 
 def main(words: list[str]) -> None:
-    given = [word for word in words if word != "--small"]
-    names = {word.partition("=")[0] for word in given}
-    chosen = [word for word in SMALL if word.partition("=")[0] not in names] if "--small" in words else []
-    try:
-        config = parse(PostTrainPipelineConfig, [*chosen, *given], prog="python -m pipelines.post_train")
-    except TaccorlError as error:
-        raise SystemExit(str(error)) from None
+    names = {word.partition("=")[0] for word in words}
+    small = [word for word in SMALL if word.partition("=")[0] not in names]
+    config = parsed(PostTrainPipelineConfig, chosen(words, small), "python -m pipelines.post_train")
     if not config.config.is_file():
         raise SystemExit(f"--config={config.config}: no such file")
     if (config.policy is None) != (config.dataset is None):
@@ -86,18 +85,26 @@ def main(words: list[str]) -> None:
     out = config.out / config.task / f"run_{key}"
     if not (out / "checkpoints/last").exists():  # a run that ended before its first checkpoint begins anew
         shutil.rmtree(out, ignore_errors=True)
-        run("taccorl", "post-train", *settings, f"--out={out}")
+        train([*settings, f"--out={out}"])
     elif not is_finished(out):
-        run("taccorl", "post-train", f"--out={out}", "--resume=true")
+        train([f"--out={out}", "--resume=true"])
     result, score = out / "checkpoints/last/pretrained_model", out / f"score_{config.scored}"
     if not (score / "evaluation.json").exists():
         shutil.rmtree(score, ignore_errors=True)
-        scenes = [f"--episodes={config.scored}", f"--seed={FIRST_SCENE}", *(word.replace("env.", "") for word in limit)]
-        words = [f"--policy.path={result}", f"--against={start}", f"--task={config.task}", *scenes, f"--out={score}"]
-        run("taccorl", "evaluate", *words)
+        scenes = EvaluateConfig(task=[config.task], episodes=config.scored, seed=FIRST_SCENE, out=score)
+        policy = PolicyChoice(path=result)
+        length = config.episode_length
+        step(evaluate.run, dataclasses.replace(scenes, policy=policy, against=str(start), episode_length=length))
     comparison = json.loads((score / "evaluation.json").read_text(encoding="utf-8"))["comparisons"][config.task]
     print(f"\nafter against before, simulated, {config.scored} scenes: {json.dumps(comparison)}")
     print(f"score: {score / 'report.html'}, curve: {out / 'progress.jsonl'}, episodes: {out / 'rollouts'}")
+
+
+def train(words: list[str]) -> None:
+    """``taccorl post-train``: its file of settings and the user's further words decide, so that it takes words."""
+    print(f"\n$ {shlex.join(['taccorl', 'post-train', *words])}", flush=True)
+    if code := cli.main(words):
+        raise SystemExit(f"taccorl post-train ended with {code}")
 
 
 def is_finished(out: Path) -> bool:

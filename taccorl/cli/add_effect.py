@@ -44,8 +44,12 @@ class AddEffectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl add-effect``; exit status 0: written."""
-    config = parse(AddEffectConfig, argv, positional="effect", prog="taccorl add-effect")
+    """Run ``taccorl add-effect``; returns its exit status."""
+    return run(parse(AddEffectConfig, argv, positional="effect", prog="taccorl add-effect"))
+
+
+def run(config: AddEffectConfig) -> int:
+    """Exit status 0: written."""
     out = _place(config)
     from taccorl.diagnosis.machines.load import load_machine
 

@@ -57,8 +57,12 @@ class AugmentConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl augment``; returns the exit status 0."""
-    config = parse(AugmentConfig, argv, positional=None)
+    """Run ``taccorl augment``; returns its exit status."""
+    return run(parse(AugmentConfig, argv, positional=None))
+
+
+def run(config: AugmentConfig) -> int:
+    """Returns the exit status 0."""
     from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts
     from taccorl.demos.mimicgen.coverage import Share
     from taccorl.demos.mimicgen.report import Spent, pages_of, write_report

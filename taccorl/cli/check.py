@@ -31,8 +31,12 @@ class CheckConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl check``; exit status 0: notes at most, 1: warnings or errors."""
-    config = parse(CheckConfig, argv, positional="path")
+    """Run ``taccorl check``; returns its exit status."""
+    return run(parse(CheckConfig, argv, positional="path"))
+
+
+def run(config: CheckConfig) -> int:
+    """Exit status 0: notes at most, 1: warnings or errors."""
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)
     if not config.path.exists():

@@ -57,8 +57,12 @@ class CollectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl collect``; returns the exit status 0."""
-    config = parse(CollectConfig, argv, positional=None)
+    """Run ``taccorl collect``; returns its exit status."""
+    return run(parse(CollectConfig, argv, positional=None))
+
+
+def run(config: CollectConfig) -> int:
+    """Returns the exit status 0."""
     if not config.task and not isinstance(config.source, ActionsSource):
         from taccorl.sim.task import tasks
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import command, parse
 from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
@@ -74,8 +74,12 @@ class CompareConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl compare``; exit status 0: compared, 1: the measurements have errors, nothing was compared."""
-    config = parse(CompareConfig, argv, positional="measurements")
+    """Run ``taccorl compare``; returns its exit status."""
+    return run(parse(CompareConfig, argv, positional="measurements"))
+
+
+def run(config: CompareConfig) -> int:
+    """Exit status 0: compared, 1: the measurements have errors, nothing was compared."""
     _check_outputs(config)
     from taccorl.alignment.checks.telemetry import check_names
     from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_findings, unused_accepts
@@ -106,7 +110,7 @@ def main(argv: list[str]) -> int:
     score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
     for line in far_off(comparisons[-1]):
         print(line)
-    _write(config, comparisons, findings, late, twins, argv)
+    _write(config, comparisons, findings, late, twins)
     return 0
 
 
@@ -220,14 +224,13 @@ def _write(
     findings: dict[str, list["Finding"]],
     late: dict[str, list["Finding"]],
     twins: "Sequence[Machine]",
-    argv: Sequence[str],
 ) -> None:
     first, after = comparisons[0], comparisons[1] if len(comparisons) > 1 else None
     if config.out is not None:
         from taccorl.diagnosis.report.report import Report
         from taccorl.diagnosis.report.write import write_report
 
-        provenance = {"command": shlex.join(["taccorl", "compare", *argv])}
+        provenance = {"command": shlex.join(command("compare", config, "measurements"))}
         for twin in twins:
             provenance[f"{twin.name}, SHA-256"] = twin.digest()
         clock = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}

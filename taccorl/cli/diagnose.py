@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import command, parse
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
@@ -71,9 +71,13 @@ class DiagnoseConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl diagnose``; exit status 0: the remaining error is at the noise floor, 1: something else remains, or the
+    """Run ``taccorl diagnose``; returns its exit status."""
+    return run(parse(DiagnoseConfig, argv, positional="measurements"))
+
+
+def run(config: DiagnoseConfig) -> int:
+    """Exit status 0: the remaining error is at the noise floor, 1: something else remains, or the
     measurements have errors."""
-    config = parse(DiagnoseConfig, argv, positional="measurements")
     from taccorl.diagnosis.report.write import check_folder
 
     check_folder(config.out, config.measurements)
@@ -110,7 +114,7 @@ def main(argv: list[str]) -> int:
     found = _diagnosed(config, machine, parts, measurements)
     mended, disagree = machine.mended(found)
     said = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
-    report = _report(config, argv, machine, found, before, measurements, mended, said)
+    report = _report(config, machine, found, before, measurements, mended, said)
     verdicts, regimes = report.verdicts(), report.regimes()
     for finding in found:
         print_finding(finding, verdicts[finding.part], regimes.get(finding.part))
@@ -279,7 +283,6 @@ def details(finding: "Finding") -> list[str]:
 
 def _report(
     config: DiagnoseConfig,
-    argv: Sequence[str],
     machine: "Machine",
     found: "Sequence[Finding]",
     before: "Comparison",
@@ -305,7 +308,7 @@ def _report(
         options=[shlex.quote(word) for word in options],
         findings=findings,
         provenance={
-            "command": shlex.join(["taccorl", "diagnose", *argv]),
+            "command": shlex.join(command("diagnose", config, "measurements")),
             "twin": str(config.twin) if config.twin else "nominal twin",
             "twin, SHA-256": machine.digest(),
         },

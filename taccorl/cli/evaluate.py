@@ -76,8 +76,12 @@ class EvaluateConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl evaluate``; returns the exit status 0."""
-    config = parse(EvaluateConfig, argv, positional=None)
+    """Run ``taccorl evaluate``; returns its exit status."""
+    return run(parse(EvaluateConfig, argv, positional=None))
+
+
+def run(config: EvaluateConfig) -> int:
+    """Returns the exit status 0."""
     _check_places(config)
     from taccorl.evaluation.episodes import ROWS_FILE, compare, write_rows
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored, score

@@ -44,8 +44,12 @@ class ExecuteConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl execute``; exit status 0: executed, 1: executed, but demonstrations were left out."""
-    config = parse(ExecuteConfig, argv, positional=None)
+    """Run ``taccorl execute``; returns its exit status."""
+    return run(parse(ExecuteConfig, argv, positional=None))
+
+
+def run(config: ExecuteConfig) -> int:
+    """Exit status 0: executed, 1: executed, but demonstrations were left out."""
     resolution = _resolution(config)
     from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
     from taccorl.lineage.store import Store

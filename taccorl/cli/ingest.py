@@ -73,8 +73,8 @@ class InspectConfig:
 def main(argv: list[str]) -> int:
     """Run ``taccorl ingest``; exit status 0: all recordings were written or split, 1: some were quarantined or refused."""
     if argv and argv[0] == "inspect":
-        return _inspect(parse(InspectConfig, argv[1:], positional="paths", prog="taccorl ingest inspect"))
-    return _ingest(parse(IngestConfig, argv, positional="paths"))
+        return inspect(parse(InspectConfig, argv[1:], positional="paths", prog="taccorl ingest inspect"))
+    return run(parse(IngestConfig, argv, positional="paths"))
 
 
 def _save_memory() -> None:
@@ -90,7 +90,8 @@ def _save_memory() -> None:
         pass  # not glibc: it works without
 
 
-def _ingest(config: IngestConfig) -> int:
+def run(config: IngestConfig) -> int:
+    """Exit status 0: all recordings were written or split, 1: some were quarantined or refused."""
     _save_memory()
     from taccorl.cli.tables import Bars, ingest_table
     from taccorl.data.ingest import find_jobs, ingest
@@ -273,7 +274,8 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
         print(f"look:    taccorl view {shlex.quote(str(config.out))} --episode=0")
 
 
-def _inspect(config: InspectConfig) -> int:
+def inspect(config: InspectConfig) -> int:
+    """Exit status 0: all recordings were inspected, 1: some could not be read."""
     from taccorl.cli.tables import inventory_table
     from taccorl.data.draft import dataset_path, sensor_path
     from taccorl.data.inspection import inspect_source

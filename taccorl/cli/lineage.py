@@ -52,10 +52,15 @@ def main(argv: list[str]) -> int:
 
 def _explain(argv: list[str]) -> int:
     from taccorl.cli.parse import parse
+
+    return explain(parse(ExplainConfig, argv, positional="path", prog="taccorl lineage explain"))
+
+
+def explain(config: ExplainConfig) -> int:
+    """Exit status 0: everything is as it was recorded, 1: something changed or is missing."""
     from taccorl.lineage.explain import render, trace
     from taccorl.lineage.prune import open_store
 
-    config = parse(ExplainConfig, argv, positional="path", prog="taccorl lineage explain")
     if config.store.exists() or config.store != DEFAULT_STORE:
         store = open_store(config.store)
     else:

@@ -29,8 +29,12 @@ class MergeConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl merge``; returns the exit status 0."""
-    config = parse(MergeConfig, argv, positional=None)
+    """Run ``taccorl merge``; returns its exit status."""
+    return run(parse(MergeConfig, argv, positional=None))
+
+
+def run(config: MergeConfig) -> int:
+    """Returns the exit status 0."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
     from taccorl.lineage.store import Store
     from taccorl.training.cotrain import Part, publish

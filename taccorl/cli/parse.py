@@ -74,6 +74,43 @@ def parse[ConfigT](
     return dataclasses.replace(_draccus(config_class, rest), **texts)  # pyright: ignore[reportArgumentType]
 
 
+def command(verb: str, config: Any, positional: str | None = None) -> list[str]:
+    """Words that a user types for a configuration: ``["taccorl", "collect", "--task=assembly_1"]``. ``parse`` is the inverse.
+
+    Args:
+        positional: field whose value stands without an option name.
+    """
+    words = ["taccorl", *verb.split()]
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name == positional:
+            words += [str(v) for v in value] if isinstance(value, list) else [str(value)]
+        elif value != _default(field):
+            words += _options(field.name.rstrip("_"), value, _default(field))
+    return words
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
+
+
+def _options(name: str, value: Any, default: Any) -> list[str]:
+    if dataclasses.is_dataclass(value):
+        same = type(value) is type(default)
+        words = [] if same else [f"--{name}.type={value.get_choice_name(type(value))}"]  # pyright: ignore
+        for field in dataclasses.fields(value):
+            own, usual = getattr(value, field.name), getattr(default, field.name) if same else _default(field)
+            words += [] if own == usual else _options(f"{name}.{field.name}", own, usual)
+        return words
+    if isinstance(value, list) and value and isinstance(value[0], Path):
+        return [f"--{name}={path}" for path in value]
+    if isinstance(value, list | dict):
+        return [f"--{name}={json.dumps(value, ensure_ascii=False)}"]
+    return [f"--{name}={str(value).lower() if isinstance(value, bool) else value}"]
+
+
 def joined(argv: Sequence[str]) -> list[str]:
     """Replace ``--a b`` by ``--a=b``. Every option takes a value; one that begins with a minus must be a number."""
     found: list[str] = []

@@ -46,8 +46,12 @@ class SurrogateConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl surrogate``; exit status 0: written."""
-    config = parse(SurrogateConfig, argv, positional=None)
+    """Run ``taccorl surrogate``; returns its exit status."""
+    return run(parse(SurrogateConfig, argv, positional=None))
+
+
+def run(config: SurrogateConfig) -> int:
+    """Exit status 0: written."""
     from taccorl.surrogate.writing import SWEEPS, TWIN, reveal
 
     if config.reveal is not None:

@@ -19,7 +19,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -72,10 +72,18 @@ class ViewConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl view``; returns the exit status 0."""
-    config = parse(ViewConfig, argv, positional="path")
+    """Run ``taccorl view``; returns its exit status."""
+    return run(parse(ViewConfig, argv, positional="path"), given_names(argv))
+
+
+def run(config: ViewConfig, given: Collection[str] = ()) -> int:
+    """Returns the exit status 0.
+
+    Args:
+        given: names of options that a user typed, of which those without effect are refused.
+    """
     _check_outputs(config)
-    _check_against(config, given_names(argv))
+    _check_against(config, given)
     with contextlib.ExitStack() as stack:
         from taccorl.views.part import part_of
 
@@ -95,10 +103,10 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _check_against(config: ViewConfig, given: set[str]) -> None:
+def _check_against(config: ViewConfig, given: Collection[str]) -> None:
     if config.align not in ALIGNMENTS:
         raise TaccorlError(f"--align={config.align}: {nearest(config.align, ALIGNMENTS)}")
-    useless = sorted({"against_episode", "against_spec", "align"} & given) if config.against is None else []
+    useless = sorted({"against_episode", "against_spec", "align"}.intersection(given)) if config.against is None else []
     if useless:
         raise TaccorlError(f"--{useless[0]} has no effect without --against=: leave it out, or name the other episode")
     if config.against is not None and config.sheet is not None:

@@ -255,3 +255,26 @@ def test_a_word_in_place_of_a_number_names_option_and_value(words: list[str], fa
     with pytest.raises(TaccorlError) as raised:
         parse(CollectConfig, ["--task=bench", *words])
     assert all(fact in str(raised.value) for fact in facts) and "parse" not in str(raised.value)
+
+
+def test_the_command_of_a_configuration_gives_the_configuration() -> None:
+    from taccorl.cli.augment import AugmentConfig
+    from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
+    from taccorl.cli.ingest import IngestConfig
+    from taccorl.cli.merge import MergeConfig
+    from taccorl.cli.parse import command, parse
+    from taccorl.cli.surrogate import SurrogateConfig
+    from taccorl.lineage.engines import LocalEngine
+
+    augmented = AugmentConfig(source=Path("a b"), task="puzzle", images=False, engine=LocalEngine(workers=3))
+    assert command("augment", augmented) == [
+        "taccorl", "augment", "--source=a b", "--task=puzzle", "--images=false", "--engine.workers=3",
+    ]  # fmt: skip
+    for config, positional in (
+        (augmented, None),
+        (IngestConfig(paths=[Path("x.mcap"), Path("y z")], spec="s", domain="real"), "paths"),
+        (MergeConfig(real=[Path("r")], sim=[Path("s1"), Path("s2")], out=Path("o")), None),
+        (SurrogateConfig(secret=3, effects=["coulomb_friction"], strength=12.5, gains_known=True), None),
+        (EvaluateConfig(policy=PolicyChoice(path=Path("p")), task=["puzzle", "test_tube"], episode_length=9), None),
+    ):
+        assert parse(type(config), command("x", config, positional)[2:], positional=positional) == config

@@ -1,6 +1,7 @@
 """pipelines/learn.py with ``--small``: from sources to a score, and again without doing anything anew."""
 
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,8 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     (score,) = out.glob("score_*/evaluation.json")
     assert json.loads(score.read_text())["scenes"]["seed"] == 50000
     commands: list[str] = []
-    monkeypatch.setattr(learn, "run", lambda *given: commands.append(given[1]))
+    monkeypatch.setattr(learn, "step", lambda verb, _: commands.append(verb.__module__.rpartition(".")[2]))
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("LeRobot was run again"))
     learn.main(words)
     assert commands == ["collect", "augment", "execute"]  # which find what they made; no training, no evaluation
 

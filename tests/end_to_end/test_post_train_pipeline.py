@@ -22,7 +22,8 @@ def test_the_chain_ends_in_a_comparison_and_goes_on_where_it_was(
     assert score["scenes"]["seed"] == 60000 and score["comparisons"]["assembly_2"]["n"] == 2
     assert post_train.is_finished(out)
     commands: list[str] = []
-    monkeypatch.setattr(post_train, "run", lambda *given: commands.append(given[1]))
+    monkeypatch.setattr(post_train, "step", lambda verb, _: commands.append(verb.__module__))
+    monkeypatch.setattr(post_train, "train", commands.append)
     post_train.main(words)
     assert commands == []
 

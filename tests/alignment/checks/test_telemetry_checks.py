@@ -138,7 +138,7 @@ def test_where_nothing_can_be_known_it_says_so():
     m = shifted(sweep(2, friction_nm=3.0, joints=[4, 5]), 1)
     findings = check_clock(m, floors(m))
     assert [f.check for f in findings] == ["not_judged"]
-    assert "an offset of one row (5.0 ms) not judged: left_joint5, left_joint6 do not answer" in findings[0].text
+    assert "one row (5.0 ms) not judged" in findings[0].text and "left_joint5, left_joint6" in findings[0].text
     # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.
     least = 8 * max(floors(m)[s] for s in ("left_joint5", "left_joint6")) * 0.12 / 0.005
     assert f"jumps by {least:.2g} rad or more" in findings[0].text
