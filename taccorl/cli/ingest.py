@@ -15,17 +15,18 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, cast
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
-from taccorl.errors import DatasetError, InTheWayError, RecordingError, TaccorlError, printable
+from taccorl.errors import DatasetError, InTheWayError, RecordingError, TaccorlError, nearest, printable
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
     from taccorl.data.ingest import Job
     from taccorl.data.inspection import Inventory
+    from taccorl.data.origin import Domain
     from taccorl.data.recording import Source
     from taccorl.data.spec import RecordingSpec
 
@@ -47,7 +48,7 @@ class IngestConfig:
     watch: bool = False
     """Ingest recordings as they arrive in the folders, with one line each, until Ctrl-C or SIGTERM; then publish the dataset of
     all complete ones. A recording is complete when its files have not changed for 5 s."""
-    domain: Literal["real", "surrogate", "twin"] | None = None
+    domain: str | None = None
     """Who made the recordings that do not say so themselves: real (a robot), surrogate (a simulation in its place) or twin."""
     replace: bool = False
     """If `out` holds another dataset, move that one aside (out.old-1, …) and publish the new one."""
@@ -95,9 +96,12 @@ def run(config: IngestConfig) -> int:
     _save_memory()
     from taccorl.cli.tables import Bars, ingest_table
     from taccorl.data.ingest import find_jobs, ingest
+    from taccorl.data.origin import DOMAINS
     from taccorl.data.spec import load_recording_spec
     from taccorl.lineage.store import Store
 
+    if config.domain not in (None, *DOMAINS):
+        raise TaccorlError(f"--domain={config.domain}: {nearest(config.domain, DOMAINS)}")
     spec = load_recording_spec(config.spec)
     skipped: list[str] = []
     if config.watch:
@@ -106,7 +110,7 @@ def run(config: IngestConfig) -> int:
             print("no recording arrived; nothing was written")
             return 0
     else:
-        jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped, config.domain)
+        jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped, _domain(config))
     for line in skipped:
         print(f"not read: {printable(line)}")
     _check_out(config, jobs)
@@ -128,6 +132,10 @@ def run(config: IngestConfig) -> int:
     return (
         1 if report["episodes_quarantined"] + report["outcomes"]["quarantined"] + report["outcomes"]["refused"] else 0
     )
+
+
+def _domain(config: IngestConfig) -> "Domain | None":
+    return cast("Domain | None", config.domain)
 
 
 def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "list[Job]":
@@ -159,7 +167,7 @@ def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "
         jobs: dict[str, Job] = {}
         for path in config.paths:
             with contextlib.suppress(RecordingError):  # nothing there yet
-                found = find_jobs([path], spec, config.spec, config.store, False, skipped, config.domain)
+                found = find_jobs([path], spec, config.spec, config.store, False, skipped, _domain(config))
                 jobs |= {job.source.name: job for job in found}
         return list(jobs.values())
 

@@ -36,7 +36,7 @@ def report(folder: Path, name: str = "new") -> dict[str, Any]:
 def test_the_report_tells_what_the_dataset_holds(place: Path) -> None:
     told, dataset = report(place), Dataset(place / "new")
     assert dataset.num_episodes == told["yield"]["successes"] == 1
-    assert told["data"] == "MuJoCo twin, not a robot"
+    assert told["data"] == "twin: MuJoCo twin, not a robot"
     assert len(told["failed"]) == told["yield"]["attempts"] - 1
     assert told["cost"]["wall_s"] > 0
     assert told["cost"]["cpu_s_per_success"] > 0
@@ -47,7 +47,7 @@ def test_the_report_tells_what_the_dataset_holds(place: Path) -> None:
     for name, value in made["draw"].items():  # reckoned from the seeds; there as the simulation drew it
         assert by_attempt[made["attempt"]][name] == value
     card = (place / "new/README.md").read_text()
-    assert "**Origin: MuJoCo twin, not a robot**" in card and f"{told['yield']['attempts']} attempt" in card
+    assert "**Data: twin: MuJoCo twin, not a robot**" in card and f"{told['yield']['attempts']} attempt" in card
     page = (place / "new.augment_report.html").read_text()
     assert "Yield: 1 of " in page
     assert "data:image/png;base64," in page

@@ -204,7 +204,7 @@ def test_inspect_shows_channels_and_names_the_spec_that_fits(good: Path, said: A
     for topic in PAD_TOPICS.values():
         assert topic in text
     assert f"fits the shipped spec: taccorl ingest {good} {SPEC}" in text
-    assert "surrogate stand-in" in text
+    assert "stand-in recording, not a robot" in text
     assert list(Path.cwd().iterdir()) == []
 
 

@@ -71,7 +71,7 @@ def test_recording_beside_an_episode_of_a_dataset(recording: Path, dataset: Path
         values = np.array(column.values, dtype=np.float32)[:, 0]
         assert np.array_equal(values, episode.arrays["observation.state"][:, 6])
     page = found["/pair"]["TextDocument:text"].values[0][0]
-    assert page.count("surrogate stand-in, not a robot") == 2
+    assert page.count("surrogate: stand-in recording, not a robot") == 2
     assert str(recording) in page and "dataset episode 1" in page
 
 
@@ -90,7 +90,7 @@ def test_recorded_actions_in_the_twin_begin_where_they_were_recorded(dataset: Pa
     assert 0.01 < np.abs(a - b).max() < 0.3
     assert "/b/touch/sum/left_a" not in found, "an empty bench has nothing to touch"
     page = found["/pair"]["TextDocument:text"].values[0][0]
-    assert f"replayed in {twin}" in page and "twin replay of: surrogate stand-in" in page
+    assert f"replayed in {twin}" in page and "twin: replay of: stand-in recording" in page
 
 
 def test_sheet_of_a_part_holds_that_part(dataset: Path, tmp_path: Path):
@@ -98,7 +98,7 @@ def test_sheet_of_a_part_holds_that_part(dataset: Path, tmp_path: Path):
     assert main(["view", str(dataset), f"--sheet={out}", "--start_s=1", "--end_s=2"]) == 0
     with Image.open(out) as image:
         assert image.info["Title"].endswith("episode 0, 1.00 to 2.00 s")
-        assert image.info["Source"] == "surrogate stand-in, not a robot"
+        assert image.info["Source"] == "surrogate: stand-in recording, not a robot"
 
 
 @pytest.mark.parametrize(

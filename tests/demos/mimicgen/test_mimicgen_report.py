@@ -100,7 +100,7 @@ def test_the_page_names_poor_boxes_and_every_failure_and_needs_no_other_file():
     assert "<td>friction</td><td>0.3 … 0.4</td><td class=n>0 of 20: 0 % (95 %: 0 … 16)</td>" in page
     assert page.count("taccorl view ") == 20
     assert "it &lt;fell&gt;" in page
-    assert "MuJoCo twin, not a robot: simulated" in page
+    assert "twin: MuJoCo twin, not a robot" in page
     assert "What the whole run took is not known" in page
     for name in ("retarget", "contact_mode"):
         assert f"<tr><td>{name}</td><td>{getattr(plan().spec.datagen_config, name)}</td></tr>" in page
