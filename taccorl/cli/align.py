@@ -149,10 +149,11 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
 
 def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
     """With a remark if much more than noise is left."""
-    if floor is None or one.trouble or one.after < FAR_ABOVE_FLOOR * floor:
+    left = one.before if one.trouble or one.unchanged else one.after
+    if floor is None or not left >= FAR_ABOVE_FLOOR * floor:
         return one
     remark = (
-        f"{one.after / floor:.3g} noise floors are left: the twin lacks an effect, and these gains take up part of it. Find it "
+        f"{left / floor:.3g} noise floors are left, so the twin lacks an effect, and fitted gains take up part of it. Find it "
         "with taccorl diagnose, add it, then align again"
     )
     return dataclasses.replace(one, remarks=(remark, *one.remarks))
@@ -182,6 +183,8 @@ def _print(one: "Alignment") -> None:
     out.print(Text(one.part, "bold"))
     if one.trouble:
         out.print(Text(f"  not aligned: {one.trouble}", "red"), soft_wrap=True)
+    if one.unchanged:
+        out.print(Text("  the recordings agree with the twin's numbers, which stay as they are"), soft_wrap=True)
     if not one.numbers:
         return
     out.print(Text(f"  fitted to {_few(one.fitted_to)}; judged by {_few(one.judged_by)}"), soft_wrap=True)

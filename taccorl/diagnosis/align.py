@@ -67,6 +67,8 @@ class Alignment:
     remarks: tuple[str, ...] = ()
     trouble: str = ""
     """Reason why the numbers are not written; empty if they are."""
+    unchanged: bool = False
+    """True if the twin keeps its numbers: they are inside the intervals, and the fitted ones are no better."""
     effects: tuple[Effect, ...] = ()
     """Effects whose parameters were fitted with the numbers: latency and exposure of a camera."""
     twin: TwinConfig | None = None
@@ -141,12 +143,14 @@ def _align_joint(
     before, after = (
         float(np.sqrt(np.mean([getattr(e, name) ** 2 for e in judged]))) for name in ("rmse_before", "rmse_after")
     )
+    numbers = _gains(fit, model)
     trouble = "" if fit.converged else "; ".join(r for r in fit.remarks if r.startswith("not converged"))
-    if not trouble and after > before:
+    unchanged = not trouble and after > before and all(n.fixed or n.low <= n.before <= n.high for n in numbers)
+    if not trouble and not unchanged and after > before:
         trouble = f"the error on {', '.join(e.name for e in judged)} is larger with the fitted gains"
     return Alignment(
         part=signal,
-        numbers=_gains(fit, model),
+        numbers=numbers,
         error_name="RMS error of the angle, rad",
         before=before,
         after=after,
@@ -154,6 +158,7 @@ def _align_joint(
         fitted_to=tuple(e.name for e in fit.errors if e.use == "fit"),
         remarks=tuple(r for r in fit.remarks if not r.startswith("not converged")),
         trouble=trouble,
+        unchanged=unchanged,
     )
 
 
@@ -307,7 +312,7 @@ def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig,
     k_n and k_d are common to all pads: if two arms need different ones, the pads stay as they were.
     """
     config = copy.deepcopy(config)
-    good = [a for a in found if not a.trouble]
+    good = [a for a in found if not a.trouble and not a.unchanged]
     why = ""
     for a in good:
         values = {n.name: n.value for n in a.numbers if n.name in Gains._fields and not n.fixed}

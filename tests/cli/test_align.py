@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_press import K_D, K_N, ball_at, press
+from one_joint import recorded
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.alignment.measurements.folder import Measurements
@@ -69,6 +70,17 @@ def test_gains_that_stand_in_for_a_missing_effect_are_said_to_do_so(said: Any, t
     _, text = said("align", "sweeps")
     [part] = json.loads((tmp_path / "alignment" / "report.json").read_text())["parts"]
     assert part["trouble"] or any("noise floors" in r and "diagnose" in r for r in part["remarks"]), text
+
+
+def test_right_gains_stay_as_they_are():
+    # Recordings of the twin itself: whether the fit is better on the validation recording is chance, and then nothing is changed.
+    found = []
+    for seed in range(4):
+        fit, validation = (recorded(SIGNAL, k, seconds=4.0) for k in (2 * seed, 2 * seed + 1))
+        found.append(align_part(SIGNAL, TwinConfig(), Measurements((fit,), (validation,), rule="by hand")))
+    assert all(a.unchanged or a.after <= a.before for a in found) and not any(a.trouble for a in found)
+    kept = next(a for a in found if a.unchanged)
+    assert aligned(TwinConfig(), [kept]) == (TwinConfig(), "")
 
 
 def test_what_would_be_overwritten_or_is_no_piper_is_refused(folder: Path, said: Any, tmp_path: Path):
