@@ -5,6 +5,7 @@ A hypothesis is a list of effects; its numbers are those that are always fitted 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,6 +24,8 @@ MANY_RECORDINGS = 4
 COARSE, FINE = 1e-3, 1e-4
 """Steps of finite differences, in coordinates of order 1. Coarse ones average over the kinks of dry friction and limits while
 hypotheses are compared; fine ones are needed to follow the ridge of K_p and K_d to its top, and for correct intervals."""
+OUTLYING = 10.0
+"""Residual [floors] from which a robust fit (``loss="cauchy"``) discounts a row."""
 _OPEN = 1e-14
 """Directions that move the residuals, squared, so little of the strongest one count as this: open."""
 _AT_BOUND = 1e-3
@@ -176,6 +179,7 @@ def fit(
     start: Mapping[str, float],
     most: int = 40,
     step: float = COARSE,
+    loss: Literal["linear", "cauchy"] = "linear",
 ) -> Fit:
     """Fit all numbers of a hypothesis together.
 
@@ -183,6 +187,8 @@ def fit(
         start: start values; numbers that are left out start at their defaults.
         most: most steps of the solver.
         step: step of its finite differences.
+        loss: ``cauchy`` counts a residual r as log(1 + (r / ``OUTLYING``)²), so that stretches that a number moves by jumps (a
+            pendulum that sticks one swing earlier) do not hold back the others. For a start of a ``linear`` fit.
     """
     layout = tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s)) for r in recordings)
     candidates = chosen(problem, names)
@@ -234,6 +240,8 @@ def fit(
         ftol=1e-5,
         xtol=1e-6,
         gtol=1e-9,
+        loss=loss,
+        f_scale=OUTLYING,
     )
     ended = np.clip(found.x + shift, low, high)
     values, effects = at(ended)

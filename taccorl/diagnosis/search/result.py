@@ -60,6 +60,8 @@ class SearchConfig:
     """Number of effects that are refitted after the screening: the true one was among the first 12 in every tested case."""
     first_steps: int = 5
     """Most steps of the solver in the first refits, which select effects for the full refits."""
+    num_rough: int = 4
+    """Number of effects, in the order of the screening, that also get robust fits where every first refit is ``OUTLYING`` off."""
     num_finished: int = 2
     """Number of effects with the least error that are refitted fully, from several starts."""
     num_likely: int = 2

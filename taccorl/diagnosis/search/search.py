@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 
 from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
-from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit, moved_by, rms, stacked
+from taccorl.diagnosis.search.fit import FINE, OUTLYING, Fit, best_fit, fit, moved_by, rms, stacked
 from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round, SearchConfig, Status
 from taccorl.diagnosis.search.screen import Probe, can_fade, probe
@@ -159,6 +159,9 @@ class _Search:
             for name in order
         }
         short = {name: self._short(parent, name, starts[name][0]) for name in order[: c.num_refitted]}
+        if min(model.error for model in short.values()) > OUTLYING:
+            self.progress("refitting without what is far off")
+            short |= {name: self._rough(short[name]) for name in order[: c.num_rough]}
         by_error = sorted(short, key=lambda name: short[name].error)
         rows = []
         for place, name in enumerate(by_error):
@@ -194,6 +197,16 @@ class _Search:
             again = self._fitted((*parent.names, name), [start | self.given], self.config.first_steps)
             model = min((model, again), key=lambda m: m.error)
         return model
+
+    def _rough(self, model: Fit) -> Fit:
+        """``model``, or the best robust fit from where the numbers began if that leaves less: stretches that answer by jumps,
+        such as a swing that sticks earlier, hold a linear fit beside the truth."""
+        found = [model]
+        for start in self.problem.candidates[model.names[-1]].starts[:3]:
+            steps = 2 * self.config.first_steps
+            found.append(fit(self.problem, self.fit_to, model.names, self.given | start, steps, loss="cauchy"))
+            self.evaluations += found[-1].evaluations
+        return min(found, key=lambda m: m.error)
 
     def _child(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
         """``parent`` with one effect more; never worse than ``parent``, which it contains."""
