@@ -17,6 +17,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipelines.lerobot_commands import FIRST_SEED, Scoring, Training
 from pipelines.steps import chosen, lerobot, parsed, step
 from taccorl.cli import augment, collect, ingest, merge
 from taccorl.cli.augment import AugmentConfig
@@ -26,7 +27,6 @@ from taccorl.cli.merge import MergeConfig
 from taccorl.demos.mimicgen.coverage import Share
 from taccorl.sim.twin_file import save_twin
 from taccorl.surrogate.twin import ORIGIN, draw_surrogate_twin
-from taccorl.training.lerobot_commands import FIRST_SEED, Scoring, Training
 
 RECORDING_SPEC = "piper_flexitac_mcap"
 SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import yaml
 
+from pipelines.lerobot_commands import Training
 from pipelines.steps import chosen, lerobot, parsed, step
 from taccorl.cli import augment, collect, evaluate, execute
 from taccorl.cli.augment import AugmentConfig
@@ -22,7 +23,6 @@ from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
 from taccorl.cli.execute import ExecuteConfig
 from taccorl.demos.mimicgen.spec import mimic_spec_path
 from taccorl.lineage.engines import LocalEngine
-from taccorl.training.lerobot_commands import Training
 
 SMALL = ("--sources=1", "--episodes=1", "--scored=2", "--episode_length=12", "--workers=1")
 SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]", "--cache=host")

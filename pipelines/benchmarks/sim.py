@@ -8,11 +8,11 @@ from statistics import median
 import mujoco
 import numpy as np
 
+from pipelines.benchmarks.grip_rig import gripped, in_hand_m, rest, shake
 from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
 from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import cpu_s
 from taccorl.robots import ROBOT
-from taccorl.sim.grip_rig import gripped, in_hand_m, rest, shake
 from taccorl.sim.pad import OneSim, PadArray
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.robot import RobotConfig

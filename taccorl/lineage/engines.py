@@ -7,7 +7,6 @@ every item that failed. Finished work is in the store, so the next run does only
 """
 
 import abc
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,6 @@ import draccus
 from taccorl.lineage import cluster
 from taccorl.lineage.errors import EngineError
 from taccorl.lineage.processes import NO_CARE, Care, Done, Failed, attempt, run_in_processes
-from taccorl.lineage.store import Artefact, Stage, Store
 
 NAMED_FAILURES = 20  # in one message; the rest is counted
 NAME_LENGTH = 160
@@ -158,43 +156,6 @@ class RayEngine(Engine):
             cpus_per_task=self.cpus_per_task,
             mem_per_cpu_gb=self.mem_per_cpu_gb,
         )
-
-
-def map_stage(
-    store: Store,
-    stage: Stage,
-    config: Any,
-    inputs: Sequence[Artefact],
-    *,
-    engine: Engine | None = None,
-    on_done: Callable[[Artefact, Artefact], None] | None = None,
-) -> list[Artefact]:
-    """Run one stage on many inputs, one artefact each, in order. Artefacts that are in the store already are not made again.
-
-    Args:
-        store: store of the artefacts; those that it has are not made again.
-        stage: stage that gets one input at a time.
-        config: configuration, the same for all inputs.
-        inputs: inputs, for one run of the stage each.
-        engine: engine; by default in this process.
-        on_done: function that is called with (input, artefact), first for artefacts that were in the store.
-
-    Raises:
-        EngineError: an input failed; the message names each one. The artefacts of all others are in the store.
-    """
-    found = {i: artefact for i, item in enumerate(inputs) if (artefact := store.find(stage, config, [item]))}
-    for i, artefact in found.items():
-        if on_done is not None:
-            on_done(inputs[i], artefact)
-    missing = [i for i in range(len(inputs)) if i not in found]
-    fn = functools.partial(_run_one, store, stage, config)
-    made = (engine or LocalEngine()).map(fn, [inputs[i] for i in missing], on_done=on_done)
-    every = found | dict(zip(missing, made, strict=True))
-    return [every[i] for i in range(len(inputs))]
-
-
-def _run_one(store: Store, stage: Stage, config: Any, item: Artefact) -> Artefact:
-    return store.run(stage, config, [item])
 
 
 def _failure_text(failures: list[tuple[str, Failed]], num_items: int) -> str:

@@ -260,20 +260,6 @@ def _draw_measured(camera: mujoco.MjsCamera, measured: Intrinsics) -> None:
     camera.principal_pixel = [(measured.columns - 1) / 2 - measured.cx_px, (measured.rows - 1) / 2 - measured.cy_px]
 
 
-def place_camera(model: mujoco.MjModel, config: CameraConfig) -> None:
-    """Move a camera of a compiled model to ``config``'s pose, offset included: so that calibration can try poses without
-    compiling the model again.
-
-    Raises:
-        TaccorlError: the model has no camera of that name.
-    """
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, config.name)
-    if index < 0:
-        known = [model.camera(i).name for i in range(model.ncam)]
-        raise TaccorlError(f"camera {config.name!r} is not in the model; {nearest(config.name, known)}")
-    model.cam_pos[index], model.cam_quat[index] = config.pose()
-
-
 def project(
     points_world: np.ndarray, position_world: np.ndarray, world_from_camera: np.ndarray, intrinsics: Intrinsics
 ) -> np.ndarray:

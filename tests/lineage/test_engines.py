@@ -14,12 +14,10 @@ import pytest
 
 from taccorl.errors import TaccorlError
 from taccorl.lineage import cluster
-from taccorl.lineage.engines import Engine, LocalEngine, RayEngine, SlurmEngine, map_stage
+from taccorl.lineage.engines import Engine, LocalEngine, RayEngine, SlurmEngine
 from taccorl.lineage.errors import EngineError
-from taccorl.lineage.store import Store
 
 from . import toys
-from .toys import INGEST, IngestConfig, make_raw
 
 ONE_AND_TWO_WORKERS = pytest.mark.parametrize("workers", [1, 2])
 
@@ -216,36 +214,6 @@ def is_running(pid: int) -> bool:
     except FileNotFoundError:
         return False
     return state not in ("Z", "X")  # a zombie has ended; only its entry waits for whoever adopted it
-
-
-# One stage over many inputs.
-
-
-@ONE_AND_TWO_WORKERS
-def test_map_stage_makes_one_artefact_per_input_and_only_what_is_missing(tmp_path, workers):
-    store, raw, log = Store(tmp_path / "store"), make_raw(tmp_path / "raw", num=3), tmp_path / "log"
-    sources = [store.source(path) for path in sorted(raw.iterdir())]
-    config = IngestConfig(log=log)
-    middle = store.run(INGEST, config, [sources[1]])
-    done = []
-    made = map_stage(
-        store, INGEST, config, sources, engine=LocalEngine(workers=workers), on_done=lambda *pair: done.append(pair)
-    )
-    assert [artefact.manifest["inputs"][0]["digest"] for artefact in made] == [source.digest for source in sources]
-    assert made[1] == middle
-    assert done[0] == (sources[1], middle)
-    assert sorted(done, key=str) == sorted(zip(sources, made, strict=True), key=str)
-    assert sorted(log.read_text().splitlines()) == ["ingest demo_0.raw", "ingest demo_1.raw", "ingest demo_2.raw"]
-    assert map_stage(store, INGEST, config, sources) == made
-
-
-def test_map_stage_names_the_input_that_failed_and_keeps_the_rest(tmp_path):
-    store, raw = Store(tmp_path / "store"), make_raw(tmp_path / "raw")
-    sources = [store.source(path) for path in sorted(raw.iterdir())]
-    (raw / "demo_0.raw").unlink()
-    with pytest.raises(EngineError, match=rf"{raw}/demo_0\.raw: LineageError: .* is gone"):
-        map_stage(store, INGEST, IngestConfig(), sources)
-    assert store.find(INGEST, IngestConfig(), [sources[1]]) is not None
 
 
 # Clusters. datatrove is not installed with the tests: what is ours is tested, its executors are not.

@@ -18,7 +18,6 @@ from taccorl.sim.cameras import (
     letterbox_window,
     look_at_quat,
     offset_pose,
-    place_camera,
     project,
     sensor_intrinsics,
 )
@@ -193,23 +192,6 @@ def test_an_offset_moves_the_picture_as_the_pinhole_says():
     assert np.linalg.norm(pose_of(model, "back")[0] - target) == pytest.approx(depth + shift_m)
 
 
-def test_a_camera_placed_in_a_compiled_model_is_where_compiling_puts_it():
-    moved = dataclasses.replace(
-        bench_cameras()[1], offset=CameraOffset(rotation_rad=(0.02, -0.03, 0.01), translation_m=(0.004, -0.002, 0.006))
-    )
-    spec = bench_bodies()
-    add_cameras(spec, bench_cameras())
-    model = spec.compile()
-    nominal = pose_of(model, "left_wrist")
-    place_camera(model, moved)
-    placed = pose_of(model, "left_wrist")
-    fresh = bench_bodies()
-    add_cameras(fresh, [moved])
-    compiled = pose_of(fresh.compile(), "left_wrist")
-    assert np.allclose(placed[0], compiled[0], atol=1e-15) and np.allclose(placed[1], compiled[1], atol=1e-15)
-    assert np.linalg.norm(placed[0] - nominal[0]) == pytest.approx(math.sqrt(16 + 4 + 36) * 1e-3)
-
-
 def test_a_quaternion_may_stand_in_for_a_target():
     quat = look_at_quat(np.array([0.0, 0, 1]), np.zeros(3), np.array([0.0, 1, 0]))
     assert quat == pytest.approx((1, 0, 0, 0))  # straight down with y up is MuJoCo's own default
@@ -237,8 +219,6 @@ def test_mistakes_are_answered_with_a_way_out():
     add_cameras(spec, bench_cameras())
     with pytest.raises(TaccorlError, match="front: the model has one of that name"):
         add_cameras(spec, bench_cameras())
-    with pytest.raises(TaccorlError, match="'frnt' is not in the model; did you mean 'front'"):
-        place_camera(spec.compile(), dataclasses.replace(bench_cameras()[0], name="frnt"))
     with pytest.raises(TaccorlError, match="either look_at_m or quat_wxyz"):
         CameraConfig(name="x")
     with pytest.raises(TaccorlError, match="another `up`"):

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from pipelines.benchmarks.grip_rig import gripped, in_hand_m, rest, shake
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.robots.bimanual_piper import INERTIAS
-from taccorl.sim.grip_rig import gripped, in_hand_m, rest, shake
 from taccorl.sim.robot import RobotConfig, add_arm, link_poses
 from taccorl.sim.twin import TwinConfig, empty_bench
 

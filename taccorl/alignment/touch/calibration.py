@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import norm, wasserstein_distance
+from scipy.stats import wasserstein_distance
 
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion
@@ -53,11 +53,6 @@ class NoiseLevel:
     @property
     def pooled_std_count(self) -> float:
         return float(np.sqrt(np.mean(np.square(self.std_count))))
-
-    @property
-    def threshold_of_taxels_count(self) -> np.ndarray:
-        """(P, R, C) λ_noise of each taxel from its own mean and standard deviation, for a normal distribution."""
-        return self.mean_count + norm.ppf(QUANTILE) * self.std_count
 
 
 @dataclass(frozen=True)

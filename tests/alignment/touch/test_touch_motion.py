@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from made_press import K_D, K_N, RADIUS_M, ball_at, penetration_m, press
 
+from pipelines.benchmarks.grip_rig import HOME_RAD, gripped
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
 from taccorl.alignment.touch.model import TouchModel
@@ -16,7 +17,6 @@ from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.added import AddedEffects
 from taccorl.sim.effects.effect import Effect, Memory, TouchEffect, parameter
-from taccorl.sim.grip_rig import HOME_RAD, gripped
 from taccorl.sim.pad import OneSim, PadArray
 from taccorl.sim.shapes import Box
 from taccorl.sim.twin import TwinConfig

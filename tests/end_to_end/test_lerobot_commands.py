@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from pipelines.lerobot_commands import Scoring, Training
 from taccorl.data.dataset import PROVENANCE
 from taccorl.errors import DatasetError
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
-from taccorl.training.lerobot_commands import Scoring, Training
 
 
 def published(out: Path, content: str = "1") -> Path:
