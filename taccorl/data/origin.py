@@ -76,12 +76,17 @@ class Origin:
             features: features of the dataset; ``sim.*`` are a simulator's state.
 
         Raises:
-            TaccorlError: an unknown domain, or a real one with a text that says otherwise.
+            TaccorlError: an unknown domain, or a real one with a text or a feature that says otherwise.
         """
         text = str(record.get("origin") or "")
+        simulated = any(key.startswith("sim.") for key in features)
+        if simulated and record.get("domain") == "real":
+            raise TaccorlError(
+                f"domain 'real' of {text!r}: the data hold a simulator's state (sim.*), and stay simulated"
+            )
         if "domain" in record:
             return cls(cast("Domain | None", record["domain"]), text, str(record.get("domain_derived")) == "True")
-        domain = _derived(text) or ("twin" if any(key.startswith("sim.") for key in features) else None)
+        domain = _derived(text) or ("twin" if simulated else None)
         return cls(domain, text, domain is not None)
 
     def agreed(self, domain: Domain | None, who: str) -> "Origin":

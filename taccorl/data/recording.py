@@ -335,12 +335,22 @@ class Recording:
         """Origin that the file's metadata state.
 
         Raises:
-            TaccorlError: they state a real domain of a simulated recording.
+            TaccorlError: they state a real domain of a simulated recording, or several domains (RecordingError).
         """
         records = self.reader.metadata.values()
-        stated = (r for r in records if r.get("domain") in DOMAINS)  # other people's key may have any value
-        named = ({"origin": r["origin"]} for r in records if "origin" in r)
-        return Origin.read(next(stated, None) or next(named, {}))
+        stated = [
+            Origin.read(r) for r in records if r.get("domain") in DOMAINS
+        ]  # other people's key may have any value
+        named = [
+            Origin.read({"origin": r["origin"]}) for r in records if "origin" in r and r.get("domain") not in DOMAINS
+        ]
+        found = stated or named
+        domains = {origin.domain for origin in (*stated, *named) if origin.domain is not None}
+        if len(domains) > 1:
+            raise RecordingError(
+                f"{self.source.name}: its metadata state several domains: {', '.join(sorted(domains))}"
+            )
+        return found[0] if found else Origin()
 
     def pictures(
         self, wanted: dict[str, list[tuple[int, int | None]]]

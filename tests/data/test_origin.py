@@ -82,6 +82,12 @@ def test_no_text_of_a_simulation_goes_with_real(text: str) -> None:
         stated_origin("real", text)
 
 
+def test_a_simulator_s_columns_go_with_no_real_domain() -> None:
+    with pytest.raises(TaccorlError, match=r"sim\.\*"):
+        Origin.read({"domain": "real", "origin": ""}, ["action", "sim.state"])
+    assert Origin.read({"domain": "surrogate", "origin": ""}, ["sim.state"]).domain == "surrogate"
+
+
 # ---- a stand-in never becomes real ----
 
 
@@ -104,6 +110,19 @@ def test_a_stand_in_with_an_edited_label_is_refused(tmp_path: Path) -> None:
         file.attrs["domain"] = "real"
     entry = ingest_one(job(path, tmp_path, None, "cobot_magic_hdf5"))
     assert entry["outcome"] == "refused" and "stays simulated" in entry["reason"]
+
+
+def test_a_recording_that_states_two_domains_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "episode_0.hdf5"
+    write_cobot_magic_hdf5(path, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
+    spec = load_recording_spec("cobot_magic_hdf5")
+    recording = load_recording(find_sources(path, reader=spec.reader)[0][1], spec, tmp_path)
+    recording.reader.metadata = {"joined": {"domain": "real"}, **recording.reader.metadata}
+    with pytest.raises(TaccorlError, match=r"episode_0.*real, surrogate"):
+        _ = recording.origin
+    recording.reader.metadata = {"joined": {"domain": "real"}, "old": {"origin": "surrogate stand-in"}}
+    with pytest.raises(TaccorlError, match=r"real, surrogate"):
+        _ = recording.origin
 
 
 def test_a_dataset_of_a_stand_in_keeps_its_domain_through_another_ingest(dataset: Path, tmp_path: Path) -> None:
