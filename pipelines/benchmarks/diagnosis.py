@@ -86,7 +86,7 @@ def cells() -> Iterator[Row]:
 
 @benchmark("robots")
 def robots() -> Iterator[Row]:
-    """One joint of robots that are not the PiPER, by their robot files; the whole study is ``diagnosis.studies.robots``."""
+    """One joint of robots that are not the PiPER, by their robot files; the whole study is ``pipelines.studies.robots``."""
     from pipelines.studies import robots as robot_study
 
     rows = [robot_study.run(job) for job in robot_study.jobs()[:6]]

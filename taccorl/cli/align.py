@@ -2,7 +2,8 @@
 
 Joints that move: K_d and T_ref, with --fit_kp=true also K_p. Pads for which measurements.yaml states the pressed object: k_n and
 k_d. Cameras that --cameras names: pose, latency and exposure, from the first episode. Each number has its 95 % interval; errors
-before and after are those of validation recordings. Writes a new twin. Then ``taccorl diagnose`` searches for effects.
+before and after are those of validation recordings (cameras: of frames that were not fitted). Writes a new twin. Then
+``taccorl diagnose`` searches for effects.
 
     --joints=[J3,left_joint5] --pads=[left] --cameras=[front]    only these
     --fit_kp=true    fit K_p, too
@@ -82,6 +83,8 @@ def main(argv: list[str]) -> int:
             f"{config.twin}: describes another machine than the PiPER; its numbers are fitted by taccorl diagnose "
             "--until=noise_floor, which writes them into a new file"
         )
+    _check_cameras(config, machine)
+    _make_out(config.out)
     found = _joints_and_pads(config, machine) if config.joints or config.pads or not config.cameras else []
     if found is None:
         return 1
@@ -92,7 +95,6 @@ def main(argv: list[str]) -> int:
     if disagree:
         print(disagree)
     good = [one.part for one in found if not one.trouble]
-    config.out.mkdir(parents=True, exist_ok=True)
     report = {
         "command": shlex.join(["taccorl", "align", *argv]),
         "twin": str(config.twin) if config.twin else "nominal twin",
@@ -107,7 +109,10 @@ def main(argv: list[str]) -> int:
         return 1
     save_twin(twin, config.out / TWIN)
     print(f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}")
-    print(f"next: {shlex.join(['taccorl', 'diagnose', str(config.measurements), f'--twin={config.out / TWIN}'])}")
+    options = {name: getattr(config, name) for name in ("spec", "columns", "validation_every")}
+    given = [f"--{name}={value}" for name, value in options.items() if value is not None]
+    words = ["taccorl", "diagnose", str(config.measurements), f"--twin={config.out / TWIN}", *given]
+    print(f"next: {shlex.join(words)}")
     return int(len(good) < len(found) or bool(disagree))
 
 
@@ -143,8 +148,9 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
         fit_kp=config.fit_kp,
         workers=config.workers,
     )
-    floors = {s.signal: s.floor for s in before.scores() if s.kind == "position" and s.use == "validation"}
-    return [_beside_floor(one, floors.get(one.part)) for one in found]
+    floors = {(s.signal, s.use): s.floor for s in before.scores() if s.kind == "position"}
+    use = "validation" if measurements.validation else "fit"
+    return [_beside_floor(one, floors.get((one.part, use))) for one in found]
 
 
 def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
@@ -153,10 +159,44 @@ def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
     if floor is None or not left >= FAR_ABOVE_FLOOR * floor:
         return one
     remark = (
-        f"{left / floor:.3g} noise floors are left, so the twin lacks an effect, and fitted gains take up part of it. Find it "
-        "with taccorl diagnose, add it, then align again"
+        f"{left / floor:.3g} noise floors are left: the twin lacks an effect, or a clock is off (see above), and fitted gains "
+        "take up part of it. Find it with taccorl diagnose, add it, then align again"
     )
     return dataclasses.replace(one, remarks=(remark, *one.remarks))
+
+
+def _make_out(out: Path) -> None:
+    """Make the folder before the fits, which may take long.
+
+    Raises:
+        TaccorlError: it cannot be made or written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / REPORT).touch()
+        (out / REPORT).unlink()
+    except OSError as error:
+        raise TaccorlError(f"--out={out}: cannot be written ({error.strerror}): give another folder") from error
+
+
+def _check_cameras(config: AlignConfig, machine: "PiperTwin") -> None:
+    """
+    Raises:
+        TaccorlError: the twin has no such camera, or the measurements have no episode with pictures.
+    """
+    if not config.cameras:
+        return
+    from taccorl.cli.view import opened_episode
+
+    known = [camera.name for camera in machine.config.cameras]
+    for name in config.cameras:
+        if name not in known:
+            raise TaccorlError(f"--cameras={name}: the twin has no such camera; {nearest(name, known)}")
+    try:
+        with opened_episode(config.measurements, 0, config.spec, "--spec"):
+            pass
+    except TaccorlError as error:
+        raise TaccorlError(f"--cameras={','.join(config.cameras)} needs one recording or dataset: {error}") from error
 
 
 def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
@@ -165,10 +205,6 @@ def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
     from taccorl.cli.view import opened_episode
     from taccorl.diagnosis.align import align_camera
 
-    known = [camera.name for camera in machine.config.cameras]
-    for name in config.cameras:
-        if name not in known:
-            raise TaccorlError(f"--cameras={name}: the twin has no such camera; {nearest(name, known)}")
     with opened_episode(config.measurements, 0, config.spec, "--spec") as episode:
         return [align_camera(name, machine.config, episode) for name in config.cameras]
 

@@ -70,7 +70,8 @@ class Alignment:
     unchanged: bool = False
     """True if the twin keeps its numbers: they are inside the intervals, and the fitted ones are no better."""
     effects: tuple[Effect, ...] = ()
-    """Effects whose parameters were fitted with the numbers: latency and exposure of a camera."""
+    """Effects whose parameters were fitted with the numbers: latency and exposure of a camera. They replace the twin's; one that
+    is absent only removes it."""
     twin: TwinConfig | None = None
     """For a camera: the twin with its new pose."""
     overlays: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -80,7 +81,7 @@ class Alignment:
         """The result as JSON values; NaN becomes None."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_STORED}
         values["numbers"] = [dataclasses.asdict(n) for n in self.numbers]
-        values["effects"] = [effect.name for effect in self.effects]
+        values["effects"] = [effect.name for effect in self.effects if not effect.is_absent]
         return _plain(values)
 
 
@@ -148,6 +149,11 @@ def _align_joint(
     unchanged = not trouble and after > before and all(n.fixed or n.low <= n.before <= n.high for n in numbers)
     if not trouble and not unchanged and after > before:
         trouble = f"the error on {', '.join(e.name for e in judged)} is larger with the fitted gains"
+    remarks = _limits_of_gains("kp" in free, all(m.kp_known for m in motions))
+    if not own.validation:
+        remarks.append(
+            "no recording is for validation (measurements.yaml): both errors are those of the fit's recordings"
+        )
     return Alignment(
         part=signal,
         numbers=numbers,
@@ -156,10 +162,25 @@ def _align_joint(
         after=after,
         judged_by=tuple(e.name for e in judged),
         fitted_to=tuple(e.name for e in fit.errors if e.use == "fit"),
-        remarks=tuple(r for r in fit.remarks if not r.startswith("not converged")),
+        remarks=(*remarks, *(r for r in fit.remarks if not r.startswith("not converged"))),
         trouble=trouble,
         unchanged=unchanged,
     )
+
+
+def _limits_of_gains(kp_fitted: bool, kp_known: bool) -> list[str]:
+    """What the intervals of K_p, K_d and T_ref leave out, where K_p is not commanded and known."""
+    if kp_known:
+        return []
+    if not kp_fitted:
+        return [
+            "K_p is the twin's and was not measured: K_d and T_ref, with their intervals, hold for this K_p only and are "
+            "proportional to it; K_d / K_p and T_ref / K_p hold for any. Commanded gains belong in measurements.yaml (kp)"
+        ]
+    return [
+        "the intervals of K_p, K_d and T_ref contain the noise but no error of the model (inertia, pose, scale of torques), "
+        "which changes all three in proportion, often by more; those of K_d / K_p and T_ref / K_p hardly depend on it"
+    ]
 
 
 def _gains(fit: ControllerFit, model: JointModel) -> tuple[FittedNumber, ...]:
@@ -231,7 +252,7 @@ def _align_camera(part: str, camera: str, config: TwinConfig, episode: Episode) 
     had = _effects_of(config, camera)
     late = camera_latency(all_pictures(episode, camera), episode.time_s, joint_rows(episode), config, camera)
     known_s = sum(float(getattr(e, "delay_s", 0.0)) for e in had)
-    latency_s = 0.0 if late.problems else late.latency_s
+    latency_s = known_s if late.problems else late.latency_s
     frames = camera_frames(episode, camera, latency_s=latency_s)
     fit = calibrate_camera(frames, config, camera)
     numbers = [
@@ -249,12 +270,14 @@ def _align_camera(part: str, camera: str, config: TwinConfig, episode: Episode) 
     if not late.problems:
         low, high = late.interval_s
         numbers.append(FittedNumber(name="latency", unit="s", before=known_s, value=late.latency_s, low=low, high=high))
-        if low > 0.0:
-            effects.append(
-                make_effect(
-                    "camera_latency", cameras=[camera], delay_s=late.latency_s, interval={"delay_s": (low, high)}
-                )
-            )
+        is_late = low > 0.0
+        if not is_late:
+            remarks.append("the latency's interval contains 0: the new twin has none")
+        effects.append(
+            make_effect("camera_latency", cameras=[camera], delay_s=late.latency_s, interval={"delay_s": (low, high)})
+            if is_late
+            else make_effect("camera_latency", cameras=[camera], delay_s=0.0)
+        )
     if fit.converged:
         twin = fit.twin(config)
         try:

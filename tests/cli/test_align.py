@@ -13,7 +13,7 @@ from one_joint import recorded
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.diagnosis.align import align_part, aligned
+from taccorl.diagnosis.align import Alignment, align_part, aligned
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.twin import TwinConfig
@@ -93,7 +93,11 @@ def test_what_would_be_overwritten_or_is_no_piper_is_refused(folder: Path, said:
     assert code == 2 and "axis.yaml" in text
     code, text = said("align", folder / "sweeps", "--cameras=[frnt]")
     assert code == 2 and "frnt" in text and "front" in text
+    code, text = said("align", folder / "sweeps", "--joints=[left_joint5]", "--cameras=[front]")
+    assert code == 2 and "--cameras=front" in text and "sweeps" in text
     assert not (tmp_path / "alignment").exists()
+    code, text = said("align", folder / "sweeps", "--out=mine/notes.txt/found")
+    assert code == 2 and "--out=mine/notes.txt/found" in text and "fitted" not in text, "before the fit"
 
 
 def test_pads_get_stiffness_and_damping_and_what_has_no_validation_says_so():
@@ -108,6 +112,34 @@ def test_pads_get_stiffness_and_damping_and_what_has_no_validation_says_so():
     alone = align_part("left pads", config, Measurements((presses[0],), (), rule="by hand"))
     assert "validation" in alone.trouble
     assert aligned(config, [alone])[0] == config
+
+
+def test_intervals_say_what_they_assume_and_a_twin_that_fits_already_is_no_trouble():
+    truth = other_gains()
+    truth.controller_of("left").kp_nm_per_rad[J] *= 1.3
+    made = sweeps(truth, seconds=3.0)
+    control = truth.controller_of("left")
+    kp, kd = control.kp_nm_per_rad[J], control.kd_nms_per_rad[J]
+    found = align_part(SIGNAL, TwinConfig(), Measurements(made.fit, (), rule="by hand"))
+    numbers = {n.name: n for n in found.numbers}
+    assert numbers["kd/kp"].low < kd / kp < numbers["kd/kp"].high
+    assert numbers["kd"].high < 0.8 * kd, "K_d is fitted for the twin's K_p, which is 1.3 times too low"
+    assert any("K_p is the twin's" in r for r in found.remarks)
+    assert found.judged_by == found.fitted_to and any("validation" in r for r in found.remarks)
+    stated = tuple(dataclasses.replace(m, kp={SIGNAL: kp}) for m in made.fit)
+    known = align_part(SIGNAL, TwinConfig(), Measurements(stated, made.validation, rule="by hand"))
+    kd_known = next(n for n in known.numbers if n.name == "kd")
+    assert kd_known.low < kd < kd_known.high and not any("K_p" in r or "validation" in r for r in known.remarks)
+    again = align_part(SIGNAL, truth, made)
+    assert again.trouble == "" and again.after == pytest.approx(again.before, rel=0.02)
+
+
+def test_a_latency_that_may_be_zero_is_removed_from_the_aligned_camera_only():
+    late = make_effect("camera_latency", cameras=["front", "left_wrist"], delay_s=0.02)
+    config = TwinConfig(effects=[late])
+    none = make_effect("camera_latency", cameras=["front"], delay_s=0.0)
+    [left] = aligned(config, [Alignment(part="camera front", effects=(none,), twin=TwinConfig())])[0].effects
+    assert left == dataclasses.replace(late, cameras=["left_wrist"])
 
 
 @pytest.mark.slow

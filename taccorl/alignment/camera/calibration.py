@@ -154,7 +154,7 @@ class CameraFit:
         camera are removed.
 
         Raises:
-            TaccorlError: the calibration is not valid, or one effect moves this camera and others.
+            TaccorlError: the calibration is not valid.
         """
         if self.problems:
             raise TaccorlError(f"camera {self.camera.name}: {'; '.join(self.problems)}. The twin keeps its camera")
@@ -162,10 +162,8 @@ class CameraFit:
         for effect in config.effects:
             if effect.name != "camera_pose" or self.camera.name not in effect.acts_on():
                 kept.append(effect)
-            elif len(effect.acts_on()) > 1:
-                raise TaccorlError(
-                    f"camera {self.camera.name}: one camera_pose moves {', '.join(effect.acts_on())}; give each its own entry"
-                )
+            elif others := [name for name in effect.acts_on() if name != self.camera.name]:
+                kept.append(dataclasses.replace(effect, cameras=others))
         cameras = [self.camera if camera.name == self.camera.name else camera for camera in config.cameras]
         return dataclasses.replace(config, cameras=cameras, effects=kept)
 

@@ -45,7 +45,8 @@ class TwinView:
         style(spec)
         for effect in present(config.effects):
             if effect.layer == "camera" and name in effect.acts_on():
-                effect.edit(spec, dataclasses.replace(config, cameras=[self.camera]))
+                here = dataclasses.replace(effect, cameras=[name])  # it may act on cameras that this scene lacks
+                here.edit(spec, dataclasses.replace(config, cameras=[self.camera]))
         self.model = spec.compile()
         self.model.cam_resolution[0] = 1  # not said: the view fills its frame, there are no bars
         self.data = mujoco.MjData(self.model)

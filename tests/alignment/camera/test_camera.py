@@ -101,8 +101,19 @@ def test_a_camera_pose_effect_is_where_it_starts_and_goes_into_the_offset():
     assert pose_error(fit.offset, truth)[1] < 4.0
     assert fit.twin(config).effects == []
     config.effects = [make_effect("camera_pose", turn_x_rad=0.01, cameras=["front", "left_wrist"])]
-    with pytest.raises(TaccorlError, match="one camera_pose moves front, left_wrist"):
-        fit.twin(config)
+    [other] = fit.twin(config).effects
+    assert other.acts_on() == ["left_wrist"] and other.turn_x_rad == 0.01  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_an_effect_on_several_cameras_moves_each_as_an_own_entry_would():
+    config = twin()
+    views = []
+    for cameras in (["front"], ["left_wrist", "front"]):
+        config.effects = [make_effect("camera_pose", turn_x_rad=0.01, shift_z_m=0.004, cameras=cameras)]
+        with TwinView(config, "front", SIZE) as view:
+            views.append(view.start)
+    np.testing.assert_allclose(views[1], [0.01, 0, 0, 0, 0, 0.004], atol=1e-9)
+    np.testing.assert_array_equal(*views)
 
 
 def test_overlays_show_the_stages_and_the_outlines_where_the_arms_are():
