@@ -71,7 +71,8 @@ def main(argv: list[str]) -> int:
     from taccorl.lineage.destinations import is_free
 
     if not is_free(config.out):
-        raise TaccorlError(f"--out={config.out}: holds files already; nothing was touched: give another folder")
+        held = "holds files already" if config.out.is_dir() else "is a file"
+        raise TaccorlError(f"--out={config.out}: {held}; nothing was touched: give another folder")
     from taccorl.diagnosis.align import aligned
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
