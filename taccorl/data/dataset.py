@@ -26,7 +26,7 @@ from taccorl.data.file_kinds import no_recording
 from taccorl.data.origin import Origin
 from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec
 from taccorl.data.strict_yaml import Document
-from taccorl.errors import DatasetError, nearest
+from taccorl.errors import DatasetError, TaccorlError, nearest
 
 PROVENANCE = Path("meta/taccorl")
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -468,12 +468,15 @@ def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[st
     if rows != [r["length"] for r in table]:
         raise DatasetError(
             f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, the dataset has {len(table)} episodes, "
-            f"{sum(r['length'] for r in table)} rows: edited by another tool? Remove this file to read it without"
+            f"{sum(r['length'] for r in table)} rows: edited by another tool? Remove this file to read it without; nothing then "
+            "states its origin"
         )
     try:
         return [_from_record(r, features) for r in records]
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: not as taccorl writes it ({type(error).__name__}: {error})") from error
+    except TaccorlError as error:  # of an origin
+        raise DatasetError(f"{path}: {error}") from error
 
 
 def _read_json(path: Path, kind: type = dict) -> Any:

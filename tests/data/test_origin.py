@@ -14,7 +14,7 @@ from taccorl.data.ingest import Job, ingest_one
 from taccorl.data.origin import Origin, stated_origin
 from taccorl.data.recording import find_sources, load_recording
 from taccorl.data.spec import load_recording_spec
-from taccorl.errors import TaccorlError
+from taccorl.errors import DatasetError, TaccorlError
 from taccorl.surrogate.stand_in.config import StandInConfig
 from taccorl.surrogate.stand_in.files import write_cobot_magic_hdf5
 
@@ -130,6 +130,17 @@ def test_a_dataset_of_a_stand_in_keeps_its_domain_through_another_ingest(dataset
     spec = load_recording_spec("taccorl_lerobot")
     source = find_sources(dataset, reader=spec.reader)[0][1]
     assert load_recording(source, spec, tmp_path).origin == Origin("surrogate", "stand-in recording, not a robot")
+
+
+def test_an_edited_record_of_a_dataset_is_refused_with_its_file(dataset: Path, tmp_path: Path) -> None:
+    import shutil
+
+    edited = tmp_path / "edited"
+    shutil.copytree(dataset, edited)
+    path = edited / "meta/taccorl/episodes.json"
+    path.write_text(json.dumps([r | {"domain": "real"} for r in json.loads(path.read_text())]))
+    with pytest.raises(DatasetError, match=r"edited/meta/taccorl/episodes\.json.*stays simulated"):
+        Dataset(edited)
 
 
 def test_a_folder_of_stand_ins_cannot_be_stated_real_for_compare(recordings: Path, tmp_path: Path) -> None:
