@@ -13,6 +13,7 @@ before and after are those of validation recordings (cameras: of frames that wer
 
 import dataclasses
 import json
+import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -50,7 +51,7 @@ class AlignConfig:
     """Fit K_p of joints, too. Positions determine K_d / K_p and T_ref / K_p but hardly K_p itself; without this option K_p stays
     what the recordings state, or the twin's."""
     method: Literal["least_squares", "spsa"] = "least_squares"
-    """Search for the gains of joints."""
+    """Search for the gains of joints: least_squares, or spsa as in the paper."""
     out: Path = Path("alignment")
     """Folder of the result; it must be new or empty."""
     workers: int = 2
@@ -112,7 +113,11 @@ def main(argv: list[str]) -> int:
     print(f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}")
     options = {name: getattr(config, name) for name in ("spec", "columns", "validation_every")}
     given = [f"--{name}={value}" for name, value in options.items() if value is not None]
-    words = ["taccorl", "diagnose", str(config.measurements), f"--twin={config.out / TWIN}", *given]
+    if any(one.floors_left >= FAR_ABOVE_FLOOR for one in found):  # fitted gains hide a part of what is to be found
+        given += [f"--twin={config.twin}"] * (config.twin is not None)
+    else:
+        given.append(f"--twin={config.out / TWIN}")
+    words = ["taccorl", "diagnose", str(config.measurements), *given]
     print(f"next: {shlex.join(words)}")
     return int(len(good) < len(found) or bool(disagree))
 
@@ -155,15 +160,15 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
 
 
 def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
-    """With a remark if much more than noise is left."""
-    left = one.before if one.trouble or one.unchanged else one.after
-    if floor is None or not left >= FAR_ABOVE_FLOOR * floor:
-        return one
+    """With the error that is left in noise floors, and a remark if that is much more than noise."""
+    left = (one.before if one.trouble or one.unchanged else one.after) / floor if floor else math.nan
+    if not left >= FAR_ABOVE_FLOOR:
+        return dataclasses.replace(one, floors_left=left)
     remark = (
-        f"{left / floor:.3g} noise floors are left: the twin lacks an effect, or a clock is off (see above), and fitted gains "
+        f"{left:.3g} noise floors are left: the twin lacks an effect, or a clock is off (see above), and fitted gains "
         "take up part of it. Find it with taccorl diagnose, add it, then align again"
     )
-    return dataclasses.replace(one, remarks=(remark, *one.remarks))
+    return dataclasses.replace(one, floors_left=left, remarks=(remark, *one.remarks))
 
 
 def _make_out(out: Path) -> None:

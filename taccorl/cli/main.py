@@ -37,6 +37,10 @@ VERBS = {
 }
 
 
+_KEEPS = ("collect", "augment", "correct", "execute", "ingest", "merge")
+"""Verbs that keep finished work in a store."""
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one verb. Exit status 0: done, 1: done, but something was quarantined, refused or found wrong, 2: not done because of
     an error."""
@@ -62,7 +66,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"taccorl {words[0]}: {printable(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"\ntaccorl {words[0]}: stopped; what was finished is kept, run again to go on", file=sys.stderr)
+        kept = "; what was finished is kept, run again to go on" if words[0] in _KEEPS else ""
+        print(f"\ntaccorl {words[0]}: stopped{kept}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # `taccorl … | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -61,6 +61,8 @@ class Alignment:
     before: float = math.nan
     """Error of the twin that was given, on ``judged_by``."""
     after: float = math.nan
+    floors_left: float = math.nan
+    """For a joint: error that is left, in noise floors; NaN if its noise floor is not known."""
     judged_by: tuple[str, ...] = ()
     """Recordings (for cameras: frames) of the two errors. They are not those of the fit, unless there were no others."""
     fitted_to: tuple[str, ...] = ()

@@ -100,7 +100,7 @@ def test_help_comes_first_whatever_else_is_wrong(capsys: pytest.CaptureFixture[s
         (TaccorlError("front: no such topic"), 2, "taccorl check: front: no such topic"),
         (FileNotFoundError(2, "No such file or directory", "x.mcap"), 2, "No such file or directory (x.mcap)"),
         (OSError("odd"), 2, "taccorl check: odd"),
-        (KeyboardInterrupt(), 130, "run again to go on"),
+        (KeyboardInterrupt(), 130, "taccorl check: stopped\n"),
     ],
 )
 def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
@@ -118,6 +118,17 @@ def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
     shown = capsys.readouterr().err
     assert words in shown and "Traceback" not in shown
     assert len(shown.strip().splitlines()) == 1
+
+
+def test_stopped_verbs_with_a_store_say_that_it_is_kept(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def stop(argv: Any) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("taccorl.cli.ingest.main", stop)
+    assert main(["ingest", "x"]) == 130
+    assert "kept" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
