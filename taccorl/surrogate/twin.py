@@ -50,7 +50,7 @@ def draw_surrogate_twin(secret: int) -> TwinConfig:
         values |= {f"shift_{axis}_m": float(x) for axis, x in zip("xyz", shift, strict=True)}
         hidden.append(make_effect("camera_pose", cameras=[camera.name], **values))
     for effect in hidden:
-        effect.evidence = f"{ORIGIN}; secret {secret}"
+        effect.evidence = f"surrogate: {ORIGIN}; secret {secret}"
     assert isinstance(nominal.sensor, FlexiTacConfig), "the nominal twin's pads"
     gain_count = nominal.sensor.gain_count * rng.uniform(*GAIN_RATIO)
     return dataclasses.replace(

@@ -12,12 +12,13 @@ from taccorl.data.dataset import Dataset
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--task=assembly2", "--policy.type=expert"), "did you mean 'assembly_2'"),
-        (("--task=puzzle",), "give --policy.path=CHECKPOINT"),
-        (("--task=puzzle", "--policy.type=expert", "--takeover=al"), "--takeover=al"),
-        (("--task=puzzle", "--policy.type=expert", "--num_envs=0"), "--num_envs=0"),
-        (("--task=puzzle", "--policy.type=expert", "--out=store/x", "--store=store"), "lie in one another"),
-        (("--task=puzzle", "--policy.type=expert", "--twin=none.yaml"), "none.yaml"),
+        (("--task=assembly2", "--policy.path=x"), "did you mean 'assembly_2'"),
+        (("--task=puzzle",), "missing --policy.path=CHECKPOINT"),
+        (("--task=puzzle", "--policy.type=expert"), "missing --policy.path=CHECKPOINT"),
+        (("--task=puzzle", "--policy.path=x", "--takeover=al"), "--takeover=al"),
+        (("--task=puzzle", "--policy.path=x", "--num_envs=0"), "--num_envs=0"),
+        (("--task=puzzle", "--policy.path=x", "--out=store/x", "--store=store"), "lie in one another"),
+        (("--task=puzzle", "--policy.path=x", "--twin=none.yaml"), "none.yaml"),
     ],
 )
 def test_wrong_words_end_before_the_policy_acts(words: tuple[str, ...], message: str, said: Any) -> None:
@@ -25,10 +26,16 @@ def test_wrong_words_end_before_the_policy_acts(words: tuple[str, ...], message:
     assert code == 2 and message in shown and not Path("kept").exists()
 
 
+@pytest.mark.slow
 def test_what_lies_at_out_is_not_touched(said: Any, tmp_path: Path) -> None:
+    from tiny_checkpoint import write_checkpoint
+
+    checkpoint = write_checkpoint(tmp_path / "policy")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").touch()
-    code, shown = said("correct", "--policy.type=expert", "--task=assembly_1", "--out=mine")
+    code, shown = said(
+        "correct", f"--policy.path={checkpoint}", "--policy.device=cpu", "--task=assembly_2", "--out=mine"
+    )
     assert code == 2 and "mine is in the way" in shown and [p.name for p in (tmp_path / "mine").iterdir()] == ["file"]
 
 

@@ -159,7 +159,7 @@ class _Search:
             for name in order
         }
         short = {name: self._short(parent, name, starts[name][0]) for name in order[: c.num_refitted]}
-        if min(model.error for model in short.values()) > OUTLYING:
+        if short and min(model.error for model in short.values()) > OUTLYING:
             self.progress("refitting without what is far off")
             short |= {name: self._rough(short[name]) for name in order[: c.num_rough]}
         by_error = sorted(short, key=lambda name: short[name].error)
