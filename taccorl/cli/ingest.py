@@ -248,7 +248,8 @@ def _check_same(out: Path, jobs: "list[Job]") -> None:
             else "it was made with another spec or domain"
         )
         raise DatasetError(
-            f"{out} exists and holds another dataset ({why}): {way_out}. Finished recordings are not done again"
+            f"{out} exists and holds another dataset ({why}): {way_out}. Finished recordings are then taken from --store, not "
+            "ingested again"
         )
 
 

@@ -50,7 +50,8 @@ class Origin:
 
     def __post_init__(self) -> None:
         if self.domain is not None and self.domain not in DOMAINS:
-            raise TaccorlError(f"domain {self.domain!r} of {self.text!r}: {nearest(self.domain, DOMAINS)}")
+            described = f" of data described as {self.text!r}" if self.text else ""
+            raise TaccorlError(f"unknown domain {self.domain!r}{described}: {nearest(self.domain, DOMAINS)}")
         if self.domain == "real" and (NO_ROBOT in self.text or _derived(self.text)):
             raise TaccorlError(f"domain 'real' of {self.text!r}: a simulation made it, and it stays simulated")
 

@@ -241,7 +241,7 @@ def taxel_list(mask: np.ndarray) -> str:
 
 
 def check_pads(episode: Episode, key: str, pads: list[Pad]) -> list[Finding]:
-    """All checks of one pad."""
+    """All checks of the pads of the feature ``key``."""
     if episode.num_rows < JUDGE_S * episode.spec.fps:
         seconds = episode.num_rows / episode.spec.fps
         return [not_judged(key, "taxels", f"{seconds:.1f} s, it takes {JUDGE_S:g} s")]

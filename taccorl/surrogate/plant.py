@@ -148,7 +148,7 @@ class Run(NamedTuple):
 
 @numba.njit(cache=True)
 def encoder(d: Drive, angle):
-    """Reading of the joint under test's encoder."""
+    """Reading [rad] of the tested joint's encoder: scale, bias and a sinusoidal error; not quantised."""
     return d.encoder_scale * angle + d.encoder_bias + d.encoder_wave * np.sin(d.encoder_waves * angle + d.encoder_phase)
 
 

@@ -71,8 +71,8 @@ class ControllerFit:
     gains: Gains
     """Gains in force in the first recording."""
     estimates: dict[str, Estimate]
-    """``kp``, ``kd``, ``torque_ff``; ``lag`` = K_d / K_p and ``offset`` = T_ref / K_p, which positions
-    determine; ``late``: delay of the rows of positions, if it is fitted as well."""
+    """Always all six: ``kp``, ``kd``, ``torque_ff``; ``lag`` = K_d / K_p [s] and ``offset`` = T_ref / K_p, which positions alone
+    determine; ``late``: delay of the measured rows [s], from a second fit that has it as a further unknown."""
     ridge: float
     """Correlation of log K_p and log K_d; 1 means that only their ratio is known. NaN if one is fixed."""
     errors: tuple[MotionError, ...]

@@ -239,7 +239,8 @@ def _planned(m: Measurement, j: int) -> np.ndarray:
 
 
 def moved_by_others(m: Measurement, signal: str, others: Sequence[str], still: float = STILL) -> dict[str, np.ndarray]:
-    """Low-pass filtered motion of ``signal`` and of those ``others`` in the recording that move by more than ``still``."""
+    """Signal → (T,) low-pass filtered motion [rad, m]: ``signal`` itself, always, and those ``others`` whose motion has a range
+    above ``still``."""
     found = {signal: _smooth(m.measured[:, m.column(signal)], m.rate_hz)}
     for other in others:
         if other != signal and other in m.signals:

@@ -16,7 +16,8 @@ from taccorl.sim.signed_distance import Felt, Shapes
 
 
 def shapes_in_object(solids: Sequence[Solid]) -> tuple[list[Shapes], np.ndarray]:
-    """Solids for the pads' depth queries, and the corners (8 G, 3) of their bounding boxes, in the object's frame."""
+    """The G solids that touch (no ballast) as ``Shapes``, one of each kind, for depth queries in the object's frame; and the
+    corners (8 G, 3) of their boxes there [m]."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="pressed")
     for k, solid in enumerate(s for s in solids if s.touches):

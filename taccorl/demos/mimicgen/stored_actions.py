@@ -56,7 +56,7 @@ class StoredActions:
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """Task, difficulty, twin and randomisation of the simulation (the keys ``SIMULATION``)."""
+        """What determines the simulation (the keys ``SIMULATION``): task, difficulty, twin, origin, root seed, versions …"""
         return {key: self.meta[key] for key in SIMULATION}
 
 
@@ -107,7 +107,7 @@ def read_stored(root: Path) -> StoredActions:
     if not isinstance(meta, dict) or meta.get("format") not in _FORMATS:
         found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
         raise DatasetError(
-            f"{path}: format {found!r}, this taccorl reads {FORMAT}; make it again: taccorl augment --rows=actions"
+            f"{path}: format {found!r}, this taccorl reads {FORMAT}; make it again: taccorl augment or correct, --rows=actions"
         )
     missing = [key for key in (*SIMULATION, "spec", "disturbed", "action_time", "episodes") if key not in meta]
     if missing:

@@ -85,7 +85,7 @@ class TouchTrace:
     replayed: np.ndarray
     """(N, P, R, C) replayed readings."""
     floor: np.ndarray
-    """(P, R, C) noise floor of each taxel."""
+    """(P, R, C) noise floor of each taxel, in ``unit``; ``repeated`` says what it is estimated from."""
     origin: Origin
     touched: np.ndarray | None = None
     """(N, P) bool: the object is in contact with the pad, by their poses; None if that is not known."""

@@ -139,8 +139,8 @@ def make_tactile_pi05_pre_post_processors(
     tokenizer = PromptTokenizerStep(tokenizer_name=config.tokenizer_name, max_length=config.tokenizer_max_length)
     if config.backbone in SIZES and len(tokenizer.input_tokenizer) > SIZES[config.backbone].vocabulary:
         raise TaccorlError(
-            f"--policy.tokenizer={config.tokenizer_name}: {len(tokenizer.input_tokenizer)} tokens, --policy.backbone="
-            f"{config.backbone} knows {SIZES[config.backbone].vocabulary}: leave the tokenizer out"
+            f"--policy.tokenizer={config.tokenizer_name}: has {len(tokenizer.input_tokenizer)} tokens, more than the "
+            f"{SIZES[config.backbone].vocabulary} of --policy.backbone={config.backbone}: leave --policy.tokenizer out"
         )
     relative = RelativeActionsProcessorStep(
         enabled=config.use_relative_actions,

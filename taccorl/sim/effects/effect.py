@@ -414,7 +414,7 @@ class BoardEffect(TouchEffect):
         return ("pads",)
 
     seed: int = 0
-    """Seed of these boards; with another seed other taxels are affected."""
+    """Seed of these boards' random numbers: of which taxels are dead, or of each taxel's gain."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

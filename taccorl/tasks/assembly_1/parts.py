@@ -44,7 +44,8 @@ def tenon_socket(name: str = "socket", clearance_m: float = CLEARANCE_M) -> Part
 
 
 def side_grasp(approach: tuple, height_m: float, z_m: float, width_m: float) -> Grasp:
-    """Grasp from above, for a part that lies with its axis level; the fingers reach ``height_m`` below the axis. TCP x points to
-    the partner."""
+    """Grasp from above, for a part that lies with its axis level, ``height_m`` above the table: the fingers end 4 mm above the
+    table. TCP x points to the partner.
+    """
     at = -np.asarray(approach) * (TCP_ABOVE_M - height_m) + (0, 0, z_m)
     return Grasp(part_from_tcp=frame_pose((0, 0, -1), approach, tuple(at)), width_m=width_m)
