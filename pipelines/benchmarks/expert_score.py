@@ -34,7 +34,7 @@ class Score:
 
     @property
     def failures(self) -> dict[str, int]:
-        """Failure category → number of episodes."""
+        """Name of a failure category, such as ``timeout`` or ``dropped`` → number of episodes that ended so."""
         return dict(Counter(o for o in self.outcomes if o != "success"))
 
 

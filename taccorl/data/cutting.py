@@ -66,7 +66,7 @@ class _Interval:
     instruction: str
     success: bool | None
     marked: bool
-    """True if markers give the ends of the interval; False if they are the ends of the file."""
+    """True if messages on the marker topic give start and end of the episode; False if it is the whole recording."""
 
     @property
     def slack_ns(self) -> int:

@@ -239,7 +239,7 @@ class InstructionSpec:
 
     from_: Literal["spec", "metadata", "markers", "topic"]
     text: str | None = None
-    """The instruction, for ``from: spec``."""
+    """Instruction of every episode, such as "insert the plug". Required with ``from: spec``."""
     key: str | None = None
     """Key of the MCAP metadata record that holds the instruction, for ``from: metadata``."""
     topic: str | None = None

@@ -111,7 +111,8 @@ class Grasp:
     width_m: float
     """Distance between the pads when closed on the part [m]."""
     num_turns: int = 2
-    """Number of rotations about the approach direction, in equal steps, that give an equally good grasp."""
+    """Number of gripper rotations about the approach direction, 2π / ``num_turns`` apart, that grip the part equally well;
+    2 if only the two jaws can be exchanged."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -113,8 +113,10 @@ def save_twin(config: TwinConfig, path: Path) -> None:
     """Write ``twin_text``; the file is replaced as a whole or not at all.
 
     Raises:
-        TaccorlError: the folder cannot be written to, or a number is not finite.
+        TaccorlError: the folder cannot be written to, a number is not finite, or two of its effects exclude each other, so that
+            ``load_twin`` would refuse the file.
     """
+    present(config.effects)
     write_whole(path, twin_text(config))
 
 

@@ -51,10 +51,11 @@ class Change:
     carried: float = 1.0
     """Factor on the share of the weight that the controller compensates."""
     ball: tuple[float, float, float, float] | None = None
-    """Point mass fixed to link 6: mass [kg], x, y, z [m]; None: none."""
+    """Point mass fixed to the arm's last link: mass [kg], then its position x, y, z in the frame of link 6 [m]. None: no mass is
+    added."""
     report_delay_s: float = 0.0
     dropped: float = 0.0
-    """Share of commands that never arrive; other ones in each recording."""
+    """Probability that a command is lost, 0 … 1. The lost commands are drawn anew for each recording."""
 
 
 _ADD = frozenset(

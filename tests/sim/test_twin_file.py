@@ -200,3 +200,11 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one_alone(tmp_path: Path) 
     with pytest.raises(TaccorlError, match=r"nowhere.*cannot be written"):
         save_twin(TwinConfig(), tmp_path / "nowhere" / "twin.yaml")
     assert [p.name for p in tmp_path.iterdir()] == ["twin.yaml"]
+
+
+def test_a_twin_that_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
+    before = written(tmp_path, TwinConfig())
+    twice = [make_effect("camera_pose", cameras=["front"], turn_x_rad=x) for x in (0.01, 0.02)]
+    with pytest.raises(TaccorlError, match="camera_pose acts on front twice"):
+        save_twin(TwinConfig(effects=twice), tmp_path / "twin.yaml")
+    assert (tmp_path / "twin.yaml").read_text(encoding="utf-8") == before

@@ -235,7 +235,8 @@ def split(
     sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "validation", "test")}
     if not sides["fit"]:
         raise TaccorlError(
-            f"nothing is left to fit: {len(sides['validation'])} for validation, {len(sides['test'])} for the test"
+            f"no recording is left to fit: of {', '.join(names)}, {len(sides['validation'])} are for validation and "
+            f"{len(sides['test'])} for the test; record another motion, or give one of them use: fit in measurements.yaml"
         )
     words = [f"{len(validation) + len(test)} by name"] * bool(validation or test)
     words += [f"every {validation_every}. of {len(free)} motions for validation"] * bool(validation_every)

@@ -70,7 +70,8 @@ class Estimate:
     n: int
     """Number of samples in the estimate."""
     without_bursts: bool = False
-    """True for repeats of which the median of the blocks was used, because few blocks hold most of the difference."""
+    """True if a few short blocks of time hold most of the difference between two repeats of a motion, so that ``value`` was
+    computed from the median block instead of from all blocks."""
 
 
 @dataclass(frozen=True)

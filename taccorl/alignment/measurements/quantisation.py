@@ -1,4 +1,4 @@
-"""Find the step q of an encoder from its readings, which are offset + n · q with integers n."""
+"""Find an encoder's resolution q from its readings alone [in their unit]: readings are offset + n · q with integers n."""
 
 import numpy as np
 

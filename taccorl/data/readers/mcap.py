@@ -91,7 +91,8 @@ class McapReader(Reader):
         return super().sources(path, split_bag=split_bag)
 
     def topics(self) -> dict[str, TopicType]:
-        """Topics named by the definitions read so far; reads the whole recording if that has not happened yet."""
+        """Topic → its type, for all topics of the file. An MCAP file may define topics anywhere, so this reads it to its end
+        unless ``messages`` has done so."""
         if not self._whole:
             for _ in self.messages(()):
                 pass

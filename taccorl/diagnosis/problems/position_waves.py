@@ -18,10 +18,11 @@ SPAN_RAD = math.pi
 SMOOTH_S = 0.025
 """Window of the quadratic whose second derivative is the measured acceleration. A choice: waves of up to 20 Hz pass."""
 BINS = 4
-"""A period of the shortest wave."""
+"""Number of equal bins of position in one period of the shortest wave that is looked for."""
 FINER = 8
-"""Bins of the periodogram in its resolution, 2π over the span."""
+"""Number of frequency bins of the periodogram within its resolution of 2π / span [periods per turn]."""
 MOST_WAVES = 3
+"""Number of waves that are returned at most. A choice."""
 
 
 def position_waves(motions: Sequence[JointMotion], inertias_kgm2: Sequence[float]) -> dict[str, float]:

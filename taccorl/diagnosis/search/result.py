@@ -99,7 +99,8 @@ class Evidence:
     base: Values
     """Values of all other numbers, refitted with it."""
     explained: float
-    """Share of the squared residual that its probe explained, before any refit."""
+    """Share of the squared residual, 0 … 1, that the best multiple of the effect's change at its start value removes, before any
+    number is refitted."""
     fit_error: float
     validation_error: float
     """Validation RMS after refitting everything [floors]."""

@@ -90,7 +90,14 @@ class CameraEncoder(nn.Module):
 
 
 def encode_pictures(camera: nn.Module, images_B3RC: Tensor) -> Tensor:
-    """Tokens (B, M, D) of one camera's pictures (B, 3, R, C)."""
+    """Encode pictures of one camera as tokens for the language model.
+
+    Args:
+        images_B3RC: (B, 3, R, C) RGB pictures.
+
+    Returns:
+        (B, M, D): M tokens of D numbers for each of the B pictures.
+    """
     return camera(images_B3RC)
 
 

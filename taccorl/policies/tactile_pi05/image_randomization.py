@@ -28,7 +28,8 @@ _ORDERS = tuple(permutations(range(3)))  # of brightness, contrast and saturatio
 
 @dataclass(kw_only=True)
 class ImageRandomizationConfig:
-    """Ranges of the image randomisation. Every change applies to every image (the paper's probability is 1.0)."""
+    """Ranges from which crop, rotation, brightness, contrast and saturation of training images are drawn. Every image gets all
+    of these changes (the paper's probability is 1.0)."""
 
     crop: float = 0.95
     """f_crop: side of the random crop relative to the image's side; the crop is scaled back to full size. 1: no crop."""

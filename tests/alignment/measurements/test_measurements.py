@@ -183,7 +183,7 @@ def test_a_motion_and_its_repeats_stay_together():
     [
         ({"validation": ["z"]}, "validation: no measurement 'z'"),
         ({"validation": ["a"], "test": ["a"]}, "a is both validation and test"),
-        ({"validation": ["a", "b"]}, "nothing is left to fit: 2 for validation"),
+        ({"validation": ["a", "b"]}, r"left to fit: of a, b.*2 are for validation.*measurements\.yaml"),
         ({"validation_every": 1}, "leaves nothing to fit"),
     ],
 )
