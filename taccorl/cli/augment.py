@@ -51,7 +51,7 @@ class AugmentConfig:
     stratify: bool = False
     """After the first half, start attempts in scenes like those with few successes so far; the report shows the effect."""
     rows: str = "dataset"
-    """What to write. dataset; or actions: only seeds and actions, for taccorl execute."""
+    """Kind of output. dataset; or actions: only seeds and actions, for taccorl execute."""
     engine: Engine = field(default_factory=LocalEngine)
     """Where attempts run: --engine.type=local --engine.workers=2, slurm, ray."""
 

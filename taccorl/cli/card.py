@@ -7,7 +7,8 @@ from taccorl.errors import TaccorlError, printable
 
 
 def add_card(root: Path) -> None:
-    """Write ``README.md`` beside ``meta/`` and print its path; an existing README.md is not changed."""
+    """Write a dataset's ``README.md`` (its card) beside its ``meta/`` and print its path; an existing README.md is not
+    changed."""
     from taccorl.views.card import write_card
 
     try:

@@ -50,8 +50,8 @@ class CorrectConfig:
     episode_length: int | None = None
     """Control steps after which an episode of the policy ends; the task's own limit if not given."""
     rows: str = "dataset"
-    """What to write. dataset; actions: only seeds and actions, for taccorl execute --source=DEMONSTRATIONS --source=OUT, which
-    makes one dataset of both with frames for a GPU."""
+    """Kind of output. dataset; or actions: only seeds and actions, for taccorl execute --source=DEMONSTRATIONS --source=OUT,
+    which makes one dataset of both with frames for a GPU."""
     images: bool = True
     """Render the dataset's cameras (needs OpenGL). A policy with camera inputs needs OpenGL even if
     this is false."""

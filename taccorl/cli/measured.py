@@ -65,7 +65,7 @@ def checked(
 
 
 def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) -> None:
-    """Warn about accepted checks without findings: they change nothing and can be left out."""
+    """Warn about checks in ``--accept`` that no recording violates: they have no effect."""
     checks = {f.check for findings in found for own in findings.values() for f in own}
     for name in dict.fromkeys(accept):
         if name not in checks:
@@ -75,10 +75,11 @@ def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) ->
 def of_replays(
     comparison: "Comparison", findings: dict[str, list["Finding"]], accept: Sequence[str]
 ) -> dict[str, list["Finding"]]:
-    """Findings about clocks from the replays of each recording; a shift is only a warning where the pose is unknown.
+    """Collect the findings about clocks that comparing each recording with its replay gave. A time shift is only a warning for
+    an arm whose pose is unknown.
 
     Args:
-        findings: findings of earlier checks; ``pose_unknown`` names an arm, or nothing for all joints.
+        findings: findings of earlier checks; the feature of a ``pose_unknown`` finding is the arm, or empty for all joints.
         accept: checks whose errors become warnings.
     """
     from taccorl.alignment.checks.telemetry import accepted

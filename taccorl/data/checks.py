@@ -165,7 +165,7 @@ def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
 
 
 def check_recording_episodes(episodes: Sequence[Episode]) -> list[Finding]:
-    """Checks that compare the episodes of one recording and name the one that differs."""
+    """Checks that compare the episodes of one recording with each other and name the episode that differs."""
     if len(episodes) < 2:
         return []
     good = [e for e in episodes if e.arrays and e.num_rows >= 2 and not joint_checks.check_values(e)]

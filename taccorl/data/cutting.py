@@ -40,7 +40,8 @@ class Unfit(RecordingError):
 
 @dataclass(frozen=True)
 class Loss:
-    """A stretch of a recording that became no rows. Seconds since the recording's first sample."""
+    """A time range of a recording that became no rows of the dataset, and the reason. Times are in seconds since the recording's
+    first sample."""
 
     start_s: float
     end_s: float
@@ -51,7 +52,7 @@ class Loss:
 
 @dataclass
 class Cut:
-    """Result of cutting one recording: its episodes, and the losses between them."""
+    """Result of cutting one recording into episodes: the episodes, and the time ranges that became no rows."""
 
     origin_ns: int = 0
     """Time of the recording's first sample on its channels' clock [ns]; ``Loss`` counts its seconds from here."""
@@ -82,7 +83,7 @@ class BrokenPicture(RecordingError):
 
 
 class Cutter:
-    """Cuts one recording. ``cut`` may be called again after broken pictures were dropped."""
+    """Cuts one recording into episodes. ``cut`` may be called again after broken pictures were dropped."""
 
     def __init__(self, recording: Recording, domain: Domain | None = None) -> None:
         """
@@ -184,7 +185,7 @@ class Cutter:
         return round((int(time_ns) - self.origin_ns) / NS_PER_S, 3)
 
     def cut(self) -> Cut:
-        """All episodes, with what was lost between them."""
+        """All episodes of the recording, and the time ranges that became no rows."""
         result = Cut(self.origin_ns)
         intervals = self._intervals(result)
         for number, interval in enumerate(intervals):

@@ -142,8 +142,8 @@ class Dataset:
         return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
 
     def told(self, index: int) -> dict[str, Any]:
-        """Fields of ``Episode`` from ``meta/taccorl/`` (success, origin, baselines, …) where taccorl wrote them; otherwise the
-        origin only."""
+        """Facts about one episode from ``meta/taccorl/``, as fields of ``Episode`` (success, origin, baselines, …); only the
+        origin if the dataset was not written by taccorl."""
         if self._records is None:
             return {"origin": Origin.read({}, self.info["features"])}
         return dict(self._records[index])

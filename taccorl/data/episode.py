@@ -46,7 +46,7 @@ class ChannelTiming:
     age_median_s: float
     age_max_s: float
     """Largest age of a sample that a row shows [s]: row time − sample time; for ``action`` the time of the next row − sample
-    time. Negative only if ``align: interpolate`` looks ahead."""
+    time. It is negative only with ``align: interpolate``, which also uses the next sample."""
     duplicates: int = 0
     out_of_order: int = 0
     zero_stamps: int = 0
@@ -85,7 +85,8 @@ class Episode:
     """(first row, name) of the task's stages, where known."""
     provenance: dict[str, object] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
-    """Findings in the recording's samples, of which the rows hold only a part; empty for a dataset."""
+    """Findings about the recording's samples, at the full rate of the channels (rows hold only some of the samples); empty for
+    an episode of a dataset."""
 
     @property
     def num_rows(self) -> int:

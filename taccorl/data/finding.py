@@ -23,7 +23,7 @@ class Finding:
 
 
 def not_judged(feature: str, what: str, why: str) -> Finding:
-    """Note that a check could not be made, and why."""
+    """Make a note that a check could not be made, with the reason."""
     return Finding("not_judged", "note", feature, f"{what} not judged: {why}")
 
 

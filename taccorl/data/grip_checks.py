@@ -112,7 +112,7 @@ class Grippers:
         return rows
 
     def rest(self, arm: str, fps: int) -> np.ndarray:
-        """(T,) bool: the gripper is open and the last release is longer ago than ``RELEASE_S``."""
+        """(T,) bool: the gripper is open, and at least ``RELEASE_S`` have passed since its last release."""
         opening = self.opening[arm]
         closed = self.held(arm) | (opening < OPEN_SHARE * opening.max())
         return ~binary_dilation(closed, np.ones(2 * round(RELEASE_S * fps) + 1, dtype=bool))

@@ -162,7 +162,7 @@ def ingest(
 def ingest_each(
     jobs: Sequence[Job], engine: Engine | None = None, progress: Progress | None = None
 ) -> list[dict[str, Any]]:
-    """Report entries of ``ingest_one`` for each job, in the order of the jobs."""
+    """Ingest the jobs on the engine; returns the report entry of each job (``ingest_one``), in the order of the jobs."""
     if engine is None or (isinstance(engine, LocalEngine) and engine.workers <= 1):
         return [ingest_one(job, progress) for job in jobs]
     done = iter(range(1, len(jobs) + 1))

@@ -103,7 +103,8 @@ class Inventory:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """Reasons why even a fitting spec cannot read the whole recording: topics in simulation time, lost data."""
+        """Reasons why the recording cannot be read as a whole even with a spec that fits: topics in simulation time, lost
+        data."""
         simulated = [t.topic for t in self.topics if t.sim_time]
         found = [f"{len(simulated)} topics are stamped in simulation time, first {simulated[0]}"] if simulated else []
         lost = [d for d in self.damage if d.lost]

@@ -40,7 +40,8 @@ class Lag:
 
     lag_s: float
     correlation: float
-    """Correlation of the velocities at that lag; below LAG_SURE the lag is not used."""
+    """Correlation of the velocities of state and command when shifted by the lag; a lag with a correlation below LAG_SURE is not
+    used."""
 
 
 def find_lag(action: np.ndarray, state: np.ndarray, fps: int, search_s: tuple[float, float] = LAG_SEARCH_S) -> Lag:

@@ -272,7 +272,8 @@ def _pixels_counted() -> Iterator[None]:
 
 
 def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
-    """LeRobot's statistics, (channels,), of numbers of which value v occurs ``counts[channel, v]`` times; as ``exact_stats``."""
+    """LeRobot's statistics of numbers given as a histogram: value v of a channel occurs ``counts[channel, v]`` times. Each
+    statistic is (channels,), as in ``exact_stats``."""
     values, num = np.arange(counts.shape[1]), counts.sum(axis=1)
     mean = counts @ values / num
     stats = {

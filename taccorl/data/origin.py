@@ -42,7 +42,7 @@ class Origin:
     """
 
     domain: Domain | None = None
-    """None: not stated."""
+    """``real`` (a robot), ``surrogate`` (a simulation in its place) or ``twin``; None: not stated."""
     text: str = ""
     """Description for people, such as "stand-in recording, not a robot"."""
     derived: bool = False
@@ -66,7 +66,7 @@ class Origin:
         return f"{words}: {self.text}" if self.text else words
 
     def record(self) -> dict[str, Any]:
-        """As JSON values; ``read`` is the inverse."""
+        """The origin as JSON values; ``read`` is the inverse."""
         return {"domain": self.domain, "origin": self.text} | ({"domain_derived": True} if self.derived else {})
 
     @classmethod

@@ -64,7 +64,8 @@ class Damage:
     start_ns: int | None = None
     end_ns: int | None = None
     lost: bool = True
-    """True if messages may be lost; False if not, as for a damaged index that only repeats what the data section holds."""
+    """True if messages of the file may be lost by this damage; False if not, as for a damaged index that only repeats what the
+    data section holds."""
 
     def __str__(self) -> str:
         return f"{Path(self.file).name} bytes {self.byte_start:,} to {self.byte_end:,}: {self.reason}"

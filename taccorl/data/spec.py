@@ -118,7 +118,7 @@ class FeatureSpec:
     history: int = 1
     """L: number of readings per row, oldest first (with ``align: window``)."""
     optional: bool = False
-    """True if a recording spec need not fill the feature."""
+    """True if recording specs may leave this feature out."""
 
     @property
     def size(self) -> int:

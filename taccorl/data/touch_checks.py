@@ -73,7 +73,7 @@ class Pad:
 
     @functools.cached_property
     def repeated(self) -> np.ndarray:
-        """(T,) bool: the frame is bit-identical to the one before."""
+        """(T,) bool: the pad's frame is bit-identical to the frame of the row before."""
         return np.concatenate([[False], (np.diff(self.counts, axis=0) == 0).all(axis=(1, 2))])
 
     @functools.cached_property
@@ -127,7 +127,8 @@ def read_pads(episode: Episode, key: str) -> list[Pad]:
 
 
 def tactile_keys(episode: Episode) -> list[str]:
-    """Tactile features to judge: a window's newest reading repeats the plain feature, where there is one."""
+    """Keys of the tactile features to check. The newest reading of a window repeats the plain feature of the same pads, so that
+    a window is not checked if there is a plain feature."""
     keys = [k for k in episode.spec.sensors if k in episode.arrays]
     plain = [k for k in keys if episode.spec.features[k].history == 1]
     return plain or keys

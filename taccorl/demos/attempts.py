@@ -103,7 +103,7 @@ def run_attempts(
     Args:
         run: function of an attempt's number that makes the attempt; pickled for worker processes. If the process died twice or
             did not end, the function is called in this process with the number and the way the process ended.
-        said: function that returns the text of an entry for the progress display.
+        said: function that returns the text that the progress display shows for an entry.
     """
     made = engine.map(
         run,

@@ -81,8 +81,8 @@ class CorrectionPlan(attempts.AttemptPlan):
     takeover: str = "failures"
     """``failures``: episodes in which the policy succeeds by itself are skipped; ``all``: they are corrected, too."""
     rows: str = "dataset"
-    """``dataset``: write a dataset. ``actions``: write seeds and actions, from which ``taccorl execute`` makes a dataset, also
-    together with others."""
+    """Kind of output. ``dataset``: a LeRobot dataset. ``actions``: seeds and actions, from which ``taccorl execute`` makes a
+    dataset, also together with other stored actions."""
     part_poses: bool = False
     """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
 

@@ -47,7 +47,7 @@ class FittedNumber:
     low: float
     high: float
     fixed: bool = False
-    """True if it was not fitted: it is what the recordings state, or the twin's."""
+    """True if the number was not fitted: ``value`` is what the recordings state, or the value in the twin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,21 +59,21 @@ class Alignment:
     error_name: str = ""
     """Name of the error with its unit, such as ``RMS error of the angle, rad``."""
     before: float = math.nan
-    """Error of the twin that was given, on ``judged_by``."""
+    """Error of the twin before the alignment, on the recordings ``judged_by``."""
     after: float = math.nan
     floors_left: float = math.nan
-    """For a joint: error that is left, in noise floors; NaN if its noise floor is not known."""
+    """For a joint: the remaining error after the alignment, in noise floors; NaN if its noise floor is not known."""
     judged_by: tuple[str, ...] = ()
     """Recordings (for cameras: frames) of the two errors. They are not those of the fit, unless there were no others."""
     fitted_to: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     trouble: str = ""
-    """Reason why the numbers are not written; empty if they are."""
+    """Reason why the numbers are not written into the twin; empty if they are written."""
     unchanged: bool = False
     """True if the twin keeps its numbers: they are inside the intervals, and the fitted ones are no better."""
     effects: tuple[Effect, ...] = ()
-    """Effects whose parameters were fitted with the numbers: latency and exposure of a camera. They replace the twin's; one that
-    is absent only removes it."""
+    """Effects whose parameters were fitted with the numbers: latency and exposure of a camera. They replace the twin's effects
+    of the same name; an absent one (without influence) only removes the twin's."""
     twin: TwinConfig | None = None
     """For a camera: the twin with its new pose."""
     overlays: Mapping[str, np.ndarray] = field(default_factory=dict)

@@ -25,7 +25,7 @@ _IMAGES = "observation.images."
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyFacts:
-    """Inputs and outputs as stated by a checkpoint. None: not stated."""
+    """Inputs and outputs of a policy as its checkpoint states them. A field is None if the checkpoint does not state it."""
 
     inputs: dict[str, tuple[int, ...]]
     """LeRobot key → shape; pictures (3, rows, columns)."""

@@ -61,7 +61,7 @@ class Actor(Protocol):
         ...
 
     def begin(self, envs: TaccorlVectorEnv) -> None:
-        """Called after the reset of all environments."""
+        """Prepare the actor for new episodes; called after the reset of all environments."""
         ...
 
     def act(self, observation: Observation) -> Acted:

@@ -14,7 +14,7 @@ def is_free(path: Path) -> bool:
 
 
 class Destinations:
-    """Paths outside a store to which it published, each with the key of the artefact published there last."""
+    """Record of the paths outside a store to which it published, each with the key of the artefact published there last."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -37,7 +37,7 @@ class Stage:
             )
 
     def bound(self, fn: Function) -> "Stage":
-        """The same stage with another function, which has access to further objects, such as a simulation."""
+        """A copy of the stage with another function, such as one that has access to a simulation."""
         return dataclasses.replace(self, fn=fn)
 
 

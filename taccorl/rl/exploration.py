@@ -22,8 +22,8 @@ _STEP_RAD = 1e-4  # of the finite difference of the forward kinematics
 
 
 class Noise(NamedTuple):
-    """Effect of exploration noise, as root mean squares over decisions, executed steps and both arms, for decisions with the
-    stochastic step k."""
+    """Effect of exploration noise on actions and hands, as root mean squares over decisions, executed steps and both arms, for
+    decisions whose stochastic denoising step is k."""
 
     step: int
     joints_rad: float

@@ -34,7 +34,8 @@ class FlowPolicy(ABC):
 
     @abstractmethod
     def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
-        """Call ``compute`` for groups of rows that are computed together; results are in the order of the batch."""
+        """Call ``compute`` for each group of rows that are computed together, and return the results in the order of the
+        batch."""
 
     @abstractmethod
     def actions(self, chunk_BHD: Tensor) -> Tensor:

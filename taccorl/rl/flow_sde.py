@@ -63,7 +63,7 @@ class FlowSDE:
 
     @property
     def stds(self) -> list[float]:
-        """s_k, in normalised actions."""
+        """Standard deviation s_k of the noise of each denoising step, in normalised actions."""
         rest = [1 - t if t < 1 else -self.dt for t in self.times]
         return [self.level * math.sqrt(-self.dt * t / r) for t, r in zip(self.times, rest, strict=True)]
 

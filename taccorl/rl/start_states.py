@@ -21,7 +21,8 @@ _TIME_LEFT = 1 / 3
 
 
 class StartStates:
-    """Ring buffer of states of single environments with their windows of touch, and the choice of who starts in one."""
+    """Ring buffer of states of single environments with their windows of touch. It also draws which new episodes start in a
+    stored state."""
 
     def __init__(self, share: float, size: int) -> None:
         """

@@ -40,7 +40,7 @@ class WatchedEpisode:
 
 @dataclass
 class EpisodeWatch:
-    """Records the present episode of environment 0, and keeps the first one that ended since ``take``."""
+    """Records the present episode of environment 0, and keeps the first episode that ended since the last ``take``."""
 
     chunks: list[np.ndarray] = field(default_factory=list)
     values: list[np.ndarray] = field(default_factory=list)

@@ -91,7 +91,7 @@ class ColorSensor:
     rows: int
     columns: int
     fov_rows: int
-    """Rows that the published vertical angle spans."""
+    """Number of the imager's rows that the published vertical field of view spans."""
     vertical_fov_deg: float
 
     @property

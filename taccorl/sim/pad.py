@@ -39,10 +39,10 @@ KINEMATIC_FIELDS = ("site_xpos", "site_xmat", "geom_xpos", "geom_xmat", "cvel", 
 
 
 class Kinematics(Protocol):
-    """The fields of ``KINEMATIC_FIELDS``, each with a leading axis N.
+    """Positions, velocities and poses of N simulations: the fields of ``KINEMATIC_FIELDS``, each with a leading axis N.
 
-    A ``mujoco.batch.Batch`` is one: bind the fields before its first step, and step with ``stage=mjSTAGE_VEL``, else they are
-    one substep behind. ``OneSim`` makes one of an ``MjData``.
+    A ``mujoco.batch.Batch`` provides them: bind the fields before its first step, and step with ``stage=mjSTAGE_VEL``, else they
+    are one substep behind. ``OneSim`` provides them for an ``MjData``.
     """
 
     @property
@@ -60,7 +60,7 @@ class Kinematics(Protocol):
 
 
 class OneSim:
-    """An ``MjData`` as ``Kinematics`` with N = 1. Live: made once, it follows the data; ``mj_forward`` brings it up to date."""
+    """``Kinematics`` of one ``MjData`` (N = 1). Its arrays follow the data; ``mj_forward`` updates them."""
 
     site_xpos: np.ndarray
     site_xmat: np.ndarray
@@ -77,7 +77,8 @@ class OneSim:
 
 
 class Touch(NamedTuple):
-    """Depth and depth rate, each (N, P, K) float32; taxel = row · columns + column. Both are 0 without contact."""
+    """Depth [m] and depth rate [m/s], each (N, P, K) float32 for N simulations, P pads and K taxels of a pad; taxel = row ·
+    columns + column. Both are 0 without contact."""
 
     depth_m: np.ndarray
     depth_rate_mps: np.ndarray

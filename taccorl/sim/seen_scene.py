@@ -171,7 +171,7 @@ class SeenScene:
         self._renderers.clear()
 
     def poses(self, body: str) -> np.ndarray:
-        """World-from-body (N, 4, 4)."""
+        """World-from-body poses (N, 4, 4) of ``body`` in N simulations."""
         k = self._body(body)
         pose = np.zeros((self.num_sims, 4, 4))
         pose[:, :3, :3] = self.arrays["xmat"][:, k].reshape(-1, 3, 3)
@@ -179,7 +179,7 @@ class SeenScene:
         return pose
 
     def tcp(self, arm: str) -> np.ndarray:
-        """World-from-TCP (N, 4, 4): z = approach direction, y = closing direction."""
+        """World-from-TCP poses (N, 4, 4) of an arm in N simulations: z = approach direction, y = closing direction."""
         k = self.model.site(f"{arm}_tcp").id
         pose = np.zeros((self.num_sims, 4, 4))
         pose[:, :3, :3] = self.arrays["site_xmat"][:, k].reshape(-1, 3, 3)
@@ -187,7 +187,7 @@ class SeenScene:
         return pose
 
     def velocities(self, body: str) -> np.ndarray:
-        """(N, 3) linear velocity of the origin of the body's frame, in world coordinates [m/s]."""
+        """(N, 3) linear velocity of the origin of the body's frame in N simulations, in world coordinates [m/s]."""
         k = self._body(body)
         spatial = self.arrays["cvel"][:, k]
         turn, arm = spatial[:, :3], self.arrays["xpos"][:, k] - self.arrays["subtree_com"][:, self.model.body_rootid[k]]
@@ -196,7 +196,7 @@ class SeenScene:
         return spatial[:, 3:] + across
 
     def pads_touching(self, body: str) -> np.ndarray:
-        """(N, 4) bool: which pads touch the body, in the order of the pads."""
+        """(N, 4) bool for N simulations: which of the 4 pads touch ``body``, in the order of ``ROBOT.pads``."""
         return self.arrays["sensordata"][:, self._touching[body]] > 0
 
     def contact(self, body: str, other: str) -> Contact:

@@ -38,7 +38,7 @@ class Scene(Protocol):
         ...
 
     def pads_touching(self, body: str) -> np.ndarray:
-        """(N, 4) bool: which pads touch the body, in the order left_a, left_b, right_a, right_b."""
+        """(N, 4) bool for N simulations: which pads touch the body, in the order left_a, left_b, right_a, right_b."""
         ...
 
     def contact(self, body: str, other: str) -> "Contact":

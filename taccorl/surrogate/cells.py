@@ -92,7 +92,7 @@ RECORDINGS: dict[str, tuple[str, Knots]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CellsCase:
-    """One simulated sensor with its hidden effect."""
+    """One simulated sensor of force cells with its hidden effect."""
 
     seed: int
     shape: tuple[int, int] = (1, 1)
@@ -181,7 +181,8 @@ def record(case: CellsCase, name: str) -> CellMeasurement:
 
 
 def write_cells(case: CellsCase, folder: Path) -> int:
-    """Write the files of a sensor, and the hidden effect in a sealed file, as ``taccorl.surrogate.writing`` does for robots.
+    """Write the recordings and files of a simulated sensor of force cells, and its hidden effect in a sealed file, as
+    ``taccorl.surrogate.writing`` does for robots.
 
     FOLDER/presses/*.csv, measurements.yaml, columns.yaml    for ``taccorl compare`` and ``diagnose``
     FOLDER/taxel.yaml                                        the sensor as known to its user

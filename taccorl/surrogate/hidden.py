@@ -64,7 +64,7 @@ _ADD = frozenset(
 
 
 def changed(drive: Drive, changes: list[Change]) -> Drive:
-    """``drive`` with all hidden effects."""
+    """A copy of ``drive`` with the changes of all hidden effects."""
     for change in changes:
         for name, value in change.drive.items():
             before = getattr(drive, name)

@@ -65,7 +65,7 @@ class Servo:
     torque_nm_per_a: float = field(init=False)
     emf_v_s_per_rad: float = field(init=False)
     dry_nm: float = field(init=False)
-    """Dry friction that the servo's file also states [N·m]; 0 for servos with another hidden friction."""
+    """Dry friction that the servo's own file states as well [N·m]; 0 for servos whose hidden fault is another friction."""
     arm_kg_per_m: float = field(init=False)
     rate_hz: int = field(init=False)
     """Rate at which the script is meant to run [Hz]."""

@@ -72,9 +72,9 @@ class Drive(NamedTuple):
     hung_inertia: float = 0.0
     """Inertia that is coupled to the link by a spring [kg·m²] (not in the registry)."""
     hung_rad_per_s: float = 30.0
-    """Natural frequency of that inertia on its spring [rad/s]."""
+    """Natural frequency of the inertia ``hung_inertia`` on its spring [rad/s]."""
     hung_damping: float = 0.05
-    """Damping ratio of that inertia on its spring."""
+    """Damping ratio of the inertia ``hung_inertia`` on its spring."""
     # setpoint
     delay: float = 0.0
     lag: float = 0.0
@@ -127,7 +127,7 @@ class Arm(NamedTuple):
     believed: Bodies
     """Rigid bodies with which the controller computes the gravity compensation."""
     carried: float
-    """Share of that weight that it compensates."""
+    """Share of the weight computed from ``believed`` that the controller compensates, 0 … 1."""
     armature: np.ndarray
     """(6,) rotor inertias [kg·m²]."""
     kp: np.ndarray

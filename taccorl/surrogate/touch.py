@@ -139,7 +139,7 @@ class TouchCase:
 
     @cached_property
     def resting(self) -> np.ndarray:
-        """(4, R, C) resting counts."""
+        """(P, R, C) resting counts of the pads."""
         low, high = RESTING_COUNT
         return np.random.default_rng([self.seed, 77]).uniform(low, high, (len(ROBOT.pads), *ROBOT.pad.shape))
 

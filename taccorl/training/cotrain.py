@@ -31,7 +31,7 @@ VERSION = 2  # of the stage
 
 @dataclass(frozen=True)
 class Part:
-    """One input dataset of the merge."""
+    """One input dataset of the merge, with its domain and origins."""
 
     dataset: str
     is_sim: bool

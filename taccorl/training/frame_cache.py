@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class CacheRequest:
-    """Request for cached frames: place (gpu, host, disk), resolution, store."""
+    """Options for cached frames: their place (gpu, host, disk), resolution and store."""
 
     place: Place
     resolution: tuple[int, int] | None

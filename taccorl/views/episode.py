@@ -80,7 +80,8 @@ def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, nati
 
 
 def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
-    """The newest row at or before ``at_s`` [s] (else the first row), as an episode of one row at its place on the time line."""
+    """Part of an episode for a picture at one time: an episode of one row, the newest at or before ``at_s`` [s] (else the first
+    row), at its original place on the time line."""
     fps = log.episode.spec.fps
     row = min(max(math.floor((at_s - log.begins_s) * fps + 1e-6), 0), log.episode.num_rows - 1)
     part = part_of(log.episode, row / fps, (row + 1) / fps)

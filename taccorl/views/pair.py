@@ -83,7 +83,7 @@ class Pair:
         return [(a, b) for a, b in pairs if _layout(a) == _layout(b)]
 
     def common_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of A during which B runs, and for each the newest row of B at or before it."""
+        """(rows of A, rows of B): the rows of A during which B runs, and for each the newest row of B at or before it."""
         a, b = self.episodes
         offset_s = self.begins_s[0] - self.begins_s[1]
         rows_b = np.floor((a.time_s + offset_s) * b.spec.fps + 1e-6).astype(int)

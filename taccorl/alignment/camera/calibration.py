@@ -145,13 +145,13 @@ class CameraFit:
 
     @property
     def change(self) -> tuple[float, float]:
-        """Change from the twin's camera: rotation [rad] and translation [m]."""
+        """Size of the change from the twin's camera: rotation angle [rad] and distance [m]."""
         start, end = (Rotation.from_rotvec(x[:3]) for x in (self.start, self.offset))
         return float((start.inv() * end).magnitude()), float(np.linalg.norm(self.offset[3:] - self.start[3:]))
 
     def twin(self, config: TwinConfig) -> TwinConfig:
-        """``config`` with the calibrated camera. The offset contains the whole change, so that effects that moved only this
-        camera are removed.
+        """``config`` with the calibrated camera. The new offset contains the whole error of the mount. So ``camera_pose``
+        effects on this camera are removed.
 
         Raises:
             TaccorlError: the calibration is not valid.
@@ -173,7 +173,8 @@ def calibrate_camera(
 ) -> CameraFit:
     """Fit the pose of the twin's ``camera`` so that its arms match those in the pictures.
 
-    Every fourth frame and the stages are not used in the fit; figures and overlays before and after are made from them.
+    Every fourth frame and the frames of the stages are held out: they are not used in the fit, and errors and overlays are
+    computed from them.
 
     Args:
         known: at least ``FEWEST_POINTS`` points for a start by PnP; without them the fit starts at the twin's mount. Points in

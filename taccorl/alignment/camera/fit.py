@@ -87,8 +87,8 @@ def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level
 
 
 def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrinsics) -> Outlines:
-    """Outlines of the twin's arms at joints (F, 14), rendered at a camera pose (6,) at the size of ``at``. At most ``_POINTS``
-    per frame."""
+    """Outlines of the twin's arms at joints (F, 14), rendered at a camera pose (6,) in pictures of the size that ``at`` states;
+    at most ``_POINTS`` points per frame."""
     rng = np.random.default_rng(0)
     position, turn = view.pose(offset)
     parts = []

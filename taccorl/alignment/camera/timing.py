@@ -40,7 +40,7 @@ class LatencyFit:
     interval_s: tuple[float, float]
     """95 % interval [s], by a bootstrap over blocks of pictures."""
     correlation: float
-    """Correlation of the two curves at that latency."""
+    """Correlation, at that latency, of the motion in the recorded pictures with the motion in the twin's pictures."""
     problems: tuple[str, ...]
     """Reasons why the result is not valid; empty if it is."""
 

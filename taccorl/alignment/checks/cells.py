@@ -37,7 +37,8 @@ TOO_MUCH, TOO_LITTLE = 3.0, 0.02
 def check_cells(
     config: CellsConfig, measurements: Sequence[CellMeasurement], fit_names: Sequence[str]
 ) -> dict[str, list[Finding]]:
-    """Recording → findings. A finding about all fit recordings together is given at the first of them.
+    """Check the recordings of a sensor of cells. Returns recording → findings. A finding about all fit recordings together is
+    stored at the first of them.
 
     Args:
         fit_names: names of the fit recordings.

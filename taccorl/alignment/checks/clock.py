@@ -60,7 +60,7 @@ class CommandTiming:
     """Lag by correlation [s]: delays and the controller's response together; NaN if velocities hardly correlate (steps)."""
     fit: FirstOrder
     described: bool
-    """True if the lag describes the joint, so that its delay is meaningful."""
+    """True if the first-order lag ``fit`` describes the joint well, so that the delay in it is meaningful."""
 
 
 def command_timing(m: Measurement, floor: dict[str, float]) -> list[CommandTiming]:

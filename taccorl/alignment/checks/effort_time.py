@@ -50,7 +50,8 @@ def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> 
 
 
 def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
-    """The estimate of r and its standard error; None if the recording does not determine them."""
+    """Estimate of r, the share of a target's change in one row that the row's effort already responds to (0: measured before the
+    target acts, 1: after), and its standard error; None if the recording does not determine them."""
     j = m.column(signal)
     q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
     if m.torque_ff.size:

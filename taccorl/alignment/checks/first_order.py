@@ -46,7 +46,7 @@ class FirstOrder:
 
 
 def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -> FirstOrder:
-    """Fit τ, d, g and b by least squares.
+    """Fit the lag τ, delay d, gain g and offset b of the module's equation by least squares.
 
     Args:
         target: (T,) commands, in force from row k on.

@@ -25,7 +25,7 @@ SMOOTH_S = 0.05
 
 
 def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequence[str]) -> list[Finding]:
-    """Findings of one recording.
+    """Check one recording of a machine with a robot file; returns its findings.
 
     Args:
         whole: the measurement ``m`` extended to all signals of the robot.

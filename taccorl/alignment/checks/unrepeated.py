@@ -81,7 +81,8 @@ class Unrepeated:
     repeats: float | None
     """RMS difference of repeats / √2; None without repeats."""
     quiet: float
-    """Noise from rest, residue and rounding."""
+    """Noise of the signal without use of repeats: the largest of the estimates from rest, from the high-frequency residue and
+    from rounding [rad, m]."""
     burst_share: float | None
     """Share of the time that holds ``BURST_POWER`` of the squared difference; None without repeats."""
     bursts: tuple[Burst, ...]

@@ -42,7 +42,7 @@ def split_signal(signal: str) -> tuple[str, str]:
 
 
 def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
-    """Those of ``effects`` that are not absent and act on this joint alone, in the order in which they act."""
+    """Select those of ``effects`` that are not absent and act on this joint alone, in the order in which they act."""
     arm, joint = split_signal(signal)
     own: list[Effect] = []
     for effect in present(effects):

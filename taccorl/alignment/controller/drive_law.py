@@ -136,7 +136,7 @@ class DriveLaw:
 
     @property
     def facts(self) -> dict[str, float]:
-        """Fields of ``joint_kernel.Drive`` that the law determines."""
+        """Fields of ``joint_kernel.Drive`` that follow from the law and its numbers."""
         found: dict[str, float] = {"command": _COMMANDS.get(self.law, POSITION), "midpoint": 1.0}
         found["effort_after"] = float(self.effort_after_target)
         if self.law == "pwm":
@@ -152,7 +152,8 @@ class DriveLaw:
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
     def takes(self, effect: str) -> bool:
-        """Whether an effect of this name can act in the law's controller."""
+        """Whether an effect of this name acts inside the controller of this law (an integral, for example, does not exist in law
+        torque)."""
         return self.target_kind in _OF_LOOPS.get(effect, (self.target_kind,))
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:

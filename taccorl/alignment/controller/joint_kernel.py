@@ -64,12 +64,12 @@ class Drive(NamedTuple):
     """Coefficients of the torque that the motor adds for gravity compensation, in the same form."""
     compensation_cos: float = 0.0
     gravity_carried: float = 1.0
-    """Factor on the gravity compensation."""
+    """Factor on the torque that the motor adds for gravity compensation."""
     # Bodies and friction.
     added_inertia: float = 0.0
     speed_delay: float = 0.0
-    """Delay of the velocity [s]: it subtracts K_d times it from the inertia, at most ``MOST_LOST`` of it. The motor gives that
-    torque, and the effort contains it."""
+    """Delay of the measured velocity in the controller [s]. Its effect is that of an inertia smaller by K_d · delay (by at most
+    ``MOST_LOST`` of it). The motor supplies this torque, so that the effort contains it."""
     viscous: float = 0.0
     quadratic_drag: float = 0.0
     coulomb: float = 0.0
@@ -126,11 +126,11 @@ class Drive(NamedTuple):
     back_emf: float = 0.0
     """Torque per speed that the back-EMF takes, k_t k_e / R."""
     effort_after: float = 0.0
-    """1: the reported effort of a row responds to the row's command; 0: it is the effort before it."""
+    """1: the reported effort of a row was measured after the row's command acted; 0: before."""
     effort_age: float = 0.0
     """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
     midpoint: float = 0.0
-    """1: second-order steps; 0: MuJoCo's."""
+    """Integration method. 1: second-order midpoint steps; 0: the semi-implicit Euler steps of MuJoCo."""
     # Gear.
     backlash: float = 0.0
     """Width of the whole play."""

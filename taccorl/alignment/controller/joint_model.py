@@ -69,7 +69,8 @@ class JointResponse:
     reported: np.ndarray
     """(T,) reported positions [rad]."""
     effort: np.ndarray
-    """(T,) torque of the motor at the time of each row, before its command acts [N·m]: ``Replay.effort`` of the row before."""
+    """(T,) torque of the motor at the time of each row, before the row's command acts [N·m]. ``Replay.effort`` has the same
+    value one row earlier."""
 
 
 class JointModel:
@@ -124,7 +125,7 @@ class JointModel:
             effects: effects besides the machine's; one of the same name replaces the machine's.
             age_s: additional age of the measured position when the drive's torque acts.
             facts: fields of ``joint_kernel.Drive`` that replace the joint's own.
-            lever: correction of the payload's weight; ignored if an effect requires MuJoCo.
+            lever: correction of the payload's weight; not used if an effect requires simulation in MuJoCo.
 
         Raises:
             TaccorlError: a row is no whole number of physics steps, or an axis cannot have one of the effects.

@@ -16,7 +16,8 @@ AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 
 @dataclass(frozen=True, kw_only=True)
 class JointMotion:
-    """Data of one joint from one recording. Row k is the joint at the time of command k, before it acts."""
+    """Data of one joint from one recording. Row k holds the state of the joint at the time of command k, before this command
+    acts."""
 
     name: str
     time_s: np.ndarray

@@ -76,8 +76,8 @@ class Surroundings:
 
 
 class RigidJoint(ABC):
-    """One joint of a machine with all bodies that it moves. The methods of the base class are those of a joint without
-    surroundings."""
+    """One joint of a machine with all bodies that it moves. The base class describes a joint that no other joint, load or file
+    influences; subclasses override its methods."""
 
     signal: str
     unit: Literal["rad", "m"] = "rad"
@@ -106,7 +106,7 @@ class RigidJoint(ABC):
     keeps_times: ClassVar[bool] = False
     """True: targets of rows with jitter act at their own arrival times. False: at the times of their rows."""
     target_late_s: float = 0.0
-    """Time by which targets act later than that [s]."""
+    """Delay from a target's arrival (see ``keeps_times``) until it acts in the controller [s]."""
 
     gain_names: tuple[str, ...] = ("kp", "kd")
     """Gains that a recording can state and a fit can determine."""

@@ -78,7 +78,7 @@ class AxisConfig(DriveLaw):
     arm_kg: float = 0.0
     """Mass of the arm that holds the payload [kg], unless a recording states another one: a uniform rod as long as the lever."""
     hangs_at_rad: float = 0.0
-    """Angle at which that payload hangs straight down."""
+    """Angle at which the payload of ``lever_m`` hangs straight down [rad]."""
     loop_hz: float | None = None
     """Rate of the drive's control loop [Hz], if known. The model then holds the loop's output for a period, and computes the
     speed as a difference of samples."""
@@ -122,7 +122,7 @@ class AxisConfig(DriveLaw):
 
     @property
     def scale(self) -> Scale:
-        """Size of the axis, for the bounds of effects."""
+        """Size of the axis's forces and motions relative to a joint of a small arm; bounds of effects are multiplied by it."""
         force = self.force_unit_n or (self.effort_limit or 10.0) / 10.0
         stroke = self.limits[1] - self.limits[0] if self.limits and self.unit == "m" else 1.0
         return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke)

@@ -183,8 +183,8 @@ class CellsConfig:
 
     @property
     def gives(self) -> tuple[str, ...]:
-        """Knowledge that its recordings can have, in words of ``taccorl.sim.effects.effect.NEEDS``, except for the
-        temperature."""
+        """Facts that recordings of this sensor can contain, except for the temperature, as keys of
+        ``taccorl.sim.effects.effect.NEEDS``."""
         return ("reading", "neighbours") if not self.cells and self.num_cells > 1 else ("reading",)
 
     @property

@@ -66,7 +66,7 @@ class JointFacts:
     stiffness: float
     """Stiffness of a spring at the joint [N·m/rad or N/m]."""
     spring_rest: float
-    """Position at which that spring is relaxed [rad or m]."""
+    """Position at which the spring of ``stiffness`` is relaxed [rad or m]."""
     actuators: tuple[ActuatorFacts, ...]
 
 

@@ -144,7 +144,7 @@ class Measurement:
 
     @property
     def extra_columns(self) -> list[str]:
-        """Those of ``load``, ``torque_ff``, ``supply_v`` and ``enabled`` that it has."""
+        """Names of those fields among ``load``, ``torque_ff``, ``supply_v`` and ``enabled`` that this measurement has."""
         return [name for name in ("load", "torque_ff", "supply_v", "enabled") if getattr(self, name).size]
 
     @property
@@ -195,11 +195,12 @@ class Measurement:
         return stated and f"{stated}; remove it from measurements.yaml"
 
     def moved(self, signal: str) -> np.ndarray:
-        """(T,) positions by which motion of a signal is judged: commanded ones, or measured ones if targets are no positions."""
+        """(T,) positions from which the motion of a signal is determined: the commanded positions, or the measured ones if the
+        targets are velocities or torques."""
         return (self.target if self.target_kind(signal) == "position" else self.measured)[:, self.column(signal)]
 
     def only(self, signals: Sequence[str]) -> Self:
-        """The measurement with these signals only."""
+        """A copy of the measurement that has only these signals."""
         at = [self.column(signal) for signal in signals]
         names = ("target", "measured", "velocity", "effort", *self.extra_columns)
         return dataclasses.replace(

@@ -14,7 +14,8 @@ REPEATS = 10.0
 def find_quantum(values: np.ndarray) -> float:
     """Step q of (T,) readings in their unit; 0 if they show none (or have only one level).
 
-    q is the smallest difference between two levels, refined over all of them: q = Σ d / Σ round(d / q).
+    q is the smallest difference between two levels, refined over the differences d of all neighbouring levels: q = Σ d / Σ
+    round(d / q).
     """
     values = np.asarray(values, dtype=float)
     values = values[np.isfinite(values)]

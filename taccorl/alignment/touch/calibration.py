@@ -48,7 +48,7 @@ class NoiseLevel:
     threshold_count: float
     """λ_noise common to all taxels [counts]: the 0.999 quantile of their readings."""
     num_frames: tuple[int, ...]
-    """Number of frames of each pad."""
+    """Number of frames without contact of each pad."""
 
     @property
     def pooled_std_count(self) -> float:
@@ -74,7 +74,7 @@ class TouchMatch:
     mask_iou: float
     """Masks of active taxels: intersection over union, all frames together."""
     active_count: float
-    """Mean difference of the number of active taxels of a pad, over frames with contact."""
+    """Mean absolute difference of the number of active taxels of a pad, over frames with contact."""
     centroid_m: float
     """Mean distance of the centroids of counts [m], over frames in which both have active taxels."""
     histogram_count: float
@@ -82,7 +82,7 @@ class TouchMatch:
     temporal_count: float
     """RMS difference of the change between frames [counts], over taxels that are ever active in either."""
     num_frames: int
-    """Number of frames of single pads in contact."""
+    """Number of compared frames: frames of single pads with contact."""
 
 
 @dataclass(frozen=True)

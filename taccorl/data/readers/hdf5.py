@@ -33,7 +33,8 @@ BOOKKEEPING = ("/compress_len",)  # ALOHA: bytes of each padded picture; decoder
 
 @dataclass(frozen=True)
 class RowClock:
-    """Times of rows at a fixed rate. Time 0 is the first row that every channel of the spec can fill."""
+    """Times of the rows of a file without time stamps, at a fixed rate. Time 0 is the first row that every channel of the spec
+    can fill."""
 
     rate_hz: float
     lead_frames: dict[str, int]

@@ -46,8 +46,8 @@ class Mating:
         return scene.body(self.holder)[:3, :3] @ self.holder_from_hole[:3, 2]
 
     def turned(self, scene: Seen) -> np.ndarray:
-        """Rotation (4, 4) about the hole's axis, among the symmetric ones, that is nearest to the held part's present
-        rotation."""
+        """Rotation (4, 4) about the hole's axis, among those at which the part looks the same, that is nearest to the held
+        part's present rotation."""
         hole, mate = self._relative(scene)
         angle = measure_fit(hole, mate, 1).turn_rad
         wrong = measure_fit(hole, mate, self.num_turns).turn_rad
@@ -65,9 +65,10 @@ class Aim:
     part_from_tcp: np.ndarray
     """(4, 4) pose of the TCP in the part's frame when the expert last observed it."""
     turned: np.ndarray
-    """(4, 4) rotation about the hole's axis, one of those that look the same."""
+    """(4, 4) rotation about the hole's axis at which the part is inserted: one of those at which it looks the same."""
     given: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    """(6,) [m, rad] displacement of the compliant wrist about the TCP, in the hole's frame; 0 along the axis."""
+    """(6,) [m, rad] displacement of the compliant wrist by contact, about the TCP, in the hole's frame; 0 along the hole's
+    axis."""
 
     def pose(self, scene: Seen, mating: Mating, depth_m: float) -> np.ndarray:
         """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, with the hand's aiming error."""

@@ -95,11 +95,11 @@ class ContactHands(Protocol):
 
 @dataclass(frozen=True)
 class Ahead:
-    """Number of control steps, from the next one on, until the arm must follow its path exactly; 0: in the next one; infinite:
-    not on its present path, as far as known."""
+    """Control steps that remain until an arm must follow its path exactly. 0: the next step; infinite: no such event on the
+    present path is known."""
 
     gripper: float
-    """Steps until its gripper begins to open or close."""
+    """Steps until the arm's gripper begins to open or close."""
     contact: float
     """Steps until contact (``contact_lead_steps`` before the held object touches its mate), or until another controller moves
     the arm."""

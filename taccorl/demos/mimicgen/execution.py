@@ -47,7 +47,7 @@ class Execution:
     """``success``; a failure category of the task; ``not reproduced``; or the acceptance criterion (gate) that was not met."""
     reason: str
     is_same: bool
-    """Whether the last state is that of the attempt, bit for bit."""
+    """Whether the last state of this execution equals the last state of the stored attempt, bit for bit."""
 
 
 def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, gates: GatesSpec) -> Execution:

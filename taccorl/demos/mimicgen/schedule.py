@@ -34,7 +34,7 @@ class Constraint:
 
 
 class Cue(NamedTuple):
-    """Step of an arm in the present control step: subtask and index of the step."""
+    """What an arm does in the present control step: its subtask, and the index of the step in the subtask's trajectory."""
 
     subtask: int
     step: int

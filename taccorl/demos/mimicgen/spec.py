@@ -140,11 +140,12 @@ class GenerationSpec:
     again, with a human-like aiming error and tremor. It is stored in the provenance, with the expert's corrections."""
     bridge: BridgeSpec = field(default_factory=BridgeSpec)
     num_settle_steps_before_gripper: int = 12
-    """Most steps, without noise, for which an arm waits until it is at rest before its gripper opens or closes; its partner in a
-    coordination also waits."""
+    """Largest number of steps, without noise, for which an arm waits until it is at rest before its gripper opens or closes; the
+    other arm of a coordinated subtask waits, too."""
     num_settle_steps_before_contact: int = 30
-    """Most steps for which it waits until the hand has reached its goal before contact begins (``contact_lead_steps``). In this
-    time the steady-state offset of the arm in this twin is estimated, and the noise of the transport decays."""
+    """Largest number of steps for which an arm waits until its hand has reached its goal before contact begins
+    (``contact_lead_steps``). In this time the steady-state offset of the arm in this twin is estimated, and the noise of the
+    transport decays."""
     contact_lead_steps: int = 15
     noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
     disturbance: DisturbanceSpec = field(default_factory=DisturbanceSpec)

@@ -92,7 +92,8 @@ def compare(
 def replay_all(
     config: TwinConfig, measurements: Sequence[Measurement], progress: Callable[[str, int, int], None]
 ) -> list[Response]:
-    """Replays of the measurements by the module's rule; None for one without a signal to compare."""
+    """Replay every measurement: without contact and without a gripper command each moving joint alone in the one-joint model,
+    otherwise the whole twin. A measurement without a signal to compare gets a response of NaN."""
     found = []
     for k, m in enumerate(measurements):
         progress(m.name, k, len(measurements))
@@ -114,7 +115,7 @@ def moving(m: Measurement) -> list[str]:
 
 
 def compared(m: Measurement) -> list[str]:
-    """Signals that move (all, if none does), without grippers that an object holds open."""
+    """Signals to compare: those that are commanded to move (all, if none is), without grippers that an object holds open."""
     return [s for s in moving(m) or m.signals if s not in held_up(m)]
 
 

@@ -30,8 +30,9 @@ SMOOTH_S = 0.05
 
 
 def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
-    """Phase → (N,) bool; each frame is in exactly one phase. Loading is determined from the measured counts, and so is contact
-    if geometry does not determine it."""
+    """Phase of contact (loading, hold, unloading, just released, untouched) → (N,) bool; each frame is in exactly one phase.
+    Contact is determined from the poses of pad and object if they are known, else from the measured counts, and loading always
+    from the counts."""
     counts = trace.measured[:, pad].reshape(len(trace.measured), -1).astype(float)
     period_s = trace.period_s
     total = gaussian_filter1d(counts.sum(axis=1), SMOOTH_S / period_s)

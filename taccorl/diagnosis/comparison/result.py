@@ -90,9 +90,10 @@ class TouchTrace:
     touched: np.ndarray | None = None
     """(N, P) bool: the object is in contact with the pad, by their poses; None if that is not known."""
     unit: str = "counts"
-    """Unit of the readings."""
+    """Unit of ``measured``, ``replayed`` and ``floor``."""
     thirds: tuple[str, ...] = ("palm third", "middle third", "tip third")
-    """Names of parts of the rows with about equally many rows each; empty if there are too few rows."""
+    """Names of the parts into which the rows of a pad are divided for the errors by regime: palm, middle and tip. Empty if the
+    pad has too few rows."""
     load: np.ndarray | None = None
     """(N, P, R, C) load on each cell, in ``load_unit``; None if only the object's shape and pose are known."""
     load_unit: str = ""
@@ -154,7 +155,7 @@ class Comparison:
     split: dict[str, object]
     """The recordings for fit, validation and test, and the rule of the division."""
     clock: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
-    """Recording → what its replay says about its clock."""
+    """Recording → findings about a time shift between the recording and its replay."""
     left_out: tuple[str, ...] = ()
     """Data that were not compared, with the reason."""
 

@@ -37,7 +37,7 @@ is used."""
 @machines.register("axis")
 @dataclass(frozen=True)
 class Axis(Machine):
-    """A single driven axis, which is its own only part."""
+    """A single driven axis as a machine; the axis is its only part."""
 
     config: AxisConfig
     name: str
@@ -62,7 +62,8 @@ class Axis(Machine):
         return {self.config.name: self.config.unit}
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """Findings: positions beyond the limits, an impossible inertia, an effort of the wrong sign."""
+        """Check recordings: positions beyond the limits, an impossible inertia, an effort of the wrong sign. Returns recording →
+        findings."""
         found = {}
         for m in measurements.all:
             self._check_signal(m)

@@ -60,12 +60,12 @@ class Finding(Protocol):
 
     @property
     def numbers(self) -> str:
-        """Text: where the values of the always fitted numbers come from."""
+        """Text that states which numbers are always fitted, and from where the other numbers are taken."""
         ...
 
     @property
     def measured(self) -> str:
-        """Text: channels whose errors are counted."""
+        """Text that names the channels whose errors are minimised and reported, such as positions."""
         ...
 
     @property
@@ -80,7 +80,7 @@ class Finding(Protocol):
 
     @property
     def remark(self) -> str:
-        """Text: what the search could not judge; empty if there is nothing."""
+        """Text on what the search could not decide; empty if there is nothing."""
         ...
 
 
@@ -131,7 +131,7 @@ class Machine(ABC):
     part_word: ClassVar[str] = "part"
     """Word for one of its parts in messages: joint, axis, pad."""
     saved_words: ClassVar[str] = "compare and diagnose load it"
-    """Words for messages about the use of a file that ``save`` has written."""
+    """Text that completes messages about a file that ``save`` has written: what the file is for."""
 
     @property
     def file_name(self) -> str:

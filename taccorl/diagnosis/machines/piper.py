@@ -61,7 +61,8 @@ class PiperTwin(Machine):
         return {name: unit_of(name) for name in ROBOT.action_names}
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """Findings, such as a table without an arm's other joints: inertia and weight are then those of the bench's pose."""
+        """Check recordings for faults specific to the PiPER, such as a table without an arm's other joints: inertia and weight
+        are then those of the rest pose. Returns recording → findings."""
         return {m.name: _pose_unknown(m) for m in measurements.all}
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
@@ -109,7 +110,7 @@ class PiperTwin(Machine):
     def effect(
         self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
     ) -> Effect | None:
-        """Make an effect at one part. An effect on pads acts on those pads whose zeros are in ``base``."""
+        """Make an effect at one part. An effect on pads acts on the pads whose zero offsets are among the numbers in ``base``."""
         if {"arm", "joints", "pads"} & {*values}:  # as a report has it: it says itself where it acts
             return make_effect(name, **values)
         where = selectors(effects.get(name), part) if part in _SIGNALS else {"pads": pads.pads_of(base or {})}

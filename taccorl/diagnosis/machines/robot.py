@@ -58,7 +58,8 @@ class RobotMachine(Machine):
     # measurements ----------------------------------------------------------------------------------------------------
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """Findings: positions or efforts beyond their limits, an impossible inertia, missing columns."""
+        """Check recordings: positions or efforts beyond their limits, an impossible inertia, missing columns. Returns recording
+        → findings."""
         found: dict[str, list[DataFinding]] = {}
         for m in measurements.all:
             moved = [name for name in self.robot.config.joints if moves(m, name)]

@@ -77,12 +77,12 @@ class AxisProblem:
 
     @property
     def numbers(self) -> str:
-        """Text: where the values of the always fitted numbers come from."""
+        """Text that states which numbers are always fitted, and from where the other numbers are taken."""
         return f"fitted: {', '.join(f.name for f in self.base)}; other numbers as the file states them"
 
     @property
     def measured(self) -> str:
-        """Text: channels whose errors are counted."""
+        """Text that names the channels whose errors are minimised and reported, such as positions."""
         return "positions and efforts together" if self.effort else "positions"
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:

@@ -60,14 +60,14 @@ class JointFinding:
 
     @property
     def numbers(self) -> str:
-        """Text: where the values of the always fitted numbers come from."""
+        """Text that states which numbers are always fitted, and from where the other numbers are taken."""
         if "stall_nm" in self.diagnosis.base:
             return "gains as the file states them, stall torque and back-EMF fitted"
         return "commanded gains" if self.commanded else "gains fitted (not stated by the recordings)"
 
     @property
     def measured(self) -> str:
-        """Text: channels whose errors are counted."""
+        """Text that names the channels whose errors are minimised and reported, such as positions."""
         return "angles and efforts together" if len(self.floors) > 1 else "angles"
 
     remark = ""

@@ -63,7 +63,7 @@ class PadFinding:
 
     @property
     def remark(self) -> str:
-        """Text: what the search could not judge, and the press that would show it; empty if there is nothing."""
+        """Text on what the search could not decide, and the press that would show it; empty if there is nothing."""
         return gain_words(self.gains, self.not_shared) if self.gains else ""
 
     @property
@@ -73,7 +73,7 @@ class PadFinding:
 
     @property
     def numbers(self) -> str:
-        """Text: where the values of the always fitted numbers come from."""
+        """Text that states which numbers are always fitted, and from where the other numbers are taken."""
         return "k_n, k_d and each pad's zero fitted"
 
     measured = f"means of {FRAMES_A_ROW} frames"
@@ -85,17 +85,17 @@ def part_of(arm: str) -> str:
 
 
 def pads_of(base: Mapping[str, float]) -> list[str]:
-    """Pads whose zeros are among the fitted numbers."""
+    """Pads whose zero offsets are among the names of the fitted numbers."""
     return [name.removeprefix("zero_") for name in base if name.startswith("zero_")]
 
 
 def presses(m: Measurement, arm: str) -> bool:
-    """Whether the recording states what the pads of an arm pressed."""
+    """Whether the recording states which object the pads of this arm pressed (``pressed`` in measurements.yaml)."""
     return m.pressed is not None and m.pressed.arm == arm
 
 
 def pressed_arms(measurements: Measurements) -> tuple[str, ...]:
-    """Arms whose pads press a known object in at least one fit recording."""
+    """Arms for which at least one fit recording states which object their pads pressed."""
     return tuple(arm for arm in ROBOT.arms if any(presses(m, arm) for m in measurements.fit))
 
 

@@ -21,7 +21,7 @@ def evidence_words(e: Evidence) -> str:
     """Evidence for an effect as text: ΔBIC on the recordings that it was fitted to, gain and standard errors on validation
     recordings.
 
-    ``weak``: the search would not add the effect; ``none``: it removes nothing.
+    The text says ``weak`` if the search would not add the effect, and ``none`` if the effect removes no error.
     """
     if e.gain < NO_GAIN or e.bic <= 0:
         return "none"

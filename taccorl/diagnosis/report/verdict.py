@@ -75,7 +75,8 @@ def verdict(
 
 
 def refitted_words(d: Diagnosis) -> str:
-    """Label of the refit without effects: it changes the gains of a joint, and other numbers of pads and axes."""
+    """Label of the fit of all always fitted numbers without an added effect: for a joint these are the gains, for pads and axes
+    others."""
     return "gains refitted" if "kp" in d.base else "with the numbers refitted that every fit adjusts"
 
 

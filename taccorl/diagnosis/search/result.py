@@ -36,8 +36,8 @@ class SearchConfig:
     min_score: float = 2.0
     """Least improvement of an accepted effect in standard errors between blocks, unless it reaches ``sure_gain``."""
     sure_gain: float = 0.5
-    """Share of the validation squared error above the floor for which ``min_score`` is not required: rare events (a limit that is
-    reached twice) never get a high score."""
+    """Share of the validation squared error above the floor for which ``min_score`` is not required: an effect that acts rarely
+    (a limit that is reached twice) never gets a high score."""
     min_bic: float = 10.0
     """Least decrease of the Bayesian information criterion on the fit recordings. For effects that meet ``sure_gain`` and
     ``min_score`` any decrease suffices."""
@@ -53,8 +53,8 @@ class SearchConfig:
     """Of ties the one with the fewest parameters is taken, if its remaining squared error is at most this multiple of the
     least."""
     from_tie: float = 0.25
-    """If the search ended above the floor, a search that starts from a tie of an added effect replaces it if its remaining
-    squared error is below this share (half of the error)."""
+    """If the search ended above the noise floor, it is run again from each effect that tied with an added one. The new result
+    replaces the old one if its remaining squared error above the floor is below this share of the old one's."""
     max_effects: int = 4
     num_refitted: int = 12
     """Number of effects that are refitted after the screening: the true one was among the first 12 in every tested case."""

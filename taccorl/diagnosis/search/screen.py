@@ -29,7 +29,7 @@ WRONG_SIGN = 0.1
 
 @dataclass(frozen=True)
 class Probe:
-    """Signature of one start of one effect in the recordings."""
+    """Change of the simulated signals that one candidate effect, at one of its start values, would cause in the recordings."""
 
     name: str
     start: Values

@@ -71,8 +71,8 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
     """Whether the model distinguishes cameras: each has weights of its own, so that pictures go through ``embed_images`` only."""
 
     def fuses(self, device: torch.device) -> bool:
-        """Whether this module's joint forward is used instead of LeRobot's. With activation recomputation (gradient
-        checkpointing) LeRobot's is used."""
+        """Whether this module's joint forward pass of language model and action expert is used instead of LeRobot's. With
+        activation recomputation (gradient checkpointing) LeRobot's is used."""
         models: Any = self.paligemma.model.language_model, self.gemma_expert.model
         checkpoints = any(model.gradient_checkpointing for model in models)
         return self.compiles_layers and self.training and device.type == "cuda" and not checkpoints

@@ -16,8 +16,8 @@ _HEADS = 4
 class TactileEncoder(nn.Module):
     """Two convolutions over each reading's four pads, then M tokens that each attend to all L readings.
 
-    A learned embedding of its age is added to each reading, and is their only distinction. Pads are channels: the meaning of one
-    pad's reading depends on the opposite pad.
+    A learned embedding of its age is added to each reading; nothing else tells the encoder the order of the readings. Pads are
+    channels: the meaning of one pad's reading depends on the opposite pad.
     """
 
     def __init__(self, layout: tuple[int, int, int], history: int, num_tokens: int, width: int) -> None:

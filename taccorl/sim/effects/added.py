@@ -95,10 +95,10 @@ class AddedEffects:
         return self._read(reading, self._copied(np.arange(len(reading))), np.arange(len(reading)))
 
     def scan(self, reading: np.ndarray, ids: np.ndarray) -> None:
-        """Advance the memory of touch effects. The reading is taken as constant since the last scan.
+        """Advance the memory of touch effects. The reading counts as constant since the last scan.
 
         Args:
-            reading: (N, P, R, C) what pads without effects would read now, in units of the policy's normalised reading.
+            reading: (N, P, R, C) readings of the pads without effects at this instant, as the policy's normalised readings.
             ids: (n,) simulations whose pads are scanned now; other rows are not used.
         """
         memories = self._copied(ids)

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 @effects.register("armature")
 @dataclass(kw_only=True)
 class Armature(JointEffect):
-    """(M + ΔJ) q̈: what a rotor adds behind its gear, J_rotor · ratio². Grows with the square of the frequency."""
+    """Additional inertia of the motor's rotor: (M + ΔJ) q̈ with ΔJ = J_rotor · (gear ratio)². Its torque grows with the square
+    of the motion's frequency."""
 
     name: ClassVar = "armature"
     needs: ClassVar = ("acceleration",)

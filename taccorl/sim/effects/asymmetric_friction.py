@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 @effects.register("asymmetric_friction")
 @dataclass(kw_only=True)
 class AsymmetricFriction(JointEffect):
-    """τ = −F (1 + a sign q̇) sign q̇; at rest any τ with −F (1 + a) ≤ τ ≤ F (1 − a). With a > 0 moving up costs more.
+    """Dry friction that depends on the direction: τ = −F (1 + a sign q̇) sign q̇; at rest any τ with −F (1 + a) ≤ τ ≤ F (1 − a).
+    With a > 0 friction is greater in the positive direction.
 
-    That is −F sign q̇ − a F: Coulomb's friction and a constant torque, and so it is built. The torque is not the motor's: efforts
-    do not contain it.
+    The torque equals −F sign q̇ − a F, so that it is implemented as Coulomb friction and a constant torque. It does not come
+    from the motor: efforts do not include it.
     """
 
     name: ClassVar = "asymmetric_friction"

@@ -16,10 +16,12 @@ if TYPE_CHECKING:
 @effects.register("backlash")
 @dataclass(kw_only=True)
 class Backlash(JointEffect):
-    """The link is free within ± w of the motor (total play 2 w) and is carried along at its ends; weight decides which end.
+    """Play of the gear: the link moves freely within ± w of the motor (total play 2 w), and the motor moves it at both ends. The
+    weight of the link decides at which end it rests.
 
-    Controller and encoder see the motor. Built as a second, limited hinge between the motor's joint and the link, so the model
-    has one joint more: ``left_joint5_backlash``. Its ends are stiff, but not rigid: 10–20 µrad remain of a play that goes to 0.
+    Controller and encoder are on the motor's side. The effect is a second hinge with limits between the motor's joint and the
+    link, so that the model has one more joint: ``left_joint5_backlash``. The limits are stiff, but not rigid: 10–20 µrad of
+    motion remain if the play approaches 0.
     """
 
     name: ClassVar = "backlash"

@@ -12,9 +12,9 @@ from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
 @effects.register("baseline_drift")
 @dataclass(kw_only=True)
 class BaselineDrift(TouchEffect):
-    """r = f + b t, with t since the reset, when the baseline was taken.
+    """Linear drift of the readings: r = f + b t, with the time t since the reset, at which the baseline was taken.
 
-    A reading of 1 is 75 counts; what sinks below the converter's 0 is cut off.
+    A reading of 1 is 75 counts. Counts cannot fall below the converter's 0.
     """
 
     name: ClassVar = "baseline_drift"

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 @effects.register("cable_spring")
 @dataclass(kw_only=True)
 class CableSpring(JointEffect):
-    """τ = −k (q − q₀): the joint rests k (q₀ − q) / K_p off, more the further it is from q₀. MuJoCo's joint spring."""
+    """Spring of cables at a joint: τ = −k (q − q₀), relaxed at q₀. At rest the joint deviates from its target by k (q₀ − q) /
+    K_p, which grows with the distance from q₀. Implemented as MuJoCo's joint spring."""
 
     name: ClassVar = "cable_spring"
     needs: ClassVar = ("position",)

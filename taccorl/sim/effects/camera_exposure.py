@@ -15,7 +15,8 @@ from taccorl.sim.effects.effect import parameter
 @effects.register("camera_exposure")
 @dataclass(kw_only=True)
 class CameraExposure(CameraEffect):
-    """y = (g·x)^γ for values in 0 … 1, cut off at 1, then blurred by a Gaussian of σ pixels of the recorded stream."""
+    """Exposure, gamma and blur of a camera: y = (g·x)^γ for values x in 0 … 1, clipped at 1, then blurred by a Gaussian of σ
+    pixels of the recorded stream."""
 
     name: ClassVar = "camera_exposure"
     equation: ClassVar = "y = G_σ * min(1, (g·x)^γ)"

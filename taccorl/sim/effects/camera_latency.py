@@ -11,7 +11,7 @@ from taccorl.sim.effects.effect import parameter
 @effects.register("camera_latency")
 @dataclass(kw_only=True)
 class CameraLatency(CameraEffect):
-    """The picture at time t shows the scene of t − d. Before the reset everything stood still."""
+    """Latency of a camera: the picture at time t shows the scene at t − d. Before the reset the scene counts as at rest."""
 
     name: ClassVar = "camera_latency"
     equation: ClassVar = "I(t) = picture of the scene at t − d"

@@ -28,7 +28,8 @@ def _shift(symbol: str) -> float:
 @effects.register("camera_pose")
 @dataclass(kw_only=True)
 class CameraPose(CameraEffect):
-    """R = R₀·exp(ω), p = p₀ + R₀·t in the camera's own frame: x right, y up, z back, as ``CameraOffset``."""
+    """Error of a camera's mount: R = R₀·exp(ω), p = p₀ + R₀·t in the camera's own frame (x right, y up, z back), as in
+    ``CameraOffset``."""
 
     name: ClassVar = "camera_pose"
     equation: ClassVar = "R = R₀·exp(ω), p = p₀ + R₀·t"

@@ -21,9 +21,9 @@ _MOST_PERIODS, _MOST_STARTS = 60.0, 32  # where a search for it ends; enough for
 @effects.register("cogging")
 @dataclass(kw_only=True)
 class Cogging(JointEffect):
-    """τ = +A sin(N q + φ), with N periods a turn of the joint: magnets and slots of the motor, teeth of the gear.
+    """Cogging torque of the motor's magnets or of gear teeth: τ = +A sin(N q + φ), with N periods per turn of the joint.
 
-    MuJoCo's cogging of a passive DC motor. Efforts do not contain it.
+    Implemented by the cogging term of a passive MuJoCo DC motor. Efforts do not include the torque.
     """
 
     name: ClassVar = "cogging"

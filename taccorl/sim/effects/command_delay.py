@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 @effects.register("command_delay")
 @dataclass(kw_only=True)
 class CommandDelay(JointEffect):
-    """The controller works on q*(t − d): bus, driver, interpolation in the drive. The phase lags in proportion to the frequency.
+    """Delay of the commands: the controller receives q*(t − d), because of bus, driver and interpolation in the drive. The phase
+    lag grows in proportion to the frequency.
 
-    The control loop itself is not delayed: it runs in the drive.
+    The control loop itself is not delayed, because it runs in the drive.
     """
 
     name: ClassVar = "command_delay"

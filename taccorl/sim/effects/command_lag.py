@@ -13,9 +13,10 @@ from taccorl.sim.effects.effect import JointEffect, Memory, parameter
 @effects.register("command_lag")
 @dataclass(kw_only=True)
 class CommandLag(JointEffect):
-    """ṙ = (q* − r) / T, and the controller works on r: a low-pass in the driver. Slow motions look delayed by T.
+    """Low-pass of the commands: ṙ = (q* − r) / T, and the controller's target is r. Slow motions look delayed by T.
 
-    Solved exactly for targets that stand between two sendings, of which r has the value at the end.
+    The equation is solved exactly for targets that are constant between two commands. The controller gets the value of r at the
+    end of that interval.
     """
 
     name: ClassVar = "command_lag"

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 @effects.register("contact_compliance")
 @dataclass(kw_only=True)
 class ContactCompliance(Effect):
-    """Contact stiffness of every part and fixture times k, its damping times √k: the same damping ratio, softer or harder.
+    """Contact stiffness of every part and fixture multiplied by k, and contact damping by √k, so that the damping ratio stays. k
+    < 1 is softer.
 
-    MuJoCo's contact spring works on accelerations: a light part sinks in deeper than a heavy one under the same force.
+    MuJoCo's contact spring acts on accelerations: under the same force a light part penetrates deeper than a heavy one.
     """
 
     name: ClassVar = "contact_compliance"

@@ -10,7 +10,8 @@ from taccorl.sim.effects.effect import Effect, parameter
 @effects.register("contact_friction")
 @dataclass(kw_only=True)
 class ContactFriction(Effect):
-    """μ = c μ_scene: sliding friction of every part and fixture with whatever touches it, randomised or not."""
+    """Sliding friction of every part and fixture with everything that touches it: μ = c μ_scene, with the coefficient μ_scene of
+    the scene, randomised or not."""
 
     name: ClassVar = "contact_friction"
     needs: ClassVar = ("contact",)

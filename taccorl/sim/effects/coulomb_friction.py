@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @effects.register("coulomb_friction")
 @dataclass(kw_only=True)
 class CoulombFriction(JointEffect):
-    """τ = −F sign(q̇); at rest any τ with |τ| ≤ F. The joint stops up to F / K_p before its target, on the side it comes from."""
+    """Dry friction of a joint: τ = −F sign(q̇); at rest any τ with |τ| ≤ F. The joint stops up to F / K_p before its target."""
 
     name: ClassVar = "coulomb_friction"
     needs: ClassVar = ("velocity",)

@@ -13,7 +13,8 @@ from taccorl.sim.effects.effect import BoardEffect, Memory, parameter
 @effects.register("dead_taxels")
 @dataclass(kw_only=True)
 class DeadTaxels(BoardEffect):
-    """r = 0 for a share of each pad's taxels, drawn once from ``seed``. A greater share adds to the taxels of a smaller one."""
+    """Taxels that always read 0: a share of each pad's taxels, drawn once from ``seed``. The dead taxels of a smaller share are
+    also dead at a greater one."""
 
     name: ClassVar = "dead_taxels"
     layer: ClassVar = "taxel"
@@ -35,8 +36,8 @@ class DeadTaxels(BoardEffect):
     )
 
     def dead(self, shape: tuple[int, int, int]) -> np.ndarray:
-        """Bool of ``shape`` (pads, rows, columns): round(s · taxels) dead taxels on each pad, also on pads that are not
-        chosen."""
+        """(pads, rows, columns) bool, of the given ``shape``: round(s · taxels) dead taxels of each pad, also of pads that are
+        not selected."""
         num_pads, num_taxels = shape[0], math.prod(shape[1:])
         rank = np.random.default_rng(self.seed).permuted(np.tile(np.arange(num_taxels), (num_pads, 1)), axis=1)
         return (rank < round(self.share * num_taxels)).reshape(shape)

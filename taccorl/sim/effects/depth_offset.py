@@ -13,10 +13,11 @@ from taccorl.sim.effects.pad_frame import PadFrameEffect
 @effects.register("depth_offset")
 @dataclass(kw_only=True)
 class DepthOffset(PadFrameEffect):
-    """δ = δ_model + d: a pad thicker by d, box and taxels alike, touches at an opening that is greater by d.
+    """Offset of the depth: δ = δ_model + d, as by a pad (box and taxels) that is thicker by d and touches at an opening that is
+    greater by d.
 
-    In a replay of a measured opening every taxel is deeper by d. In the simulation contact comes earlier and the same command
-    presses harder.
+    In a replay of a measured opening, every taxel is deeper by d. In the simulation, contact begins earlier, and the same
+    command presses harder.
     """
 
     name: ClassVar = "depth_offset"

@@ -18,15 +18,15 @@ _WORD = 0xFFFFFFFF
 @effects.register("dropped_commands")
 @dataclass(kw_only=True)
 class DroppedCommands(JointEffect):
-    """r_k = q*_k with probability 1 − p, else r_{k−1}; the controller works on r.
+    """Commands that are lost: r_k = q*_k with probability 1 − p, else r_{k−1}; the controller's target is r.
 
-    Each command that is sent is lost or arrives by itself, and with it those of all chosen joints: they travel in one message.
-    Which ones are lost follows from ``seed``, the episode's seed and k, the number of commands since the reset; a greater p loses
-    more commands besides those of a smaller one. It comes after ``command_lag`` and before ``slew_limit``,
-    ``velocity_feedforward`` and ``command_delay``. SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) makes the numbers: the compiled
-    one-joint model draws the same ones.
+    Each command is lost independently of the others, for all selected joints at once, because they travel in one message. The
+    lost commands follow from ``seed``, the episode's seed and the number k of commands since the reset. The commands that are
+    lost at a small p are also lost at a greater p. The effect acts after ``command_lag`` and before ``slew_limit``,
+    ``velocity_feedforward`` and ``command_delay``. Random numbers are those of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014),
+    which the compiled one-joint model draws, too.
 
-    No search fits it: two recordings of one motion lose different commands, so no p makes the simulation repeat the measurement.
+    No search fits the effect: two recordings of one motion lose different commands, so that no p reproduces a measurement.
     """
 
     name: ClassVar = "dropped_commands"

@@ -125,7 +125,7 @@ class Effect:
     """Name under which the effect is registered."""
     layer: ClassVar[Literal["robot", "material", "spread", "taxel", "baseline", "camera"]]
     needs: ClassVar[tuple[str, ...]]
-    """Knowledge that a model of the part must have to compute the effect, in words of ``NEEDS``."""
+    """Facts that a model of the part must have so that the effect can be computed, as keys of ``NEEDS``."""
     equation: ClassVar[str] = ""
     in_words: ClassVar[str] = ""
     """Description of the effect on a robot, for readers who do not know it."""
@@ -144,8 +144,8 @@ class Effect:
     """Name of a simpler effect → parameter of this effect at whose upper bound both are equal. A fit within a tenth of that
     bound is rejected."""
     fitted: ClassVar[bool] = True
-    """Whether a search may fit it. False for effects that do not repeat from one recording to the next: least squares cannot fit
-    them, so they are no candidates, and a twin keeps theirs unchanged."""
+    """Whether a search may fit the effect. False for effects that differ between recordings of the same motion: least squares
+    cannot fit them, so that they are not candidates, and a twin keeps its own unchanged."""
     rewrites: ClassVar[tuple[str, ...]] = ()
     """Fields of ``mujoco.MjModel``, or ``qfrc_applied`` of ``mujoco.MjData``, that ``rewrite`` changes."""
 
@@ -196,7 +196,7 @@ class Effect:
 
     @classmethod
     def works_with(cls, gives: Collection[str]) -> bool:
-        """Whether a model that knows ``gives`` (words of ``NEEDS``) has everything that the effect needs."""
+        """Whether a model that has the facts ``gives`` (keys of ``NEEDS``) can compute the effect."""
         return set(cls.needs) <= set(gives)
 
     @property

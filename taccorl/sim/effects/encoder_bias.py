@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 @effects.register("encoder_bias")
 @dataclass(kw_only=True)
 class EncoderBias(JointEffect):
-    """y = q + b, and τ = K_p (q* − y) − K_d q̇ + T_ref: the joint settles at q* − b and reports q*.
+    """Constant error of an encoder: y = q + b, and τ = K_p (q* − y) − K_d q̇ + T_ref. The joint settles at q* − b and reports
+    q*.
 
-    So the report alone tells nothing at rest; cameras, touch and the arm's weight do.
+    So the reported angle alone does not show the effect at rest; cameras, touch and the arm's weight do.
     """
 
     name: ClassVar = "encoder_bias"

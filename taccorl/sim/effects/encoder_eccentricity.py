@@ -15,10 +15,11 @@ from taccorl.sim.effects.live_model import LiveModel
 @effects.register("encoder_eccentricity")
 @dataclass(kw_only=True)
 class EncoderEccentricity(JointEffect):
-    """y = q + A sin(q + φ), and τ = K_p (q* − y) − K_d ẏ + T_ref with ẏ = q̇ (1 + A cos(q + φ)): the joint reports q* at rest.
+    """Sinusoidal error of an encoder: y = q + A sin(q + φ), and τ = K_p (q* − y) − K_d ẏ + T_ref with ẏ = q̇ (1 + A cos(q + φ)).
+    At rest the joint reports q*.
 
-    A is the disc's eccentricity over its radius. The weight is carried for the true pose. A physics step takes the wave at its
-    beginning.
+    A is the eccentricity of the encoder's disc divided by its radius. Gravity compensation uses the true pose. A physics step
+    uses the error at its beginning.
     """
 
     name: ClassVar = "encoder_eccentricity"

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 @effects.register("encoder_scale")
 @dataclass(kw_only=True)
 class EncoderScale(JointEffect):
-    """y = s q, and τ = K_p (q* − y) − K_d ẏ + T_ref: the joint settles at q* / s and reports q*.
+    """Scale error of an encoder: y = s q, and τ = K_p (q* − y) − K_d ẏ + T_ref. The joint settles at q* / s and reports q*.
 
-    The angle is counted from the joint's zero. The weight is carried for the true pose.
+    Angles are measured from the joint's zero. Gravity compensation uses the true pose.
     """
 
     name: ClassVar = "encoder_scale"

@@ -17,11 +17,12 @@ DAMPING_S = 0.005
 @effects.register("end_stop")
 @dataclass(kw_only=True)
 class EndStop(JointEffect):
-    """τ = ∓[k δ + b δ̇]₊ with δ = ±(q − q_e) beyond the stop, b = k · 5 ms; it pushes and never pulls.
+    """Mechanical stop at the angle q_e: τ = ∓[k δ + b δ̇]₊ with δ = ±(q − q_e) beyond the stop, b = k · 5 ms. It pushes and
+    never pulls.
 
     A spring-damper contact (Kelvin-Voigt, as in Gilardi and Sharf, "Literature survey of contact dynamics modelling", 2002) on
-    one side: the joint is free where it stands at the reset, and stopped on its way past q_e. An arm cannot begin beyond a stop
-    that it has. q is the motor's angle. Whether it touches is taken at the end of each physics step for the next.
+    one side: the joint is free on the side of q_e on which it is at the reset. q is the motor's angle. Whether the joint touches
+    the stop is determined at the end of each physics step, for the next step.
     """
 
     name: ClassVar = "end_stop"

@@ -15,10 +15,10 @@ _LEFT = 1e-6  # of K_p within the band: the command that has arrived, delays inc
 @effects.register("error_deadband")
 @dataclass(kw_only=True)
 class ErrorDeadband(JointEffect):
-    """τ = K_p d(q* − q) − K_d q̇ + T_ref with d(e) = e − w sign e beyond ± w, and 0 within.
+    """Dead band of the position error: τ = K_p d(q* − q) − K_d q̇ + T_ref with d(e) = e − w sign e beyond ± w, and 0 within.
 
-    Where the error lies is taken at the end of each physics step for the next. The error is that of the joint's angle times an
-    encoder's scale; an encoder's bias and an integral do not know of the band.
+    Whether the error is in the band is determined at the end of each physics step, for the next step. The error is that of the
+    joint's angle times an encoder's scale; an encoder's bias and an integral are not subject to the dead band.
     """
 
     name: ClassVar = "error_deadband"

@@ -15,9 +15,10 @@ if TYPE_CHECKING:
 @effects.register("gravity_mismatch")
 @dataclass(kw_only=True)
 class GravityMismatch(ArmEffect):
-    """τ_comp = s c g(q), with c the configured share (``robot.gravity_compensation``): the controller's masses are wrong.
+    """Error of the gravity compensation: τ_comp = s c g(q), with the configured share c (``robot.gravity_compensation``). The
+    controller's masses differ from the arm's by the factor s.
 
-    A joint rests (s − 1) c g(q) / K_p off, more where the arm reaches out.
+    At rest a joint deviates from its target by (s − 1) c g(q) / K_p, which is greatest when the arm is stretched out.
     """
 
     name: ClassVar = "gravity_mismatch"

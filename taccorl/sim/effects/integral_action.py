@@ -20,11 +20,12 @@ _POSITION = 1  # mjINPUT_POS of mjtype.h, for which Python has no name
 @effects.register("integral_action")
 @dataclass(kw_only=True)
 class IntegralAction(JointEffect):
-    """τ = K_p (q* − q) + K_p r I − K_d q̇ + T_ref with İ = q* − q: a joint that rests off its target creeps there at rate r.
+    """Integral part of the controller: τ = K_p (q* − q) + K_p r I − K_d q̇ + T_ref with İ = q* − q. A joint at rest beside its
+    target moves to it at rate r.
 
-    An episode or a replay begins with the I that holds the joint where it is, and a physics step applies I_n and makes
-    I_{n+1} = I_n + h (q*_n − q_n). MuJoCo's PID actuator. An encoder's bias on the same joint is not integrated. Of a velocity
-    loop, which an axis or robot file may have, τ = K_d (q̇* − q̇ + r I) with İ = q̇* − q̇.
+    At the start of an episode or a replay, I has the value that holds the joint where it is. A physics step applies I_n and
+    computes I_{n+1} = I_n + h (q*_n − q_n). Implemented as MuJoCo's PID actuator. An encoder's bias on the same joint is not
+    integrated. In a velocity loop, which an axis or robot file may have, τ = K_d (q̇* − q̇ + r I) with İ = q̇* − q̇.
     """
 
     name: ClassVar = "integral_action"

@@ -16,10 +16,11 @@ if TYPE_CHECKING:
 @effects.register("joint_compliance")
 @dataclass(kw_only=True)
 class JointCompliance(JointEffect):
-    """The link turns by c τ against the motor under the torque τ that the gear carries, the arm's weight included.
+    """Compliance of the gear: the link rotates by c τ relative to the motor under the torque τ in the gear, which includes the
+    arm's weight.
 
-    Controller and encoder see the motor. Built as a second, sprung hinge between the motor's joint and the link, so the model has
-    one joint more: ``left_joint5_compliance``. Its damping is κ / c.
+    Controller and encoder are on the motor's side. The effect is a second hinge with a spring between the motor's joint and the
+    link, so that the model has one more joint: ``left_joint5_compliance``. Its damping is κ / c.
     """
 
     name: ClassVar = "joint_compliance"

@@ -8,12 +8,8 @@ from mujoco.batch import Batch
 
 
 class LiveModel:
-    """Access of the hooks ``feel`` and ``rewrite`` of effects to N simulations: state that they read, model fields that they
-    change.
-
-    Args:
-        rewritten: fields of ``mujoco.MjModel`` that effects rewrite, or ``qfrc_applied`` of ``mujoco.MjData``.
-    """
+    """Access to N simulations for the hooks ``feel`` and ``rewrite`` of effects: state that they read, and model fields that
+    they change."""
 
     def __init__(self, batch: Batch, rewritten: Sequence[str]) -> None:
         self.model: mujoco.MjModel = batch.model
@@ -64,7 +60,7 @@ class LiveModel:
         return self._indices[key]
 
     def integrates(self, joints: Sequence[str]) -> np.ndarray:
-        """(number of joints,) bool: the joint's motor is MuJoCo's PID actuator, whose ``gainprm`` belongs to the integral."""
+        """(number of joints,) bool: the joint's motor is MuJoCo's PID actuator, whose ``gainprm`` are those of the integral."""
         return self.model.actuator_gaintype[self.actuators(joints)] == mujoco.mjtGain.mjGAIN_PID
 
     def integrals(self, joints: Sequence[str]) -> np.ndarray:
@@ -90,7 +86,7 @@ class LiveModel:
         return torque + np.where(apart, self.seen("qfrc_gravcomp")[:, dofs], 0.0)
 
     def scale_carried(self, joints: Sequence[str], carried_nm: np.ndarray, factor: np.ndarray | float) -> None:
-        """Scale the motors' gravity compensation by ``factor``; ``carried_nm`` is the compensation that MuJoCo already applies
-        [N·m]."""
+        """Scale the motors' gravity compensation by ``factor``; ``carried_nm`` is the compensation torque that MuJoCo already
+        applies [N·m]."""
         applied, dofs = self.own("qfrc_applied"), self.dofs(joints)
         applied[:, dofs] = factor * (applied[:, dofs] + carried_nm) - carried_nm

@@ -18,11 +18,12 @@ if TYPE_CHECKING:
 @effects.register("load_friction")
 @dataclass(kw_only=True)
 class LoadFriction(JointEffect):
-    """τ = −μ |τ_motor − τ_load| sign q̇; at rest |τ| ≤ μ |τ_motor − τ_load|.
+    """Dry friction in proportion to the load of the gear: τ = −μ |τ_motor − τ_load| sign q̇; at rest |τ| ≤ μ |τ_motor − τ_load|.
 
-    τ_motor is what the drive gives, weight carried included. τ_load is what the load does to the joint: its weight (and Coriolis)
-    pull by τ_load = −g(q), where +g(q) is what holds it. So |τ_motor − τ_load| = |τ_motor + g(q)|: twice the weight's torque in a
-    joint that holds it (Rhoban BAM, ICRA 2025, their model M2). Both are taken at the end of each physics step for the next.
+    τ_motor is the torque of the drive, gravity compensation included. τ_load is the torque of the load on the joint: its weight
+    (and Coriolis forces) pull with τ_load = −g(q), where +g(q) is the torque that holds it. So |τ_motor − τ_load| = |τ_motor +
+    g(q)|: twice the weight's torque in a joint that holds it (Rhoban BAM, ICRA 2025, their model M2). Both torques are
+    determined at the end of each physics step, for the next step.
     """
 
     name: ClassVar = "load_friction"

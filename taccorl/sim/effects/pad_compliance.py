@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 @effects.register("pad_compliance")
 @dataclass(kw_only=True)
 class PadCompliance(TouchEffect):
-    """A pad's stiffness is k times ``robot.pad_stiffness_n_per_m``: the same force presses it in by 1 / k of the depth.
+    """Stiffness of a pad: k times ``robot.pad_stiffness_n_per_m``. The same force compresses the pad by 1 / k of the depth.
 
-    A sensor's gain does the same to readings; only how far the fingers close tells them apart.
+    A sensor's gain changes readings in the same way; only the opening of the fingers distinguishes the two.
     """
 
     name: ClassVar = "pad_compliance"

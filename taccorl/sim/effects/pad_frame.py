@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class PadFrameEffect(TouchEffect):
-    """Base of effects that move the frame of a pad's taxels in the finger, and of the pad's box if it moves with them.
+    """Base of effects that move the frame of a pad's taxels in the finger, and the pad's box with it if the effect says so.
 
-    The twin's model is edited; the matched contact replay (``taccorl.alignment.touch.model``), which has no model, evaluates the
-    depths at positions moved by ``offset_pad_m``.
+    ``edit`` changes the twin's model. The matched contact replay (``taccorl.alignment.touch.model``) has no model: it evaluates
+    the depths at positions displaced by ``offset_pad_m``.
     """
 
     layer: ClassVar = "robot"
     needs: ClassVar = ("depth",)
 
     def offset_pad_m(self, pad: str) -> np.ndarray:
-        """(3,) displacement of the taxels of ``pad`` [m] in the pad's frame: across, from palm to tip, out of the pad. Across
-        runs along x of the TCP on fingers a and against it on fingers b."""
+        """(3,) displacement of the taxels of ``pad`` [m] in the pad's frame: across, from palm to tip, out of the pad. The
+        direction "across" is +x of the TCP for fingers a and −x for fingers b."""
         raise NotImplementedError
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:

@@ -14,9 +14,10 @@ from taccorl.sim.effects.pad_frame import PadFrameEffect
 @effects.register("pad_shift")
 @dataclass(kw_only=True)
 class PadShift(PadFrameEffect):
-    """Taxels feel what is s further across the hand (x of the TCP) and t further towards the tips; the rubber stays where it is.
+    """Displacement of the taxels on the pad: each taxel reads what is s further along x of the TCP (across the hand) and t
+    further towards the finger tips. The rubber is not displaced.
 
-    On both pads of a hand it is also what an object does that sits (−s, −t) beside where it is taken to be.
+    On both pads of a hand, an object that is displaced by (−s, −t) from its assumed position has the same effect.
     """
 
     name: ClassVar = "pad_shift"

@@ -18,9 +18,10 @@ _RADIUS_M = 0.02  # of the ball, for its inertia
 @effects.register("payload")
 @dataclass(kw_only=True)
 class Payload(ArmEffect):
-    """A ball of mass m fixed to link 6 at c: torque m g × lever arm on every joint, and its inertia.
+    """Unknown payload: a ball of mass m fixed to link 6 at c. It adds the torque m g × lever arm to every joint, and its
+    inertia.
 
-    It has no shape that could touch anything.
+    It has no contacts.
     """
 
     name: ClassVar = "payload"

@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 @effects.register("position_dependent_friction")
 @dataclass(kw_only=True)
 class PositionDependentFriction(JointEffect):
-    """τ = −F(q) sign q̇ with F(q) = F₀ exp(−((q − q₀) / w)²); at rest any τ with |τ| ≤ F(q).
+    """Dry friction about one angle of the joint: τ = −F(q) sign q̇ with F(q) = F₀ exp(−((q − q₀) / w)²); at rest any τ with |τ|
+    ≤ F(q).
 
-    One tight spot: a dent in a bearing, a cable guide, a gear that runs out of true. That friction of gears hangs on the position
-    was measured by Armstrong-Hélouvry, "Control of Machines with Friction", 1991, ch. 3. Narrow, it is a spot; with w of a radian
-    it also is the crest of F (1 + a cos(2 (q − q₀))), since cos² x ≈ exp(−x²): for a from 0.6 on, no Coulomb friction besides is
-    needed over a range of ± 1 rad. A sinusoid of several turns, as of a bent shaft before the gear, it is not. q is the motor's
-    angle at the end of each physics step, for the next.
+    Causes are a dent in a bearing, a cable guide, or a gear that is out of true. Armstrong-Hélouvry, "Control of Machines with
+    Friction", 1991, ch. 3, measured gear friction that depends on the position. With w of about a radian the law also
+    approximates F (1 + a cos(2 (q − q₀))), since cos² x ≈ exp(−x²): for a ≥ 0.6, no additional Coulomb friction is required over
+    a range of ± 1 rad. It does not approximate a sinusoid of several turns, as of a bent shaft before the gear. q is the motor's
+    angle at the end of each physics step, for the next step.
     """
 
     name: ClassVar = "position_dependent_friction"

@@ -15,9 +15,10 @@ if TYPE_CHECKING:
 @effects.register("quadratic_drag")
 @dataclass(kw_only=True)
 class QuadraticDrag(JointEffect):
-    """τ = −c q̇ |q̇|. Half the speed leaves a quarter of it; K_d can follow it at one speed only.
+    """Drag in proportion to the squared speed: τ = −c q̇ |q̇|. At half the speed a quarter of it remains, so that a change of
+    K_d can reproduce it at one speed only.
 
-    MuJoCo's polynomial joint damping, its second coefficient.
+    Implemented as the second coefficient of MuJoCo's polynomial joint damping.
     """
 
     name: ClassVar = "quadratic_drag"

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 @effects.register("sensor_delay")
 @dataclass(kw_only=True)
 class SensorDelay(JointEffect):
-    """y(t) = q(t − d): the arm moves as before, the report lags. Its controller sits in the drive and sees q at once."""
+    """Delay of the reported angle: y(t) = q(t − d). The motion does not change: the controller is in the drive and uses q
+    without delay."""
 
     name: ClassVar = "sensor_delay"
     needs: ClassVar = ("position",)

@@ -15,10 +15,11 @@ from taccorl.sim.effects.effect import JointEffect, Memory, parameter
 @effects.register("slew_limit")
 @dataclass(kw_only=True)
 class SlewLimit(JointEffect):
-    """|ṙ| ≤ v_max, and the controller works on r: r moves towards q* by at most v_max Δt until the next sending.
+    """Speed limit of the commands: |ṙ| ≤ v_max, and the controller's target is r, which moves towards q* by at most v_max Δt
+    until the next command.
 
-    r has its value at the end of that Δt, as in ``command_lag``: r_k = r_{k−1} + clip(q*_k − r_{k−1}, ± v_max Δt). It comes after
-    ``command_lag`` and before ``velocity_feedforward`` and ``command_delay``.
+    As in ``command_lag``, the controller gets the value of r at the end of that Δt: r_k = r_{k−1} + clip(q*_k − r_{k−1}, ± v_max
+    Δt). The effect acts after ``command_lag`` and before ``velocity_feedforward`` and ``command_delay``.
     """
 
     name: ClassVar = "slew_limit"

@@ -23,12 +23,12 @@ POSES = 64
 @effects.register("speed_delay")
 @dataclass(kw_only=True)
 class SpeedDelay(JointEffect):
-    """−K_d (q̇ − τ q̈): to first order in τ an inertia of −K_d τ.
+    """Delay τ of the velocity in the controller: −K_d (q̇ − τ q̈), to first order in τ an inertia of −K_d τ.
 
-    τ is half a period for the difference of two samples, half a period for the output that is held, and the time constant of the
-    speed's filter. The diagnosis fits it with the gains wherever recordings say anything about it (recorded effort, known weight,
-    commanded gains), so it is no candidate of the search. The effort of the one-joint model holds K_d τ q̈, which the
-    motor gives; that of a whole twin in MuJoCo, where only the inertia is changed, does not.
+    τ is the sum of half a sampling period for the difference of two samples, half a period for the output that is held, and the
+    time constant of the velocity's filter. The diagnosis fits τ with the gains if the recordings determine it (recorded effort,
+    known weight, commanded gains), so that it is not a candidate of the search. In the one-joint model the effort includes K_d τ
+    q̈, which the motor supplies; in a whole twin in MuJoCo, where only the inertia is changed, it does not.
     """
 
     name: ClassVar = "speed_delay"

@@ -18,10 +18,11 @@ _BRISTLE_DAMPING_S = 0.001  # over their stiffness: they settle in a physics ste
 @effects.register("stribeck_friction")
 @dataclass(kw_only=True)
 class StribeckFriction(JointEffect):
-    """|τ| = F (1 + s exp(−(q̇ / v_s)²)) when sliding, after a springy presliding of up to x_p.
+    """Friction that decreases with the speed: |τ| = F (1 + s exp(−(q̇ / v_s)²)) when sliding, after an elastic deflection of up
+    to x_p before sliding.
 
-    LuGre bristles (Canudas de Wit et al. 1995): F is Coulomb's part, s F what stiction adds to it. Built as MuJoCo's passive DC
-    motor, with one activation more in the state.
+    LuGre bristle model (Canudas de Wit et al. 1995): F is the Coulomb friction, s F the additional torque of stiction.
+    Implemented as MuJoCo's passive DC motor, with one additional activation in the state.
     """
 
     name: ClassVar = "stribeck_friction"

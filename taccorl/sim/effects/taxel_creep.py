@@ -15,11 +15,12 @@ from taccorl.sim.effects.touch_memory import RememberingEffect
 @effects.register("taxel_creep")
 @dataclass(kw_only=True)
 class TaxelCreep(RememberingEffect):
-    """r = f + a m with ṁ = (f − m) / τ: at once f, at length (1 + a) f; after release a m remains for a while.
+    """Creep of the readings: r = f + a m with ṁ = (f − m) / τ. The reading is f at once and (1 + a) f after a long time; after
+    release a m remains and decays.
 
-    Standard linear solid. a < 0 is relaxation: the reading sinks under a load that stays; what falls below 0 is cut off.
+    Standard linear solid. a < 0 is relaxation: the reading decreases under a constant load. Readings do not fall below 0.
 
-    ṁ is solved exactly for a reading that has stood since the last scan.
+    The equation is solved exactly for a reading that was constant since the last scan.
     """
 
     name: ClassVar = "taxel_creep"
@@ -77,7 +78,7 @@ class TaxelCreep(RememberingEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: rising quickly, rising slowly, sinking."""
+        """Start values: a fast increase, a slow increase, a decrease."""
         return [
             {"share": 0.3, "time_constant_s": 0.3},
             {"share": 0.3, "time_constant_s": 3.0},

@@ -12,9 +12,10 @@ from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
 @effects.register("taxel_crosstalk")
 @dataclass(kw_only=True)
 class TaxelCrosstalk(TouchEffect):
-    """r = f + c/4 Σ (f_neighbour − f) over the neighbours in its row and column: a taxel keeps 1 − c and gives c/4 to each.
+    """Crosstalk between neighbouring taxels of a row or column: r = f + c/4 Σ (f_neighbour − f). A taxel keeps 1 − c of its
+    reading and adds c/4 of it to each neighbour.
 
-    At the edge it keeps the share of neighbours that it lacks, so the sum over a pad stays.
+    At the edge a taxel keeps the shares of missing neighbours, so that the sum over a pad does not change.
     """
 
     name: ClassVar = "taxel_crosstalk"

@@ -17,7 +17,8 @@ from taccorl.sim.effects.effect import Kind, Memory, TouchEffect, parameter
 @effects.register("taxel_gain_map")
 @dataclass(kw_only=True)
 class TaxelGainMap(TouchEffect):
-    """r_i = (1 + s (g_i − 1)) f_i: known gains of these boards, where ``taxel_gain_spread`` draws those of boards like them."""
+    """Gain of each taxel: r_i = (1 + s (g_i − 1)) f_i, with the known gains g_i of these boards. ``taxel_gain_spread`` draws
+    gains of similar boards instead."""
 
     name: ClassVar = "taxel_gain_map"
     layer: ClassVar = "taxel"
@@ -47,7 +48,7 @@ class TaxelGainMap(TouchEffect):
         source="1 is the map as it was measured; less fades it out",
     )
     gains: list[float] = field(default_factory=lambda: [0.0])
-    """g_i: one per taxel, row after row from palm to tip, pad after pad; or one for all of them. 0, the default, is a pad that
+    """g_i: one gain per taxel, row after row from palm to tip, pad after pad; or one gain for all. The default 0 is a pad that
     is not connected."""
 
     @classmethod

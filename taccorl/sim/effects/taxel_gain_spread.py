@@ -12,7 +12,8 @@ from taccorl.sim.effects.effect import BoardEffect, Memory, parameter
 @effects.register("taxel_gain_spread")
 @dataclass(kw_only=True)
 class TaxelGainSpread(BoardEffect):
-    """r_i = g_i f_i with ln g_i normal, of mean 0 and standard deviation s: drawn once, from ``seed``."""
+    """Random gain of each taxel: r_i = g_i f_i, where ln g_i is normally distributed with mean 0 and standard deviation s, drawn
+    once from ``seed``."""
 
     name: ClassVar = "taxel_gain_spread"
     layer: ClassVar = "taxel"

@@ -12,7 +12,8 @@ from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
 @effects.register("taxel_ghosting")
 @dataclass(kw_only=True)
 class TaxelGhosting(TouchEffect):
-    """r_ij = f_ij + g (Σ_k f_ik + Σ_k f_kj − 2 f_ij): each of the others on its two wires adds the share g of its reading."""
+    """Ghosting along the wires of rows and columns: r_ij = f_ij + g (Σ_k f_ik + Σ_k f_kj − 2 f_ij). Every other taxel on a
+    taxel's two wires adds the share g of its reading."""
 
     name: ClassVar = "taxel_ghosting"
     needs: ClassVar = ("reading", "neighbours")

@@ -14,9 +14,10 @@ from taccorl.sim.effects.touch_memory import RememberingEffect
 @effects.register("taxel_hysteresis")
 @dataclass(kw_only=True)
 class TaxelHysteresis(RememberingEffect):
-    """r stays while (1 − h) f ≤ r ≤ (1 + h) f, and is carried along at these ends: Prandtl's play, its width in proportion to f.
+    """Hysteresis of the readings: r stays constant while (1 − h) f ≤ r ≤ (1 + h) f, and follows the limit that it reaches
+    (Prandtl's play with a width in proportion to f).
 
-    Loading reads (1 − h) f, unloading (1 + h) f, and nothing is left without contact.
+    The reading is (1 − h) f during loading, (1 + h) f during unloading, and 0 without contact.
     """
 
     name: ClassVar = "taxel_hysteresis"

@@ -18,9 +18,10 @@ TIMES_S = (0.1, 1.0, 10.0, 100.0, 1000.0)
 @effects.register("taxel_log_creep")
 @dataclass(kw_only=True)
 class TaxelLogCreep(RememberingEffect):
-    """r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ, τᵢ = 0.1 s … 1000 s: after t seconds of load about (1 + a log₁₀(t / 0.06 s)) f.
+    """Creep over many time scales: r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ, τᵢ = 0.1 s … 1000 s. After t seconds of load r is
+    about (1 + a log₁₀(t / 0.06 s)) f.
 
-    a < 0 is relaxation. What falls below 0 is cut off.
+    a < 0 is relaxation. Readings do not fall below 0.
     """
 
     name: ClassVar = "taxel_log_creep"
@@ -67,7 +68,7 @@ class TaxelLogCreep(RememberingEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: rising and sinking."""
+        """Start values: an increase and a decrease."""
         return [{"share": 0.05}, {"share": -0.05}]
 
 

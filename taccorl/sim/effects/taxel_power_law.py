@@ -13,9 +13,9 @@ from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
 @effects.register("taxel_power_law")
 @dataclass(kw_only=True)
 class TaxelPowerLaw(TouchEffect):
-    """r = f₀ (f / f₀)^p. Readings of f₀ stay as they are.
+    """Nonlinear characteristic of the taxels: r = f₀ (f / f₀)^p. Readings equal to f₀ do not change.
 
-    p > 1 is steeper where pressed hard, as a ball on a soft half-space (Hertz); p < 1 is flatter, as resistive foils.
+    p > 1 is steeper at high pressure, as for a ball on a soft half-space (Hertz); p < 1 is flatter, as for resistive foils.
     """
 
     name: ClassVar = "taxel_power_law"

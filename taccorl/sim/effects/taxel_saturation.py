@@ -14,7 +14,8 @@ from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
 @effects.register("taxel_saturation")
 @dataclass(kw_only=True)
 class TaxelSaturation(TouchEffect):
-    """r = f / (1 + f / f_s): a voltage divider, whose other resistor is as great as the taxel's at f = f_s. r stays below f_s."""
+    """Saturation of the taxels: r = f / (1 + f / f_s), which is the output of a voltage divider whose other resistor equals the
+    taxel's at f = f_s. r remains below f_s."""
 
     name: ClassVar = "taxel_saturation"
     layer: ClassVar = "material"

@@ -17,7 +17,8 @@ NOMINAL_C = 20.0
 @effects.register("taxel_temperature")
 @dataclass(kw_only=True)
 class TaxelTemperature(TouchEffect):
-    """r = (1 + α (ϑ − 20 °C)) f + β (ϑ − 20 °C), with the temperature ϑ that was recorded beside the readings."""
+    """Influence of the temperature ϑ on the readings: r = (1 + α (ϑ − 20 °C)) f + β (ϑ − 20 °C). ϑ is recorded together with the
+    readings."""
 
     name: ClassVar = "taxel_temperature"
     needs: ClassVar = ("reading", "temperature")

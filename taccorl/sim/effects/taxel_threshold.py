@@ -12,7 +12,8 @@ from taccorl.sim.effects.effect import Memory, TouchEffect, parameter
 @effects.register("taxel_threshold")
 @dataclass(kw_only=True)
 class TaxelThreshold(TouchEffect):
-    """r = [f − t]₊: foils that lie apart and meet at t, or a driver that cuts off what is small."""
+    """Threshold of the readings: r = [f − t]₊, because foils touch each other only from t on, or because a driver cuts off small
+    values."""
 
     name: ClassVar = "taxel_threshold"
     layer: ClassVar = "material"

@@ -13,9 +13,10 @@ from taccorl.sim.effects.live_model import LiveModel
 @effects.register("torque_fade")
 @dataclass(kw_only=True)
 class TorqueFade(JointEffect):
-    """τ_motor = [1 − t / T_f]₊ (K_p (q* − q) − K_d q̇ + T_ref + c g(q)) with t since the reset and the rate 1 / T_f.
+    """Loss of torque over time: τ_motor = [1 − t / T_f]₊ (K_p (q* − q) − K_d q̇ + T_ref + c g(q)), with the time t since the
+    reset and the rate 1 / T_f.
 
-    The controller's torque and the one that carries the weight; efforts are what is given.
+    The factor acts on the controller's torque and on the gravity compensation. Efforts are the reduced torques.
     """
 
     name: ClassVar = "torque_fade"

@@ -13,11 +13,12 @@ from taccorl.sim.effects.live_model import LiveModel
 @effects.register("torque_lag")
 @dataclass(kw_only=True)
 class TorqueLag(JointEffect):
-    """T τ̇ = u − τ with the controller's u = K_p (q* − q) − K_d q̇ + T_ref. The torque that carries the weight does not lag.
+    """Lag of the motor's torque: T τ̇ = u − τ with the controller's output u = K_p (q* − q) − K_d q̇ + T_ref. The gravity
+    compensation does not lag.
 
-    Backward Euler, so that it fades out with T: with β = h / (h + T) a physics step applies τ_{n+1} = β u_{n+1} + (1 − β) τ_n,
-    where MuJoCo takes u_{n+1} at the end of the step as it does without lag: the actuator's gains are β K_p, β K_d, and its bias
-    is β T_ref + (1 − β) τ_n. At the start of an episode or a replay τ = u.
+    Backward Euler, so that the effect vanishes with T: with β = h / (h + T) a physics step applies τ_{n+1} = β u_{n+1} + (1 − β)
+    τ_n, where MuJoCo evaluates u_{n+1} at the end of the step as it does without lag: the actuator's gains are β K_p, β K_d, and
+    its bias is β T_ref + (1 − β) τ_n. At the start of an episode or a replay τ = u.
     """
 
     name: ClassVar = "torque_lag"

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 @effects.register("torque_saturation")
 @dataclass(kw_only=True)
 class TorqueSaturation(JointEffect):
-    """|τ| ≤ τ_max, where τ is the controller's torque and the one that carries the arm's weight together.
+    """Limit of the motor's torque: |τ| ≤ τ_max, where τ is the sum of the controller's torque and the gravity compensation.
 
-    MuJoCo's ``actuatorfrcrange`` with ``actuatorgravcomp``: a limit at the joint. While it is reached, K_d does not damp either.
+    Implemented by MuJoCo's ``actuatorfrcrange`` with ``actuatorgravcomp``, a limit at the joint. While the limit is reached, K_d
+    does not damp the motion.
     """
 
     name: ClassVar = "torque_saturation"

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 @effects.register("torque_scale")
 @dataclass(kw_only=True)
 class TorqueScale(JointEffect):
-    """τ_motor = g (K_p (q* − q) − K_d q̇ + T_ref + c g_w(q)): the controller's torque and the one that carries the weight.
+    """Scale of the motor's torque: τ_motor = g (K_p (q* − q) − K_d q̇ + T_ref + c g_w(q)). The factor g acts on the controller's
+    torque and on the gravity compensation c g_w(q).
 
-    Efforts are what is given, g times what is asked.
+    Efforts are the scaled torques: g times the requested ones.
     """
 
     name: ClassVar = "torque_scale"

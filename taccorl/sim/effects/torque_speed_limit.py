@@ -19,13 +19,15 @@ if TYPE_CHECKING:
 @effects.register("torque_speed_limit")
 @dataclass(kw_only=True)
 class TorqueSpeedLimit(JointEffect):
-    """|τ| ≤ τ_s [1 − |q̇| / v₀]₊ where the motor drives (τ q̇ > 0), |τ| ≤ τ_s where it brakes or stands.
+    """Torque limit that depends on the speed: |τ| ≤ τ_s [1 − |q̇| / v₀]₊ where the motor drives (τ q̇ > 0), |τ| ≤ τ_s where it
+    brakes or stands.
 
-    A motor at supply voltage U with winding resistance R and torque constant k_t gives at most τ = k_t (U − k_t q̇) / R: the
-    torque-speed line of every DC motor's datasheet, from stall torque τ_s = k_t U / R to no-load speed v₀ = U / k_t. When it
-    brakes, the back-EMF helps the supply, and the drive's current limit holds; it is taken at τ_s, as in Isaac Lab's ``DCMotor``.
-    τ is the controller's torque and the one that carries the weight together, both numbers are those of the joint, behind the
-    gear. The speed is that at the end of each physics step for the next. While the limit is reached, K_d does not damp.
+    A motor at supply voltage U with winding resistance R and torque constant k_t has at most τ = k_t (U − k_t q̇) / R: the
+    torque-speed line of a DC motor's datasheet, from the stall torque τ_s = k_t U / R to the no-load speed v₀ = U / k_t. When
+    the motor brakes, the back-EMF adds to the supply, and the drive's current limit applies; it is assumed to be at τ_s, as in
+    Isaac Lab's ``DCMotor``. τ is the sum of the controller's torque and the gravity compensation; τ_s and v₀ are values at the
+    joint, after the gear. The speed is that at the end of each physics step, for the next step. While the limit is reached, K_d
+    does not damp the motion.
     """
 
     name: ClassVar = "torque_speed_limit"

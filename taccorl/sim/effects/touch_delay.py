@@ -17,7 +17,7 @@ _GAP_S = 0.008  # readings closer than this are not kept beside each other; pads
 @effects.register("touch_delay")
 @dataclass(kw_only=True)
 class TouchDelay(RememberingEffect):
-    """r(t) = f(t − d), in straight lines between scans. Before the reset nothing was touched."""
+    """Delay of the readings: r(t) = f(t − d), with linear interpolation between scans. Before the reset readings count as 0."""
 
     name: ClassVar = "touch_delay"
     layer: ClassVar = "taxel"

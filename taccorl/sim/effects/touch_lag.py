@@ -14,7 +14,7 @@ from taccorl.sim.effects.touch_memory import RememberingEffect
 @effects.register("touch_lag")
 @dataclass(kw_only=True)
 class TouchLag(RememberingEffect):
-    """ṙ = (f − r) / T: a low-pass. Solved exactly for a reading that has stood since the last scan."""
+    """Low-pass of the readings: ṙ = (f − r) / T. Solved exactly for a reading that was constant since the last scan."""
 
     name: ClassVar = "touch_lag"
     layer: ClassVar = "taxel"

@@ -14,11 +14,11 @@ from taccorl.sim.effects.live_model import LiveModel
 @effects.register("velocity_feedforward")
 @dataclass(kw_only=True)
 class VelocityFeedforward(JointEffect):
-    """τ = K_p (q* − q) + K_d (α q̇* − q̇) + T_ref: with α = 1 the lag K_d / K_p is gone.
+    """Velocity feedforward of the drive: τ = K_p (q* − q) + K_d (α q̇* − q̇) + T_ref. With α = 1 the lag K_d / K_p vanishes.
 
-    q̇*_k = (q*_k − q*_{k−1}) / Δt from one sending to the next, held as q*_k is; 0 at first. What is sent on is
-    q* + α (K_d / K_p) q̇*. It comes after ``command_lag`` and ``slew_limit``, of whose r it takes the speed, and before
-    ``command_delay``.
+    q̇*_k = (q*_k − q*_{k−1}) / Δt between two commands, constant while q*_k is in force; 0 for the first command. The controller
+    gets q* + α (K_d / K_p) q̇*. The effect acts after ``command_lag`` and ``slew_limit``, whose output r is differentiated, and
+    before ``command_delay``.
     """
 
     name: ClassVar = "velocity_feedforward"

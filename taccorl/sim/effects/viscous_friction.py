@@ -15,9 +15,10 @@ if TYPE_CHECKING:
 @effects.register("viscous_friction")
 @dataclass(kw_only=True)
 class ViscousFriction(JointEffect):
-    """τ = −b q̇. Of a joint that follows fixed targets b adds to K_d and nothing else: no position tells them apart.
+    """Viscous friction: τ = −b q̇. For a joint that follows given targets, b has the same effect as a larger K_d: positions
+    cannot distinguish them.
 
-    To see b, change the gains between recordings, or record torques.
+    To determine b, change the gains between recordings, or record torques.
     """
 
     name: ClassVar = "viscous_friction"

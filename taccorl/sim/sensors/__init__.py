@@ -39,19 +39,20 @@ class Transform(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TactileFrames:
-    """Readings of all pads at one instant, in converter counts."""
+    """Counts of all pads of N simulations at one instant."""
 
     counts: np.ndarray
-    """(N, P, R, C) uint8 or uint16 counts on the wire, in the pads' own layout."""
+    """(N, P, R, C) uint8 or uint16 counts as the converter sends them, for N simulations, P pads, R rows and C columns of taxels
+    in the pads' own layout."""
     baseline: np.ndarray
-    """(P, R, C) counts at rest, without noise: up to noise equal to the median of a recording's first frames, which ingest
-    uses."""
+    """(P, R, C) resting counts, without noise. They equal the median of a recording's first frames, which ingest subtracts, up
+    to noise."""
     pads: tuple[str, ...]
     spec: SensorSpec
 
     @property
     def counts_above_baseline(self) -> np.ndarray:
-        """(N, P · K) int16: ``observation.tactile`` of the dataset, pad after pad, row after row."""
+        """(N, P · K) int16 counts above baseline: ``observation.tactile`` of the dataset, pad after pad, row after row."""
         above = np.subtract(self.counts, self.baseline, dtype=np.int16, casting="unsafe")
         return above.reshape(len(above), -1)
 

@@ -28,7 +28,7 @@ class AirAssembly(ScriptedExpert):
     """Base of both assembly experts: both hands lift a part, the left one holds its part in the air, the right one inserts."""
 
     enough_m: float
-    """Least depth at which the plug stays in its place [m]."""
+    """Least depth in its hole at which the plug stays in place after release [m]."""
     _held_like: np.ndarray | None = None
     """(3, 3) orientation of the hole in the left hand when it began to hold it; None: level."""
 
@@ -46,7 +46,7 @@ class AirAssembly(ScriptedExpert):
 
     @abstractmethod
     def push_in(self, mating: Mating) -> Script:
-        """Insert the plug, from both parts held to the plug in place and still in the hand."""
+        """Motion that inserts the plug, from both parts held in the hands to the plug in place and still in the hand."""
 
     def script(self, arm: str) -> Script:
         return self._left() if arm == "left" else self._right()

@@ -101,8 +101,8 @@ class Puzzle(Task):
         return fit._replace(turn_rad=np.where(self._is_round[k], 0.0, turn_rad))
 
     def inside(self, fit: Fit) -> np.ndarray:
-        """Whether pieces with these pose errors are inserted: at most 2.5 mm above the hole's floor, and tilted by less than
-        3°."""
+        """(N, len(which)) bool: pieces with these pose errors are inserted, i.e. at most 2.5 mm above the hole's floor and
+        tilted by less than 3°."""
         # The other two are wider than any clearance: only what is in its own hole is within.
         turned = np.abs(fit.turn_rad) < _TURN_RAD
         return (fit.depth_m > self.in_depth_m) & (fit.tilt_rad < _TILT_RAD) & (fit.lateral_m < _LATERAL_M) & turned
